@@ -56,6 +56,11 @@ UNITS: tuple[tuple[str, str, float], ...] = (
 ENDINGS = [ending for ending, _, _ in UNITS]
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HEADING = re.compile(r"(.+_)?(heading|yaw|theta|psi)")
+TURN_RATE = re.compile(
+    r"w_?z?|omega(_?z)?|(.+_)?(turn|angular(_vel(ocity)?)?(_z)?|ang_vel(_z)?|"
+    r"(v|d|vel_|velocity_)(heading|yaw|theta|psi|th|rot|ang)|"
+    r"(heading|yaw|theta|psi|turn(ing)?|rot(ation)?)_?(rate|vel|velocity|speed|dot))"
+)
 ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
 LENGTH = re.compile(
     r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"

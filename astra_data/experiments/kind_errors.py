@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from astra_data.exchange.guessing import Floats, Logs
+from astra_data.exchange.logs import Floats, Logs
 
 
 class Kind(Protocol):

@@ -1,106 +1,19 @@
-"""The abstract simulators that a new robot may begin with, and how they fit its logs."""
+"""The abstract simulator of a new robot of any other kind: values that commands move."""
 
-import json
-import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.field_names import HEADING, LENGTH
-from astra_data.exchange.guessing import Field, Floats, Logs
+from astra_data.exchange.field_names import HEADING
+from astra_data.exchange.logs import Field, Floats, Logs
 from astra_data.experiments.kind_errors import errors
+from astra_data.experiments.written_values import numbers, texts, typical
 
-_TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|rot|steer).*")
 _SPEED = re.compile(r"^(vel_|velocity_|v|d)(?=[a-z])")
-
-
-@dataclass(frozen=True)
-class Planar:
-    """A position, a heading, and commands of speed and of turning: a unicycle.
-
-    Attributes:
-        logs: what was recorded.
-        position: x and y. heading: an angle, or its cosine and sine.
-    """
-
-    logs: Logs
-    position: tuple[Field, Field]
-    heading: tuple[Field, ...]
-
-    template = "unicycle.py"
-
-    @property
-    def simulator(self) -> str:
-        """What it is and what moves it, in a few words."""
-        moved, commands = (
-            ", ".join(field.short for field in fields)
-            for fields in ((*self.position, *self.heading), self.logs.of("command"))
-        )
-        return f"a unicycle: {moved}, driven by {commands}"
-
-    @classmethod
-    def of(cls, logs: Logs) -> Self | None:
-        """Return how it fits; None if it does not."""
-        states = {field.short: field for field in logs.of("state")}
-        for short, x in states.items():
-            y = states.get(f"{short[:-1]}y")
-            if short[-1] != "x" or y is None or not LENGTH.fullmatch(short) or not _moves(logs, (x, y)):
-                continue
-            angles = [name for name in states if HEADING.fullmatch(name)]
-            pairs = [name[:-2] for name in states if HEADING.fullmatch(name[:-2]) and name.endswith("_x")]
-            if len(logs.of("command")) != 2 or not (angles or pairs):
-                return None
-            names = (f"{pairs[0]}_x", f"{pairs[0]}_y") if pairs else (angles[0],)
-            return (
-                cls(logs, (x, y), tuple(states[name] for name in names))
-                if set(names) <= set(states)
-                else None
-            )
-        return None
-
-    def values(self) -> dict[str, str]:
-        """Return what its templates name."""
-        commands = self.logs.of("command")
-        turn = next((number for number, field in enumerate(commands) if _TURNS.fullmatch(field.short)), 1)
-        variables = ["speed", "speed"]
-        variables[turn] = "turn"
-        order = {field.name: number for number, field in enumerate(self.logs.of("state"))}
-        indices = [order[field.name] for field in (*self.position, *self.heading)]
-        if len(self.heading) == 2:
-            abstraction = f"return state[..., {indices}]"
-        else:
-            x, y, yaw = (f"state[..., {index}]" for index in indices)
-            library = "np if isinstance(state, np.ndarray) else torch"
-            abstraction = (
-                f"of, yaw = {library}, {yaw}\n"
-                f"        return of.stack([{x}, {y}, of.cos(yaw), of.sin(yaw)], -1)"
-            )
-        poses = [self._pose(values) for values in self.logs.values((*self.position, *self.heading))]
-        starts = np.array([pose[0] for pose in poses])
-        goal, close = _typical([pose[:, :2] for pose in poses])
-        x, y, yaw = poses[0][0]
-        timestep_s = 1 / self.logs.rate
-        return {
-            "abstraction": abstraction,
-            "commands": ", ".join(variables),
-            "goal": _numbers(goal, "()"),
-            "close": f"{close:.2g}",
-            "lows": _numbers(starts.min(axis=0)),
-            "highs": _numbers(starts.max(axis=0)),
-            "phi": _numbers([x, y, math.cos(yaw), math.sin(yaw)]),
-            "before": "[0.0, 0.0, 0.0, 1.0]",
-            "command": _numbers(np.arange(2) != turn),
-            "after": _numbers([0.0, timestep_s, 0.0, 1.0]),
-        }
-
-    def _pose(self, values: Floats) -> Floats:
-        """Return x, y and the angle (T, 3) of positions and headings."""
-        yaw = np.arctan2(values[:, 3], values[:, 2]) if len(self.heading) == 2 else values[:, 2]
-        return np.column_stack([values[:, :2], yaw])
 
 
 @dataclass(frozen=True)
@@ -143,7 +56,7 @@ class Direct:
         left = {field.short: field for field in logs.of("state")}
         moved: list[Field | None] = []
         for command in logs.of("command"):
-            names = (_SPEED.sub("", command.short), command.short, command.short.lstrip("u"))
+            names = _names(command, left)
             moved.append(next((left.pop(name) for name in names if name in left), None))
         rest = [field for short, field in left.items() if not _SPEED.match(short)]
         filled = []
@@ -156,10 +69,12 @@ class Direct:
             raise BadInputError(
                 "found no state that a command could move: name it as its command, cmd_q1 and q1"
             )
-        as_rates, as_targets = (
+        rates, targets = (
             errors(cls(logs, found, (is_rate,) * len(found)), 1)[0] for is_rate in (True, False)
         )
-        return cls(logs, found, tuple((as_rates <= as_targets).tolist()))
+        pairs = zip(found, logs.of("command"), strict=False)
+        is_same = np.array([_is_same(state, command) for state, command in pairs])
+        return cls(logs, found, tuple(((rates <= targets) & ~is_same).tolist()))
 
     def states(self) -> list[Floats]:
         """Return the values (T, D) of each episode that commands move."""
@@ -176,7 +91,7 @@ class Direct:
         episodes = self.states()
         starts = np.array([values[0] for values in episodes])
         span = np.ptp(np.concatenate(episodes), axis=0)
-        goal, close = _typical([values / span for values in episodes])
+        goal, close = typical([values / span for values in episodes])
         actions, moved = len(self.logs.of("command")), len(self.moved)
         command = "command" if actions == moved else f"command[:, :{moved}]"
         rate = f"self.state + TIMESTEP_S * {command}"
@@ -192,25 +107,38 @@ class Direct:
         return {
             "names": texts(field.short for field in self.moved),
             "units": texts(field.unit for field in self.moved),
-            "goal": _numbers(goal * span, "()"),
+            "goal": numbers(goal * span, "()"),
             "close": f"{close:.2g}",
-            "range": _numbers(span, "()"),
+            "range": numbers(span, "()"),
             "sentence": sentence,
             "indices": str([order[field.name] for field in self.moved]),
             "step": step,
             "actions": str(actions),
-            "lows": _numbers(starts.min(axis=0)),
-            "highs": _numbers(starts.max(axis=0)),
-            "phi": _numbers(episodes[0][0]),
-            "before": _numbers(before),
-            "command": _numbers(given),
-            "after": _numbers(self.step(before, given[None])[0]),
+            "lows": numbers(starts.min(axis=0)),
+            "highs": numbers(starts.max(axis=0)),
+            "phi": numbers(episodes[0][0]),
+            "before": numbers(before),
+            "command": numbers(given),
+            "after": numbers(self.step(before, given[None])[0]),
         }
 
 
-def _moves(logs: Logs, fields: Sequence[Field]) -> bool:
-    """Return whether one of the fields changes within an episode."""
-    return any(np.ptp(values, axis=0).any() for values in logs.values(fields))
+def _names(command: Field, states: Mapping[str, Field]) -> list[str]:
+    """Return the names of the states that a command moves first of all."""
+    named = _SPEED.sub("", command.short)
+    names = [named, command.short, command.short.lstrip("u")]
+    if not command.is_turn_rate:
+        return names
+    headings = [name for name in states if HEADING.fullmatch(name) and _may_move(command, states[name])]
+    return sorted(headings, key=lambda name: name != named) + names
+
+
+def _is_same(state: Field, command: Field) -> bool:
+    """Return whether a state is what is commanded, and not what it is a rate of."""
+    if "1" not in (command.unit, state.unit):
+        return command.unit == state.unit
+    is_speed = state.is_turn_rate or _SPEED.match(state.short) is not None
+    return is_speed and command.short == state.short
 
 
 def _may_move(command: Field, state: Field) -> bool:
@@ -220,34 +148,3 @@ def _may_move(command: Field, state: Field) -> bool:
 
 def _length(filled: list[Field | None]) -> int:
     return filled.index(None) if None in filled else len(filled)
-
-
-def _typical(episodes: list[Floats]) -> tuple[Floats, float]:
-    """Return the end (D,) of the episode whose way from its start is the median, and a tenth of the way.
-
-    Where that ends as it began, it is a tenth of the farthest way that an episode went, or else of how far
-    episodes lie apart.
-    """
-    ways = [float(np.linalg.norm(values[-1] - values[0])) for values in episodes]
-    typical = int(np.argsort(ways)[len(ways) // 2])
-    farthest = max(float(np.linalg.norm(values - values[0], axis=1).max()) for values in episodes)
-    apart = float(np.linalg.norm(np.ptp(np.concatenate(episodes), axis=0)))
-    return episodes[typical][-1], (ways[typical] or farthest or apart) / 10
-
-
-def _numbers(values: Iterable[float] | Floats, brackets: str = "[]") -> str:
-    """Return a list, or a tuple, as code."""
-    inside = [repr(significant(value)) for value in values]
-    comma = "," if brackets == "()" and len(inside) == 1 else ""
-    return f"{brackets[0]}{', '.join(inside)}{comma}{brackets[1]}"
-
-
-def significant(value: float) -> float:
-    """Return a number of the logs as it is written down: to nine digits, as exact as float32."""
-    return float(f"{value:.9g}") + 0.0
-
-
-def texts(values: Iterable[str]) -> str:
-    """Return a tuple as code."""
-    inside = [json.dumps(value, ensure_ascii=False) for value in values]
-    return f"({', '.join(inside)}{',' if len(inside) == 1 else ''})"

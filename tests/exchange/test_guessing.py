@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.guessing import RATE_HZ, guess
+from astra_data.exchange.guessing import guess
+from astra_data.exchange.logs import RATE_HZ
 
 
 def write(path: Path, columns: Mapping[str, object], rows: int = 6) -> Path:

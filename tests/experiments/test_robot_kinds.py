@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.guessing import Logs, guess
-from astra_data.experiments.robot_kinds import Direct, Planar
+from astra_data.exchange.guessing import guess
+from astra_data.exchange.logs import Logs
+from astra_data.experiments.planar_kinds import Planar
+from astra_data.experiments.robot_kinds import Direct
 
 T = np.arange(50.0)
 

@@ -1,0 +1,200 @@
+"""The abstract simulators of new robots that drive on a plane, and how they fit their logs."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from astra_data.exchange.field_names import HEADING, LENGTH
+from astra_data.exchange.logs import Field, Floats, Logs
+from astra_data.experiments.kind_errors import errors
+from astra_data.experiments.written_values import numbers, typical
+
+_TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|(?<!th)rot|steer).*")
+_SPEED_X = re.compile(r"(.+_)?(v|vel|velocity|linear)_?x")
+
+
+@dataclass(frozen=True)
+class Planar:
+    """A position, a heading, and commands of speed and of turning: a unicycle.
+
+    Attributes:
+        logs: what was recorded.
+        position: x and y. heading: an angle, or its cosine and sine.
+    """
+
+    logs: Logs
+    position: tuple[Field, Field]
+    heading: tuple[Field, ...]
+
+    template = "planar.py"
+    angles = (False, False, True)
+    called: ClassVar[str] = "unicycle"
+
+    @property
+    def simulator(self) -> str:
+        """What it is and what moves it, in a few words."""
+        moved, commands = (
+            ", ".join(field.short for field in fields)
+            for fields in ((*self.position, *self.heading), self.logs.of("command"))
+        )
+        return f"a {self.called}: {moved}, driven by {commands}"
+
+    @property
+    def meanings(self) -> list[str]:
+        """What each command is: "turn" for a rate of turning, and for others names of speeds."""
+        commands = self.logs.of("command")
+        turn = next((number for number, field in enumerate(commands) if _TURNS.fullmatch(field.short)), 1)
+        return ["turn" if number == turn else "speed" for number in range(2)]
+
+    @classmethod
+    def of(cls, logs: Logs) -> Self | None:
+        """Return how it fits; None if it does not."""
+        pose = _pose(logs)
+        return cls(logs, *pose) if pose and len(logs.of("command")) == 2 else None
+
+    def states(self) -> list[Floats]:
+        """Return x, y and the angle of the heading (T, 3) of each episode."""
+        poses = self.logs.values((*self.position, *self.heading))
+        if len(self.heading) == 1:
+            return poses
+        return [np.column_stack([pose[:, :2], np.arctan2(pose[:, 3], pose[:, 2])]) for pose in poses]
+
+    def step(self, state: Floats, command: Floats) -> Floats:
+        """Return where x, y and the angle (B, 3) land by commands (B, A)."""
+        given = dict(zip(self.meanings, command.T, strict=True))
+        east, north = self._speeds(given, np.cos(state[:, 2]), np.sin(state[:, 2]))
+        return state + np.stack([east, north, given["turn"]], axis=-1) / self.logs.rate
+
+    def _speeds(self, given: dict[str, Floats], cos: Floats, sin: Floats) -> tuple[Floats, Floats]:
+        """Return the speeds (B,) along x and y, of commands (B,) by their meaning."""
+        return given["speed"] * cos, given["speed"] * sin
+
+    def _along(self) -> str:
+        """Return the line of code that `_speeds` is in a simulator."""
+        return "east, north = speed * yaw.cos(), speed * yaw.sin()"
+
+    def values(self) -> dict[str, str]:
+        """Return what its templates name."""
+        order = {field.name: number for number, field in enumerate(self.logs.of("state"))}
+        indices = [order[field.name] for field in (*self.position, *self.heading)]
+        if len(self.heading) == 2:
+            abstraction = f"return state[..., {indices}]"
+        else:
+            x, y, yaw = (f"state[..., {index}]" for index in indices)
+            library = "np if isinstance(state, np.ndarray) else torch"
+            abstraction = (
+                f"of, yaw = {library}, {yaw}\n"
+                f"        return of.stack([{x}, {y}, of.cos(yaw), of.sin(yaw)], -1)"
+            )
+        poses = self.states()
+        starts = np.array([pose[0] for pose in poses])
+        goal, close = typical([pose[:, :2] for pose in poses])
+        before = np.array([[0.0, 0.0, math.pi / 2]])
+        command = np.array([[float(meaning != "turn") for meaning in self.meanings]])
+        along, is_in_world = self._along(), "east" in self.meanings
+        seen = "heading_x * east + heading_y * north, heading_x * north - heading_y * east"
+        return {
+            "called": self.called,
+            "robot": self.called.title().replace(" ", ""),
+            "abstraction": abstraction,
+            "commands": ", ".join(self.meanings),
+            "along": f"\n        {along}" if along else "",
+            "seen": "east, north" if is_in_world else seen,
+            "seen_from": "from where the robot is" if is_in_world else "as the robot sees it",
+            "goal": numbers(goal, "()"),
+            "close": f"{close:.2g}",
+            "lows": numbers(starts.min(axis=0)),
+            "highs": numbers(starts.max(axis=0)),
+            "phi": numbers(_unit_vector(poses[0][0])),
+            "before": numbers(_unit_vector(before[0]).round(9)),
+            "command": numbers(command[0]),
+            "after": numbers(_unit_vector(self.step(before, command)[0]).round(9)),
+        }
+
+
+@dataclass(frozen=True)
+class Holonomic(Planar):
+    """A position, a heading, and commands of two speeds and of turning: wheels of Mecanum, or legs.
+
+    Attributes:
+        is_in_world: whether the speeds are along x and y; otherwise they are forward and to the left.
+    """
+
+    is_in_world: bool = False
+
+    called = "holonomic base"
+
+    @property
+    def simulator(self) -> str:
+        """What it is and what moves it, in a few words."""
+        return f"{super().simulator}, {'along x and y' if self.is_in_world else 'forward and to the left'}"
+
+    @property
+    def meanings(self) -> list[str]:
+        """What each command is: "turn" for a rate of turning, and for others names of speeds."""
+        along, across = ("east", "north") if self.is_in_world else ("forward", "left")
+        commands = self.logs.of("command")
+        return [
+            "turn" if field.is_turn_rate else along if field.short.endswith("x") else across
+            for field in commands
+        ]
+
+    @classmethod
+    def of(cls, logs: Logs) -> Self | None:
+        """Return how it fits, with speeds of the frame that predicts the logs better; None if it does not."""
+        pose, commands = _pose(logs), logs.of("command")
+        turns = [field.short for field in commands if field.is_turn_rate]
+        speeds = {field.short for field in commands if not field.is_turn_rate}
+        along = [field.short for field in commands if _is_speed_along_x(field)]
+        if pose is None or len(turns) != 1 or not along or speeds != {along[0], f"{along[0][:-1]}y"}:
+            return None
+        kinds = [cls(logs, *pose, is_in_world) for is_in_world in (False, True)]
+        return min(kinds, key=lambda kind: float(errors(kind, 1)[0][:2].sum()))
+
+    def _speeds(self, given: dict[str, Floats], cos: Floats, sin: Floats) -> tuple[Floats, Floats]:
+        if self.is_in_world:
+            return given["east"], given["north"]
+        forward, left = given["forward"], given["left"]
+        return forward * cos - left * sin, forward * sin + left * cos
+
+    def _along(self) -> str:
+        if self.is_in_world:
+            return ""
+        cos, sin = "yaw.cos()", "yaw.sin()"
+        return f"east, north = forward * {cos} - left * {sin}, forward * {sin} + left * {cos}"
+
+
+def _pose(logs: Logs) -> tuple[tuple[Field, Field], tuple[Field, ...]] | None:
+    """Return the fields of a position that moves and of a heading; None if one is missing."""
+    states = {field.short: field for field in logs.of("state")}
+    for short, x in states.items():
+        y = states.get(f"{short[:-1]}y")
+        if short[-1] != "x" or y is None or not LENGTH.fullmatch(short) or not _moves(logs, (x, y)):
+            continue
+        angles = [name for name in states if HEADING.fullmatch(name)]
+        pairs = [name[:-2] for name in states if HEADING.fullmatch(name[:-2]) and name.endswith("_x")]
+        names = [f"{pairs[0]}_x", f"{pairs[0]}_y"] if pairs else angles[:1]
+        return (
+            ((x, y), tuple(states[name] for name in names)) if names and set(names) <= set(states) else None
+        )
+    return None
+
+
+def _moves(logs: Logs, fields: Sequence[Field]) -> bool:
+    """Return whether one of the fields changes within an episode."""
+    return any(np.ptp(values, axis=0).any() for values in logs.values(fields))
+
+
+def _is_speed_along_x(command: Field) -> bool:
+    """Return whether it is a speed by its name, or by its unit."""
+    is_speed = command.unit == "m/s" or (command.unit == "1" and _SPEED_X.fullmatch(command.short))
+    return bool(is_speed) and command.short.endswith("x")
+
+
+def _unit_vector(pose: Floats) -> Floats:
+    """Return x, y, cosine and sine (4,) of x, y and an angle (3,)."""
+    return np.array([pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])])

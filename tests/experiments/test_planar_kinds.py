@@ -1,0 +1,125 @@
+import runpy
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.exchange.guessing import guess
+from astra_data.exchange.importing import import_dataset
+from astra_data.exchange.logs import Floats
+from astra_data.experiments.new_robot import write_robot
+from astra_data.experiments.planar_kinds import Holonomic, Planar
+from astra_data.experiments.robot_kinds import Direct
+from astra_data.worlds.registry import task_named
+from astra_data.worlds.walk_through import check_task
+
+
+def drive(rows: int = 120, *, in_world: bool = False) -> tuple[Floats, Floats]:
+    """Return poses (rows, 3), x, y and yaw, ten a second, and the commands (rows, 3): vx, vy, wz."""
+    commands = np.random.default_rng(0).uniform(-1, 1, (rows, 3))
+    forward, left, turn = commands.T
+    yaw = np.cumsum(turn / 10) - turn / 10
+    cos, sin = (np.ones(rows), np.zeros(rows)) if in_world else (np.cos(yaw), np.sin(yaw))
+    speeds = np.column_stack([forward * cos - left * sin, forward * sin + left * cos, turn])
+    return np.cumsum(speeds / 10, axis=0) - speeds / 10, commands
+
+
+def write(path: Path, names: Sequence[str], *values: Floats) -> Path:
+    table = np.column_stack([np.arange(len(values[0])) / 10, *values])
+    np.savetxt(path, table, "%.7f", ",", header=",".join(["time", *names]), comments="")
+    return path
+
+
+BASE = ("x", "y", "yaw", "vx", "vy", "wz", "cmd_vx", "cmd_vy", "cmd_wz")
+
+
+@pytest.mark.parametrize("in_world", [False, True])
+def test_a_base_that_drives_sideways_is_stepped_as_it_was_driven(tmp_path: Path, in_world: bool) -> None:
+    poses, commands = drive(in_world=in_world)
+    log = write(tmp_path / "log.csv", BASE, poses, 0.9 * commands, commands)
+    kind = write_robot("mecanum", tmp_path / "mecanum", [log])
+    assert isinstance(kind, Holonomic) and kind.is_in_world is in_world
+    frame = "along x and y" if in_world else "forward and to the left"
+    assert kind.simulator == f"a holonomic base: x, y, yaw, driven by vx, vy, wz, {frame}"
+    np.testing.assert_allclose(kind.step(poses[:-1], commands[:-1]), poses[1:], atol=1e-6)
+    task = task_named(f"{tmp_path}/mecanum/mecanum.py:TASK")
+    assert check_task(task) == []
+    simulator = task.make_simulator(len(poses) - 1)
+    states = torch.from_numpy(np.column_stack([poses, 0.9 * commands])).float()
+    simulator.reset_to(task.abstraction(states[:-1]))
+    landed = simulator.step(torch.from_numpy(commands[:-1]).float())
+    torch.testing.assert_close(landed, task.abstraction(states[1:]), atol=1e-4, rtol=0)
+    tests = runpy.run_path(f"{tmp_path}/mecanum/test_mecanum.py")
+    tests["test_a_step_of_the_simulator"]()
+    tests["test_phi_of_the_first_row_of_the_logs"]()
+    ahead = task.objective.observe(torch.tensor([[0.0, 0.0, 0.0, 1.0]]), torch.zeros(1, 0))[0]
+    goal = torch.tensor([float(value) for value in kind.values()["goal"].strip("()").split(",")])
+    torch.testing.assert_close(ahead, goal if in_world else torch.stack([goal[1], -goal[0]]))
+    shutil.copy(log, tmp_path / "again.csv")
+    import_dataset([log, tmp_path / "again.csv"], tmp_path / "mecanum/logs.toml", out=tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("cmd_wz", "cmd_vy", "cmd_vx"),
+        ("cmd_vel.angular.z", "cmd_vel.linear.y", "cmd_vel.linear.x"),
+        ("cmd_yaw_rate", "cmd_vel_y", "cmd_vel_x"),
+        ("u_vyaw", "u_vy", "u_vx"),
+        ("cmd_yaw_rad_s", "cmd_y_m_s", "cmd_x_m_s"),
+        ("cmd_omega", "cmd_v_y", "cmd_v_x"),
+    ],
+)
+def test_two_speeds_and_a_turn_rate_have_many_names(tmp_path: Path, names: Sequence[str]) -> None:
+    poses, commands = drive()
+    vector = np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    log = write(tmp_path / "log.csv", ["x", "y", "theta_x", "theta_y", *names], vector, commands[:, ::-1])
+    kind = Holonomic.of(guess([log]))
+    assert kind is not None and kind.meanings == ["turn", "left", "forward"]
+    landed = kind.step(kind.states()[0][:-1], commands[:-1, ::-1])
+    np.testing.assert_allclose(landed[:, :2], poses[1:, :2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("cmd_vx", "cmd_vy", "cmd_grip"),
+        ("cmd_vx", "cmd_vy", "cmd_yaw"),  # where to look
+        ("cmd_vx", "cmd_vz", "cmd_wz"),
+        ("cmd_x_m", "cmd_y_m", "cmd_wz"),  # where to be
+    ],
+)
+def test_other_commands_are_no_holonomic_base(tmp_path: Path, names: Sequence[str]) -> None:
+    poses, commands = drive()
+    assert (
+        Holonomic.of(guess([write(tmp_path / "a.csv", ["x", "y", "yaw", *names], poses, commands)])) is None
+    )
+    three = ("x", "y", "z", "cmd_vx", "cmd_vy", "cmd_wz")
+    assert Holonomic.of(guess([write(tmp_path / "b.csv", three, poses, commands)])) is None
+
+
+@pytest.mark.parametrize("command", ["cmd_wz", "cmd_w", "cmd_omega", "cmd_yaw_rate", "cmd_vyaw"])
+def test_a_turn_rate_moves_the_heading(tmp_path: Path, command: str) -> None:
+    poses, commands = drive()
+    names = [command.removeprefix("cmd_"), "theta", command]
+    log = write(tmp_path / "log.csv", names, 0.9 * commands[:, 2], poses[:, 2], commands[:, 2])
+    kind = Direct.of(guess([log]))
+    assert [field.short for field in kind.moved] == ["theta"] and kind.is_rate == (True,)
+
+
+@pytest.mark.parametrize("unit", ["", "_rad_s"])
+def test_a_turn_rate_of_no_heading_is_where_it_is_put(tmp_path: Path, unit: str) -> None:
+    poses, commands = drive()  # a state that happens to rise as if the command were its rate
+    log = write(tmp_path / "log.csv", [f"wz{unit}", f"cmd_wz{unit}"], poses[:, 2], commands[:, 2])
+    kind = Direct.of(guess([log]))
+    assert [field.short for field in kind.moved] == ["wz"] and kind.is_rate == (False,)
+
+
+def test_a_throttle_does_not_turn(tmp_path: Path) -> None:
+    poses, commands = drive()
+    names = ["x", "y", "yaw", "cmd_throttle", "cmd_steering"]
+    kind = Planar.of(guess([write(tmp_path / "log.csv", names, poses, commands[:, :2])]))
+    assert kind is not None and kind.meanings == ["speed", "turn"]
