@@ -13,6 +13,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.angles import LARGEST
 from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers
+from astra_data.exchange.cutting import RATE_TOLERANCE
 from astra_data.exchange.field_names import (
     ANGLE,
     COMMAND,
@@ -42,8 +43,8 @@ def guess(paths: Sequence[Path]) -> Logs:
 
     Raises:
         BadInputError: there is no such file, it is no CSV, files differ, a time is not finite or a command
-            mostly not, two fields come to the same name, or there are no commands, no states or no episodes
-            of two rows.
+            mostly not, two fields come to the same name, there are no commands, no states or no episodes of
+            two rows, or the rate is too far from a whole number for an import.
     """
     files = [file for path in paths for file in csv_files(path)]
     tables = {file: read_numbers(file, EPISODE) for file in files}
@@ -80,6 +81,13 @@ def guess(paths: Sequence[Path]) -> Logs:
             raise BadInputError(
                 f"{files[0]}: found no {role} among {listed}: name one in the header, such as {example}"
             )
+    if abs(found.rate_error) > RATE_TOLERANCE:
+        (time, *_) = found.of("time")
+        raise BadInputError(
+            f"{files[0]}: {time.name}: expected rows a second within {RATE_TOLERANCE:.0%} of a whole number, "
+            f"as fps is one, got {found.recorded_rate:.4g}: correct its unit, or resample the logs to "
+            f"{found.rate} rows a second"
+        )
     return found
 
 

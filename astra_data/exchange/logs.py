@@ -1,7 +1,9 @@
 """CSV logs, cut into episodes, and what their fields are taken for."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,8 @@ from astra_data.exchange.field_names import HEADING, TURN_RATE, Role
 Floats = NDArray[np.float64]
 RATE_HZ = 10
 """Of logs without a time."""
+_EVEN = 0.005
+"""Error of a rate that is taken for a whole number."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +58,42 @@ class Logs:
 
     @property
     def rate(self) -> int:
-        """Rows a second; `RATE_HZ` where the logs have no time."""
+        """Whole rows a second, the nearest to the usual ones; `RATE_HZ` where the logs have no time."""
+        for usual in self._rates[:1]:
+            below = max(1, math.floor(usual))
+            return min(below, below + 1, key=lambda whole: abs(usual / whole - 1))
+        return RATE_HZ
+
+    @property
+    def recorded_rate(self) -> float:
+        """Rows a second by the times, usual or in the mean: the one that is nearer to `rate`."""
+        return min(self._rates, key=lambda recorded: abs(recorded / self.rate - 1), default=float(RATE_HZ))
+
+    @property
+    def rate_error(self) -> float:
+        """By how much 1 / `rate` is too long for a recorded step, as a share of it."""
+        return self.recorded_rate / self.rate - 1
+
+    @property
+    def uneven(self) -> str:
+        """That the rate is no whole number, and what to do; nothing where it is one within `_EVEN`."""
+        if abs(self.rate_error) < _EVEN:
+            return ""
+        off = f"{abs(self.rate_error):.1%} too {'long' if self.rate_error > 0 else 'short'}"
+        return (
+            f"the logs have {self.recorded_rate:.4g} rows a second, no whole number: TIMESTEP_S is {off}; "
+            f"resample them, to {self.rate} rows a second"
+        )
+
+    @cached_property
+    def _rates(self) -> tuple[float, ...]:
+        """The usual rows a second, and their mean without gaps, as in an import; none without a time."""
         for field in self.of("time"):
             steps = np.concatenate([np.diff(episode[field.name]) for episode in self.episodes])
-            return max(1, round(1 / float(np.median(steps))))
-        return RATE_HZ
+            usual = float(np.median(steps))
+            regular = steps[(steps > 0) & (steps <= 5 * usual)]
+            return 1 / usual, 1 / float(regular.mean())
+        return ()
 
     def of(self, role: Role) -> tuple[Field, ...]:
         """Return the fields with a role."""

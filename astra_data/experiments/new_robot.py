@@ -94,6 +94,7 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
     split = [f"field = {_toml(field.name)}\n" for field in logs.of("episode")[:1]]
     if time:
         split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
+    check = logs.uneven if logs.of("time") else "the logs have no time"
     lines = ["| field | taken for | unit | factor | why |", "|---|---|---|---|---|"]
     for field in logs.fields:
         called = field.name.replace("|", r"\|")
@@ -102,7 +103,7 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
     return {
         "name": name,
         "timestep_s": repr(1 / logs.rate),
-        "rate_hz": f"{logs.rate}" + ("" if logs.of("time") else "  # CHECK: the logs have no time"),
+        "rate_hz": f"{logs.rate}" + (f"  # CHECK: {check}" if check else ""),
         "time": "".join(time),
         "not_finite": 'not_finite = "split"  # CHECK: rows without a number end the episode\n'
         if logs.left_out

@@ -68,6 +68,34 @@ def test_a_unit_of_time_is_told_by_its_steps(tmp_path: Path, step: float, unit: 
     assert (time.unit, logs.rate) == (unit, rate)
 
 
+@pytest.mark.parametrize(
+    ("step", "rate", "error"),
+    [(0.08, 13, -0.038), (0.1, 10, 0.0), (0.22, 5, -0.091), (1 / 29.97, 30, -0.001)],
+)
+def test_the_rate_is_the_nearest_whole_number(tmp_path: Path, step: float, rate: int, error: float) -> None:
+    logs = guess([write(tmp_path / "log.csv", {"t": step * RAMP, "x": RAMP, "cmd": RAMP})])
+    assert logs.rate == rate and logs.rate_error == pytest.approx(error, abs=5e-4)
+    assert (logs.uneven == "") is (abs(error) < 0.005)
+
+
+def test_times_that_are_rounded_are_of_their_mean_rate(tmp_path: Path) -> None:
+    times = np.round(np.arange(90) / 30, 3)
+    logs = guess([write(tmp_path / "log.csv", {"t": times, "x": times, "cmd": times}, rows=90)])
+    assert logs.rate == 30 and logs.uneven == ""
+
+
+@pytest.mark.parametrize(("step", "measured", "rate"), [(0.4, "2.5", 3), (0.7, "1.429", 2), (3, "0.3333", 1)])
+def test_a_rate_that_no_import_takes_is_refused(
+    tmp_path: Path, step: float, measured: str, rate: int
+) -> None:
+    log = write(tmp_path / "log.csv", {"t_s": step * RAMP, "x": RAMP, "cmd": RAMP})
+    with pytest.raises(
+        BadInputError,
+        match=rf"t_s: expected rows a second .*, got {measured}: .* logs to {rate} rows a second",
+    ):
+        guess([log])
+
+
 def test_stamps_of_nanoseconds_are_read(tmp_path: Path) -> None:
     rows = "".join(f"{1_700_000_000_000_000_001 + 50_000_000 * row},{row},{row}\n" for row in range(9))
     (tmp_path / "log.csv").write_text("stamp,x,cmd\n" + rows)

@@ -166,6 +166,21 @@ def test_what_is_guessed_is_marked(tmp_path: Path) -> None:
     assert "none of them is a time: 10 rows a second were taken" in shown.output
 
 
+def test_a_rate_that_is_no_whole_number_is_marked_and_imported(tmp_path: Path) -> None:
+    rows = np.arange(40)
+    table = np.column_stack([0.08 * rows, np.cumsum(rows % 3), rows % 3])
+    np.savetxt("log.csv", table, "%.3f", ",", header="time,x,cmd_vx", comments="")
+    shown = CliRunner().invoke(app, ["new", "slide", "--from", "log.csv"])
+    why = (
+        "the logs have 12.5 rows a second, no whole number: TIMESTEP_S is 3.8% too short; "
+        "resample them, to 13 rows a second"
+    )
+    assert f"{why} (CHECK)" in shown.output
+    assert f"fps = 13  # CHECK: {why}\n" in Path("slide/logs.toml").read_text()
+    shutil.copy("log.csv", "again.csv")
+    command("import log.csv again.csv --mapping slide/logs.toml")
+
+
 @pytest.mark.parametrize("name", ["", "My", "a-b", "1st", "a.py", "../a"])
 def test_a_name_is_one_of_a_file_and_a_task(name: str) -> None:
     with pytest.raises(BadInputError, match="expected a name of a-z, 0-9 and _, such as my_cart"):
