@@ -64,7 +64,7 @@ def guess(paths: Sequence[Path]) -> Logs:
             lacking = next(file for file, table in tables.items() if not np.isfinite(table[name]).all())
             raise BadInputError(f"{lacking}: {error}") from None
     try:
-        fields = _distinct(_places_apart(guessed, every))
+        fields = _distinct(_times_apart(_places_apart(guessed, every), every))
     except BadInputError as error:
         raise BadInputError(f"{files[0]}: {error}") from None
     needed = [field.name for field in fields if field.role in ("state", "command")]
@@ -157,14 +157,42 @@ def _is_force(field: Field) -> bool:
     return field.role == "state" and FORCE.fullmatch(field.short) is not None
 
 
+def _times_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> list[Field]:
+    """Return the fields, with a state that ends in a unit of time and rises as a time, if none is one."""
+    found: list[Field] = []
+    has_time = any(field.role == "time" for field in fields)
+    for field in fields:
+        _, ending = _without_unit(plain_name(field.name), TIMES)
+        if ending is None or (field.role, field.unit) != ("state", "1") or not _rises(field.name, tables):
+            found.append(field)
+        elif has_time:
+            found.append(replace(field, role="left out", why="a second time"))
+        else:
+            has_time = True
+            why = "its ending, and it rises in every row"
+            found.append(Field(field.name, "time", "time", ending, TIMES[ending], why))
+    return found
+
+
 def _stays(name: str, tables: Sequence[dict[str, Floats]]) -> bool:
     """Return whether a field has one value in each episode."""
-    for table in tables:
-        numbered = (values for other, values in table.items() if EPISODE.fullmatch(plain_name(other)))
-        begins = {int(row) for values in numbered for row in np.flatnonzero(np.diff(values))}
-        if not np.isfinite(table[name]).all() or {*np.flatnonzero(np.diff(table[name])).tolist()} - begins:
-            return False
-    return True
+    return not any(_steps(name, table).any() for table in tables)
+
+
+def _rises(name: str, tables: Sequence[dict[str, Floats]]) -> bool:
+    """Return whether a field grows from each row of an episode to the next."""
+    return all((_steps(name, table) > 0).all() for table in tables)
+
+
+def _steps(name: str, table: dict[str, Floats]) -> Floats:
+    """Return the differences between the rows of each episode; nan where one is not finite."""
+    values: Floats = np.where(np.isfinite(table[name]), table[name], np.nan)
+    goes_on = np.ones(len(values) - 1, bool)
+    for other, numbers in table.items():
+        if EPISODE.fullmatch(plain_name(other)):
+            goes_on &= np.diff(numbers) == 0
+    steps: Floats = np.diff(values)[goes_on]
+    return steps
 
 
 def _field(name: str, values: Floats) -> Field:

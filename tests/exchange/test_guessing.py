@@ -140,6 +140,22 @@ def test_a_time_that_does_not_rise_is_left_out(tmp_path: Path) -> None:
     assert (logs.fields[0].role, logs.fields[0].why) == ("left out", "a time that does not rise")
 
 
+def test_what_rises_in_a_unit_of_time_is_a_time(tmp_path: Path) -> None:
+    rest = {"trial": RAMP // 3, "x": RAMP, "cmd": -RAMP}
+    restarts = 50 * (RAMP % 3)
+    logs = guess([write(tmp_path / "a.csv", {"zeit_ms": restarts} | rest)])
+    assert (logs.fields[0].role, logs.fields[0].unit, logs.rate) == ("time", "ms", 20)
+    assert logs.fields[0].why == "its ending, and it rises in every row"
+    np.testing.assert_allclose(logs.episodes[1]["zeit_ms"], [0, 0.05, 0.1])
+    times: dict[str, object] = {"uptime_s": RAMP, "t": RAMP / 10, "age_us": 7 * RAMP}
+    logs = guess([write(tmp_path / "b.csv", times | rest)])
+    assert [field.role for field in logs.fields[:3]] == ["left out", "time", "left out"] and logs.rate == 10
+    assert logs.fields[0].why == "a second time"
+    others: dict[str, object] = {"delay_ms": RAMP // 2, "speed_m_s": RAMP, "wait_s": -RAMP, "load": RAMP}
+    logs = guess([write(tmp_path / "c.csv", others | rest)])
+    assert [field.role for field in logs.fields[:4]] == ["state"] * 4
+
+
 def test_forces_are_commands_where_there_are_no_others(tmp_path: Path) -> None:
     columns = {"q1": RAMP, "q2": -RAMP, "tau1_nm": RAMP, "tau2_nm": -RAMP}
     taken = [field.taken_for for field in guess([write(tmp_path / "a.csv", columns)]).fields]
