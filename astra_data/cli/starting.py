@@ -29,6 +29,7 @@ def new(
     """Begin with a robot of your own: a task, a recipe, a mapping of its logs, a test and a page."""
     from rich.table import Table
 
+    from astra_data.experiments.kind_errors import JUDGED_STEPS, is_of_no_use
     from astra_data.experiments.new_robot import write_robot
 
     folder = out or Path(name)
@@ -39,6 +40,11 @@ def new(
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
     show_table(table)
     typer.echo(f"abstract simulator: {kind.simulator}")
+    if is_of_no_use(kind):
+        typer.echo(
+            f"after {JUDGED_STEPS} steps it predicts each state of the logs worse than standing still does: "
+            f"edit `step` in {folder}/{name}.py"
+        )
     if not found.of("time"):
         typer.echo(f"none of them is a time: {found.rate} rows a second were taken; set fps and TIMESTEP_S")
     if found.uneven:

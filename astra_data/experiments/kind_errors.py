@@ -7,6 +7,9 @@ import numpy as np
 
 from astra_data.exchange.logs import Floats, Logs
 
+JUDGED_STEPS = 10
+"""After so many steps a simulator should be better than nothing."""
+
 
 class Kind(Protocol):
     """An abstract simulator of D states and A commands, without a file of its own yet."""
@@ -28,6 +31,12 @@ class Kind(Protocol):
     def step(self, state: Floats, command: Floats) -> Floats:
         """Return where states (B, D) land by commands (B, A)."""
         ...
+
+
+def is_of_no_use(kind: Kind) -> bool:
+    """Return whether standing still predicts each state better after `JUDGED_STEPS`."""
+    simulated, still = errors(kind, JUDGED_STEPS)
+    return bool((simulated > still).all())
 
 
 def errors(kind: Kind, steps: int) -> tuple[Floats, Floats]:
