@@ -14,7 +14,7 @@ from astra_data.experiments.kind_errors import errors
 from astra_data.experiments.written_values import numbers, typical
 
 _TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|(?<!th)rot|steer).*")
-_SPEED_X = re.compile(r"(.+_)?(v|vel|velocity|linear)_?x")
+_SPEED_AXIS = re.compile(r"(.+_)?(v|vel|velocity|linear)_?[xy]")
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,15 @@ class Planar:
     def meanings(self) -> list[str]:
         """What each command is: "turn" for a rate of turning, and for others names of speeds."""
         commands = self.logs.of("command")
-        turn = next((number for number, field in enumerate(commands) if _TURNS.fullmatch(field.short)), 1)
+        turns = (field.is_turn_rate or _TURNS.fullmatch(field.short) is not None for field in commands)
+        turn = next((number for number, is_turn in enumerate(turns) if is_turn), 1)
         return ["turn" if number == turn else "speed" for number in range(2)]
 
     @classmethod
     def of(cls, logs: Logs) -> Self | None:
         """Return how it fits; None if it does not."""
-        pose = _pose(logs)
-        return cls(logs, *pose) if pose and len(logs.of("command")) == 2 else None
+        pose, commands = _pose(logs), logs.of("command")
+        return cls(logs, *pose) if pose and len(commands) == 2 and not _are_along_axes(commands) else None
 
     def states(self) -> list[Floats]:
         """Return x, y and the angle of the heading (T, 3) of each episode."""
@@ -147,10 +148,8 @@ class Holonomic(Planar):
     def of(cls, logs: Logs) -> Self | None:
         """Return how it fits, with speeds of the frame that predicts the logs better; None if it does not."""
         pose, commands = _pose(logs), logs.of("command")
-        turns = [field.short for field in commands if field.is_turn_rate]
-        speeds = {field.short for field in commands if not field.is_turn_rate}
-        along = [field.short for field in commands if _is_speed_along_x(field)]
-        if pose is None or len(turns) != 1 or not along or speeds != {along[0], f"{along[0][:-1]}y"}:
+        straight = [field for field in commands if not field.is_turn_rate]
+        if pose is None or len(commands) - len(straight) != 1 or not _are_along_axes(straight):
             return None
         kinds = [cls(logs, *pose, is_in_world) for is_in_world in (False, True)]
         return min(kinds, key=lambda kind: float(errors(kind, 1)[0][:2].sum()))
@@ -189,10 +188,14 @@ def _moves(logs: Logs, fields: Sequence[Field]) -> bool:
     return any(np.ptp(values, axis=0).any() for values in logs.values(fields))
 
 
-def _is_speed_along_x(command: Field) -> bool:
-    """Return whether it is a speed by its name, or by its unit."""
-    is_speed = command.unit == "m/s" or (command.unit == "1" and _SPEED_X.fullmatch(command.short))
-    return bool(is_speed) and command.short.endswith("x")
+def _are_along_axes(commands: Sequence[Field]) -> bool:
+    """Return whether they are two speeds, by their names or units, one along x and one along y."""
+    names = {
+        field.short
+        for field in commands
+        if field.unit == "m/s" or (field.unit == "1" and _SPEED_AXIS.fullmatch(field.short))
+    }
+    return len(commands) == 2 and any(names == {f"{name[:-1]}x", f"{name[:-1]}y"} for name in names)
 
 
 def _unit_vector(pose: Floats) -> Floats:

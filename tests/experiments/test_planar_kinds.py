@@ -118,8 +118,19 @@ def test_a_turn_rate_of_no_heading_is_where_it_is_put(tmp_path: Path, unit: str)
     assert [field.short for field in kind.moved] == ["wz"] and kind.is_rate == (False,)
 
 
-def test_a_throttle_does_not_turn(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("names", "meanings"),
+    [
+        (("cmd_throttle", "cmd_steering"), ["speed", "turn"]),
+        (("cmd_vtheta", "cmd_v"), ["turn", "speed"]),
+        (("cmd_vx", "cmd_vy"), None),
+        (("cmd_vx", "cmd_wz"), ["speed", "turn"]),
+    ],
+)
+def test_a_unicycle_has_a_speed_and_a_turn_rate(
+    tmp_path: Path, names: Sequence[str], meanings: list[str] | None
+) -> None:
     poses, commands = drive()
-    names = ["x", "y", "yaw", "cmd_throttle", "cmd_steering"]
-    kind = Planar.of(guess([write(tmp_path / "log.csv", names, poses, commands[:, :2])]))
-    assert kind is not None and kind.meanings == ["speed", "turn"]
+    log = write(tmp_path / "log.csv", ["x", "y", "yaw", *names], poses, commands[:, :2])
+    kind = Planar.of(guess([log]))
+    assert (kind and kind.meanings) == meanings
