@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import place
 from astra_data.experiments.own_methods import add_all
@@ -26,7 +27,8 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         percent: the size of the dataset, where the recipe sweeps over sizes.
 
     Raises:
-        BadInputError: the row trains no policy, or an artefact of it is not there.
+        BadInputError: the run has no such row or seed, the row trains no policy, or an artefact of it is not
+            there.
 
     Example:
         >>> from astra_data import load_policy
@@ -80,6 +82,10 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     """
     settings = settings_of(run)
     add_all(settings.get("own_methods", {}))
+    folder, where = Path(run), place(seed, percent)
+    files = {"train": folder / "train" / row / where / POLICY}
+    if not files["train"].is_file():
+        _check_asked(settings, row, seed)
     method = method_named(row)
     if not method.trains:
         raise BadInputError(f"{row} trains no policy: it is written by hand")
@@ -87,8 +93,7 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     if (percent is None) == bool(sizes) or (sizes and percent not in sizes):
         wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"
         raise BadInputError(f"{run}: percent: expected {wanted}, got {percent or 'none'}")
-    folder, base, where = Path(run), grounded_as(row), place(seed, percent)
-    files = {"train": folder / "train" / row / where / POLICY}
+    base = grounded_as(row)
     if method.grounds:
         files["ground"] = folder / "ground" / base / where / GROUNDING
     if method.aligns:
@@ -96,3 +101,12 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
     return files
+
+
+def _check_asked(settings: dict[str, Any], row: str, seed: int) -> None:
+    """Refuse a row or a seed that a run's recipe, which had these `settings`, does not have."""
+    rows, seeds = settings.get("methods", [row]), settings.get("seeds", [seed])
+    if row not in rows:
+        raise BadInputError(f"the run has no row '{row}'{did_you_mean(row, rows)}")
+    if seed not in seeds:
+        raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")

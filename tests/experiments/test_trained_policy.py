@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,31 @@ def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> No
     )
     with pytest.raises(BadInputError, match=missing):
         load_policy(run, "astra_plus", seed=1)
+
+
+@pytest.mark.parametrize(
+    ("row", "seed", "told"),
+    [
+        ("astra", 7, "the run has no seed 7; its seeds: 0, 1"),
+        ("astr", 0, "the run has no row 'astr': did you mean 'astra'?"),
+        ("iql", 0, "the run has no row 'iql'; known: astra, follower"),
+        ("follower", 0, "follower trains no policy: it is written by hand"),
+    ],
+)
+def test_a_row_or_seed_that_the_recipe_lacks_is_told(row: str, seed: int, told: str, tmp_path: Path) -> None:
+    settings = {"task": "antmaze-umaze", "methods": ["astra", "follower"], "seeds": [0, 1]}
+    (tmp_path / "recipe.json").write_text(json.dumps(settings))
+    with pytest.raises(BadInputError, match=f"^{re.escape(told)}$"):
+        load_policy(tmp_path, row, seed=seed)
+
+
+def test_a_policy_that_is_there_is_loaded_whatever_the_recipe_has_now(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "recipe.json").write_text(
+        json.dumps({"task": "antmaze-umaze", "methods": ["nas"], "seeds": [1]})
+    )
+    for stage in ("train", "ground", "align"):
+        (tmp_path / stage).symlink_to(run / stage)
+    assert load_policy(tmp_path, "astra_plus")
 
 
 def test_a_run_of_several_sizes_is_asked_for_one(run: Path, tmp_path: Path) -> None:
