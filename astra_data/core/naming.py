@@ -1,4 +1,4 @@
-"""Names of result rows, and of the folders of seeds.
+"""Names of result rows, and of what the folder of a run holds: its record, and folders of seeds.
 
 A row is a method's name, or that name followed by `_plus`: the method trained with the `[plus]` settings.
 """
@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 PLUS = "_plus"
+RECORD = "recipe.json"
+"""In the folder of a run: the settings that its artefacts were made with."""
 
 RUNS = Path("runs")
 """The folder of the folders of runs, unless another is given."""

@@ -5,9 +5,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.naming import RECORD
+from astra_data.core.wording import first_few
 from astra_data.dataset.declared import declared_columns
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.plain import read_object
+
+_SHOWN = 4
+"""Datasets of a run."""
 
 
 def refuse_others(root: Path) -> None:
@@ -16,6 +21,7 @@ def refuse_others(root: Path) -> None:
     if versions:
         raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
     if not (root / "meta").is_dir():
+        refuse_run(root)
         if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
             raise BadInputError(
                 f"{root} holds logs, {logs[0]} and so on: make a dataset of them by `astra-data import` with "
@@ -25,6 +31,16 @@ def refuse_others(root: Path) -> None:
             f"{root}: no dataset there; check the path (`astra-data list` says where names are) "
             "or run the stage that writes it."
         )
+
+
+def refuse_run(root: Path) -> None:
+    """Raise BadInputError where `root` is the folder of a run; name the datasets in it."""
+    if not (root / RECORD).is_file():
+        return
+    places = ("*/seed_*", "*/percent_*/seed_*")
+    found = sorted(info.parents[1] for place in places for info in root.glob(f"{place}/{INFO_PATH}"))
+    held = f"its datasets are {first_few(found, _SHOWN)}" if found else "it has no datasets yet"
+    raise BadInputError(f"{root} is a run; {held}")
 
 
 @contextmanager

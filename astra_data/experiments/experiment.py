@@ -16,11 +16,11 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import base_method, is_plus
+from astra_data.core.naming import RECORD, base_method, is_plus
 from astra_data.experiments.own_files import changed_code
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
-from astra_data.experiments.recipe_file import RECORD, read_tables, recorded_settings
+from astra_data.experiments.recipe_file import read_tables, recorded_settings
 from astra_data.methods import METHODS, tables
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size

@@ -3,6 +3,7 @@
 A run writes down the settings that it is made with, in recipe.json.
 """
 
+import os
 import sys
 from collections.abc import Mapping
 from functools import cache
@@ -13,13 +14,11 @@ from pydantic import BaseModel, ConfigDict, JsonValue
 
 from astra_data.core.config import load_tables, read_written
 from astra_data.core.errors import RecipeError
+from astra_data.core.naming import RECORD
 from astra_data.dataset.format import INFO_PATH
 from astra_data.experiments.own_methods import looked_up
 from astra_data.training.build_env import RENAMED
 from astra_data.worlds.own_code import place_beside
-
-RECORD = "recipe.json"
-"""In the folder of a run: the settings that its artefacts were made with."""
 
 
 class _OwnMethod(BaseModel):
@@ -54,7 +53,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     Raises:
         RecipeError: it cannot be read, is a recipe of `gap`, or has a key by two names.
     """
-    tables = with_current_keys(load_tables(path), path)
+    tables = with_current_keys(tables_of(path), path)
     if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
         raise RecipeError(
             f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
@@ -67,6 +66,27 @@ def read_tables(path: Path) -> dict[str, Any]:
     if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
         tables["data"] = str(path.parent / data)
     return tables
+
+
+def tables_of(path: Path) -> dict[str, Any]:
+    """Return the tables of the file of a recipe as they are.
+
+    Raises:
+        RecipeError: it cannot be read; of a run or a dataset in its place, it says so.
+    """
+    if os.path.isdir(path):  # of a name that is too long, too, `load_tables` tells
+        _refuse_folder(path)
+    return load_tables(path)
+
+
+def _refuse_folder(path: Path) -> None:
+    """Refuse a run or a dataset; name the recipe that made it, if that is known."""
+    whole = path.absolute()
+    run = next((folder for folder in (whole, *whole.parents) if (folder / RECORD).is_file()), None)
+    kind = "a run" if run == whole else "a dataset" if (path / INFO_PATH).is_file() else ""
+    if kind:
+        made_by = f", {run.name}.toml" if run else ""
+        raise RecipeError(f"{path} is {kind}: expected the recipe that made it{made_by}")
 
 
 def with_current_keys(tables: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
-from astra_data.core.naming import RUNS
+from astra_data.core.naming import RECORD, RUNS
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
@@ -28,7 +28,6 @@ from astra_data.experiments.plan import check_stage, plan, stage_of, stages_unti
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.experiments.recipe import Recipe
-from astra_data.experiments.recipe_file import RECORD
 from astra_data.methods import grounded_as
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.own_code import is_own_code

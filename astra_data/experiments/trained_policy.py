@@ -5,9 +5,9 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import place
+from astra_data.core.naming import RECORD, place
 from astra_data.experiments.own_methods import add_all
-from astra_data.experiments.recipe_file import RECORD, recorded_settings
+from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import grounded_as, method_named

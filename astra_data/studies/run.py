@@ -6,11 +6,12 @@ from pathlib import Path
 
 import torch
 
-from astra_data.core.config import load_recipe, load_tables
+from astra_data.core.config import load_recipe
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import RUNS
 from astra_data.experiments.display import shown
+from astra_data.experiments.recipe_file import tables_of
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import place_name, read_recordings
 from astra_data.studies.study import run_study
@@ -20,9 +21,9 @@ def is_gap_recipe(path: Path) -> bool:
     """Return whether the file at `path` has the keys of a recipe for `astra-data gap`.
 
     Raises:
-        RecipeError: it is missing or not TOML.
+        RecipeError: it is missing, a folder or not TOML.
     """
-    return {"mapping", "models"} <= load_tables(path).keys()
+    return {"mapping", "models"} <= tables_of(path).keys()
 
 
 def load_gap_recipe(recipe_path: Path) -> GapRecipe:
@@ -31,7 +32,7 @@ def load_gap_recipe(recipe_path: Path) -> GapRecipe:
     Raises:
         RecipeError: the recipe has faults, or the mapping is missing.
     """
-    if {"methods", "based_on"} & load_tables(recipe_path).keys() and not is_gap_recipe(recipe_path):
+    if {"methods", "based_on"} & tables_of(recipe_path).keys() and not is_gap_recipe(recipe_path):
         raise RecipeError(
             f"{recipe_path}: expected a recipe for `astra-data gap`, got one for `astra-data run`, whose "
             f"gaps `astra-data run {recipe_path} --until ground` writes to gap.md"

@@ -12,6 +12,8 @@ from fake_dataset import COLUMNS, LENGTHS, concatenated, fake_columns, fake_epis
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import STATE, TIMESTAMP, Episode
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.doctor.repair import repair
 
 
 @pytest.mark.parametrize("block_rows", [1, 2**16])
@@ -134,6 +136,25 @@ def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="no dataset there"):
         Dataset.open(tmp_path / "typo")
+
+
+def test_a_run_names_its_datasets(tmp_path: Path) -> None:
+    def told() -> set[str]:
+        reads = Dataset.open, check, lambda run: repair(run, out=tmp_path / "saved")
+        found = set()
+        for read in reads:
+            with pytest.raises(BadInputError) as caught:
+                read(tmp_path)
+            found.add(str(caught.value))
+        return found
+
+    (tmp_path / "recipe.json").touch()
+    assert told() == {f"{tmp_path} is a run; it has no datasets yet"}
+    places = ["label/seed_0", "label/seed_1", "pair/seed_0", "pair/seed_1", "subset/percent_025/seed_0"]
+    for place in (*places, "set_aside/1/pair/seed_0"):
+        write_fake(tmp_path / place)
+    named = ", ".join(f"{tmp_path}/{place}" for place in places[:4])
+    assert told() == {f"{tmp_path} is a run; its datasets are {named} and 1 more"}
 
 
 def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ import pytest
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.recipe import Recipe
-from astra_data.experiments.recipe_file import recorded_settings, with_current_keys
+from astra_data.experiments.recipe_file import read_tables, recorded_settings, with_current_keys
+from astra_data.studies.run import is_gap_recipe, load_gap_recipe
 
 RECIPE = """
 task = "antmaze-umaze"
@@ -35,6 +36,25 @@ def test_old_keys_are_taken_with_a_message_each(capsys: pytest.CaptureFixture[st
         f"old.toml: {table}.doubt_penalty is now called disagreement_penalty: please rename it"
         for table in ("train", "plus")
     ]
+
+
+def test_a_run_or_a_dataset_in_place_of_a_recipe_is_told(tmp_path: Path) -> None:
+    run, pairs, other = tmp_path / "mec", tmp_path / "mec/pair/seed_0", tmp_path / "walks"
+    for dataset in (pairs, other):
+        (dataset / "meta").mkdir(parents=True)
+        (dataset / "meta/info.json").touch()
+    (run / "recipe.json").touch()
+    for path, told in (
+        (run, "a run: expected the recipe that made it, mec.toml"),
+        (pairs, "a dataset: expected the recipe that made it, mec.toml"),
+        (other, "a dataset: expected the recipe that made it"),
+        (tmp_path, "a folder: expected a TOML file"),
+    ):
+        for read in (read_tables, is_gap_recipe, load_gap_recipe):
+            with pytest.raises(RecipeError, match=f"^{path} is {told}$"):
+                read(path)
+    with pytest.raises(RecipeError, match="cannot be read as a text file"):
+        read_tables(tmp_path / ("n" * 300))
 
 
 def test_a_table_may_have_several_old_keys() -> None:

@@ -25,6 +25,7 @@ from astra_data.dataset.format import (
     SUBSETS_PATH,
 )
 from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
+from astra_data.dataset.opening import refuse_run
 from astra_data.dataset.plain import (
     MOST_FPS,
     PlainColumn,
@@ -50,6 +51,7 @@ def check(root: Path) -> Report:
         BadInputError: there is no folder `root`, or it holds no dataset.
     """
     if not (root / "meta").is_dir() and not (root / "data").is_dir():
+        refuse_run(root)
         raise BadInputError(f"{root}: no dataset there; expected a folder with meta/ and data/")
     report = Report()
     info = read_object(root / INFO_PATH)

@@ -24,6 +24,7 @@ from astra_data.dataset.format import (
     TASKS_PATH,
 )
 from astra_data.dataset.meta_files import read_description
+from astra_data.dataset.opening import refuse_run
 from astra_data.dataset.plain import (
     PlainColumn,
     read_object,
@@ -81,10 +82,12 @@ def repair(
 
     Raises:
         CorruptDatasetError: meta/info.json is missing, or no episode is intact.
-        BadInputError: there is no `folder`, `out` exists, or episodes cannot be joined with `like`.
+        BadInputError: there is no `folder`, it is a run, `out` exists, or episodes cannot be joined with
+            `like`.
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder}: expected the folder of a dataset, got no folder")
+    refuse_run(folder)
     info = read_object(folder / INFO_PATH)
     if isinstance(info, str):
         raise CorruptDatasetError(f"{folder}: {INFO_PATH} {info}; without it columns and fps are unknown")
