@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from astra_data.core.config import did_you_mean, load_recipe, validated
+from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import AstraDataError, BadInputError, in_short
 from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
@@ -20,7 +20,7 @@ from astra_data.exchange.cutting import Cut, Cutter
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.import_report import ImportReport, losses
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz, parquet, torch
-from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.mapping import ImportMapping, read_mapping
 from astra_data.exchange.recording import (
     VALUE_BYTES,
     Block,
@@ -87,7 +87,7 @@ def import_dataset(
     options = {key: value for key, value in given.items() if value is not None}
     settings = None
     if mapping is not None:
-        read = load_recipe(mapping, ImportMapping)
+        read = read_mapping(mapping)
         settings = validated(read.model_dump() | options, ImportMapping, str(mapping))
     chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:

@@ -1,11 +1,14 @@
 """The mapping of a recording's fields to columns, a TOML file."""
 
+from collections.abc import Mapping
 from difflib import get_close_matches
-from typing import Annotated, Literal, Self
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from astra_data.core.config import Config, Count, Positive
+from astra_data.core.config import Config, Count, Positive, load_tables, validated
+from astra_data.core.errors import RecipeError
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -32,6 +35,8 @@ def _other_than_zero(factor: float) -> float:
 Factor = Annotated[float, AfterValidator(_other_than_zero)]
 FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
 FLOATS = (STATE, NEXT_STATE, GOAL, ACTION, REWARD)
+_OF_RECIPES = {"methods", "based_on", "models"}
+"""Keys that recipes of `run` and `gap` have, and no mapping."""
 
 
 class ColumnMapping(Config):
@@ -179,3 +184,24 @@ class ImportMapping(Config):
     def all_fields(self) -> list[str]:
         """The fields that the mapping needs, with the one that separates episodes."""
         return list(dict.fromkeys([*self.fields, *([self.split.field] if self.split.field else [])]))
+
+
+def refuse_mapping(tables: Mapping[str, Any], path: Path) -> None:
+    """Raise RecipeError where `tables`, of the file `path` that was given as a recipe, are a mapping."""
+    if "columns" in tables and not _OF_RECIPES & tables.keys():
+        raise RecipeError(f"{path} is a mapping: `astra-data import LOGS --mapping {path}`")
+
+
+def read_mapping(path: Path) -> ImportMapping:
+    """Read the mapping in the file `path`.
+
+    Raises:
+        RecipeError: it is missing, not TOML or a recipe, or has faults; one message holds them all.
+    """
+    tables = load_tables(path)
+    if "columns" not in tables and (found := _OF_RECIPES & tables.keys()):
+        command = f"gap {path} --data LOGS" if "models" in found else f"run {path}"
+        raise RecipeError(
+            f"{path} is a recipe: `astra-data {command}`; expected a mapping, which `astra-data new` writes"
+        )
+    return validated(tables, ImportMapping, str(path))

@@ -16,6 +16,7 @@ from astra_data.core.config import load_tables, read_written
 from astra_data.core.errors import RecipeError
 from astra_data.core.naming import RECORD
 from astra_data.dataset.format import INFO_PATH
+from astra_data.exchange.mapping import refuse_mapping
 from astra_data.experiments.own_methods import looked_up
 from astra_data.training.build_env import RENAMED
 from astra_data.worlds.own_code import place_beside
@@ -72,11 +73,13 @@ def tables_of(path: Path) -> dict[str, Any]:
     """Return the tables of the file of a recipe as they are.
 
     Raises:
-        RecipeError: it cannot be read; of a run or a dataset in its place, it says so.
+        RecipeError: it cannot be read; of a run, a dataset or a mapping in its place, it says so.
     """
     if os.path.isdir(path):  # of a name that is too long, too, `load_tables` tells
         _refuse_folder(path)
-    return load_tables(path)
+    tables = load_tables(path)
+    refuse_mapping(tables, path)
+    return tables
 
 
 def _refuse_folder(path: Path) -> None:

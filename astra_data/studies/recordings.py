@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.core.config import load_recipe
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_rows
@@ -20,7 +19,7 @@ from astra_data.dataset.endings import is_terminated, stands_still
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.versions import Version, locate
 from astra_data.exchange.importing import import_dataset, log_suffixes
-from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.mapping import read_mapping
 from astra_data.exchange.recording import find_sources, is_archive
 from astra_data.studies.body import Body, Floats, Reading
 
@@ -100,7 +99,7 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
             raise BadInputError(
                 f"{place} does not exist: expected a dataset, or logs that {mapping} describes ({error})"
             ) from None
-    settings = load_recipe(mapping, ImportMapping)
+    settings = read_mapping(mapping)
     suffixes = log_suffixes(settings)
     found, faults = [], []
     for part in _parts(place, suffixes, each=settings.split.files):

@@ -6,7 +6,7 @@ from recordings import MAPPING
 
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import RecipeError
-from astra_data.exchange.mapping import ColumnMapping, ImportMapping, Jump, Split
+from astra_data.exchange.mapping import ColumnMapping, ImportMapping, Jump, Split, read_mapping
 
 
 @pytest.mark.parametrize(
@@ -71,3 +71,16 @@ def test_a_name_like_that_of_a_column_beside_it_is_no_slip(tmp_path: Path) -> No
     path = tmp_path / "mapping.toml"
     path.write_text(MAPPING.replace("columns.gait", "columns.actions"))
     assert "actions" in load_recipe(path, ImportMapping).columns
+
+
+@pytest.mark.parametrize(
+    ("recipe", "command"), [("quickstart", "run {path}"), ("nao_real", "gap {path} --data LOGS")]
+)
+def test_a_recipe_in_place_of_a_mapping_is_told(recipe: str, command: str) -> None:
+    path = Path(__file__).parents[2] / f"recipes/{recipe}.toml"
+    with pytest.raises(RecipeError) as caught:
+        read_mapping(path)
+    assert str(caught.value) == (
+        f"{path} is a recipe: `astra-data {command.format(path=path)}`; expected a mapping, which "
+        "`astra-data new` writes"
+    )

@@ -57,6 +57,14 @@ def test_a_run_or_a_dataset_in_place_of_a_recipe_is_told(tmp_path: Path) -> None
         read_tables(tmp_path / ("n" * 300))
 
 
+def test_a_mapping_in_place_of_a_recipe_is_told() -> None:
+    path = Path(__file__).parents[2] / "recipes/imports/nao_guda.toml"
+    for read in (read_tables, is_gap_recipe, load_gap_recipe):
+        with pytest.raises(RecipeError) as caught:
+            read(path)
+        assert str(caught.value) == f"{path} is a mapping: `astra-data import LOGS --mapping {path}`"
+
+
 def test_a_table_may_have_several_old_keys() -> None:
     old = {"plus": {"doubt_penalty": 1.0, "command_limit_m_s": 0.5, "ramp": 0.1}}
     new = {"disagreement_penalty": 1.0, "command_limit": 0.5, "ramp": 0.1}
