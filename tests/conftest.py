@@ -67,14 +67,15 @@ def _fake_stages() -> "tuple[dict[str, Stage], type[Recipe]]":
 def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     """Replace the stages, methods and tasks by fake ones, and return the model of their recipes."""
     # Imported here, so that tests of other parts need not wait for every stage.
-    plan, recipe, experiment = (
-        importlib.import_module(f"astra_data.experiments.{name}") for name in ("plan", "recipe", "experiment")
+    plan, recipe, experiment, staleness = (
+        importlib.import_module(f"astra_data.experiments.{name}")
+        for name in ("plan", "recipe", "experiment", "staleness")
     )
     registry = importlib.import_module("astra_data.worlds.registry")
     stages, model = _fake_stages()
     monkeypatch.setattr(plan, "STAGES", stages)
     methods = importlib.import_module("astra_data.methods")
-    for module in (recipe, experiment, methods):
+    for module in (recipe, staleness, methods):
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
     monkeypatch.setitem(registry.TASKS, "maze", registry.TASKS["antmaze-umaze"])
     monkeypatch.setattr(experiment, "Recipe", model)

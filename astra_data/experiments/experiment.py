@@ -7,7 +7,7 @@ difference are not run again: links in its folder lead to the other recipe's art
 task with the same target; then it shares the collected episodes.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,12 +16,12 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import RECORD, base_method, is_plus
+from astra_data.core.naming import RECORD, base_method, reference_of
 from astra_data.experiments.own_files import changed_code
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
 from astra_data.experiments.recipe_file import read_tables, recorded_settings
-from astra_data.methods import METHODS, tables
+from astra_data.experiments.staleness import ROWS_TABLES, SIMULATOR, reads, stale_stages
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
 from astra_data.stages.registry import STAGES
@@ -29,11 +29,6 @@ from astra_data.worlds.registry import task_named
 
 ALWAYS_NEW = {"report"}
 """Made by every run: it is cheap, and shows the rows and seeds that the recipe has now."""
-
-_SIMULATOR = "simulator"
-"""Stands for the difference between two tasks with the same target."""
-_ROWS_TABLES = tables().keys() | {"plus"}
-"""Tables of a recipe that only some rows read."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,7 @@ class Experiment:
         absent |= {stage for stage, key in asked.items() if not getattr(self.recipe, key)}
         sizes, theirs = (set(one.sweep.percent) for one in (self.recipe, self.base.recipe))
         resized = {"subset"} if bool(sizes) != bool(theirs) or not sizes <= theirs else set()
-        return STAGES.keys() - ALWAYS_NEW - absent - _stale_stages(changed, resized)
+        return STAGES.keys() - ALWAYS_NEW - absent - stale_stages(changed, resized)
 
     def maker(self, stage: str) -> "Experiment":
         """Return the experiment that makes the artefacts of `stage`."""
@@ -137,18 +132,20 @@ class Experiment:
                 recorded[key] = now
         changed = _differences(recorded, self.recipe)
         code = changed_code(self.recipe, self.folder)
-        whole = _stale_stages((changed - _ROWS_TABLES) | ({"task"} & code.keys()))
+        whole = stale_stages((changed - ROWS_TABLES) | ({"task"} & code.keys()))
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
         own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
         folders = [self.folder / stage for stage in STAGES if stage in whole & own]
-        for table in sorted(changed & _ROWS_TABLES):
-            for stage in sorted((_stale_stages({table}) - whole) & own):
+        for table in sorted(changed & ROWS_TABLES):
+            for stage in sorted((stale_stages({table}) - whole) & own):
                 folders += self._rows_of(table, stage)
         rows = [place for stage in sorted(own - whole) for place in sorted((self.folder / stage).iterdir())]
         folders += [row for row in rows if base_method(row.name) in code]
         texts = [f"{' and '.join(sorted(changed))} changed in the recipe"] if changed else []
         texts += [f"{what} changed" for what in dict.fromkeys(code.values())]
-        return " and ".join(texts), list(dict.fromkeys(folders))
+        return " and ".join(texts), [
+            folder for folder in dict.fromkeys(folders) if folder.parent not in folders
+        ]
 
     @property
     def results(self) -> Path:
@@ -170,9 +167,8 @@ class Experiment:
         points = set()
         for percent, found in by_size(read_published(self.published_in)).items():
             changed = _differences(found.settings, self.recipe) - ALWAYS_NEW - {"select"}
-            changed -= {
-                table for table in _ROWS_TABLES if not any(_reads(row, table) for row in found.methods)
-            }
+            tested = {*found.methods, *filter(None, [reference_of(self.recipe.methods)])}
+            changed -= {table for table in ROWS_TABLES if not any(reads(row, table) for row in tested)}
             if changed:
                 raise RecipeError(
                     f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "
@@ -183,8 +179,18 @@ class Experiment:
         return points
 
     def _rows_of(self, table: str, stage: str) -> list[Path]:
-        """Return the folders in `stage` of the rows that read `table`."""
-        return [row for row in sorted((self.folder / stage).iterdir()) if _reads(row.name, table)]
+        """Return the folders in `stage` of the rows that depend on `table`; its own where all do."""
+        folder = self.folder / stage
+        if stage == "select":  # it has no rows; that it is of other policies is told by digests
+            return [folder] if table == "ground" else []
+        rows = sorted(folder.iterdir())
+        # An evaluation may be of a time when the recipe had the reference.
+        grounded = (place.name for place in (self.folder / "ground").glob("*"))
+        reference = reference_of([*self.recipe.methods, *grounded]) if stage == "evaluate" else None
+        if reference and reads(reference, table):
+            return [folder]
+        found = [row for row in rows if reads(row.name, table)]
+        return [folder] if found == rows else found
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
@@ -211,33 +217,6 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     return Experiment(recipe, path, folder, base)
 
 
-def _reads(row: str, table: str) -> bool:
-    """Return whether a row, or the row that it is initialised from, has its settings from `table`."""
-    if table == "plus":
-        return is_plus(row)
-    base = base_method(row)
-    method = METHODS.get(base)
-    if method is None:
-        return False
-    ours = method.table and method.table.name
-    return table == ours or (method.initial is not None and _reads(method.initial, table))
-
-
-def _stale_stages(changed: set[str], begun: Collection[str] = ()) -> set[str]:
-    """Return the stages that are affected when the keys `changed` of a recipe change, or those `begun`."""
-    stale = set(begun)
-    for stage in STAGES:
-        more = {"collect": ("sweep",), "label": ("data",), "train": ("plus",)}
-        sections = {"task", stage, *more.get(stage, ())}
-        sections |= set() if stage == "collect" else {_SIMULATOR}
-        sections |= {
-            method.table.name for method in METHODS.values() if method.table and method.configures == stage
-        }
-        if changed & sections or stale.intersection(STAGES[stage].reads):
-            stale.add(stage)
-    return stale
-
-
 def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     """Return the settings of `recipe` that differ from those recorded `before`.
 
@@ -249,7 +228,7 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
     elsewhere = {"methods", "own_methods", "seeds", "based_on"}
     changed = {key for key in now.keys() - elsewhere if before.get(key) != now[key]}
     if "task" in changed and _share_target(str(before.get("task")), recipe.task):
-        return changed - {"task"} | {_SIMULATOR}
+        return changed - {"task"} | {SIMULATOR}
     return changed - {"plus"} if "train" in changed else changed  # which "plus" takes over
 
 

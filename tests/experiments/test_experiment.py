@@ -319,6 +319,61 @@ def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_
     assert check(base, root=tmp_path)["train/astra/seed_0"].is_finished
 
 
+@pytest.mark.parametrize(
+    ("rows", "table", "stale"),
+    [
+        ([], "ground", ["align", "evaluate/astra", "evaluate/astra_plus", "ground", "train/astra"]),
+        (["nas"], "ground", ["align", "evaluate", "ground", "train/astra"]),
+        ([], "align", ["align", "evaluate/astra", "evaluate/astra_plus"]),
+    ],
+)
+def test_rows_that_ground_or_align_nothing_are_left_alone(
+    rows: list[str], table: str, stale: list[str], base: Path, tmp_path: Path
+) -> None:
+    if "train/astra" in stale:
+        stale = [*stale, "train/astra_plus", *(f"train/{row}" for row in rows)]
+    methods = ["direct_transfer", "fine_tuned", "follower", "target", "astra", "astra_plus", *rows]
+    text = f'task = "maze"\nmethods = {json.dumps(methods)}\nseeds = [0]\n'
+    base.write_text(text)
+    folder = run(base, root=tmp_path, jobs=2)
+    base.write_text(f"{text}[{table}]\nrate = 2.0\n")
+    conditions = check(base, root=tmp_path)
+    with pytest.raises(RecipeError) as caught:
+        run(base, root=tmp_path)
+    places = [folder / place for place in stale]
+    assert str(caught.value).endswith(f"or remove {' '.join(map(str, places))}")
+    others = [key for key in conditions if not any((folder / key).is_relative_to(one) for one in places)]
+    assert {key for key, found in conditions.items() if found.is_finished} == set(others)
+    made = {key: attempts(folder / key) for key in others}
+    for place in places:
+        shutil.rmtree(place)
+    run(base, root=tmp_path, jobs=2)
+    assert made | {"report": 1} == {key: attempts(folder / key) for key in others}
+    assert all(found.is_finished for found in check(base, root=tmp_path).values())
+
+
+def test_what_was_tested_in_the_reference_depends_on_its_grounding_once_it_is_no_row(
+    base: Path, tmp_path: Path
+) -> None:
+    text = BASE.replace('"follower"', '"follower", "nas"')
+    base.write_text(text)
+    folder = run(base, root=tmp_path, jobs=2)
+    base.write_text(BASE)
+    run(base, root=tmp_path, jobs=2)
+    base.write_text(BASE + "[ground]\nrate = 2.0\n")
+    with pytest.raises(RecipeError, match=f"{folder}/evaluate "):
+        run(base, root=tmp_path)
+
+
+def test_a_choice_depends_on_all_groundings(base: Path, tmp_path: Path) -> None:
+    text = 'task = "maze"\nmethods = ["nas", "direct_transfer"]\nseeds = [0, 1]\n[select]\n'
+    base.write_text(text)
+    folder = run(base, root=tmp_path, jobs=2)
+    base.write_text(text + "[ground]\nrate = 2.0\n")
+    with pytest.raises(RecipeError, match=f"{folder}/ground {folder}/select {folder}/train/nas$"):
+        run(base, root=tmp_path)
+
+
 def test_recipes_are_read_without_what_only_trainings_and_tables_need() -> None:
     code = (
         "import sys, astra_data.experiments.run, astra_data.studies.run; "
