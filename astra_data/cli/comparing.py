@@ -5,6 +5,10 @@ from typing import Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName
+from astra_data.core.wording import first_few
+
+_SHOWN = 5
+"""Uids of episodes whose metadata differ."""
 
 
 def log(dataset: DatasetName) -> None:
@@ -31,10 +35,16 @@ def diff(
     listed = {
         f"only in {first.reference}": found.only_in_a,
         f"only in {second.reference}": found.only_in_b,
-        "changed": found.changed,
+        "differ in values": found.values,
     }
     for title, uids in listed.items():
         if uids:
             typer.echo(f"{len(uids)} episodes {title}: {', '.join(map(str, uids))}")
+    if found.metadata:
+        if not found.values:
+            typer.echo("0 episodes differ in values")
+        keys = ", ".join(f"{key} ({first_few(uids, _SHOWN)})" for key, uids in found.metadata.items())
+        different = set().union(*found.metadata.values())
+        typer.echo(f"{len(different)} episodes differ in metadata: {keys}")
     for sentence in (*found.schema, *found.description):
         typer.echo(sentence)

@@ -31,4 +31,22 @@ def test_every_kind_of_difference_is_told(tmp_path: Path) -> None:
         "fps: 20, then 10",
     ]
     assert (found.only_in_a, found.only_in_b, found.changed) == ([0, 2**53 + 1], [99], [4, 6])
+    assert (found.values, found.metadata) == ([6], {"return": [4]})
     assert found.description == ["version: '1.0.0', then '1.1.0'", "config.noise_m: 0.1, then 0.2"]
+
+
+def test_long_lists_of_the_provenance_are_counted(tmp_path: Path) -> None:
+    def made(name: str, recordings: list[str]) -> Dataset:
+        description = dict(DESCRIPTION) | {"config": {"recordings": recordings}}
+        with writer(tmp_path / name, description=description) as open_writer:
+            open_writer.add(fake_episode(4, 1))
+        return Dataset.open(tmp_path / name)
+
+    logs = [f"{number}.csv" for number in range(60)]
+    long = made("long", logs)
+    for recordings, told in (
+        (["other.csv", *logs[1:]], "60 entries, then 60 entries, 1 of them new"),
+        (logs[:2], "60 entries, then ['0.csv', '1.csv']"),
+    ):
+        other = made(str(len(recordings)), recordings)
+        assert differences(long, other).description == [f"config.recordings: {told}"]
