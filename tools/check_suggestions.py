@@ -21,7 +21,7 @@ import typer
 from door import run_tool
 from scipy import stats
 
-from astra_data.core.naming import place
+from astra_data.core.naming import seed_folder
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
 from astra_data.dataset.edit import delete, merge
@@ -132,7 +132,7 @@ def foreseen(setting: Setting, folder: Path, seed: int, fresh: str) -> float:
 
     The latter is the distance of the committee's mean from the recorded next state, in units of the scatter.
     """
-    made = load_grounding(folder / place(seed) / "before" / "grounding.safetensors")
+    made = load_grounding(folder / seed_folder(seed) / "before" / "grounding.safetensors")
     committee = Committee.of(task_named(setting.task), [made])
     pairs = PairedEpisodes.load(folder / f"fresh_{fresh}_pairs")
     windows, predictions = pairs.windows, []
@@ -146,7 +146,7 @@ def foreseen(setting: Setting, folder: Path, seed: int, fresh: str) -> float:
 
 def measured(setting: Setting, folder: Path, seed: int) -> dict[str, Any]:
     """Make all of a seed; return steps, falls, and errors by fresh behaviour, arm and horizon."""
-    home = folder / place(seed)
+    home = folder / seed_folder(seed)
     result = home / "result.json"
     if result.is_file():
         kept: dict[str, Any] = json.loads(result.read_text())

@@ -32,6 +32,6 @@ def reference_of(rows: Iterable[str]) -> str | None:
     return "nas" if "nas" in map(base_method, rows) else None
 
 
-def place(seed: int, percent: int | None = None) -> str:
+def seed_folder(seed: int, percent: int | None = None) -> str:
     """Return the folder of a seed, inside that of the dataset size in per cent where there are several."""
     return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"

@@ -10,7 +10,7 @@ from astra_data.core.wording import shortened
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import place
+from astra_data.dataset.versions import home_of
 
 _Described = tuple[Path, Mapping[str, Any]]
 """Folder and description."""
@@ -86,7 +86,7 @@ def _ancestor(
 
 def _found(identity: Mapping[str, str], beside: Path) -> _Described | None:
     neighbours = sorted(path.parents[2] for path in beside.glob(f"*/{DATASET_PATH}"))
-    for folder in (place(identity), *neighbours):
+    for folder in (home_of(identity), *neighbours):
         try:
             found = read_description(folder)
         except CorruptDatasetError:

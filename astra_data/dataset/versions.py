@@ -74,7 +74,7 @@ def home() -> Path:
     return Path(os.environ.get("ASTRA_DATA_HOME", "datasets"))
 
 
-def place(description: Mapping[str, Any]) -> Path:
+def home_of(description: Mapping[str, Any]) -> Path:
     """Return the folder at home of the dataset with this "name" and "version"."""
     return home() / str(description["name"]) / f"data-{description['version']}"
 
@@ -110,7 +110,7 @@ def locate(dataset: str | Path) -> Path:
     if version and Version.parse(version) not in versions:
         known = ", ".join(f"data-{known}" for known in versions)
         raise BadInputError(f"{name} has no version data-{version} in {home()}; it has {known}")
-    return place({"name": name, "version": version or versions[-1]})
+    return home_of({"name": name, "version": version or versions[-1]})
 
 
 def _is_another(folder: Path) -> bool:
@@ -172,4 +172,4 @@ def successor(
     identities = [dataset.identity for dataset in (source, *parents)]
     changed = {"version": str(version), "stage": stage, "config": dict(config), "parents": identities}
     description = {**kept, **changed, **more}
-    return description, place(description) if out is None else out
+    return description, home_of(description) if out is None else out

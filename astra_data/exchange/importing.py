@@ -14,7 +14,7 @@ from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import AstraDataError, BadInputError, in_short
 from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
-from astra_data.dataset.versions import place
+from astra_data.dataset.versions import home_of
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.cutting import Cut, Cutter
 from astra_data.exchange.export_record import ExportRecord
@@ -122,7 +122,7 @@ def import_dataset(
         "stage": "import",
         "config": settings.model_dump(exclude_defaults=True) | {"recordings": identities(sources)},
     }
-    root = place(description) if out is None else out
+    root = home_of(description) if out is None else out
     if root.exists():
         raised = f"raise `version` in the mapping (now {settings.version}), " if mapping else ""
         another = f"{raised}give another --name or an --out" if out is None else "give another --out"

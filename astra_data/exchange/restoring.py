@@ -11,7 +11,7 @@ import numpy as np
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
 from astra_data.dataset.description import ContentHash
-from astra_data.dataset.versions import Version, place, versions_at_home
+from astra_data.dataset.versions import Version, home_of, versions_at_home
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.mapping import ColumnMapping, ImportMapping
@@ -103,7 +103,7 @@ def write_restored(
         "environment": record.environment,
         "simulator": record.simulator,
     }
-    root = place(description) if out is None else out
+    root = home_of(description) if out is None else out
     frames = 0
     with DatasetWriter(
         root,

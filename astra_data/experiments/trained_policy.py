@@ -5,7 +5,7 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import RECORD, place
+from astra_data.core.naming import RECORD, seed_folder
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
@@ -82,7 +82,7 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     """
     settings = settings_of(run)
     add_all(settings.get("own_methods", {}))
-    folder, where = Path(run), place(seed, percent)
+    folder, where = Path(run), seed_folder(seed, percent)
     files = {"train": folder / "train" / row / where / POLICY}
     if not files["train"].is_file():
         _check_asked(settings, row, seed)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.durable import write_file
-from astra_data.core.naming import place
+from astra_data.core.naming import seed_folder
 from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
 from astra_data.reports.artefacts import GAP, METRICS, Foresight, Gap, Metrics, read_json
@@ -51,7 +51,9 @@ def write_held_out(
     found: dict[str, dict[int | None, GapMeans]] = {}
     for method in groundings:
         for percent in sorted(percents) or (None,):
-            files = {seed: root / "ground" / method / place(seed, percent) / GAP for seed in sorted(seeds)}
+            files = {
+                seed: root / "ground" / method / seed_folder(seed, percent) / GAP for seed in sorted(seeds)
+            }
             gaps = {seed: read_json(Gap, file) for seed, file in files.items() if file.is_file()}
             if gaps:
                 found.setdefault(method, {})[percent] = mean_gap(gaps)
@@ -117,7 +119,7 @@ def _measured(
     """Return how well each part of a grounding foresees failures, on the seeds where some were held out."""
     measured: dict[str, list[Foresight]] = {}
     for seed in seeds:
-        file = root / "ground" / method / place(seed, percent) / METRICS
+        file = root / "ground" / method / seed_folder(seed, percent) / METRICS
         for part, one in read_json(Metrics, file).failures.items() if file.is_file() else ():
             if one.auc:
                 measured.setdefault(part, []).append(one)

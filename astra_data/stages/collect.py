@@ -17,7 +17,7 @@ from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import OUTCOME_COLUMNS
 from astra_data.dataset.staging import StagedWriter
-from astra_data.dataset.versions import place
+from astra_data.dataset.versions import home_of
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.behaviors import (
@@ -136,7 +136,7 @@ def collect(
     world = task_named(task)
     plan = None if config.plan is None else RecordingPlan.load(config.plan, world)
     description = _description(world, config, seed, name)
-    folder = out or place(description)
+    folder = out or home_of(description)
     with StagedWriter(
         folder,
         [*world.state_columns, *OUTCOME_COLUMNS],

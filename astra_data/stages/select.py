@@ -16,7 +16,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
-from astra_data.core.naming import place, reference_of
+from astra_data.core.naming import reference_of, seed_folder
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -199,7 +199,7 @@ def select(
 
 def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -> Bench:
     dataset = "pair" if percent is None else "subset"
-    where = {seed: place(seed, percent) for seed in recipe.seeds}
+    where = {seed: seed_folder(seed, percent) for seed in recipe.seeds}
     entries = [
         Entry(
             row,

@@ -1,4 +1,4 @@
-from astra_data.core.naming import base_method, is_plus, place, reference_of
+from astra_data.core.naming import base_method, is_plus, reference_of, seed_folder
 
 
 def test_a_row_is_a_method_or_its_plus() -> None:
@@ -12,5 +12,5 @@ def test_rows_are_tested_in_nas_if_it_is_among_them() -> None:
 
 
 def test_folders_of_seeds_lie_in_those_of_sizes() -> None:
-    assert place(3) == "seed_3"
-    assert place(3, 5) == "percent_005/seed_3"
+    assert seed_folder(3) == "seed_3"
+    assert seed_folder(3, 5) == "percent_005/seed_3"

@@ -4,7 +4,7 @@ import pytest
 from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.versions import Version, locate, names_at_home, open_dataset, place, successor
+from astra_data.dataset.versions import Version, home_of, locate, names_at_home, open_dataset, successor
 
 
 def versions(*texts: str) -> list[Version]:
@@ -73,7 +73,7 @@ def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) 
     description, folder = successor(source, "episodes", stage="subset", config={"count": 2})
     assert description["version"] == "1.1.0"
     assert description["parents"] == [source.identity]
-    assert folder == place(description) == home / source.description["name"] / "data-1.1.0"
+    assert folder == home_of(description) == home / source.description["name"] / "data-1.1.0"
     folder.mkdir(parents=True)
     assert successor(source, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
     elsewhere = successor(source, "columns", stage="pair", config={}, out=tmp_path / "here")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import place
+from astra_data.core.naming import seed_folder
 from astra_data.reports.assembly import assemble
 from astra_data.reports.drawing import Camera, figure_of_sizes, figures_of
 from astra_data.reports.figures.style import DEPLOYED, SIMULATED
@@ -147,9 +147,9 @@ def test_sizes_are_mapped_where_all_datasets_of_a_seed_are_there(results: Result
         command="",
         sizes=[SizeResults(percent=percent, results=results) for percent in (50, 100)],
     )
-    write_fake(tmp_path / "subset" / place(1, 50))
+    write_fake(tmp_path / "subset" / seed_folder(1, 50))
     assert len(figure_of_sizes(found, tmp_path).axes) == 1
-    write_fake(tmp_path / "subset" / place(1, 100))
+    write_fake(tmp_path / "subset" / seed_folder(1, 100))
     figure = figure_of_sizes(found, tmp_path)
     maps = [axes for axes in figure.axes if axes.images]
     assert [axes.get_title() for axes in maps[:2]] == ["50 %", "100 %"]

@@ -32,7 +32,7 @@ from matplotlib.figure import Figure
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.manifest import read_manifest
-from astra_data.core.naming import place
+from astra_data.core.naming import seed_folder
 from astra_data.reports.page import render
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizesResults
@@ -140,7 +140,8 @@ def test_every_dataset_is_named_and_timed(root: Path) -> None:
     made = {"name": "antmaze-u-random", "version": "data-2.0.0", "content_hash": "hash"}
     for made_by, seconds in (("label", 11.0), ("augment", 13.0)):
         write_json(
-            root / made_by / place(1, None) / "meta/astra/dataset.json", made | {"wall_seconds": seconds}
+            root / made_by / seed_folder(1, None) / "meta/astra/dataset.json",
+            made | {"wall_seconds": seconds},
         )
     make(root)
     found = Results.model_validate_json((root / "report/results.json").read_text())
@@ -245,9 +246,9 @@ def test_sizes_are_set_side_by_side(tasks: None, tmp_path: Path) -> None:
         for seed in SEEDS:
             write_evaluation(root, "astra", seed, percent)
             write_evaluation(root, "direct_transfer", seed, percent)
-            write_fake(root / "subset" / place(seed, percent))
+            write_fake(root / "subset" / seed_folder(seed, percent))
     # At 50 % one seed of ASTRA is worse.
-    path = root / "evaluate/astra" / place(2, 50) / "evaluation.json"
+    path = root / "evaluate/astra" / seed_folder(2, 50) / "evaluation.json"
     edit_json(path, target=outcomes([0, 0, 0, 0], 2))
     sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(50, 100))
     make(root, tmp_path / "results", sized)

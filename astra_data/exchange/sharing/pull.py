@@ -13,7 +13,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.atomic import publish
 from astra_data.dataset.description import NAME
 from astra_data.dataset.doctor.check import check
-from astra_data.dataset.versions import Version, place
+from astra_data.dataset.versions import Version, home_of
 from astra_data.exchange.sharing.address import Hub, parse_source
 from astra_data.exchange.sharing.fetch import fetch, refuse_planted
 from astra_data.exchange.sharing.hub import HubStore
@@ -81,7 +81,7 @@ def pull(
     name, called = description.get("name"), description.get("version")
     if not isinstance(name, str) or not NAME.fullmatch(name) or called != str(chosen):
         raise SharingError(f"{remote.name} calls itself {name!r} {called!r}; it cannot be trusted.")
-    target = place(description) if out is None else out
+    target = home_of(description) if out is None else out
     sums = parse_sums(remote.read_text(SUMS_PATH), remote.name)
     if target.exists():
         dataset = _present(target, description, sums)
