@@ -38,7 +38,7 @@ def toy_episodes(
         reward=none if parts is None else parts,
         goes_on=1.0 - ended.float(),
         failed=nothing if parts is None else (parts[..., 1] != 0).float(),
-        topples_soon=nothing,
+        fails_soon=nothing,
         mask=torch.ones_like(nothing) if mask is None else mask,
     )
     return PairedEpisodes(

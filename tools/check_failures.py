@@ -68,7 +68,7 @@ def main(
         if not tells_failures(world, part):
             continue
         fitted = fit_failures(world, grounding, part, members, seed=0)
-        failures = int(part.windows.topples_soon.any(1).sum())
+        failures = int(part.windows.fails_soon.any(1).sum())
         for name, others in measured.items():
             said = fitted.probability(replayed_inputs(world, grounding, fitted, others))
             found = foresight(said, failing(world, others, fitted.shape.risk_steps), windows)
@@ -97,7 +97,7 @@ def _print_likelihoods(
     print("| within | failures | nats a failure above a constant rate | expected |\n|---|---|---|---|")
     for steps in within:
         episodes = failing(task, whole, steps)
-        mask, fails = episodes.windows.mask, episodes.windows.topples_soon.any(1)
+        mask, fails = episodes.windows.mask, episodes.windows.fails_soon.any(1)
         if fails.sum() < 2:
             raise typer.BadParameter(f"expected two episodes that fail to cross-fit, got {int(fails.sum())}")
         hazard = torch.zeros_like(mask)
@@ -106,7 +106,7 @@ def _print_likelihoods(
             fitted_to, fresh = (episodes.select(part.nonzero().squeeze(1)) for part in (~fold, fold))
             model = fit_failures(task, grounding, fitted_to, members, 0, steps)
             hazard[fold] = model.hazard(model.probability(replayed_inputs(task, grounding, model, fresh)))
-        here = fails[:, None] & (failing(task, whole, 1).windows.topples_soon > 0)
+        here = fails[:, None] & (failing(task, whole, 1).windows.fails_soon > 0)
         count, steps_in_all = float(fails.sum()), float(mask.sum())
         rate = torch.full_like(mask, count / steps_in_all)
         known, usual = (
@@ -137,10 +137,10 @@ def _print_rates(task: Task, grounding: HistoryGrounding, measured: Mapping[int,
         simulator.start(windows.state[:, 0], torch.arange(len(episodes)), windows.goal[:, 0])
         for action, mask in zip(windows.action.unbind(1), windows.mask.unbind(1), strict=True):
             simulator.step(action)
-            risk = simulator.topple_risk()
+            risk = simulator.failure_risk()
             assert risk is not None
             expected += float((risk * mask).sum())
-        steps, recorded = float(windows.mask.sum()), int(windows.topples_soon.any(1).sum())
+        steps, recorded = float(windows.mask.sum()), int(windows.fails_soon.any(1).sum())
         print(f"| {name} | {1e3 * recorded / steps:.2f} | {1e3 * expected / steps:.2f} |")
 
 

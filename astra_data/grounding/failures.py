@@ -34,7 +34,7 @@ BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 def failing(task: Task, episodes: PairedEpisodes, risk_steps: int) -> PairedEpisodes:
-    """Return the episodes with what a failure model learns of them as `topples_soon`.
+    """Return the episodes with what a failure model learns of them as `fails_soon`.
 
     That is the last `risk_steps` before a failure that no abstract state shows. Where one does, as with a
     ball beside the goal, simulators end episodes themselves, and a failure model would end them twice. A
@@ -44,9 +44,9 @@ def failing(task: Task, episodes: PairedEpisodes, risk_steps: int) -> PairedEpis
     windows, last = episodes.windows, episodes.lengths - 1
     each = torch.arange(len(episodes), device=last.device)
     is_shown = task.objective.missed(windows.next_state[each, last], windows.goal[each, last])
-    fails = windows.topples_soon.any(1) & ~is_shown
+    fails = windows.fails_soon.any(1) & ~is_shown
     soon = before_failures(fails, windows.mask, risk_steps)
-    return replace(episodes, windows=replace(windows, topples_soon=soon))
+    return replace(episodes, windows=replace(windows, fails_soon=soon))
 
 
 def tells_failures(task: Task, episodes: PairedEpisodes, risk_steps: int = RISK_STEPS) -> bool:
@@ -55,7 +55,7 @@ def tells_failures(task: Task, episodes: PairedEpisodes, risk_steps: int = RISK_
 
 
 def _tells(episodes: PairedEpisodes) -> bool:
-    return _has_both(episodes.steps(episodes.windows.topples_soon))
+    return _has_both(episodes.steps(episodes.windows.fails_soon))
 
 
 def fit_failures(
@@ -71,7 +71,7 @@ def fit_failures(
     The episodes are such that `tells_failures`.
     """
     training = failing(task, training, risk_steps)
-    fails = training.windows.topples_soon
+    fails = training.windows.fails_soon
     torch.manual_seed(derive(seed, "failure model"))
     untrained = _untrained(task, training, members, risk_steps)
     inputs = replayed_inputs(task, grounding, untrained, training)
@@ -83,10 +83,10 @@ def fit_failures(
         others = training.select((~fold).nonzero().squeeze(1))
         if not _tells(others):
             continue
-        fitted = _descended(untrained, others.steps(inputs[~fold]), others.steps(others.windows.topples_soon))
+        fitted = _descended(untrained, others.steps(inputs[~fold]), others.steps(others.windows.fails_soon))
         own = training.select(fold.nonzero().squeeze(1))
         odds.append(fitted.log_odds(own.steps(inputs[fold])).detach())
-        happened.append(own.steps(own.windows.topples_soon))
+        happened.append(own.steps(own.windows.fails_soon))
     if odds and _has_both(torch.cat(happened)):
         model.calibrate(*calibration(torch.cat(odds, dim=1), torch.cat(happened), risk_steps))
     return model.requires_grad_(False).eval()
@@ -207,7 +207,7 @@ def compared_foresight(
 def foresight(
     probability: Tensor, episodes: PairedEpisodes, ahead: Sequence[tuple[int, int]] = AHEAD_STEPS
 ) -> dict[str, Any]:
-    """Measure probabilities (E, T) of what `topples_soon` marks on episodes that were not fitted.
+    """Measure probabilities (E, T) of what `fails_soon` marks on episodes that were not fitted.
 
     Returns:
         "failures": of the episodes. "auc": by window `ahead` of the failure, the probability that a step
@@ -220,7 +220,7 @@ def foresight(
 
     windows = episodes.windows
     mask = windows.mask.bool()
-    fails = windows.topples_soon.bool() & mask
+    fails = windows.fails_soon.bool() & mask
     count = int(fails.any(1).sum())
     if not count:
         return {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}

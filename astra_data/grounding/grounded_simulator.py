@@ -156,8 +156,8 @@ class GroundedSimulator(EpisodeSimulator):
         return state
 
     @torch.no_grad()
-    def topple_risk(self) -> Tensor:
-        """Return the probability (B,) that the target toppled in the last step."""
+    def failure_risk(self) -> Tensor:
+        """Return the probability (B,) that the target failed in the last step."""
         if self._hazard is not None:
             return self._hazard
         _, *known = self._last

@@ -71,7 +71,7 @@ def _replayed(
     states, risks, apart = [moments.state], [], []
     for step in range(windows.mask.shape[1]):
         states.append(simulator.step(moments.action(step)))
-        if (risk := simulator.topple_risk()) is not None:
+        if (risk := simulator.failure_risk()) is not None:
             risks.append(risk)
         apart.append(simulator.disagreement)
     return torch.stack(states, dim=1), torch.stack(risks, dim=1) if risks else None, torch.stack(apart, dim=1)

@@ -127,7 +127,7 @@ class PairedEpisodes:
                 reward=torch.stack([reward * ~terminated, reward * failed], dim=-1),
                 goes_on=(mask & ~terminated).float(),
                 failed=failed.float(),
-                topples_soon=before_failures(failed.any(1), mask, RISK_STEPS),
+                fails_soon=before_failures(failed.any(1), mask, RISK_STEPS),
                 mask=mask.float(),
             ),
             reference=dataset.reference,

@@ -88,8 +88,8 @@ class EpisodeSimulator:
             landed = landed + torch.randn_like(landed) @ self.scatter.T
         return self.simulator.settle(before, landed)
 
-    def topple_risk(self) -> Tensor | None:
-        """Return the probability (B,) that the target toppled in the last step; None where unknown."""
+    def failure_risk(self) -> Tensor | None:
+        """Return the probability (B,) that the target failed in the last step; None where unknown."""
         return None
 
     def predicted_reward(self, own: Tensor, *, with_failures: bool = True) -> Tensor | None:

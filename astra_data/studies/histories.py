@@ -108,7 +108,7 @@ class HistoryModel(Predictor):
             reward=torch.stack([nearer, torch.zeros_like(nearer)], dim=-1),
             goes_on=torch.ones_like(nearer),
             failed=torch.zeros_like(nearer),
-            topples_soon=torch.zeros_like(nearer),
+            fails_soon=torch.zeros_like(nearer),
             # Where steps do not count, the simulator's motion stands in: nothing to learn.
             mask=(motion != simulated)[:, 1:].any(-1).float(),
         )

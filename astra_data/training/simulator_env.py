@@ -163,7 +163,7 @@ class SimulatorEnv:
             penalty = -self.thinness[self.free.cells(after[:, :2])]
         if self.disagreement_penalty:
             penalty = penalty - self.disagreement_penalty * self.simulator.disagreement
-        risk = self.simulator.topple_risk() if self.topple or self.reward == "blend" else None
+        risk = self.simulator.failure_risk() if self.topple or self.reward == "blend" else None
         if risk is not None and self.topple:
             self.failed = self.failed | ((torch.rand_like(risk) < risk) & ~success)
         elif risk is not None:

@@ -131,7 +131,7 @@ def test_the_failure_model_is_fitted_to_replays_that_keep_clear(
     failed = torch.zeros(1, 10)
     failed[0, -1] = 1.0
     training = recorded(*[1.0] * 10)
-    training = replace(training, windows=replace(training.windows, topples_soon=failed))
+    training = replace(training, windows=replace(training.windows, fails_soon=failed))
     config = GroundConfig(
         updates=1,
         batch_windows=1,

@@ -103,7 +103,7 @@ def test_rollouts_go_as_in_the_corrected_simulator() -> None:
         torch.testing.assert_close(found.reached[step], reached)
         for world in worlds:
             world.step(command)
-        risks = [risk for world in worlds if (risk := world.topple_risk()) is not None]
+        risks = [risk for world in worlds if (risk := world.failure_risk()) is not None]
         reached = reached * (1 - (risks[0] + risks[1]) / 2)
 
 

@@ -56,7 +56,7 @@ def hurried(episodes: int, seed: int) -> PairedEpisodes:
         simulated_next=state[:, 1:] + 0.01 * torch.randn(episodes, 100, 4),
         mask=mask,
     )
-    return replace(made, windows=replace(made.windows, topples_soon=soon))
+    return replace(made, windows=replace(made.windows, fails_soon=soon))
 
 
 def said_of(model: FailureModel, episodes: PairedEpisodes) -> Tensor:
@@ -84,7 +84,7 @@ def test_failures_of_other_episodes_are_foreseen_at_their_rate(foreseeing: Failu
     assert found["auc"]["1-20"] > 0.95
     assert found["brier_skill"] > 0.5
     said = fresh.steps(said_of(foreseeing, fresh))
-    rate = fresh.steps(fresh.windows.topples_soon)
+    rate = fresh.steps(fresh.windows.fails_soon)
     assert float(said.mean()) == pytest.approx(float(rate.mean()), rel=0.3)
 
 
@@ -102,7 +102,7 @@ def test_the_seed_decides_everything(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_nothing_is_told_where_nothing_fails_or_everything(soon: float) -> None:
     episodes = hurried(4, 0)
     assert tells_failures(TASK, episodes)
-    alike = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.full((4, 100), soon)))
+    alike = replace(episodes, windows=replace(episodes.windows, fails_soon=torch.full((4, 100), soon)))
     assert not tells_failures(TASK, alike, 100)
 
 
@@ -118,11 +118,11 @@ def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
     made = toy_episodes(
         state, torch.zeros(3, 30, 2), next_state=after, mask=mask, goal=goal.expand(3, 30, 2).contiguous()
     )
-    made = replace(made, windows=replace(made.windows, topples_soon=mask))
+    made = replace(made, windows=replace(made.windows, fails_soon=mask))
     unseen = failing(kick, made, 20)
     expected = torch.zeros(3, 30)
     expected[1, 10:] = expected[2, :20] = 1
-    assert torch.equal(unseen.windows.topples_soon, expected)
+    assert torch.equal(unseen.windows.fails_soon, expected)
     assert torch.equal(unseen.windows.state, state)
     assert tells_failures(kick, made) and not tells_failures(kick, made.select(torch.tensor([0])))
 
@@ -130,13 +130,11 @@ def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
 def test_the_last_steps_before_a_failure_are_as_many_as_asked_for() -> None:
     episodes = hurried(4, 0)
     for steps in (1, 3, RISK_STEPS, 50):
-        marked = failing(TASK, episodes, steps).windows.topples_soon
+        marked = failing(TASK, episodes, steps).windows.fails_soon
         assert torch.equal(
-            marked.bool(), episodes.windows.topples_soon.any(1, True) & (left(episodes) <= steps)
+            marked.bool(), episodes.windows.fails_soon.any(1, True) & (left(episodes) <= steps)
         )
-    assert torch.equal(
-        failing(TASK, episodes, RISK_STEPS).windows.topples_soon, episodes.windows.topples_soon
-    )
+    assert torch.equal(failing(TASK, episodes, RISK_STEPS).windows.fails_soon, episodes.windows.fails_soon)
 
 
 def left(episodes: PairedEpisodes) -> Tensor:
@@ -156,7 +154,7 @@ def test_a_model_of_fewer_steps_knows_the_moment_and_expects_as_many_failures(
         assert model.shape.risk_steps == steps
         hazards[steps] = model.hazard(said_of(model, fresh)) * fresh.windows.mask
         assert float(hazards[steps].sum()) == pytest.approx(20, rel=0.35)
-    last = fresh.windows.topples_soon.any(1, True) & (left(fresh) <= 3)
+    last = fresh.windows.fails_soon.any(1, True) & (left(fresh) <= 3)
     late = {steps: float(hazard[last].sum() / hazard.sum()) for steps, hazard in hazards.items()}
     assert late[3] > 1.5 * late[RISK_STEPS]
 
@@ -228,7 +226,7 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     episodes = hurried(2, 0)
     mask, soon = torch.ones(2, 100), torch.zeros(2, 100)
     mask[0, 60:], soon[0, 60 - RISK_STEPS : 60] = 0, 1
-    episodes = replace(episodes, windows=replace(episodes.windows, mask=mask, topples_soon=soon))
+    episodes = replace(episodes, windows=replace(episodes.windows, mask=mask, fails_soon=soon))
     left = steps_left(episodes)
     said = torch.where((left >= 11) & (left <= 30) & (torch.arange(2) == 0)[:, None], 0.9, 0.1)
     auc = foresight(said, episodes)["auc"]
@@ -242,7 +240,7 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
 def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
     episodes = hurried(20, 0)
     mask = episodes.windows.mask.bool()
-    rate = float(episodes.windows.topples_soon[mask].mean())
+    rate = float(episodes.windows.fails_soon[mask].mean())
     found = foresight(torch.full(mask.shape, rate), episodes)
     assert found["brier_skill"] == pytest.approx(0.0, abs=1e-6)
     assert found["auc"] == {"1-20": 0.5, "11-30": 0.5, "21-40": 0.5}
@@ -251,7 +249,7 @@ def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
 
 def test_episodes_without_a_failure_tell_nothing() -> None:
     episodes = hurried(2, 0)
-    calm = replace(episodes, windows=replace(episodes.windows, topples_soon=torch.zeros(2, 100)))
+    calm = replace(episodes, windows=replace(episodes.windows, fails_soon=torch.zeros(2, 100)))
     nothing = {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
     assert foresight(torch.rand(2, 100), calm) == nothing
 
@@ -261,7 +259,7 @@ def test_a_window_without_steps_has_no_figure() -> None:
     episodes = hurried(2, 0)
     mask, soon = torch.ones(2, 100), torch.zeros(2, 100)
     mask[0, 25:], soon[0, 5:25] = 0, 1
-    short = replace(episodes, windows=replace(episodes.windows, mask=mask, topples_soon=soon))
+    short = replace(episodes, windows=replace(episodes.windows, mask=mask, fails_soon=soon))
     found = foresight(torch.rand(2, 100), short)["auc"]
     assert found["1-20"] is not None and found["21-40"] is not None
     mask[0, 15:], soon[0] = 0, 0
@@ -281,7 +279,7 @@ def by_chance(seed: int) -> PairedEpisodes:
     soon, mask = torch.zeros(40, 100), torch.ones(40, 100)
     for episode, end in enumerate(torch.randint(30, 100, (8,)).tolist()):
         mask[episode, end:], soon[episode, end - RISK_STEPS : end] = 0, 1
-    changed = replace(windows, action=action, topples_soon=soon, mask=mask)
+    changed = replace(windows, action=action, fails_soon=soon, mask=mask)
     return replace(episodes, windows=changed)
 
 
@@ -325,16 +323,16 @@ def test_calm_episodes_are_calm_however_short_they_are(steps: int) -> None:
     episodes = hurried(6, 0)
     mask, soon = torch.ones(6, steps), torch.zeros(6, steps)
     mask[0, 25:], soon[0, 5:25] = 0, 1
-    windows = replace(episodes.windows, mask=mask, topples_soon=soon)
+    windows = replace(episodes.windows, mask=mask, fails_soon=soon)
     found = foresight(soon.clone(), replace(episodes, windows=windows))["auc"]
     assert found == {"1-20": 1.0, "11-30": pytest.approx(5 / 6, abs=0.02), "21-40": 0.5}
 
 
 def test_a_single_failure_leaves_nothing_to_cross_fit_and_is_foreseen_at_its_rate() -> None:
     training = by_chance(0)
-    soon = training.windows.topples_soon.clone()
+    soon = training.windows.fails_soon.clone()
     soon[1:] = 0
-    training = replace(training, windows=replace(training.windows, topples_soon=soon))
+    training = replace(training, windows=replace(training.windows, fails_soon=soon))
     model = fit_failures(TASK, HistoryGrounding(grounding_model()), training, 3, seed=0)
     rate = training.steps(soon).mean()
     torch.testing.assert_close(model.log_odds_shift, rate.logit() - torch.tensor(0.25).logit())
@@ -343,7 +341,7 @@ def test_a_single_failure_leaves_nothing_to_cross_fit_and_is_foreseen_at_its_rat
 
 def test_heads_that_know_are_found_to_know(monkeypatch: pytest.MonkeyPatch) -> None:
     episodes, model = hurried(4, 0), grounding_model()
-    soon = episodes.windows.topples_soon
+    soon = episodes.windows.fails_soon
     model.failure_weight.fill_(1.0)
     model.failure_cost.fill_(-10.0)
     parts = torch.stack([torch.ones_like(soon), -10.0 * soon / RISK_STEPS], dim=-1)
@@ -359,7 +357,7 @@ def test_heads_that_know_are_found_to_know(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_failure_model_is_measured_on_what_it_foresees(monkeypatch: pytest.MonkeyPatch) -> None:
     episodes = hurried(4, 0)
     failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1, risk_steps=3)).eval()
-    soon = failing(TASK, episodes, 3).windows.topples_soon
+    soon = failing(TASK, episodes, 3).windows.fails_soon
     monkeypatch.setattr(failures, "probability", lambda inputs: soon)
     made = HistoryGrounding(grounding_model(), failures)
     found = compared_foresight(TASK, made, episodes, predicts_reward=False, ahead=[(1, 3)])

@@ -199,7 +199,7 @@ def test_no_failure_model_is_fitted_to_failures_that_abstract_states_show(
     training = episodes(0)
     soon = torch.zeros_like(training.windows.mask)
     soon[0, -4:] = 1
-    training = replace(training, windows=replace(training.windows, topples_soon=soon))
+    training = replace(training, windows=replace(training.windows, fails_soon=soon))
     task = TASKS["antmaze-umaze"]
     monkeypatch.setattr(type(task.objective), "missed", lambda _, state, goal: state[:, 0] == state[:, 0])
     config = GroundConfig(updates=1, batch_windows=4, window=5, latent_size=8, failure_members=2)
@@ -214,7 +214,7 @@ def test_a_failure_model_is_fitted_and_compared_where_it_is_asked_for(tmp_path: 
     training, held_out = episodes(0), episodes(1, 3)
     soon = torch.zeros_like(training.windows.mask)
     soon[0, -4:] = 1
-    windows = replace(training.windows, topples_soon=soon, mask=torch.ones_like(soon))
+    windows = replace(training.windows, fails_soon=soon, mask=torch.ones_like(soon))
     training = replace(training, windows=windows)
     for members in (0, 2):
         folder = tmp_path / f"{members}"

@@ -90,7 +90,7 @@ def test_risk_and_reward_are_of_the_last_step() -> None:
     latent = one.latent.clone()
     after = one.step(second)
     assert not torch.allclose(latent, one.latent)
-    torch.testing.assert_close(one.topple_risk(), used.topple_risk(latent, second, after))
+    torch.testing.assert_close(one.failure_risk(), used.topple_risk(latent, second, after))
     own = torch.tensor([1.0, 2.0, 3.0])
     torch.testing.assert_close(one.predicted_reward(own), used.predict_reward(latent, second))
     used.failure_cost.fill_(-10.0)
@@ -138,8 +138,8 @@ def test_members_correct_and_reward_their_shares_and_policies_see_the_models_lat
         nothing = torch.zeros(5)
         rewards = [alone.predicted_reward(nothing[:3]) for alone in apart]
         torch.testing.assert_close(one.predicted_reward(nothing), torch.cat([rewards[1][:2], rewards[2]]))
-        risks = [alone.topple_risk() for alone in apart]
-        torch.testing.assert_close(one.topple_risk(), torch.cat([risks[1][:2], risks[2]]))
+        risks = [alone.failure_risk() for alone in apart]
+        torch.testing.assert_close(one.failure_risk(), torch.cat([risks[1][:2], risks[2]]))
         assert not torch.allclose(rewards[1], rewards[2]) and not torch.allclose(first, second)
     follows = torch.zeros(5, 8)
     state, previous = HERE.expand(5, 4), torch.zeros(5, 2)
@@ -213,11 +213,11 @@ def test_a_failure_model_is_asked_before_each_correction_and_replaces_the_other_
         said, memory = failures.step(one.state, action, raw.step(action), memory)
         latent = one.latent
         torch.testing.assert_close(one.step(action), plain.step(action))
-        torch.testing.assert_close(one.topple_risk(), failures.hazard(said))
+        torch.testing.assert_close(one.failure_risk(), failures.hazard(said))
         going_on, _ = used.predict_reward_parts(latent, action).unbind(-1)
         expected = going_on - 10.0 * failures.hazard(said)
         torch.testing.assert_close(one.predicted_reward(torch.zeros(3)), expected)
-    assert not torch.allclose(one.topple_risk(), plain.topple_risk())
+    assert not torch.allclose(one.failure_risk(), plain.failure_risk())
 
 
 def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
@@ -227,18 +227,18 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
         one.step(action)
     saved = {name: values.clone() for name, values in one.state_dict().items()}
     one.step(played[4])
-    wanted = one.topple_risk()
+    wanted = one.failure_risk()
     resumed = foreseeing(used, failures)
     resumed.load_state_dict(saved)
     resumed.step(played[4])
-    torch.testing.assert_close(resumed.topple_risk(), wanted)
+    torch.testing.assert_close(resumed.failure_risk(), wanted)
 
     one.start(HERE.expand(3, 4), ROWS, GOAL)
     one.step(played[0])
     fresh = foreseeing(used, failures)
     fresh.step(played[0])
-    torch.testing.assert_close(one.topple_risk(), fresh.topple_risk())
-    assert not torch.allclose(fresh.topple_risk(), wanted)
+    torch.testing.assert_close(one.failure_risk(), fresh.failure_risk())
+    assert not torch.allclose(fresh.failure_risk(), wanted)
 
 
 def test_within_a_history_a_failure_model_knows_the_action_before_and_what_it_is_told() -> None:
@@ -251,7 +251,7 @@ def test_within_a_history_a_failure_model_knows_the_action_before_and_what_it_is
     raw.reset_to(HERE.expand(3, 4))
     memory = failures.initial_memory(HERE.expand(3, 4), before)
     said, _ = failures.step(HERE.expand(3, 4), action, raw.step(action), memory)
-    torch.testing.assert_close(middle.topple_risk(), failures.hazard(said))
+    torch.testing.assert_close(middle.failure_risk(), failures.hazard(said))
     averages = torch.rand(3, 15)
     middle.start(
         HERE.expand(3, 4), ROWS, GOAL, hidden=torch.cat([hidden, averages], 1), previous_action=before
@@ -259,7 +259,7 @@ def test_within_a_history_a_failure_model_knows_the_action_before_and_what_it_is
     middle.step(action)
     known = failures.initial_memory(HERE.expand(3, 4), before, averages)
     warm, _ = failures.step(HERE.expand(3, 4), action, raw.state, known)
-    torch.testing.assert_close(middle.topple_risk(), failures.hazard(warm))
+    torch.testing.assert_close(middle.failure_risk(), failures.hazard(warm))
     assert not torch.allclose(warm, said)
     states = torch.zeros(1, 5, 4)
     of = toy_episodes(states, torch.zeros(1, 5, 2), next_state=states).windows

@@ -39,7 +39,7 @@ def test_a_grounding_of_one_correction_corrects_and_does_not_disagree(episodes: 
     for step in range(STEPS):
         state = simulator.step(episodes.windows.action[:, step])
         torch.testing.assert_close(found.state[:, step + 1], state)
-        torch.testing.assert_close(found.hazard[:, step], simulator.topple_risk())
+        torch.testing.assert_close(found.hazard[:, step], simulator.failure_risk())
 
 
 def test_hazards_are_told_where_the_failure_model_was_fitted(episodes: PairedEpisodes) -> None:

@@ -139,8 +139,8 @@ def test_rewards_of_steps_that_end_the_task_badly_stand_apart(episodes: PairedEp
     assert episodes.windows.failed.nonzero().tolist() == [[3, 29]]
 
 
-def test_only_the_last_second_before_a_bad_end_topples_soon(episodes: PairedEpisodes) -> None:
-    assert episodes.windows.topples_soon.nonzero().tolist() == [[3, step] for step in range(10, 30)]
+def test_only_the_last_second_before_a_bad_end_fails_soon(episodes: PairedEpisodes) -> None:
+    assert episodes.windows.fails_soon.nonzero().tolist() == [[3, step] for step in range(10, 30)]
 
 
 def test_the_previous_action_is_one_step_late(episodes: PairedEpisodes) -> None:

@@ -60,7 +60,7 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
         reward=torch.zeros(COUNT, STEPS, 2),
         goes_on=torch.ones_like(nothing),
         failed=nothing,
-        topples_soon=nothing,
+        fails_soon=nothing,
         mask=torch.ones(COUNT, STEPS),
     )
     hidden = grounding.hidden_before(windows, every)

@@ -243,9 +243,7 @@ def test_rpred_learns_failures_only_where_no_failure_model_replaces_it(
     soon[:15, 20:40] = 1.0
     reward = torch.zeros(30, 50, 2)
     reward[:15, 39, 1] = -10.0
-    windows = replace(
-        training.windows, topples_soon=soon, reward=reward, failed=(reward[..., 1] != 0).float()
-    )
+    windows = replace(training.windows, fails_soon=soon, reward=reward, failed=(reward[..., 1] != 0).float())
     training = replace(training, windows=windows)
     config = GroundConfig(updates=1, batch_windows=1, window=2, latent_size=8, failure_members=int(foresees))
     fitting = Fitting(TASK, config, None, training, training, 0, "cpu", tmp_path, silent)

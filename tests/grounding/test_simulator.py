@@ -61,7 +61,7 @@ def test_the_raw_simulator_has_no_latents_and_predicts_nothing() -> None:
     one = simulator(3)
     one.step(torch.ones(3, 2))
     assert (one.latent, one.latent_size, one.parameters) == (None, 0, None)
-    assert (one.topple_risk(), one.predicted_reward(torch.ones(3))) == (None, None)
+    assert (one.failure_risk(), one.predicted_reward(torch.ones(3))) == (None, None)
     assert one.disagreement.tolist() == [0.0, 0.0, 0.0]
 
 

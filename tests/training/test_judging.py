@@ -133,7 +133,7 @@ def test_a_judge_without_a_failure_model_gets_one_where_its_episodes_fail(
     assert all(torch.equal(one, expected.state_dict()[key]) for key, one in fitted.state_dict().items())
     assert failures_of(known, episodes, 3) is known.failures
     assert failures_of(lacking, episodes, 0) is None
-    never = replace(episodes.windows, topples_soon=torch.zeros_like(episodes.windows.topples_soon))
+    never = replace(episodes.windows, fails_soon=torch.zeros_like(episodes.windows.fails_soon))
     assert failures_of(lacking, replace(episodes, windows=never), 3) is None
     monkeypatch.setattr(type(TASK.objective), "missed", lambda _, state, goal: state[:, 0] == state[:, 0])
     assert failures_of(lacking, episodes, 3) is None  # the simulator sees these failures itself

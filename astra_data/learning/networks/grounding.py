@@ -258,7 +258,7 @@ class GroundingModel(nn.Module):
         if weights.failures > 0:
             logit = self.topple_logit(latent.detach(), action, windows.next_state)
             surprise = functional.binary_cross_entropy_with_logits(
-                logit, windows.topples_soon, reduction="none"
+                logit, windows.fails_soon, reduction="none"
             )
             parts["topple"] = _masked_mean(surprise, mask)
             total = total + weights.failures * parts["topple"]

@@ -17,7 +17,7 @@ class PairedWindows:
         state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
         next_state: φ(s_{i+1}), (B, T, X).
-        topples_soon: (B, T), 1 where the episode fails within `RISK_STEPS`; see also `failing`.
+        fails_soon: (B, T), 1 where the episode fails within `RISK_STEPS`; see also `failing`.
         reward: r_i, or the residual reward, in two parts, (B, T, 2): of steps that go on, and of steps that
             end in failure; 0 in the other. Reaching the goal is detected and rewarded by the simulator.
         goes_on: (B, T), 1 where the step ends nothing: only there the first part of the reward is known.
@@ -34,7 +34,7 @@ class PairedWindows:
     reward: Tensor
     goes_on: Tensor
     failed: Tensor
-    topples_soon: Tensor
+    fails_soon: Tensor
     mask: Tensor
 
 

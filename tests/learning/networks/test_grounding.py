@@ -34,7 +34,7 @@ def lagging_world(episodes: int, steps: int, seed: int) -> PairedWindows:
         reward=torch.stack([state[:, 1:].norm(dim=-1), torch.zeros(episodes, steps)], dim=-1),
         goes_on=torch.ones(episodes, steps),
         failed=torch.zeros(episodes, steps),
-        topples_soon=torch.zeros(episodes, steps),
+        fails_soon=torch.zeros(episodes, steps),
         mask=torch.ones(episodes, steps),
     )
 

@@ -35,7 +35,7 @@ def windows() -> PairedWindows:
         reward=torch.stack([draw() * (failing == 0), failing], dim=-1),
         goes_on=(failing == 0).float(),
         failed=(failing != 0).float(),
-        topples_soon=(draw() > 0).float(),
+        fails_soon=(draw() > 0).float(),
         mask=mask,
     )
 
@@ -253,7 +253,7 @@ def test_the_total_is_the_weighted_sum_and_the_topple_loss() -> None:
     torch.testing.assert_close(total, expected)
     logit = used.topple_logit(latents(used), given.action, given.next_state)
     probability = logit.sigmoid()
-    surprise = -torch.where(given.topples_soon > 0, probability, 1.0 - probability).log()
+    surprise = -torch.where(given.fails_soon > 0, probability, 1.0 - probability).log()
     torch.testing.assert_close(parts["topple"], real(surprise))
 
 
