@@ -279,3 +279,10 @@ def flag_faults(run: Run, number: int) -> Iterator[str]:
             at = wrong.argmax()
             found = f"{names.DONE} is {flags[names.DONE][at]} in episode {number} frame {at}"
             yield f"{found}, expected {expected[at]}: terminated or truncated"
+
+
+def open_end_faults(run: Run, number: int) -> Iterator[str]:
+    """Yield a sentence if episode `number` has flags, and its last frame is not done."""
+    done = run.columns.get(names.DONE)
+    if done is not None and done.ndim == 1 and not done[-1]:
+        yield f"{names.DONE} is False in episode {number} frame {len(run) - 1}, expected True: it ends there"

@@ -16,6 +16,7 @@ from astra_data.dataset.plain import (
     Run,
     episode_rows,
     flag_faults,
+    open_end_faults,
     plain_columns,
     read_footer,
     read_object,
@@ -246,3 +247,10 @@ def test_a_flag_alone_may_end_the_last_step() -> None:
     assert list(flag_faults(a_run(**{"next.done": np.array([False, False, False, True])}), 3)) == []
     [fault] = flag_faults(a_run(**{"next.done": np.array([False, True, False, True])}), 3)
     assert fault == "next.done is True in episode 3 frame 1, before the last frame 3"
+
+
+def test_an_episode_that_is_not_done_in_its_last_step_has_no_end() -> None:
+    [fault] = open_end_faults(a_run(**{"next.done": np.zeros(4, bool)}), 3)
+    assert fault == "next.done is False in episode 3 frame 3, expected True: it ends there"
+    assert list(open_end_faults(a_run(**{"next.done": np.arange(4) == 3}), 3)) == []
+    assert list(open_end_faults(a_run(), 3)) == []

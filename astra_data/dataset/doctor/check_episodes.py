@@ -21,6 +21,7 @@ from astra_data.dataset.plain import (
     data_files,
     episode_rows,
     flag_faults,
+    open_end_faults,
     read_statistics,
     read_tasks,
     run_faults,
@@ -85,7 +86,7 @@ class EpisodeChecks:
                 continue
             for name, fault in run_faults(run, number=number, row=self._report.frames, fps=self._info["fps"]):
                 self._report.fault(name, fault)
-            for fault in flag_faults(run, number):
+            for fault in (*flag_faults(run, number), *open_end_faults(run, number)):
                 (self._report.fault if self._is_ours else self._report.note)("flags", fault)
             tasks = np.unique(run.columns[names.TASK_INDEX])
             unknown = [task for task in tasks.tolist() if task not in self._tasks]

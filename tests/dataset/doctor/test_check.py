@@ -72,6 +72,7 @@ def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
                 "next.done is True in episode 2 frame 1, expected False: terminated or truncated",
             ],
         ),
+        (alter(DATA, "next.done", 19, False), ["next.done is False in episode 2 frame 11, expected True"]),
         (alter(DATA, "next.truncated", 9, True), ["next.truncated is True in episode 2 frame 1, before"]),
         (
             alter(DATA, "observation.state", 10, [0, np.nan, 0]),
