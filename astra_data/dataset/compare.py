@@ -2,8 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import chain
+from dataclasses import dataclass
 from typing import Any
 
 from astra_data.dataset.columns import Column
@@ -23,8 +22,7 @@ class Differences:
         schema: one sentence per difference in columns, fps and task.
         only_in_a: uids of episodes that B lacks, ascending.
         only_in_b: uids of episodes that A lacks, ascending.
-        changed: uids of episodes of both whose values or metadata differ, ascending.
-        values: those whose values differ, ascending.
+        values: uids of episodes of both whose values differ, ascending.
         metadata: the keys of metadata that differ, each with the uids of the episodes, ascending.
         description: one sentence per difference in provenance, such as "config.noise_m: 0.1, then 0.2".
     """
@@ -32,10 +30,9 @@ class Differences:
     schema: list[str]
     only_in_a: list[int]
     only_in_b: list[int]
-    changed: list[int]
+    values: list[int]
+    metadata: dict[str, list[int]]
     description: list[str]
-    values: list[int] = field(default_factory=list)
-    metadata: dict[str, list[int]] = field(default_factory=dict)
 
 
 def differences(a: Dataset, b: Dataset) -> Differences:
@@ -53,10 +50,9 @@ def differences(a: Dataset, b: Dataset) -> Differences:
         schema=schema_differences(a, b),
         only_in_a=sorted(prints_a.keys() - prints_b.keys()),
         only_in_b=sorted(prints_b.keys() - prints_a.keys()),
-        changed=sorted({*values, *chain.from_iterable(metadata.values())}),
-        description=list(_value_differences(_described(a), _described(b), most=_SHOWN)),
         values=values,
         metadata=metadata,
+        description=list(_value_differences(_described(a), _described(b), most=_SHOWN)),
     )
 
 

@@ -18,6 +18,8 @@ EXACT = 2**53
 """Floats represent whole numbers below this exactly."""
 _LARGE = 2**24
 """The same of float32."""
+_ENOUGH = 10
+"""Changes of a value, in rows that come together, of which one can say that most are lost."""
 _KINDS = {"U": "text", "S": "text", "O": "what no number can hold, such as nothing"}
 
 
@@ -179,7 +181,8 @@ def _check_distinct(values: Array, cast: Array, column: Column) -> None:
     changes = np.diff(values, axis=0) != 0
     with np.errstate(invalid="ignore"):
         lost = changes & (np.diff(cast, axis=0) == 0) & large
-    [entries] = np.nonzero(2 * lost.sum(axis=0) > changes.sum(axis=0))
+    enough = changes.sum(axis=0) >= _ENOUGH
+    [entries] = np.nonzero(enough & (2 * lost.sum(axis=0) > changes.sum(axis=0)))
     if len(entries):
         named = column.names or [f"entry {entry}" for entry in range(column.size)]
         raise BadInputError(

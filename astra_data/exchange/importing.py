@@ -274,12 +274,15 @@ def _refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
 
 def _why_none(tally: Tally, settings: ImportMapping) -> str:
     """Return why recordings hold no episode: what cuts most of their rows, if anything does."""
+    cuts = {reason: tally.split_points.get(reason, 0) for reason in ("gap", "back", "field")}
     reasons = {
-        "gap": f"'{settings.time}' steps by over gap_s in {{}} rows: correct time_scale or gap_s",
-        "back": f"'{settings.time}' goes back in {{}} rows, first in {tally.back_first}: sort the rows by it",
-        "field": f"'{settings.split.field}' changes in {{}} rows: sort by it, or write a file of each",
+        "gap": f"'{settings.time}' steps by over gap_s in {cuts['gap']} rows: correct time_scale or gap_s",
+        "back": f"'{settings.time}' goes back in {cuts['back']} rows, first in {tally.back_first}: sort the "
+        "rows by it",
+        "field": f"'{settings.split.field}' changes in {cuts['field']} rows: sort by it, or write a file of "
+        "each",
     }
     for reason, why in reasons.items():
-        if 2 * (times := tally.split_points.get(reason, 0)) > tally.rows:
-            return why.format(times)
+        if 2 * cuts[reason] > tally.rows:
+            return why
     return "each of which needs two rows where logs have no next states"

@@ -50,8 +50,8 @@ class GymnasiumSimulator(NumpySimulator):
             env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0".
             size: of a state, X.
             read: returns the abstract state (X,) of the environment, without its wrappers.
-            write: sets it, so that `read` returns it; the first batch of states is tried. All that a step
-                depends on has to be in it.
+            write: sets it, so that `read` returns it again; this is tried after the first step. All that a
+                step depends on has to be in it.
             parameters: numbers or texts about it, by default none.
             options: of the environment.
 
@@ -67,11 +67,13 @@ class GymnasiumSimulator(NumpySimulator):
             landed = np.empty_like(states)
             for row, (state, command) in enumerate(zip(states, commands, strict=True)):
                 write(env, state)
-                if not is_checked:
-                    _check_written(env_id, state, np.asarray(read(env)))
                 env.step(command)
                 landed[row] = read(env)
-            is_checked = True
+                if not is_checked:
+                    env.reset(seed=0)
+                    write(env, landed[row])
+                    _check_written(env_id, landed[row], np.asarray(read(env)))
+                    is_checked = True
             return landed
 
         super().__init__(num_envs, function=step_each, size=size, parameters=parameters)

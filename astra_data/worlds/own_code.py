@@ -4,6 +4,7 @@ import ast
 import hashlib
 import importlib
 import importlib.util
+import os
 import sys
 import traceback
 from collections.abc import Iterator
@@ -18,6 +19,8 @@ from astra_data.core.errors import AstraDataError, BadInputError
 
 _PREFIX = "astra_data_own_"
 """Of the names of modules that are files of the user's."""
+_READ = (".csv", ".json", ".mjcf", ".npy", ".npz", ".obj", ".stl", ".toml", ".txt", ".urdf", ".xml", ".yaml")
+"""Endings of files that code reads."""
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -71,8 +74,8 @@ def file_of(name: str) -> dict[str, str]:
 def code_digest(name: str) -> str | None:
     """Return a digest of the code that `name` begins with; None where it is no file.
 
-    The files and packages beside it that it imports count too, and other files beside these that they name,
-    such as a robot.xml; comments and layout do not.
+    The files and packages beside it that it imports count too, and models and data beside these that they
+    name, such as a robot.xml; comments and layout do not.
 
     Raises:
         BadInputError: one of these files is no Python.
@@ -114,11 +117,11 @@ def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
 
 
 def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
-    """Return the files in the folder of `place` whose paths within it are texts in it, but no Python."""
+    """Return the models and data in the folder of `place` whose paths within it are texts in it."""
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    paths = {text for text in texts if isinstance(text, str) and text.isprintable() and len(text) < 256}
-    beside = {place.parent / path for path in paths if path and not Path(path).is_absolute()}
-    return sorted(file for file in beside if file.suffix != ".py" and file.is_file())
+    paths = {Path(text) for text in texts if isinstance(text, str) and text.endswith(_READ)}
+    beside = {place.parent / path for path in paths if not path.is_absolute() and ".." not in path.parts}
+    return sorted(file for file in beside if os.path.isfile(file))  # False of names that no disk takes
 
 
 def _files_of(module: str, folder: Path) -> list[Path]:

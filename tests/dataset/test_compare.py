@@ -9,7 +9,7 @@ from astra_data.dataset.compare import Differences, differences
 
 def test_equal_datasets_do_not_differ(tmp_path: Path) -> None:
     found = differences(write_fake(tmp_path / "a"), write_fake(tmp_path / "b"))
-    assert found == Differences(schema=[], only_in_a=[], only_in_b=[], changed=[], description=[])
+    assert found == Differences(schema=[], only_in_a=[], only_in_b=[], values=[], metadata={}, description=[])
 
 
 def test_every_kind_of_difference_is_told(tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_every_kind_of_difference_is_told(tmp_path: Path) -> None:
         "column other: only in fake@data-1.1.0",
         "fps: 20, then 10",
     ]
-    assert (found.only_in_a, found.only_in_b, found.changed) == ([0, 2**53 + 1], [99], [4, 6])
+    assert (found.only_in_a, found.only_in_b) == ([0, 2**53 + 1], [99])
     assert (found.values, found.metadata) == ([6], {"return": [4]})
     assert found.description == ["version: '1.0.0', then '1.1.0'", "config.noise_m: 0.1, then 0.2"]
 

@@ -199,14 +199,11 @@ def test_only_next_states_that_are_made_up_are_called_so(flag: str, terminal: st
 
 @pytest.mark.parametrize("dtype", [np.int64, np.float64])
 def test_numbers_that_float32_cannot_tell_apart_are_refused(dtype: type) -> None:
-    """Times in ms since 1970, say; not large ones that it does, nor small changes of small ones."""
-    stamps: Array = (1_700_000_000_000 + 100 * np.arange(9)).astype(dtype)
+    """Times in ms since 1970, say; not large ones that it does, small changes of small ones, or a few."""
+    stamps: Array = (1_700_000_000_000 + 100 * np.arange(11)).astype(dtype)
     with pytest.raises(BadInputError, match=r"columns\.c: entry 1: numbers as large as 1.7e\+12 change"):
-        convert({}, np.stack([np.arange(9.0), stamps], axis=1).tolist())
-    for sound in (
-        1e6 * np.arange(9),
-        np.full(9, 1.7e12),
-        1.0 + 1e-12 * np.arange(9),
-        2.0**24 + 2 * np.arange(9),
-    ):
+        convert({}, np.stack([np.arange(11.0), stamps], axis=1).tolist())
+    few = np.arange(11)
+    counter: Array = (2**24 + np.arange(100)).astype(dtype)
+    for sound in (1e6 * few, np.full(11, 1.7e12), 1.0 + 1e-12 * few, 2.0**24 + 2 * few, counter, counter[:2]):
         convert({}, sound.tolist())

@@ -54,15 +54,19 @@ def test_an_environment_that_is_not_there_is_told() -> None:
 
 
 def test_what_is_written_has_to_be_what_is_read() -> None:
-    """Entries in another order, say; once the first batch is known to be right, nothing is read again."""
+    """Entries in another order, say; after the first step nothing is read twice."""
 
     def swapped(env: Env, state: State) -> None:
         write(env, state[::-1])
 
-    simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=read, write=swapped)
-    simulator.reset_to(torch.tensor([[0.5, 0.5], [1.0, 0.25]]))
-    with pytest.raises(BadInputError, match=r"^Pendulum-v1: .*write\(env, \[1.0, 0.25\]\) .* \[0.25, 1.0\]"):
-        simulator.step(torch.zeros(2, 1))
+    def nothing(env: Env, state: State) -> None:
+        pass
+
+    for wrong in (swapped, nothing):
+        simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=read, write=wrong)
+        simulator.reset_to(torch.tensor([[0.5, 0.5], [1.0, 0.25]]))
+        with pytest.raises(BadInputError, match=r"^Pendulum-v1: after write\(.* expected the same"):
+            simulator.step(torch.zeros(2, 1))
     reads = []
 
     def noted(env: Env) -> State:
@@ -70,6 +74,22 @@ def test_what_is_written_has_to_be_what_is_read() -> None:
         return read(env)
 
     simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=noted, write=write)
-    for expected in (4, 6):
+    for expected in (3, 5):
         simulator.step(torch.zeros(2, 1))
         assert len(reads) == expected
+
+
+def test_a_state_that_the_environment_never_shows_may_be_set() -> None:
+    """As a correction of it may be, with cosine and sine of no angle."""
+
+    def shown(env: Env) -> State:
+        angle, rate = read(env)
+        return [np.cos(angle), np.sin(angle), rate]
+
+    def turned(env: Env, state: State) -> None:
+        write(env, np.array([np.arctan2(state[1], state[0]), state[2]]))
+
+    simulator = GymnasiumSimulator(1, env_id="Pendulum-v1", size=3, read=shown, write=turned)
+    simulator.reset_to(torch.tensor([[1.5, -0.5, 0.1]]))
+    landed = simulator.step(torch.zeros(1, 1))
+    assert float(landed[0, :2].norm()) == pytest.approx(1.0)

@@ -196,13 +196,14 @@ def test_a_file_of_another_kind_is_no_module(tmp_path: Path) -> None:
 def test_the_digest_covers_data_that_the_files_name(tmp_path: Path) -> None:
     """A model in MuJoCo's XML, say; what is beside it and not named does not count."""
     (tmp_path / "parts").mkdir()
-    (tmp_path / "cart.py").write_text(
-        '"""A cart."""\nXML = "parts/cart.xml"\nNO = ("", "/", "\\0", "cart.py")\n'
-    )
+    names = ["", "/", "\0.xml", "cart.py", "run.log", "../beside.xml", f"{'轮' * 100}.xml"]
+    (tmp_path / "cart.py").write_text(f'XML = "parts/cart.xml"\nNO = {names}\n')
+    (tmp_path / "run.log").write_text("1")
     (tmp_path / "parts/cart.xml").write_text("<mujoco/>")
     (tmp_path / "other.xml").write_text("<mujoco/>")
     first = code_digest(f"{tmp_path}/cart.py:TASK")
     (tmp_path / "other.xml").write_text("<mujoco></mujoco>")
+    (tmp_path / "run.log").write_text("2")
     assert code_digest(f"{tmp_path}/cart.py:TASK") == first
     (tmp_path / "parts/cart.xml").write_text("<mujoco></mujoco>")
     assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)

@@ -3,8 +3,7 @@
 From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
 topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s` ends the
 episode, and the next begins when all have sent a message again; where all are silent for as long, it ends
-with the last message. Times are the messages' log times. Files
-are read message by message.
+with the last message. Times are the messages' log times. Files are read message by message.
 """
 
 import json
@@ -53,20 +52,11 @@ class Resampler:
         self._values: dict[str, Array] = {}
         self._start: int | None = None
         self._row = 0
-        self._resumed = 0
-        self._silent: set[str] = set()
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
         """Update the values of `topic` with a message at `time` ns."""
         self._values |= values
-        if self._is_pause(time):
-            self._resumed = time
         self.times[topic] = time
-        self._silent.discard(topic)
-        for other in self._expiring & self.times.keys() - self._silent:
-            if time - max(self.times[other], self._resumed) > self._gap_ns:
-                self._silent.add(other)
-                self.silences[other] = self.silences.get(other, 0) + 1
         if self._start is None and self._is_complete(time):
             self._start, self._row = time, 0
 
@@ -86,6 +76,9 @@ class Resampler:
                 return
             if not self._is_complete(moment):
                 self._start = None
+                for topic in self._expiring:
+                    if moment - self.times[topic] > self._gap_ns:
+                        self.silences[topic] = self.silences.get(topic, 0) + 1
                 return
             yield self._row == 0, dict(self._values)
             self._row += 1
