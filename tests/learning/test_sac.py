@@ -105,6 +105,16 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
         assert torch.equal(value, resumed.policy.state_dict()[name]), name
 
 
+def test_where_the_episodes_cannot_go_on_its_replay_does_not_either() -> None:
+    """The first step of the new ones doesn't follow the last one that was kept."""
+    learner, again = (sac(GoToZero(4), 40, horizon=20) for _ in range(2))
+    learner.iterate()
+    again.load_state_dict(learner.state_dict(), again.env.reset(), goes_on=False)
+    kept, cut = (torch.as_tensor(one.state_dict()["replay"]["expired"]) for one in (learner, again))
+    assert torch.equal(cut[:-1], kept[:-1])
+    assert cut[-1].all() and not kept[-1].any()
+
+
 @pytest.mark.parametrize("memory", [0, 8])
 def test_recorded_actions_are_imitated_where_rewards_leave_the_choice(memory: int) -> None:
     action = torch.full((4, 12, 1), 0.6)

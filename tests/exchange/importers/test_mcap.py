@@ -162,12 +162,13 @@ def test_a_pause_of_all_topics_ends_the_episode_with_its_last_message(
 
 def test_a_latched_topic_keeps_no_pause_awake(tmp_path: Path) -> None:
     messages = [pose(t + k / 10, k) for t in (1.0, 60.0) for k in range(5)]
-    messages += [command(t, t) for t in (0.9, 20.0, 40.0, 59.9)]
+    messages += [command(k / 10, k) for k in (9, *range(16, 600, 3))]
     latched = MAPPING.replace('fields = ["/command:turn"]', 'fields = ["/command:turn"]\nlatched = true')
     path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
     dataset, _ = imported(tmp_path, path, latched)
-    assert dataset.lengths.tolist() == [4, 4]
-    assert dataset.columns([ACTION])[ACTION].tolist() == [np.float32(0.9)] * 4 + [np.float32(59.9)] * 4
+    # A command at 1.6 s, as one that is on time, holds the pose for a row more; those after it don't.
+    assert dataset.lengths.tolist() == [5, 4]
+    assert dataset.columns([ACTION])[ACTION].tolist() == [9.0] * 5 + [598.0] * 4
 
 
 def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
