@@ -62,13 +62,15 @@ def check(
     ] = False,
 ) -> None:
     """Check recipes without running them, and list which artefacts are finished, damaged or stale."""
+    from astra_data.experiments.recipe_file import is_gap_recipe
     from astra_data.experiments.run import check as check_recipe
-    from astra_data.studies.run import is_gap_recipe, load_gap_recipe
 
     faults: list[str] = []
     for recipe in recipes:
         try:
             if is_gap_recipe(recipe):
+                from astra_data.studies.run import load_gap_recipe
+
                 load_gap_recipe(recipe)
                 typer.echo(f"{recipe}: for `astra-data gap`, without faults")
                 continue

@@ -69,6 +69,15 @@ def read_tables(path: Path) -> dict[str, Any]:
     return tables
 
 
+def is_gap_recipe(path: Path) -> bool:
+    """Return whether the file at `path` has the keys of a recipe for `astra-data gap`.
+
+    Raises:
+        RecipeError: as `tables_of`.
+    """
+    return {"mapping", "models"} <= tables_of(path).keys()
+
+
 def tables_of(path: Path) -> dict[str, Any]:
     """Return the tables of the file of a recipe as they are.
 

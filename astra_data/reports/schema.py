@@ -20,7 +20,7 @@ Number = Annotated[float, BeforeValidator(_nan_for_null)]
 class Section(BaseModel):
     """A section of the results; frozen, without unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class Machine(Section):

@@ -11,19 +11,10 @@ from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import RUNS
 from astra_data.experiments.display import shown
-from astra_data.experiments.recipe_file import tables_of
+from astra_data.experiments.recipe_file import is_gap_recipe, tables_of
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import place_name, read_recordings
 from astra_data.studies.study import run_study
-
-
-def is_gap_recipe(path: Path) -> bool:
-    """Return whether the file at `path` has the keys of a recipe for `astra-data gap`.
-
-    Raises:
-        RecipeError: it is missing, a folder or not TOML.
-    """
-    return {"mapping", "models"} <= tables_of(path).keys()
 
 
 def load_gap_recipe(recipe_path: Path) -> GapRecipe:

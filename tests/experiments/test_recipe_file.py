@@ -6,8 +6,13 @@ import pytest
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.recipe import Recipe
-from astra_data.experiments.recipe_file import read_tables, recorded_settings, with_current_keys
-from astra_data.studies.run import is_gap_recipe, load_gap_recipe
+from astra_data.experiments.recipe_file import (
+    is_gap_recipe,
+    read_tables,
+    recorded_settings,
+    with_current_keys,
+)
+from astra_data.studies.run import load_gap_recipe
 
 RECIPE = """
 task = "antmaze-umaze"
