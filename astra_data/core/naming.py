@@ -35,3 +35,8 @@ def reference_of(rows: Iterable[str]) -> str | None:
 def seed_folder(seed: int, percent: int | None = None) -> str:
     """Return the folder of a seed, inside that of the dataset size in per cent where there are several."""
     return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"
+
+
+def stage_of_key(key: str) -> str:
+    """Return the stage of an artefact's key, as "train" of "train/astra/seed_0"."""
+    return key.partition("/")[0]

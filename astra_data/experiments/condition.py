@@ -14,6 +14,7 @@ from typing import Literal
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError
 from astra_data.core.manifest import read_manifest
+from astra_data.core.naming import stage_of_key
 from astra_data.dataset.lineage import Ancestor, lineage
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
@@ -132,7 +133,7 @@ def _has_bytes(path: Path) -> bool:
 
 
 def _stage(key: str) -> Stage:
-    return STAGES[key.partition("/")[0]]
+    return STAGES[stage_of_key(key)]
 
 
 def _unreadable(key: str, experiment: Experiment) -> str:

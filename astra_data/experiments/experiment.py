@@ -16,7 +16,7 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import RECORD, base_method, reference_of
+from astra_data.core.naming import RECORD, base_method, reference_of, stage_of_key
 from astra_data.experiments.own_files import changed_code
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import WHOLE, Recipe
@@ -65,11 +65,11 @@ class Experiment:
 
     def place(self, key: str) -> Path:
         """Return the folder of the artefact `key`."""
-        return self.maker(key.partition("/")[0]).folder / key
+        return self.maker(stage_of_key(key)).folder / key
 
     def has(self, key: str) -> bool:
         """Return whether the artefact `key` is finished."""
-        stage = key.partition("/")[0]
+        stage = stage_of_key(key)
         return self.place(key).is_dir() and not self.maker(stage)._is_link(stage)
 
     def _is_link(self, stage: str) -> bool:
@@ -114,7 +114,7 @@ class Experiment:
 
     def outdated(self, key: str) -> str:
         """Return which settings changed since the artefact `key` was made, empty if none."""
-        changed, folders = self.maker(key.partition("/")[0])._outdated
+        changed, folders = self.maker(stage_of_key(key))._outdated
         place = self.place(key)
         if not any(place.is_relative_to(folder) for folder in folders):
             return ""

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import base_method, reference_of, seed_folder
+from astra_data.core.naming import base_method, reference_of, seed_folder, stage_of_key
 from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
@@ -99,7 +99,7 @@ def _choice(recipe: Recipe, reported: Reported, folder: Path) -> Item | None:
 
 def stage_of(item: Item) -> str:
     """Return the stage that makes `item`."""
-    return item.key.partition("/")[0]
+    return stage_of_key(item.key)
 
 
 def stages_until(last: str | None) -> set[str]:

@@ -13,7 +13,7 @@ from astra_data.core.config import did_you_mean
 from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
-from astra_data.core.naming import RECORD, RUNS
+from astra_data.core.naming import RECORD, RUNS, stage_of_key
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
@@ -244,7 +244,7 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
     readers = [item for item in items if stage_of(item) not in ALWAYS_NEW]
     reads = [key for item in readers for key in item.inputs if key not in made]
     for key in dict.fromkeys(reads):
-        stage, root = key.partition("/")[0], experiment.folder.parent
+        stage, root = stage_of_key(key), experiment.folder.parent
         if not experiment.has(key):
             fault = "missing"
         elif why := damage(key, experiment, verify=not STAGES[stage].makes_dataset):

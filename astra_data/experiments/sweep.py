@@ -17,7 +17,7 @@ from rich.table import Table
 
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import RUNS
+from astra_data.core.naming import RUNS, stage_of_key
 from astra_data.core.optional import optional
 from astra_data.experiments.board import board, progress_text
 from astra_data.experiments.display import display
@@ -156,7 +156,7 @@ class PointTable:
     def _line(self, point: RunPoint) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
         means = evaluation.outcomes.means()
-        stages = {key: key.partition("/")[0] for key in sorted(set(_needed(point.key, self._items)))}
+        stages = {key: stage_of_key(key) for key in sorted(set(_needed(point.key, self._items)))}
         timed = [self.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
         # The artefacts that a point was made of may have been deleted since.
         is_complete = all(file.is_file() for file in timed)
