@@ -132,6 +132,13 @@ def collect(
 
     Raises:
         BadInputError: the task is unknown, `out` exists, or an artefact of the behavior is missing.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import collect
+        >>> from astra_data.stages.collect import CollectConfig
+        >>> config = CollectConfig(episodes=2, max_steps=5)
+        >>> drives = collect("antmaze-umaze", config, seed=1, out=Path("drives"))
     """
     world = task_named(task)
     plan = None if config.plan is None else RecordingPlan.load(config.plan, world)

@@ -66,6 +66,11 @@ def label(
             nothing to label and no `out`.
         CorruptDatasetError: the dataset is incomplete.
         SharingError: it cannot be pulled.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import label
+        >>> labelled = label("antmaze-umaze", data="walks", out=Path("labelled"))  # lacks nothing: a link
     """
     world, source = task_named(task), _opened(data)
     check_fits(source, world)

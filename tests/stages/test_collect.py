@@ -145,7 +145,7 @@ def test_episodes_can_begin_where_the_task_does(task: str, tmp_path: Path) -> No
 @pytest.fixture
 def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
     sac = suboptimal._SAC.model_copy(update={"rollout_steps": 8, "updates_per_step": 1, "batch_size": 8})
-    small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TRIALS": 2}
+    small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TEST_EPISODES": 2}
     for name, value in small.items():
         monkeypatch.setattr(suboptimal, name, value)
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)

@@ -174,6 +174,6 @@ def test_how_long_episodes_last_is_the_mean_over_all_of_them(monkeypatch: pytest
             return torch.zeros(3, 1)
 
     env = Env()
-    monkeypatch.setattr(suboptimal, "_TRIALS", 3)
+    monkeypatch.setattr(suboptimal, "_TEST_EPISODES", 3)
     assert suboptimal._lasts(Deployed(), 0, 1) == pytest.approx((2 + 4 + 6) / 3)  # type: ignore[arg-type]
     assert env.actives[2] == [False, True, True]
