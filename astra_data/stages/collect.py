@@ -118,15 +118,13 @@ def collect(
 ) -> Path:
     """Record episodes in the target; return the dataset's folder.
 
-    The physics runs on `num_threads`, by default one per core; the outcome is the same with any number.
-
     Args:
         task: see `task_named`.
         config: what to collect.
         seed: of everything random.
         out: the dataset's folder, by default its place at home.
         progress: called with the fraction done.
-        num_threads: of the physics.
+        num_threads: of the physics, by default one per core; the outcome is the same with any number.
         name: of the dataset, by default made of task, behavior and seed.
         resume: keep the finished episodes of an interrupted call and record the rest.
 
@@ -137,8 +135,7 @@ def collect(
         >>> from pathlib import Path
         >>> from astra_data import collect
         >>> from astra_data.stages.collect import CollectConfig
-        >>> config = CollectConfig(episodes=2, max_steps=5)
-        >>> drives = collect("antmaze-umaze", config, seed=1, out=Path("drives"))
+        >>> drives = collect("antmaze-umaze", CollectConfig(episodes=2, max_steps=5), out=Path("drives"))
     """
     world = task_named(task)
     plan = None if config.plan is None else RecordingPlan.load(config.plan, world)
