@@ -8,6 +8,7 @@ with the last message. Times are the messages' log times. Files are read message
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -42,7 +43,7 @@ class Resampler:
         self._origin = origin
         self.topics: dict[str, list[str]] = {}
         self.times: dict[str, int] = {}
-        self.silences: dict[str, int] = {}
+        self.silences: Counter[str] = Counter()
         for field in mapping.all_fields:
             self.topics.setdefault(field.partition(":")[0], []).append(field)
         expiring = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
@@ -74,11 +75,9 @@ class Resampler:
             moment = self._start + self._row * 10**9 // self._fps
             if moment >= time:
                 return
-            if not self._is_complete(moment):
+            if silent := self._silent(moment):
                 self._start = None
-                for topic in self._expiring:
-                    if moment - self.times[topic] > self._gap_ns:
-                        self.silences[topic] = self.silences.get(topic, 0) + 1
+                self.silences.update(silent)
                 return
             yield self._row == 0, dict(self._values)
             self._row += 1
@@ -102,9 +101,11 @@ class Resampler:
         return [self.times[topic] for topic in self._expiring & self.times.keys()]
 
     def _is_complete(self, time: int) -> bool:
-        return self.times.keys() == self.topics.keys() and all(
-            time - self.times[topic] <= self._gap_ns for topic in self._expiring
-        )
+        return self.times.keys() == self.topics.keys() and not self._silent(time)
+
+    def _silent(self, time: int) -> list[str]:
+        """Return the topics that may not be silent for so long as they were before `time`; all were heard."""
+        return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns]
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
