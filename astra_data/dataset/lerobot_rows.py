@@ -51,7 +51,7 @@ class Rows:
         for name in wanted:
             if name == names.NEXT_STATE and self.dropped:
                 sources.add(names.STATE)
-            elif name in (names.TRUNCATED, names.DONE):
+            elif name in (*ENDS, names.DONE):
                 sources.update(ENDS)
             elif name == names.SUCCESS:
                 sources.update((name, names.TERMINATED))

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.wording import shortened
 from astra_data.dataset.format import DATASET_PATH
@@ -47,6 +50,14 @@ def lineage(dataset: Dataset) -> Ancestor:
     """
     beside = dataset.root.resolve().parent
     return _ancestor(dataset.identity, (dataset.root, dataset.description), beside, ())
+
+
+def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
+    """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
+    sources = dataset.metadata.get("source_episode", [None] * len(dataset))
+    numbers: dict[int, int] = {}
+    recorded = [uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True)]
+    return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
 
 
 def tree_lines(ancestor: Ancestor) -> Iterator[str]:

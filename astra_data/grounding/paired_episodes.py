@@ -26,6 +26,7 @@ from astra_data.dataset.columns import (
     Array,
 )
 from astra_data.dataset.endings import stands_still
+from astra_data.dataset.lineage import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows, before_failures
@@ -255,14 +256,6 @@ def _made_up(dataset: Dataset, columns: Mapping[str, Array]) -> NDArray[np.bool_
         after = after[dataset.lengths[ended].cumsum() - 1]
         made_up[ended] = [*map(stands_still, columns[STATE][last[ended]], after)]
     return made_up
-
-
-def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
-    """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
-    sources = dataset.metadata.get("source_episode", [None] * len(dataset))
-    numbers: dict[int, int] = {}
-    recorded = [uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True)]
-    return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
 
 
 def _merged(

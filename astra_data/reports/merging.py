@@ -1,14 +1,17 @@
 """Results of one recipe from several places → Results: a later seed of a row replaces an earlier one."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Any
+
+import numpy as np
 
 from astra_data.core.errors import BadInputError
 from astra_data.methods import method_title
 from astra_data.reports.comparing import improvement, summarised, validity
 from astra_data.reports.origins import dataset_uses, merged_origins
-from astra_data.reports.schema import DatasetOrigin, GapMeans, Results
+from astra_data.reports.schema import BandMeans, DatasetOrigin, GapMeans, Results, shared_horizons
 from astra_data.reports.seed_table import lines_of, row_of
 
 
@@ -18,7 +21,8 @@ def merge(
     """Return one Results of those `methods` and `seeds` that any of the `sources` has, compared anew.
 
     A source of which later ones have all rows and seeds is left out. Times are summed, so other artefacts
-    that were made twice count twice. A grounding's gap is that of the source with most seeds of it.
+    that were made twice count twice. A grounding's gap is the mean over the seeds of all sources; where they
+    share seeds, of the source with most of them.
 
     Raises:
         BadInputError: the sources differ in task, episodes, robot or data.
@@ -96,9 +100,37 @@ def _gaps(sources: Sequence[Results]) -> dict[str, GapMeans]:
     gaps: dict[str, GapMeans] = {}
     for source in sources:
         for grounding, gap in source.gaps().items():
-            known = gaps.get(grounding, gap)
-            gaps[grounding] = known if len(known.seeds) > len(gap.seeds) else gap
+            gaps[grounding] = _joined(gaps[grounding], gap) if grounding in gaps else gap
     return gaps
+
+
+def _joined(known: GapMeans, found: GapMeans) -> GapMeans:
+    """Return the mean over the seeds of both; of the one with more seeds, where they cannot be averaged."""
+    shared = shared_horizons([known.horizons, found.horizons])
+    alike = known.grounded.keys() == found.grounded.keys()
+    if not (shared and alike) or set(known.seeds) & set(found.seeds):
+        return known if len(known.seeds) > len(found.seeds) else found
+
+    def mean(one: Mapping[str, BandMeans], other: Mapping[str, BandMeans]) -> dict[str, BandMeans]:
+        bands = {}
+        for quantity in one:
+            ends = [
+                [gap.at(band, horizon) for horizon in shared]
+                for gap, band in ((known, one[quantity]), (found, other[quantity]))
+            ]
+            weights = [len(known.seeds), len(found.seeds)]
+            means, lows, highs = np.average(np.array(ends, dtype=float), axis=0, weights=weights).T.tolist()
+            low, high = ([None if math.isnan(end) else end for end in of] for of in (lows, highs))
+            bands[quantity] = BandMeans(mean=means, low=low, high=high)
+        return bands
+
+    return GapMeans(
+        seeds=sorted([*known.seeds, *found.seeds]),
+        horizons=shared,
+        grounded=mean(known.grounded, found.grounded),
+        raw=mean(known.raw, found.raw),
+        still=mean(known.still, found.still) if known.still and found.still else None,
+    )
 
 
 def _sum(before: Any, now: Any) -> Any:  # noqa: ANN401 - numbers, lists, or mappings to such

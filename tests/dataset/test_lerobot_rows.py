@@ -93,6 +93,8 @@ def test_only_the_columns_that_are_needed_are_read() -> None:
     assert read("force") == {"force"}
     rows, _ = rows_and_run({names.TERMINATED: np.zeros(STEPS), names.SUCCESS: np.zeros(STEPS)})
     assert read(names.SUCCESS) == {names.SUCCESS, names.TERMINATED}
+    rows, _ = rows_and_run({names.TERMINATED: np.zeros(STEPS), names.TRUNCATED: np.zeros(STEPS)})
+    assert read(names.TERMINATED) == read(names.DONE) == {names.TERMINATED, names.TRUNCATED}
 
 
 def test_columns_of_ours_have_our_types() -> None:

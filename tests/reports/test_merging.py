@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, edit_json, write_elsewhere, write_runs
+from fake_runs import ROWS, SEEDS, band, edit_json, write_elsewhere, write_runs
 
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.reports.assembly import assemble
@@ -47,6 +47,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_seeds_found_apart_amount_to_what_they_do_together(root: Path) -> None:
+    edit_json(root / "ground/astra/seed_1/gap.json", grounded={"position_m": band(0.7)})
     whole = assembled(root)
     published = assembled(root, seeds=(1,))
     for method in ALL:
@@ -59,9 +60,13 @@ def test_seeds_found_apart_amount_to_what_they_do_together(root: Path) -> None:
     assert merged.cpu_seconds["evaluate"] == whole.cpu_seconds["evaluate"]
     assert merged.methods["astra"].cost["evaluate"] == Cost(wall_seconds=13.0, cpu_seconds=20.0)
     assert sorted(merged.throughput["evaluate"]["target_steps_per_second"]["astra"]) == [1000, 1001, 1002]
-    gap = merged.gaps()["astra"]
-    assert gap.seeds == [0, 2]
-    assert gap.grounded["position_m"].mean == pytest.approx([0.2, 0.4])
+    gap, at_once = merged.gaps()["astra"], whole.gaps()["astra"]
+    assert (gap.seeds, gap.horizons) == (at_once.seeds, at_once.horizons) == ([0, 1, 2], [1, 10])
+    assert gap.raw.keys() == gap.grounded.keys() == at_once.grounded.keys()
+    for found, known in ((gap.grounded, at_once.grounded), (gap.raw, at_once.raw)):
+        for quantity, of_both in found.items():
+            for ends in ("mean", "low", "high"):
+                assert getattr(of_both, ends) == pytest.approx(getattr(known[quantity], ends))
 
 
 def test_rows_found_apart_amount_to_what_they_do_together(root: Path) -> None:

@@ -4,15 +4,17 @@ import json
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from astra_data.dataset.columns import GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
+from astra_data.dataset.lineage import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.export_record import Export
 from astra_data.exchange.hdf5_file import hdf5_file
 from astra_data.exchange.layouts import RECORD, ROBOMIMIC, as_stored, fields_of
 
 VALID_SHARE = 0.1
-"""Share of the episodes in mask/valid, as in robomimic's own split; the others are in mask/train."""
+"""Share of the recordings in mask/valid, as in robomimic's own split; the others are in mask/train."""
 _GYM = 2
 """robomimic's code for gym environments."""
 
@@ -22,8 +24,8 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
 
     `dones` is terminated alone: robomimic's learners do not bootstrap on it. `truncated` is read by our own
     importer only. Goals (T, G) become obs/goal and next_obs/goal, other columns infos/<name>. mask/train
-    and mask/valid follow the permutation of the nested subsets; a dataset of a single episode has only
-    mask/train.
+    and mask/valid follow the permutation of the nested subsets, by recordings with all copies of them;
+    mask/valid is what an augmentation held out, if it did. A dataset of few episodes has only mask/train.
     """
     names = [column.name for column in dataset.schema]
     own = {**ROBOMIMIC, STATE: "obs/state", NEXT_STATE: "next_obs/state", GOAL: "obs/goal"}
@@ -52,8 +54,19 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
                 demo[ROBOMIMIC[REWARD]] = np.zeros(len(episode), np.float32)
             if GOAL in fields:
                 demo["next_obs/goal"] = values[GOAL]
-        train = len(dataset) - int(len(dataset) * VALID_SHARE)
-        for key, part in (("train", dataset.order[:train]), ("valid", dataset.order[train:])):
-            if part:
-                file[f"mask/{key}"] = [f"demo_{episode}".encode() for episode in sorted(part)]
+        is_valid = _validation(dataset)
+        for key, part in (("train", ~is_valid), ("valid", is_valid)):
+            if part.any():
+                file[f"mask/{key}"] = [f"demo_{episode}".encode() for episode in np.flatnonzero(part)]
         file[RECORD] = exported.text()
+
+
+def _validation(dataset: Dataset) -> NDArray[np.bool_]:
+    """Return which episodes (E,) are for validation; copies go where their recording goes."""
+    recordings = recordings_of(dataset)
+    held_out = np.array(dataset.metadata.get("held_out", [False] * len(dataset)), dtype=bool)
+    if held_out.any():
+        return np.isin(recordings, recordings[held_out])
+    ordered = list(dict.fromkeys(recordings[dataset.order].tolist()))
+    train = len(ordered) - int(len(ordered) * VALID_SHARE)
+    return np.isin(recordings, ordered[train:])

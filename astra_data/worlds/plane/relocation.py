@@ -165,7 +165,7 @@ def outcomes(
     start, end = torch.from_numpy(before), torch.from_numpy(after)
     goals = torch.from_numpy(goal).expand(len(start), 2)
     success = objective.reached(end, goals)
-    failed = torch.from_numpy(toppled) | objective.missed(end, goals)
+    failed = (torch.from_numpy(toppled) | objective.missed(end, goals)) & ~success
     terminated = (success | failed).numpy()
     length = int(terminated.argmax()) + 1 if terminated.any() else len(terminated)
     done = np.arange(length) == length - 1

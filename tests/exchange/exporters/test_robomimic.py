@@ -3,6 +3,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 from fake_dataset import COLUMNS, fake_columns, writer
 from fake_transitions import NEXT
 
@@ -50,3 +51,25 @@ def test_robomimics_masks_share_the_episodes(tmp_path: Path) -> None:
         assert (len(train), len(valid)) == (18, 2)
         assert valid == {f"demo_{number}".encode() for number in dataset.order[18:]}  # in no smaller subset
         assert train | valid == {name.encode() for name in file["data"]}
+
+
+@pytest.mark.parametrize("held_out", [None, 3])
+def test_copies_of_a_recording_are_on_its_side_of_robomimics_masks(
+    tmp_path: Path, held_out: int | None
+) -> None:
+    with writer(tmp_path / "set", columns=[*COLUMNS, NEXT]) as open_writer:
+        for uid in range(40):
+            columns = fake_columns(2, seed=uid)
+            metadata = {"source_episode": uid % 10} if uid >= 10 else {}
+            marked = {} if held_out is None else {"held_out": uid % 10 == held_out and uid < 20}
+            open_writer.add(Episode(uid, columns | {NEXT_STATE: columns[STATE]}, metadata | marked))
+    export(Dataset.open(tmp_path / "set"), tmp_path / "set.hdf5", format="robomimic")
+    with h5py.File(tmp_path / "set.hdf5") as file:
+        train, valid = (
+            [int(name.decode().removeprefix("demo_")) for name in file[f"mask/{key}"][()]]
+            for key in ("train", "valid")
+        )
+    assert sorted(train + valid) == list(range(40))
+    (recording,) = {episode % 10 for episode in valid}
+    assert sorted(valid) == [recording + 10 * number for number in range(4)]
+    assert held_out in (None, recording)

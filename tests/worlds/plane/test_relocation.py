@@ -131,6 +131,14 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
     assert judged["next.reward"][:-1].mean() == pytest.approx(0.1, abs=0.02)
 
 
+def test_who_topples_as_it_arrives_has_succeeded() -> None:
+    path = straight((AIM[0] + 2.0, AIM[1]), (AIM[0] - 1.0, AIM[1]), 30)
+    before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
+    judged = outcomes(TASK.objective, before, after, AIM, np.arange(30) == 15)
+    assert len(judged["next.success"]) == 16 and judged["next.success"][-1]
+    assert judged["next.reward"][-1] == pytest.approx(10.1, abs=0.02)
+
+
 def test_an_episode_that_just_stops_is_truncated() -> None:
     path = straight((4.0, 4.0), (3.0, 4.0), 10)
     before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
