@@ -12,7 +12,7 @@ from astra_data.experiments.condition import Condition
 from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.paired_episodes import divided
 from astra_data.methods import method_named
-from astra_data.stages.label import check_fits, drawn_goals, is_address
+from astra_data.stages.label import check_fits, is_address, remarks
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.registry import task_named
 
@@ -44,8 +44,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
     check_fits(source, task)
     if any(method_named(row).grounds for row in recipe.methods):
         _check_division(recipe, source)
-    remarks = [*differing_bounds(task.limits, source), drawn_goals(source, task)]
-    return Condition("finished", "; ".join(filter(None, remarks)))
+    return Condition("finished", "; ".join([*differing_bounds(task.limits, source), *remarks(source, task)]))
 
 
 def _check_division(recipe: Recipe, source: Dataset) -> None:

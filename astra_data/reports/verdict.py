@@ -76,7 +76,9 @@ def verdict_of(results: Results, percent: int | None = None) -> Verdict:
     worth = _worth(results)
     as_good = [floor.title for key, floor in _floors(results) if worth.get(key, -inf) >= worth[name]]
     opening = "Deploy"
-    if row.role:
+    if chosen and chosen.predicted == 0:
+        opening = "Deploy none, for all are predicted to fail: the first in the ranking is"
+    elif row.role:
         opening = "No gain over the floor: of all policies, the one to deploy is"
     elif as_good:
         opening = (
@@ -119,6 +121,9 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         candidates = results.choice.candidates
         for one in candidates[: candidates.index(chosen)]:
             yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
+        level = sum((one.lower, one.predicted) == (chosen.lower, chosen.predicted) for one in candidates)
+        if level > 1:
+            yield f"{level} policies are level with it in the ranking, itself among them."
         if best is not row:
             score = f"predicted success {worth[ahead]:.2f}" if is_predicted else _score(results, best)
             yield f"By the mean over seeds {best.title} is ahead: {score}."

@@ -23,10 +23,10 @@ from astra_data.dataset.columns import (
     TERMINATED,
     TRUNCATED,
     Array,
-    Column,
     Episode,
 )
 from astra_data.dataset.endings import outcome_of
+from astra_data.dataset.expected_columns import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
@@ -87,7 +87,7 @@ def label(
         return out
     if not more:
         raise BadInputError(f"{source.reference} has goals and outcomes already: there is nothing to label")
-    if warning := drawn_goals(source, world):
+    for warning in remarks(source, world):
         _log.warning(warning)
     description, out = successor(
         source,
@@ -110,7 +110,14 @@ def label(
     return out
 
 
-def drawn_goals(source: Dataset, task: Task) -> str:
+def remarks(source: Dataset, task: Task) -> list[str]:
+    """Say what is to be checked of a dataset that fits a task."""
+    return [
+        *filter(None, (names_apart(source, (task.state, task.action), task.name), _drawn_goals(source, task)))
+    ]
+
+
+def _drawn_goals(source: Dataset, task: Task) -> str:
     """Say that goals are drawn, where a task has some and the data have none; empty otherwise."""
     if task.goal is None or GOAL in source.features:
         return ""
@@ -198,15 +205,7 @@ def check_fits(source: Dataset, task: Task) -> None:
             f"{task.timestep_s:g}"
         )
     for expected in (task.state, task.action):
-        if expected.name not in source.features:
-            faults.append(f"has no column {expected.name}")
-        elif (found := source.features[expected.name]["shape"][0]) != expected.size:
-            faults.append(
-                f"{expected.name} has {found} values, expected those of {task.name}: {expected.size}"
-            )
-        else:
-            recorded = Column.from_feature(expected.name, source.features[expected.name])
-            faults += _contradictions(recorded, expected)
+        faults += column_faults(source, expected, task.name)
     goal_size = task.goal.size if task.goal else 0
     if GOAL in source.features and (found := source.features[GOAL]["shape"][0]) != goal_size:
         faults.append(
@@ -216,15 +215,3 @@ def check_fits(source: Dataset, task: Task) -> None:
         faults.append(f"has no column {NEXT_STATE}")
     if faults:
         raise BadInputError(f"{source.reference} {'; '.join(faults)}")
-
-
-def _contradictions(recorded: Column, expected: Column) -> list[str]:
-    """List where two columns of one size have the same names in another order, or values in other units."""
-    faults, names = [], recorded.names or ()
-    if any(name in names and names.index(name) != place for place, name in enumerate(expected.names or ())):
-        order = ", ".join(expected.labels)
-        faults.append(f"has the values {', '.join(names)} in {expected.name}, expected the order {order}")
-    for name, own, other in zip(recorded.labels, recorded.units, expected.units, strict=True):
-        if own and other and own != other:
-            faults.append(f"has {name} of {expected.name} in {own}, expected {other}: scale it on import")
-    return faults

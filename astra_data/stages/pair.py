@@ -1,5 +1,6 @@
 """Pair: reset the abstract simulator to φ(s), step it with the recorded action, and store its next state."""
 
+import logging
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from astra_data.dataset.columns import (
     Array,
     Episode,
 )
+from astra_data.dataset.expected_columns import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset, successor
 from astra_data.dataset.writer import DatasetWriter
@@ -36,6 +38,7 @@ BATCH = 4096
 """Simulators that are reset and stepped in one batch."""
 _BLOCK = 8 * BATCH
 """Steps held in memory at once, rounded up to whole episodes."""
+_log = logging.getLogger(__name__)
 
 
 class PairConfig(Config):
@@ -221,3 +224,9 @@ def _check(source: Dataset, pairing: Pairing) -> None:
         faults.append(f"{source.info['fps']} steps per second, where {pairing.id} makes {pairing.fps}")
     if faults:
         raise BadInputError(f"{source.root} has {' and '.join(faults)}; expected a dataset to be paired")
+    expected = pairing.origin.get("task", "")
+    faults = [fault for column in pairing.columns for fault in column_faults(source, column, expected)]
+    if faults:
+        raise BadInputError(f"{source.reference} {'; '.join(faults)}")
+    if warning := names_apart(source, pairing.columns, expected):
+        _log.warning(warning)

@@ -32,6 +32,7 @@ class Pairing:
         simulator: builds B simulators.
         commands: the bounds of the task's commands; None for a simulator without a task.
         fps: the task's steps per second; None for a simulator without a task.
+        columns: the states and commands of the task's robot; none for a simulator without a task.
     """
 
     id: str
@@ -42,6 +43,7 @@ class Pairing:
     simulator: Callable[[int], AbstractSimulator]
     commands: Commands | None = None
     fps: int | None = None
+    columns: tuple[Column, ...] = ()
 
 
 def pairing_named(name: str) -> Pairing:
@@ -68,6 +70,7 @@ def pairing_named(name: str) -> Pairing:
             simulator=made.own_simulator,
             commands=None if made.limits.are_normal else made.limits,
             fps=made.fps,
+            columns=(made.state, made.action),
         )
     needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
     missing = [attribute for attribute in needed if not hasattr(made, attribute)]

@@ -127,6 +127,21 @@ def test_a_chosen_policy_of_the_floor_is_the_one_to_deploy(
     assert not any("overlap" in remark or "seeds to compare" in remark for remark in verdict.remarks)
 
 
+def test_where_all_are_predicted_to_fail_none_is_deployed(results: Results) -> None:
+    candidates = [candidate("astra", 1, 0.0), candidate("astra", 2, 0.0)]
+    choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
+    verdict = verdict_of(results.model_copy(update={"choice": choice}))
+    assert verdict.opening == "Deploy none, for all are predicted to fail: the first in the ranking is"
+    assert verdict.remarks[0] == "2 policies are level with it in the ranking, itself among them."
+    candidates = [candidate("astra", 1, 0.1), candidate("astra", 2, 0.0)]
+    verdict = verdict_of(
+        results.model_copy(update={"choice": choice.model_copy(update={"candidates": candidates})})
+    )
+    assert verdict.opening == "Deploy" and not any(
+        "are level with it" in remark for remark in verdict.remarks
+    )
+
+
 def test_a_choice_among_policies_of_the_floor_alone_is_no_error(results: Results) -> None:
     choice = Choice(
         judge="nas", episodes=4, shares_episodes=False, candidates=[candidate("direct_transfer", 0, 0.4)]

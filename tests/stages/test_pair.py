@@ -1,5 +1,6 @@
 import hashlib
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from astra_data.dataset.columns import (
     ACTION,
     NEXT_STATE,
     STATE,
+    Column,
 )
 from astra_data.stages.pair import PairConfig, pair, pair_steps
 from astra_data.worlds.registry import TASKS
@@ -156,6 +158,34 @@ def test_data_of_another_rate_are_refused(collected: Path, tmp_path: Path) -> No
         pair("antmaze-umaze", PairConfig(), dataset=slow, out=tmp_path / "out", progress=silent)
     simulator = f"{MINE}:Glider"  # of no task, and of no rate
     pair(simulator, PairConfig(), dataset=slow, out=tmp_path / "out", progress=silent)
+
+
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        (Column(STATE, size=2), r"observation.state has 2 values, expected those of antmaze-umaze: "),
+        (None, r"has the values .* in observation.state, expected the order "),
+    ],
+)
+def test_data_of_another_robot_are_refused(
+    collected: Path, tmp_path: Path, state: Column | None, told: str
+) -> None:
+    source = Dataset.open(collected)
+    columns = {column.name: column for column in source.schema}
+    if state is None:
+        names = columns[STATE].names
+        assert names is not None
+        state = replace(columns[STATE], names=(names[1], names[0], *names[2:]))
+    columns |= {STATE: state, NEXT_STATE: replace(state, name=NEXT_STATE)}
+    description = {"name": "other", "stage": "import", "environment": source.description["environment"]}
+    other, size = tmp_path / "other", state.size
+    with DatasetWriter(other, columns.values(), fps=20, task="other", description=description) as writer:
+        episode = next(source.episodes())
+        cut = {name: episode.columns[name][:, :size] for name in (STATE, NEXT_STATE)}
+        writer.add(replace(episode, columns={**episode.columns, **cut}))
+    with pytest.raises(BadInputError, match=told):
+        pair("antmaze-umaze", PairConfig(), dataset=other, out=tmp_path / "out", progress=silent)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_paired_dataset_is_not_paired_again(paired: Path, tmp_path: Path) -> None:
