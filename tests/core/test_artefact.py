@@ -237,3 +237,35 @@ def test_what_a_kill_left_in_the_working_folder_is_not_published(tmp_path: Path)
     with finished_folder(tmp_path / "out", config="1") as folder:
         (folder / "model").touch()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.json", "model"]
+
+
+@pytest.mark.usefixtures("fsync")
+def test_the_disk_has_what_a_folder_holds_before_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, fsync, replace = list[str](), os.fsync, os.replace
+
+    def note_fsync(handle: int) -> None:
+        done.append(Path(os.readlink(f"/proc/self/fd/{handle}")).name)
+        fsync(handle)
+
+    def note_replace(source: Path, target: Path) -> None:
+        done.append("replace")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", note_fsync)
+    monkeypatch.setattr(os, "replace", note_replace)
+    with finished_folder(tmp_path / "out") as folder:
+        (folder / "model").write_text("weights")
+        done.clear()
+    assert sorted(done[: done.index("replace")]) == [".out.partial", "model"]
+
+
+def test_a_linked_folder_in_what_is_replaced_is_unlinked_alone(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/file").touch()
+    (tmp_path / ".out.partial").mkdir()
+    (tmp_path / ".out.partial/link").symlink_to(tmp_path / "data")
+    with finished_folder(tmp_path / "out", replace=True) as folder:
+        assert not list(folder.iterdir())
+    assert (tmp_path / "data/file").exists()

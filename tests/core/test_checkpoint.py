@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from astra_data.core.checkpoint import (
     flatten,
     load_tensors,
+    resumed,
     save_tensors,
     understood,
     unflatten,
@@ -159,3 +160,24 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
         save_tensors(path, {"x": torch.arange(3.0), "y": torch.ones(2, 2)}, metadata)
     assert len({path.read_bytes() for path in paths}) == 1
     assert load_tensors(paths[0])[1] == metadata
+
+
+def test_weights_that_share_memory_are_saved(tmp_path: Path) -> None:
+    weight = torch.ones(2)
+    save_tensors(tmp_path / "a.safetensors", {"one": weight, "tied": weight}, {})
+    assert torch.equal(load_tensors(tmp_path / "a.safetensors")[0]["tied"], weight)
+
+
+def test_tensors_come_to_the_device_that_is_asked_for(tmp_path: Path) -> None:
+    save_tensors(tmp_path / "a.safetensors", {"weight": torch.ones(2)}, {"kind": "toy"})
+    with understood(tmp_path / "a.safetensors", "a toy", ["toy"], "meta") as (tensors, _):
+        assert tensors["weight"].device.type == "meta"
+
+
+def test_a_network_of_another_size_does_not_go_on(tmp_path: Path) -> None:
+    save_tensors(tmp_path / "a.safetensors", flatten(nn.Linear(2, 1).state_dict()), {})
+    with (
+        pytest.raises(BadInputError, match=f"(?s)expected a checkpoint of this version.*: remove {tmp_path}"),
+        resumed(tmp_path / "a.safetensors") as (state, _),
+    ):
+        nn.Linear(3, 1).load_state_dict(state)

@@ -194,3 +194,15 @@ def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
     ]
     assert names(home / "ant") == []
     assert clean(tmp_path / "none") == []
+
+
+def test_what_a_kill_left_beside_a_name_with_brackets_is_removed(tmp_path: Path) -> None:
+    (tmp_path / ".walks[1].json.tmp-7").mkdir()
+    write_file(tmp_path / "walks[1].json", "{}")
+    assert names(tmp_path) == ["walks[1].json"]
+
+
+def test_ctrl_c_removes_the_folders_that_were_made(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), hidden_folder(tmp_path / "home/walks/data-1.0.0"):
+        raise KeyboardInterrupt
+    assert names(tmp_path) == []

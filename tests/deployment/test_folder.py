@@ -9,15 +9,25 @@ import pytest
 import torch
 from small_run import GROUND, TASK, TRAIN, short_task
 
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import silent
-from astra_data.deployment.folder import deploy
+from astra_data.deployment.folder import deploy, describe
+from astra_data.deployment.graph import load_torchscript
+from astra_data.deployment.page import page
 from astra_data.experiments.trained_policy import load_policy
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.alignment import TargetEncoder
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.policy import PolicyShape
+from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.ground import ground
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.train import train
+from astra_data.training.policy_file import PolicyFile
+from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.registry import TASKS
 
 
@@ -112,3 +122,48 @@ def test_what_is_no_policy_and_a_folder_that_exists_are_refused(run: Path, tmp_p
     with pytest.raises(BadInputError, match=r"exists already; delete it or choose another folder"):
         deploy(run, "nas", tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_policy_is_that_of_the_seed_and_size_that_are_asked_for(tmp_path: Path) -> None:
+    run, code = tmp_path / "rail", Path(__file__).parents[1] / "small_cart.py"
+    torch.manual_seed(0)
+    for where in ("050/seed_0", "050/seed_1", "100/seed_1"):
+        out = run / f"train/direct_transfer/percent_{where}"
+        out.mkdir(parents=True)
+        policy = ActorCritic(ActorCriticShape(2, 1, hidden_sizes=(8,), memory_size=4))
+        PolicyFile(policy, None, f"drives {where}", "0" * 64).save(out / "policy.safetensors")
+    (run / "recipe.json").write_text(json.dumps({"task": f"{code}:TASK", "sweep": {"percent": [50, 100]}}))
+    folder = deploy(run, "direct_transfer", tmp_path / "policy", seed=1, percent=50)
+    about = json.loads((folder / "policy.json").read_text())
+    assert (about["seed"], about["percent"], about["trained_on"]["dataset"]) == (1, 50, "drives 050/seed_1")
+    file = run / "train/direct_transfer/percent_050/seed_1/policy.safetensors"
+    assert about["made_from"] == {"train": file_digest(file), "file_sha256": file_digest(code)}
+    state, goal = torch.tensor([[0.3, -0.2]]), torch.tensor([[1.0]])
+    here = load_policy(run, "direct_transfer", seed=1, percent=50)
+    here.start(1)
+    hidden = torch.zeros(1, about["hidden"]["size"])
+    command, _ = load_torchscript(folder / "policy.torchscript")(state, goal, hidden)
+    torch.testing.assert_close(command, here.command(state, goal), atol=1e-5, rtol=0)
+
+
+def test_its_page_tells_sizes_and_what_stops_the_robot() -> None:
+    sizes = {"state": ["x", "v", "w"], "goal": [], "command": ["left", "right"]}
+    about = {"task": "cart", "row": "nas", "seed": 3, "rate_hz": 10.0}
+    about |= {column: {"names": names} for column, names in sizes.items()}
+    about |= {"hidden": {"size": 5, "parts": {"memory": 5}}, "trained_on": {"dataset": "a", "hash": "b"}}
+    text = " ".join(page(about).split())
+    assert "goal=[], ) run(policy, measure, send, goal, steps=600, stop=[0.0, 0.0])" in text
+    assert "## Goal None: all episodes have the same." in text
+    assert "`state` (1, 3), `goal` (1, 0) and `hidden` (1, 5) in, `command` (1, 2) and" in text
+
+
+def test_a_description_names_encoder_limit_and_frames() -> None:
+    task = TASKS["antmaze-umaze"]
+    latent = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
+    aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
+    policy = ActorCritic(ActorCriticShape(16, 2))
+    about = describe(RunningPolicy(task, policy, latent, aligned, command_limit=0.4), {"memory": 2})
+    assert (about["encoder"], about["command_limit"]) == ("target", 0.4)
+    whole = SoftActor(PolicyShape(33, 2, hidden_sizes=(8,)))
+    assert describe(RunningPolicy(task, whole, observed="full"), {})["observed"] == "full"
+    assert about["state"]["frames"] == (task.state.astra or {})["frame"]

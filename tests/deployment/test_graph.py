@@ -166,3 +166,24 @@ def test_code_that_is_no_graph_is_named_in_one_line(abstraction: Any, told: str,
     with pytest.raises(BadInputError, match=told) as raised:
         write_graphs(RunningPolicy(task, actor(2, 1)), tmp_path)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["onnx", "torchscript"])
+def test_each_graph_is_compared(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def another(path: Path) -> Any:  # noqa: ANN401
+        return lambda state, goal, hidden: (torch.full((1, 1), 9.0), hidden)
+
+    monkeypatch.setattr(f"astra_data.deployment.graph.load_{kind}", another)
+    with pytest.raises(BadInputError, match=rf"in step 0 policy\.{kind} gives the command \[9\.0\]"):
+        write_graphs(POLICIES["units, no goal"], tmp_path)
+
+
+def test_differences_are_the_largest_in_half_ranges() -> None:
+    graph, more = PolicyGraph(POLICIES["units, no goal"]), iter([0.0024])  # of a command from -1 to 4
+
+    def off(*given: Tensor) -> tuple[Tensor, Tensor]:
+        command, hidden = graph(*given)
+        return command + next(more, 0.0), hidden
+
+    with torch.no_grad():
+        assert _apart(graph, off, "it") == pytest.approx(0.0024 / 2.5, rel=1e-2)

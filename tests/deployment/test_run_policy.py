@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ GIVEN: dict[str, Any] = {"rate_hz": 10, "state": ["x", "speed"], "goal": ["goal_
     ("wrong", "told"),
     [
         ({"rate_hz": 20}, "rate_hz: expected 10, got 20"),
+        ({"rate_hz": 10.5}, "rate_hz: expected 10, got 10.5"),
         ({"rate_hz": 5}, "rate_hz: expected 10, got 5"),
         ({"state": ["speed", "x"]}, r"state: expected the values \['x', 'speed'\], got \['speed', 'x'\]"),
         ({"state": ["x"]}, r"state: expected the values \['x', 'speed'\], got \['x'\]"),
@@ -118,3 +120,14 @@ def test_the_robot_is_stopped_whatever_happens(folder: Path, error: type[BaseExc
     with pytest.raises(error):
         run(policy, measure, sent.append, [1.0], steps=9, stop=[0.25])
     assert len(sent) == 2 and sent[-1].tolist() == [0.25]
+
+
+def test_a_refused_command_is_not_remembered(folder: Path) -> None:
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    policy.act([0.5, 1.0], [1.0])
+    before = policy.hidden.copy()
+    none = [np.full((1, 1), np.nan, np.float32), np.full_like(before, np.nan)]
+    policy.session = SimpleNamespace(run=lambda *_: none)
+    with pytest.raises(ValueError, match="the policy gives no command"):
+        policy.act([0.5, 1.0], [1.0])
+    np.testing.assert_array_equal(policy.hidden, before)

@@ -55,3 +55,8 @@ def test_only_the_points_that_are_shown_are_counted() -> None:
     points = [RunPoint("nas", seed) for seed in range(3)]
     means = {points[1]: 0.5, RunPoint("astra", 0): 0.5}
     assert progress_text(points, means) == "1 of 3 points"
+
+
+def test_one_size_of_several_seeds_has_a_column_for_each_seed() -> None:
+    points = [RunPoint("nas", seed, 50) for seed in (0, 1)]
+    assert drawn(points, {points[1]: 0.5}) == [["method", "seed 0", "seed 1"], ["NAS", "", "done 0.50"]]

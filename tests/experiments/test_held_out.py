@@ -42,3 +42,14 @@ def test_rows_that_share_a_grounding_are_one(tmp_path: Path, monkeypatch: pytest
     write_errors(experiment, Selection.of(experiment.recipe))
     write_errors(experiment, Selection.of(experiment.recipe, ("astra_plus",)))
     assert given == [("astra", "nas")] * 2  # NAS is the reference of a part, too
+
+
+def test_the_page_is_of_what_was_selected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, given = written(tmp_path, 'data = "logs"\nmethods = ["nas"]\n'), list[Any]()
+    path.write_text(path.read_text().replace("[0]", "[0, 1]") + "[sweep]\npercent = [50, 100]\n")
+    monkeypatch.setattr(
+        "astra_data.experiments.held_out.write_held_out", lambda *of, **more: given.append((*of[3:], more))
+    )
+    experiment = load_experiment(path, tmp_path / "runs")
+    write_errors(experiment, Selection.of(experiment.recipe, seeds=[1], percents=[50]))
+    assert given == [((1,), (50,), {"timestep_s": 0.1})]

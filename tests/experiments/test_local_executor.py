@@ -11,6 +11,7 @@ from fake_items import Record, crash, fail, hang, kill_itself, leave, rendezvous
 
 from astra_data.core.errors import AstraDataError, MissingStageError
 from astra_data.core.lock import held
+from astra_data.experiments import local_executor
 from astra_data.experiments.execution import Item
 from astra_data.experiments.local_executor import execute
 
@@ -139,3 +140,31 @@ def _is_gone(pid: int) -> bool:
     except ProcessLookupError:
         return True
     return False
+
+
+def test_afterwards_signals_are_handled_as_before(tmp_path: Path) -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    execute([Item("a", (), partial(touch, tmp_path / "a", ()))], jobs=1, logs=tmp_path, watch=Record())
+    assert [signal.getsignal(number) for number in numbers] == before
+
+
+def test_a_process_runs_one_item_after_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, worker = list[object](), local_executor._Worker
+
+    def noted() -> object:
+        made.append(worker())
+        return made[-1]
+
+    monkeypatch.setattr(local_executor, "_Worker", noted)
+    record = Record()
+    items = [Item(key, (), partial(touch, tmp_path / key, ())) for key in "ab"]
+    with pytest.raises(MissingStageError):
+        execute([*items, Item("c", ("b",), fail)], jobs=1, logs=tmp_path / "logs", watch=record)
+    assert len(made) == 1 and record.events[-1] == ("failed", "c")
+
+
+def test_an_item_is_prepared_in_its_process(tmp_path: Path) -> None:
+    prepare = partial(Path.write_text, tmp_path / "before", "")
+    item = Item("a", (), partial(touch, tmp_path / "a", (tmp_path / "before",)))
+    execute([item], jobs=1, logs=tmp_path / "logs", watch=Record(), prepare=prepare)

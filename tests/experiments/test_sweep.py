@@ -220,3 +220,22 @@ def test_a_sweep_ends_after_the_stage_that_is_named(
     assert made in stages and not stages & {"train", "evaluate", "report"}
     assert ("ground" in stages) == (until == "ground")
     assert [given[1] for given in told] == [Selection(("nas",), (1,), (50,))] * pages
+
+
+def test_a_whole_sweep_writes_the_page_of_held_out_errors(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Selection] = []
+    monkeypatch.setattr("astra_data.experiments.sweep.write_errors", lambda _, part: told.append(part))
+    sweep(recipe, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
+    assert told == [Selection(("nas",), (1,), (50,))]
+
+
+def test_points_are_made_where_and_how_it_is_asked_for(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[dict[str, Any]] = []
+    monkeypatch.setattr("astra_data.experiments.sweep.make", lambda *_, **how: told.append(how))
+    how: dict[str, Any] = {"jobs": 3, "device": "cuda:0", "cluster": "local"}
+    sweep(recipe, root=tmp_path, until="pair", **how)
+    assert how.items() <= told[0].items()

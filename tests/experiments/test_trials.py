@@ -202,3 +202,9 @@ def test_trials_are_of_the_size_that_is_asked_for(
     found = choose_by_trials(folder, 20, field=4, percent=50)
     assert found.percent == 50 and loaded == [50] * 6
     assert found.rounds[0].candidates == [(one.row, one.seed) for one in both.ranked(50)[:4]]
+    with pytest.raises(BadInputError, match=r"with percent = 100, found 20 made with 50: give the same"):
+        choose_by_trials(folder, 20, field=4, percent=100)
+    alone = judged.model_copy(update={"candidates": judged.candidates[:1]})
+    monkeypatch.setattr(module, "select", lambda *_, **__: alone)
+    with pytest.raises(BadInputError, match=r"two candidates or more to try, of the 1 that were judged"):
+        choose_by_trials(folder, 20)

@@ -52,6 +52,7 @@ def test_commands_of_many_robots_are_those_of_the_package(made: Any, run: Path) 
     [
         (shown(torch.zeros(1, 3), torch.zeros(1, 1)), r"observation\.state: expected .*\(B, 2\).*\(1, 3\)"),
         (shown(torch.full((1, 2), torch.nan), torch.zeros(1, 1)), r"observation\.state: expected finite"),
+        (shown(torch.zeros(1, 2), torch.full((1, 1), torch.inf)), r"environment_state: expected finite"),
         ({"observation.state": torch.zeros(1, 2)}, r"observation\.environment_state: expected .*got none"),
     ],
 )
@@ -70,3 +71,11 @@ def test_a_folder_without_a_policy_is_refused(made: Any, run: Path, tmp_path: Pa
     for refuses in (lambda: made.forward({}), made.get_optim_params, made.config.get_optimizer_preset):
         with pytest.raises(NotImplementedError, match="astra-data train does"):
             refuses()
+
+
+def test_values_of_double_precision_are_taken(made: Any) -> None:  # noqa: ANN401
+    commands = []
+    for kind in (torch.float32, torch.float64):
+        made.reset()
+        commands.append(made.select_action(shown(torch.ones(1, 2, dtype=kind), torch.ones(1, 1, dtype=kind))))
+    assert torch.equal(*commands)
