@@ -45,6 +45,8 @@ class _Found(NamedTuple):
     first_row: int
     steps: int
     metadata: Mapping[str, Scalar]
+    lost_success: bool
+    lost_reward: float
 
 
 def open_recording(root: Path) -> Contents:
@@ -137,7 +139,8 @@ def _survey(
         if len(faults) >= MOST_FAULTS:
             break
         uid = int(run.columns.get(names.EPISODE_UID, run.columns[names.EPISODE_INDEX])[0])
-        episode = _Found(uid, row, len(run) - rows.dropped, _facts(run, tasks))
+        lost = rows.lost_success(run), rows.lost_reward(run)
+        episode = _Found(uid, row, len(run) - rows.dropped, _facts(run, tasks), *lost)
         found.append(episode)
         row += len(run)
         if not episode.steps:
@@ -189,6 +192,12 @@ def _announce(
     single = sum(not episode.steps for episode in episodes)
     if single:
         parts.append(f"{single} of them in episodes of a single row")
+    if lost := sum(episode.lost_success for episode in episodes):
+        parts.append(
+            f"{lost} of these last rows are the only ones that succeeded, so {names.SUCCESS} is lost"
+        )
+    if reward := sum(episode.lost_reward for episode in episodes):
+        parts.append(f"with the last rows a reward of {reward:g} in sum is left out")
     others = sorted(info["features"].keys() - set(known))
     if others:
         parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")

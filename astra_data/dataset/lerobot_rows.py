@@ -97,6 +97,17 @@ class Rows:
         with np.errstate(over="ignore", invalid="ignore"):
             return values.astype(spec.dtype)
 
+    def lost_success(self, run: Run) -> bool:
+        """Whether of an episode only the row that is left out succeeded, and no step takes that over."""
+        if not self.dropped or names.SUCCESS not in self.stored:
+            return False
+        successes = run.columns[names.SUCCESS] != 0
+        return bool(successes[-1] and not successes[:-1].any() and not self._is_terminated(run))
+
+    def lost_reward(self, run: Run) -> float:
+        """Return the reward of the row that is left out."""
+        return float(run.columns[names.REWARD][-1]) if self.dropped and names.REWARD in self.stored else 0.0
+
     def _ends(self, run: Run, steps: int) -> tuple[Array, Array]:
         """Return terminated and truncated, (T,); an episode that is cut off is truncated.
 

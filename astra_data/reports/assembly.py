@@ -8,6 +8,7 @@ from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
+from astra_data.methods import method_named
 from astra_data.reports.artefacts import (
     CURVE,
     EVALUATION,
@@ -22,11 +23,12 @@ from astra_data.reports.artefacts import (
     Metrics,
     check_alike,
     files_of,
+    read_json,
     way_to_success,
 )
 from astra_data.reports.choice import Judged, choice_of, read_judged
 from astra_data.reports.comparing import SHARED_WORLDS
-from astra_data.reports.costs import DATASET_STAGES, Files, seconds, seed_cost, throughput
+from astra_data.reports.costs import DATASET_STAGES, Files, seconds, seed_cost, throughput, with_first
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs
@@ -118,6 +120,7 @@ def _read(
     alignments = read.optional("align", METRICS, Metrics)
     datasets = {stage: read.datasets(stage) for stage in DATASET_STAGES}
     gap_means = {owner: mean_gap(of_seeds) for owner, of_seeds in gaps.items()}
+    first = _first_trainings(read, evaluations)
     rows, uses = {}, {}
     for method, of_seeds in evaluations.items():
         encoders = [{name: sorted(of) for name, of in file.encoders.items()} for file in of_seeds.values()]
@@ -140,7 +143,10 @@ def _read(
                     scores[0],
                 ),
                 grounding=grounding if grounding in gap_means else None,
-                cost=seed_cost({stage: found[seed] for stage, found in made.items() if seed in found}),
+                cost=with_first(
+                    seed_cost({stage: found[seed] for stage, found in made.items() if seed in found}),
+                    first.get(method, {}).get(seed),
+                ),
                 dataset=(file.dataset_version, file.dataset_hash),
             )
             for seed, file in of_seeds.items()
@@ -155,6 +161,9 @@ def _read(
         **({"select": {"all": [judged]}} if judged else {}),
         "evaluate": _listed(evaluations),
     }
+    # Fine-tuned policies start from those of a row that need not be reported.
+    started = {method_named(row).initial or row: of for row, of in first.items()}
+    timed: Files = {**files, "train": _listed(started | curves)}
     return Results(
         recipe=read.recipe,
         task=task,
@@ -162,8 +171,8 @@ def _read(
         scores=scores,
         settings=settings,
         origins=_origins({**files, "report": {"all": [Artefact.model_validate(origin())]}}),
-        wall_seconds=seconds(files, "wall_seconds"),
-        cpu_seconds=seconds(files, "cpu_seconds"),
+        wall_seconds=seconds(timed, "wall_seconds"),
+        cpu_seconds=seconds(timed, "cpu_seconds"),
         datasets=[
             DatasetOrigin(
                 stage=stage, seed=seed, name=file.name, version=file.version, content_hash=file.content_hash
@@ -178,6 +187,18 @@ def _read(
         methods=rows,
         throughput=throughput(files),
     )
+
+
+def _first_trainings(
+    read: Runs, rows: Mapping[str, Mapping[int, Artefact]]
+) -> dict[str, dict[int, CurveFile]]:
+    """Return, row → seed → file, the trainings from whose policies those of the row start."""
+    found: dict[str, dict[int, CurveFile]] = {}
+    for row, of_seeds in rows.items():
+        if (initial := method_named(row).initial) is not None:
+            paths = {seed: read.path("train", initial, seed, CURVE) for seed in of_seeds}
+            found[row] = {seed: read_json(CurveFile, path) for seed, path in paths.items() if path.exists()}
+    return found
 
 
 def _listed[T: Artefact](files: Mapping[str, Mapping[int, T]]) -> dict[str, list[T]]:

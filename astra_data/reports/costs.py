@@ -45,6 +45,18 @@ def seed_cost(files: Mapping[str, Artefact]) -> dict[str, Cost]:
     }
 
 
+def with_first(cost: dict[str, Cost], first: Artefact | None) -> dict[str, Cost]:
+    """Add to what a training costs, by stage, the training `first` from whose policy it starts, if any."""
+    own = cost.get("train")
+    if first is None or first.wall_seconds is None or own is None:
+        return cost
+    cpu_seconds = (
+        None if own.cpu_seconds is None or first.cpu_seconds is None else own.cpu_seconds + first.cpu_seconds
+    )
+    wall_seconds = own.wall_seconds + first.wall_seconds
+    return cost | {"train": Cost(wall_seconds=wall_seconds, cpu_seconds=cpu_seconds)}
+
+
 def throughput(files: Files) -> dict[str, dict[str, dict[str, list[float]]]]:
     """Return stage → figure → row → one value per seed."""
     return {stage: _stage_throughput(stage, rows) for stage, rows in files.items()}

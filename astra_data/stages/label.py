@@ -97,7 +97,7 @@ def label(
         name=name,
         out=out,
     )
-    steps = successes = failures = 0
+    steps = successes = failures = at_goal = 0
     with DatasetWriter.like(source, out, description, more=more) as writer:
         for number, episode in enumerate(source.episodes(), start=1):
             labelled = labels(world, episode, seed)
@@ -105,8 +105,15 @@ def label(
             steps += len(labelled)
             successes += bool(labelled.metadata["success"])
             failures += bool(labelled.metadata["failed"])
+            at_goal += SUCCESS not in episode.columns and _failed_at_its_goal(world, labelled)
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
         writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
+    if at_goal:
+        _log.warning(
+            "%s",
+            f"{source.reference}: {at_goal} episodes terminate at their goal and are labelled as failures, "
+            f"for {TERMINATED} does not say why: import {SUCCESS} as well if they ended because they arrived",
+        )
     return out
 
 
@@ -169,6 +176,18 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     )
     kept = {key: values[:length] for key, values in columns.items()}
     return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
+
+
+def _failed_at_its_goal(task: Task, labelled: Episode) -> bool:
+    """Whether an episode failed in a step that reached the goal."""
+    if not labelled.metadata["failed"] or task.objective.is_lasting:
+        return False
+    last = {
+        name: as_rows(labelled.columns[name][-1:]) for name in (NEXT_STATE, GOAL) if name in labelled.columns
+    }
+    after = torch.from_numpy(np.ascontiguousarray(task.abstraction(last[NEXT_STATE]), dtype=np.float32))
+    goal = torch.from_numpy(last.get(GOAL, np.empty((1, 0), np.float32)))
+    return bool(judged(task.objective, "reached", after, goal))
 
 
 def _opened(data: str | Path) -> Dataset:

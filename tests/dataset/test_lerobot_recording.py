@@ -127,6 +127,9 @@ def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.Log
     assert line.endswith("left out, because they are not lists of numbers: observation.images.top")
     assert "\n" not in line
     assert caplog.records[0].levelno == logging.WARNING
+    assert "3 of these last rows are the only ones that succeeded, so next.success is lost" in line
+    reward = sum(float(values("arm", number)[REWARD][-1]) for number in range(4))
+    assert f"with the last rows a reward of {reward:g} in sum is left out" in line
 
 
 def test_lineage_names_what_was_read_by_its_hash(arm: Dataset, tmp_path: Path) -> None:

@@ -104,3 +104,20 @@ def test_columns_of_ours_have_our_types() -> None:
     assert found[names.NEXT_STATE].meaning == "the state, one step later"
     assert RECORDED_TASK not in found
     assert RECORDED_TASK in {column.name for column in our_columns(recorded, has_tasks=True)}
+
+
+def test_a_success_of_the_row_that_is_left_out_is_lost_unless_it_terminated() -> None:
+    last = np.arange(STEPS) == STEPS - 1
+    for more, lost in (
+        ({names.SUCCESS: last}, True),
+        ({names.SUCCESS: last, names.TERMINATED: last}, False),
+        ({names.SUCCESS: np.ones(STEPS, bool)}, False),
+        ({names.SUCCESS: last, names.NEXT_STATE: np.ones((STEPS, 2), np.float32)}, False),
+        ({}, False),
+    ):
+        rows, run = rows_and_run(dict(more))
+        assert rows.lost_success(run) == lost
+    rows, run = rows_and_run({names.REWARD: np.arange(STEPS, dtype=np.float32)})
+    assert rows.lost_reward(run) == STEPS - 1
+    rows, run = rows_and_run({names.REWARD: np.ones(STEPS), names.NEXT_STATE: np.ones((STEPS, 2))})
+    assert rows.lost_reward(run) == 0.0

@@ -231,3 +231,19 @@ def test_who_stands_still_is_told_where_all_seeds_have_measured_it(root: Path) -
         found = assembled(root).methods["astra"].gap
         assert found is not None
         assert found.still == (found.raw if number == len(files) else None)
+
+
+@pytest.mark.parametrize("is_a_row", [True, False])
+def test_fine_tuning_costs_the_training_that_it_starts_from_too(root: Path, is_a_row: bool) -> None:
+    write_elsewhere(root, "direct_transfer_iql")
+    for seed in SEEDS:
+        path = root / f"train/direct_transfer/seed_{seed}/curve.json"
+        edit_json(path, wall_seconds=1000.0, cpu_seconds=900.0)
+    rows = ("direct_transfer", "direct_transfer_iql") if is_a_row else ("direct_transfer_iql",)
+    results = assembled(root, rows)
+    cost = results.methods["direct_transfer_iql"].cost["train"]
+    assert (cost.wall_seconds, cost.cpu_seconds) == (1003.0, None)  # fine-tuning recorded no processor time
+    for seed in SEEDS:
+        edit_json(root / f"train/direct_transfer_iql/seed_{seed}/curve.json", cpu_seconds=2.0)
+    assert assembled(root, rows).methods["direct_transfer_iql"].cost["train"].cpu_seconds == 902.0
+    assert results.wall_seconds["train"] == 3 * 1003.0

@@ -110,6 +110,20 @@ def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.parametrize(("distance", "is_told"), [(0.95, True), (1.9, False)])
+def test_who_terminates_at_the_goal_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, distance: float, is_told: bool
+) -> None:
+    ended = drive(1.0, 10) | {
+        TERMINATED: np.arange(10) == 9,
+        GOAL: np.full(10, distance, np.float32),
+    }
+    more = (Column(GOAL), *(column for column in OUTCOME_COLUMNS if column.name == TERMINATED))
+    label(CART, data=write(tmp_path / "logs", [ended, ended], more), out=tmp_path / "labelled")
+    told = "2 episodes terminate at their goal and are labelled as failures"
+    assert (told in caplog.text) == is_told
+
+
 def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
     task = replace(task_named(CART), objective=Last(horizon=10))
     short, long = (Episode(0, drive(0.01, steps), {}) for steps in (9, 10))

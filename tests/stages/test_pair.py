@@ -179,7 +179,7 @@ def test_data_of_another_robot_are_refused(
     columns |= {STATE: state, NEXT_STATE: replace(state, name=NEXT_STATE)}
     description = {"name": "other", "stage": "import", "environment": source.description["environment"]}
     other, size = tmp_path / "other", state.size
-    with DatasetWriter(other, columns.values(), fps=20, task="other", description=description) as writer:
+    with DatasetWriter(other, [*columns.values()], fps=20, task="other", description=description) as writer:
         episode = next(source.episodes())
         cut = {name: episode.columns[name][:, :size] for name in (STATE, NEXT_STATE)}
         writer.add(replace(episode, columns={**episode.columns, **cut}))

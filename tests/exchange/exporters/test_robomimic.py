@@ -60,9 +60,10 @@ def test_copies_of_a_recording_are_on_its_side_of_robomimics_masks(
     with writer(tmp_path / "set", columns=[*COLUMNS, NEXT]) as open_writer:
         for uid in range(40):
             columns = fake_columns(2, seed=uid)
-            metadata = {"source_episode": uid % 10} if uid >= 10 else {}
-            marked = {} if held_out is None else {"held_out": uid % 10 == held_out and uid < 20}
-            open_writer.add(Episode(uid, columns | {NEXT_STATE: columns[STATE]}, metadata | marked))
+            metadata: dict[str, int | bool] = {"source_episode": uid % 10} if uid >= 10 else {}
+            if held_out is not None:
+                metadata["held_out"] = uid % 10 == held_out and uid < 20
+            open_writer.add(Episode(uid, columns | {NEXT_STATE: columns[STATE]}, metadata))
     export(Dataset.open(tmp_path / "set"), tmp_path / "set.hdf5", format="robomimic")
     with h5py.File(tmp_path / "set.hdf5") as file:
         train, valid = (
