@@ -29,7 +29,7 @@ from astra_data.grounding.failures import (
     replayed_inputs,
     tells_failures,
 )
-from astra_data.grounding.files import load_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.fit import HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -53,7 +53,7 @@ def main(
     world = task_named(task)
     measured = {one: PairedEpisodes.load(run / "pair" / f"seed_{one}") for one in fresh or ()}
     windows = [_window(one) for one in ahead or ()] or list(AHEAD_STEPS)
-    grounding = load_grounding(run / "ground" / grounded_as(row) / f"seed_{seed}" / "grounding.safetensors")
+    grounding = load_grounding(run / "ground" / grounded_as(row) / f"seed_{seed}" / GROUNDING)
     if not isinstance(grounding, HistoryGrounding):
         raise typer.BadParameter(f"{row} has no history grounding")
     whole = PairedEpisodes.load(run / "pair" / f"seed_{seed}")

@@ -17,7 +17,7 @@ import typer
 from door import run_tool
 from torch import Tensor
 
-from astra_data.grounding.files import load_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -41,7 +41,7 @@ def main(
 ) -> None:
     """Print two tables for each fresh seed."""
     world = task_named(task)
-    grounding = load_grounding(run / "ground" / grounded_as(row) / f"seed_{seed}" / "grounding.safetensors")
+    grounding = load_grounding(run / "ground" / grounded_as(row) / f"seed_{seed}" / GROUNDING)
     if not isinstance(grounding, HistoryGrounding) or grounding.scatter_model is None:
         raise typer.BadParameter(f"{row} has no scatter model: expected [ground] scatter = true")
     torch.manual_seed(0)

@@ -27,7 +27,7 @@ from astra_data.core.seeding import derive
 from astra_data.dataset.edit import delete, merge
 from astra_data.dataset.reader import Dataset
 from astra_data.grounding.committee import Committee
-from astra_data.grounding.files import load_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.fit import GroundConfig
 from astra_data.grounding.open_loop_error import gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -132,7 +132,7 @@ def foreseen(setting: Setting, folder: Path, seed: int, fresh: str) -> float:
 
     The latter is the distance of the committee's mean from the recorded next state, in units of the scatter.
     """
-    made = load_grounding(folder / seed_folder(seed) / "before" / "grounding.safetensors")
+    made = load_grounding(folder / seed_folder(seed) / "before" / GROUNDING)
     committee = Committee.of(task_named(setting.task), [made])
     pairs = PairedEpisodes.load(folder / f"fresh_{fresh}_pairs")
     windows, predictions = pairs.windows, []
@@ -154,7 +154,7 @@ def measured(setting: Setting, folder: Path, seed: int) -> dict[str, Any]:
     task = task_named(setting.task)
     first = collected(setting, home / "first", seed)
     before = grounded(setting, [first], home, "before", seed)
-    made = load_grounding(home / "before" / "grounding.safetensors")
+    made = load_grounding(home / "before" / GROUNDING)
     usual = {key: first_of(setting)[key] for key in ("max_steps", "start", "hold_s")}
     config = SuggestConfig(**usual, episodes=setting.more)
     plan = home / "plan.json"
@@ -241,7 +241,7 @@ def grounded(
         pairs = paired(setting, Dataset.open(union), home / f"{name}_pairs")
         config = GroundConfig(**setting.ground | changed)
         ground(setting.task, "nas", config, dataset=pairs, seed=seed, out=out)
-    return load_grounding(out / "grounding.safetensors")
+    return load_grounding(out / GROUNDING)
 
 
 if __name__ == "__main__":

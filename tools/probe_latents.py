@@ -25,7 +25,7 @@ from torch import Tensor
 from astra_data.core.naming import seed_folder
 from astra_data.core.seeding import derive
 from astra_data.experiments.trained_policy import load_policy, policy_files, settings_of
-from astra_data.grounding.files import load_grounding, load_history_model
+from astra_data.grounding.files import GROUNDING, load_grounding, load_history_model
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as
 from astra_data.training.own_world import in_simulator, own_world, started
@@ -77,7 +77,7 @@ def _probes(run: Path, rows: list[str], seed: int, steps: int) -> None:
         f"φ(s) and {steps} actions": [recent_actions(part, steps) for part in parts],
     }
     for name in rows:
-        file = run / "ground" / grounded_as(name) / seed_folder(seed) / "grounding.safetensors"
+        file = run / "ground" / grounded_as(name) / seed_folder(seed) / GROUNDING
         model = load_history_model(file)
         inputs[f"z of {name}"] = [model.encode(part.windows)[0] for part in parts]
     found = {name: probe(*map(Probed.of, parts, given, values)) for name, given in inputs.items()}

@@ -17,10 +17,8 @@ from astra_data.experiments.plan import plan
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.trained_policy import settings_of
-from astra_data.grounding.files import GROUNDING, load_grounding
+from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.training.build_env import EnvConfig
 from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
@@ -141,15 +139,12 @@ def _world(
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     _check_made(of_train, ("dataset", "grounding"))
     episodes = PairedEpisodes.load(of_train["dataset"])
-    grounding: Grounding = NO_GROUNDING
-    if of_train["grounding"]:
-        grounding = load_grounding(of_train["grounding"] / GROUNDING)
     training = Training(
         task=task_named(of_train["task"]),
         config=of_train["config"],
         settings=of_train["settings"],
         episodes=episodes,
-        grounding=grounding,
+        grounding=grounding_at(of_train["grounding"] and of_train["grounding"] / GROUNDING),
         initial=None,
         seed=seed,
         device="cpu",

@@ -8,8 +8,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RECORD, seed_folder
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.recipe_file import recorded_settings
-from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.methods import grounded_as, method_named
 from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.running_policy import RunningPolicy
@@ -40,7 +39,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
     return running(
         task_named(task_of(run)),
         PolicyFile.load(files["train"]),
-        load_grounding(files["ground"]) if "ground" in files else NO_GROUNDING,
+        grounding_at(files.get("ground")),
         load_target_encoder(files["align"]) if "align" in files else None,
     )
 

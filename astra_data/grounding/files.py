@@ -8,7 +8,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.parameters import IdentifiedParameters
-from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.protocols import FittedGrounding, Grounding
+from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.residual import ResidualGrounding
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel
@@ -37,6 +38,15 @@ def load_grounding(path: Path | str, device: str = "cpu") -> FittedGrounding:
     """
     with understood(Path(path), "a grounding", KINDS, device) as (tensors, metadata):
         return KINDS[metadata["kind"]].from_file(tensors, metadata, device)
+
+
+def grounding_at(path: Path | None, device: str = "cpu") -> Grounding:
+    """Read a grounding; without a `path`, that is none.
+
+    Raises:
+        BadInputError: as `load_grounding`.
+    """
+    return load_grounding(path, device) if path else NO_GROUNDING
 
 
 def load_history_model(path: Path | str, device: str = "cpu") -> GroundingModel:

@@ -18,8 +18,7 @@ from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import OUTCOME_COLUMNS
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import home_of
-from astra_data.grounding.files import load_grounding, load_target_encoder
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.training.behaviors import (
     Behavior,
     HoldTimes,
@@ -283,9 +282,8 @@ def _behavior(
         return PolicyBehavior(running(task, policy)), metadata
     files = _saved_files(config)
     trained = PolicyFile.load(files["policy"])
-    grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
     encoder = load_target_encoder(files["target_encoder"]) if "target_encoder" in files else None
-    acts = running(task, trained, grounding, encoder)
+    acts = running(task, trained, grounding_at(files.get("grounding")), encoder)
     return PolicyBehavior(acts), {"policy_dataset": trained.dataset}
 
 
@@ -295,5 +293,5 @@ def _random(task: Task, config: CollectConfig, commands: type[RandomCommands]) -
 
 
 def _saved_files(config: CollectConfig) -> dict[str, Path]:
-    folders = config.model_dump(include={"policy", "grounding", "target_encoder"})
-    return {kind: Path(folder) / f"{kind}.safetensors" for kind, folder in folders.items() if folder}
+    names = {"policy": POLICY, "grounding": GROUNDING, "target_encoder": TARGET_ENCODER}
+    return {kind: Path(folder) / name for kind, name in names.items() if (folder := getattr(config, kind))}

@@ -25,7 +25,13 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_grounding, load_target_encoder
+from astra_data.grounding.files import (
+    GROUNDING,
+    TARGET_ENCODER,
+    grounding_at,
+    load_grounding,
+    load_target_encoder,
+)
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
@@ -187,7 +193,7 @@ def _follower(task: Task) -> _Row:
 
 def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
     trained = loaded or PolicyFile.load(files["policy"])
-    grounding = load_grounding(files["grounding"]) if "grounding" in files else NO_GROUNDING
+    grounding = grounding_at(files.get("grounding"))
     source = running(task, trained, grounding)
     robots: dict[EncoderKind, Begin] = {"source": partial(started, source, source.act)}
     if "target_encoder" in files:

@@ -22,9 +22,8 @@ from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.meta_files import read_description
-from astra_data.grounding.files import GROUNDING, load_grounding
+from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import grounded_as, method_named
 from astra_data.reports.choice import SELECTED, Candidate, Judged
 from astra_data.reports.choice_page import select_page
@@ -65,7 +64,7 @@ class Entry:
 
     def load(self, root: Path, task: str) -> RunningPolicy:
         """Return the policy, with the encoder of its own grounding."""
-        model = load_grounding(root / self.grounding / GROUNDING) if self.grounding else NO_GROUNDING
+        model = grounding_at(root / self.grounding / GROUNDING if self.grounding else None)
         return running(task_named(task), PolicyFile.load(root / self.policy / POLICY), model)
 
 

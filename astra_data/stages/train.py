@@ -11,9 +11,8 @@ from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.files import GROUNDING, load_grounding
+from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.reports.artefacts import CURVE
 from astra_data.training.policy_file import POLICY, PolicyFile
@@ -85,7 +84,7 @@ def train(
         )
     grounding_file = grounding and grounding / GROUNDING
     initial_file = initial and initial / POLICY
-    correction = load_grounding(grounding_file, device) if grounding_file else NO_GROUNDING
+    correction = grounding_at(grounding_file, device)
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
     if beginning and beginning.simulation and beginning.simulation.world.limits_commands:
         raise BadInputError(
@@ -118,8 +117,7 @@ def train(
             num_threads=num_threads,
         )
         if base.in_simulator:
-            tested = load_grounding(grounding_file) if grounding_file else NO_GROUNDING
-            policy, curve = with_restarts(base.learn, training, tested)
+            policy, curve = with_restarts(base.learn, training, grounding_at(grounding_file))
         else:
             policy, curve = base.learn(training)
         policy.save(folder / POLICY)
