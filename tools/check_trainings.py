@@ -11,6 +11,7 @@ import json
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -19,22 +20,11 @@ import torch
 import typer
 from door import run_tool
 
-from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import is_plus
-from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
-from astra_data.experiments.plan import plan
-from astra_data.experiments.recipe import Recipe
-from astra_data.experiments.trained_policy import settings_of
-from astra_data.grounding.files import load_grounding
-from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.experiments.grounded_env import training_of
 from astra_data.methods import method_named
 from astra_data.training.own_world import reached_in_own_world
-from astra_data.training.train import Training
-from astra_data.worlds.registry import task_named
 
 
 class Trained(NamedTuple):
@@ -82,34 +72,16 @@ def _setting(told: str) -> tuple[str, Any]:
 def trained(run: Path, row: str, seed: int, changes: dict[str, Any], policy: int) -> Trained:
     """Train a row of the run from the policy seed number `policy`; the first is the run's own."""
     torch.set_num_threads(1)
-    recorded, table = settings_of(run), "plus" if is_plus(row) else "train"
-    changed = recorded | {"methods": [row], "seeds": [seed], table: recorded.get(table, {}) | changes}
-    changed.pop("select", None)  # one row of one seed leaves nothing to choose from
-    items = plan(validated(changed, Recipe, f"{run}"), Path(f"{run}.toml"), run)
-    call: Any = next(item.call for item in items if item.key == f"train/{row}/seed_{seed}")
-    given, learn = call.keywords, method_named(row).learn
-    if learn is None:
-        raise BadInputError(f"{row} trains nothing: expected a row that is trained in a simulator")
-    grounding: Grounding = NO_GROUNDING
-    if given["grounding"]:
-        grounding = load_grounding(given["grounding"] / "grounding.safetensors")
+    training = training_of(run, row, seed, changes=changes)
+    learn = method_named(row).learn
+    assert learn is not None
+    if policy:
+        training = replace(training, seed=derive(seed, f"policy {policy}"))
     with tempfile.TemporaryDirectory() as folder:
-        training = Training(
-            task=task_named(given["task"]),
-            config=given["config"],
-            settings=given["settings"],
-            episodes=PairedEpisodes.load(given["dataset"]),
-            grounding=grounding,
-            initial=None,
-            seed=derive(seed, f"policy {policy}") if policy else seed,
-            device="cpu",
-            folder=Path(folder),
-            progress=silent,
-        )
         began = time.process_time()
-        made, _ = learn(training)
+        made, _ = learn(replace(training, folder=Path(folder)))
         seconds = time.process_time() - began
-    reached = reached_in_own_world(training.task, made, grounding, seed)
+    reached = reached_in_own_world(training.task, made, training.grounding, seed)
     return Trained(reached.success, reached.steps, seconds)
 
 

@@ -3,7 +3,7 @@
 Gymnasium's "astra_data/Grounded-v0" is made here.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
+from astra_data.methods.method import Method
 from astra_data.training.build_env import EnvConfig
 from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.own_policy import ActingPolicy, OwnPolicy
@@ -125,9 +126,7 @@ def _world(
     **options: Any,  # noqa: ANN401 - checked as a recipe's are
 ) -> tuple[SimulatorEnv, Simulation, Training]:
     """Return the environment that `train` builds for a row, and what it builds it from."""
-    settings, table = settings_of(run), "plus" if is_plus(row) else "train"
-    add_all(settings.get("own_methods", {}))
-    learn = method_named(row).learn
+    learn = _method_of(run, row).learn
     if not isinstance(learn, InSimulator):
         raise BadInputError(
             f"{row} is not trained in a simulator: expected a row that is, such as nas, or "
@@ -135,15 +134,35 @@ def _world(
         )
     if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
         raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
-    changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | options}
+    training = training_of(run, row, seed, percent, options)
+    return *learn.world(training), training
+
+
+def training_of(
+    run: str | Path,
+    row: str,
+    seed: int,
+    percent: int | None = None,
+    changes: Mapping[str, Any] = {},
+) -> Training:
+    """Return what `train` gives the method of a row of a run, with `changes` of its `[train]`, or `[plus]`.
+
+    The policy that another one starts from is not read.
+
+    Raises:
+        BadInputError: the row trains nothing, an artefact is not there, or a change does not fit.
+    """
+    if _method_of(run, row).learn is None:
+        raise BadInputError(f"{row} trains nothing: expected a row that is trained")
+    settings, table = settings_of(run), "plus" if is_plus(row) else "train"
+    changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | dict(changes)}
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     _check_made(of_train, ("dataset", "grounding"))
-    episodes = PairedEpisodes.load(of_train["dataset"])
-    training = Training(
+    return Training(
         task=task_named(of_train["task"]),
         config=of_train["config"],
         settings=of_train["settings"],
-        episodes=episodes,
+        episodes=PairedEpisodes.load(of_train["dataset"]),
         grounding=grounding_at(of_train["grounding"] and of_train["grounding"] / GROUNDING),
         initial=None,
         seed=seed,
@@ -151,7 +170,12 @@ def _world(
         folder=Path(run),
         progress=silent,
     )
-    return *learn.world(training), training
+
+
+def _method_of(run: str | Path, row: str) -> Method:
+    """Return the method of a row of a run, whose own methods are added first."""
+    add_all(settings_of(run).get("own_methods", {}))
+    return method_named(row)
 
 
 def _planned(
