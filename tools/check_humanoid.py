@@ -13,7 +13,7 @@ reads a finished run and prints
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, pstdev
 from typing import Annotated
@@ -23,16 +23,12 @@ import typer
 from door import run_tool
 from torch import Tensor, nn
 
-from astra_data.core.naming import base_method
-from astra_data.experiments.trained_policy import settings_of
-from astra_data.grounding.files import load_grounding, load_history_model
+from astra_data.experiments.trained_policy import load_policy, settings_of
+from astra_data.grounding.files import GROUNDING, load_history_model
 from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.history import HistoryEncoder, mlp
-from astra_data.methods import method_named
-from astra_data.training.policy_file import PolicyFile, running
 from astra_data.training.running_policy import target_observation
 from astra_data.worlds.humanoid.model import CommandRanges
 from astra_data.worlds.humanoid.skeleton import rotation
@@ -64,13 +60,9 @@ def no_goals(count: int) -> Tensor:
     return torch.zeros(count, 0)
 
 
-def row_acts(task: Task, run: Path, row: str, seed: int, count: int) -> Act:
+def row_acts(run: Path, row: str, seed: int, count: int) -> Act:
     """Return the policy of `row` for `count` humanoids; latents come from the simulator's encoder."""
-    trained = PolicyFile.load(run / "train" / row / f"seed_{seed}" / "policy.safetensors")
-    grounds = method_named(row).grounds
-    folder = run / "ground" / base_method(row) / f"seed_{seed}"
-    grounding = load_grounding(folder / "grounding.safetensors") if grounds else NO_GROUNDING
-    policy = running(task, trained, grounding)
+    policy = replace(load_policy(run, row, seed=seed), target_encoder=None)
     policy.start(count)
     return lambda state: policy.act(state, no_goals(len(state)))
 
@@ -248,7 +240,7 @@ def main(
     task = task_named(recipe["task"])
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    model = load_history_model(run / "ground" / "nas" / f"seed_{seed}" / "grounding.safetensors")
+    model = load_history_model(run / "ground" / "nas" / f"seed_{seed}" / GROUNDING)
     env = task.target(HUMANOIDS, seed=seed)
     assert isinstance(env, HumanoidEnv)
     stood = [float(len(walk.state)) for walk in walks(straight, env)]
@@ -260,8 +252,8 @@ def main(
         model,
     )
     for row in ROWS:
-        print_falls(task, row, walks(row_acts(task, run, row, seed, HUMANOIDS), env), model)
-    teach(task, row_acts(task, run, "full_obs", seed, HUMANOIDS), env, rounds)
+        print_falls(task, row, walks(row_acts(run, row, seed, HUMANOIDS), env), model)
+    teach(task, row_acts(run, "full_obs", seed, HUMANOIDS), env, rounds)
 
 
 if __name__ == "__main__":
