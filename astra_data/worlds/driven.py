@@ -72,19 +72,6 @@ class DrivenSimulator:
 class VariedCommands(VariedSimulator):
     """B simulators of any kind, each with the parameters of a `CommandVariation`."""
 
-    @property
-    def state(self) -> Tensor:
-        """The states, (B, X) float32."""
-        return self.simulator.state
-
-    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the states in `rows` (n,), by default all, to `state` (n, X)."""
-        self.simulator.reset_to(state, rows)
-
-    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
-        return self.simulator.settle(before, landed)
-
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A), longer or shorter by an error of the row and with noise, clipped to ±1."""
         parameters = self.by_name()

@@ -200,9 +200,9 @@ class VariedSimulator(ABC):
         self.parameters = variation.draw(len(simulator.state), simulator.state.device)
 
     @property
-    @abstractmethod
     def state(self) -> Tensor:
-        """The observed states, (B, X) float32."""
+        """The observed states, (B, X) float32; unless a subclass has sensors, the true ones."""
+        return self.simulator.state
 
     @property
     def true_state(self) -> Tensor:
@@ -228,13 +228,13 @@ class VariedSimulator(ABC):
             name: column.unsqueeze(-1) for name, column in self.variation.by_name(self.parameters).items()
         }
 
-    @abstractmethod
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""
+        self.simulator.reset_to(state, rows)
 
-    @abstractmethod
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` to where `landed` is observed, both (B, X); return the observed states."""
+        return self.simulator.settle(before, landed)
 
     @abstractmethod
     def step(self, action: Tensor) -> Tensor:

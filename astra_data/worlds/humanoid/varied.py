@@ -21,10 +21,6 @@ class VariedHumanoid(VariedSimulator):
         """The observed states, (B, X) float32."""
         return self._scale * self.true_state
 
-    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
-        """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""
-        self.simulator.reset_to(state, rows)
-
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` to where `landed` is observed, both (B, X); return the observed states."""
         self.simulator.settle(before / self._scale, landed / self._scale)
