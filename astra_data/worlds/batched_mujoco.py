@@ -36,6 +36,24 @@ def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:
     return (walls[0], walls[-1]) if walls else None
 
 
+def views(model: mujoco.MjModel, state: Floats) -> tuple[Floats, Floats]:
+    """Return views of full states (B, N): positions (B, nq) and velocities (B, nv)."""
+    after_time, end = 1 + model.nq, 1 + model.nq + model.nv
+    return state[:, 1:after_time], state[:, after_time:end]
+
+
+def share_out(
+    rows: Iterable[int], pool: ThreadPoolExecutor, work: Callable[[int, Iterator[int]], None], threads: int
+) -> None:
+    """Have `threads`, the caller's and others of `pool`, `work` with their number on some of the `rows`."""
+    # All threads take rows from one iterator (its `next` is atomic), so that none waits for a slower one.
+    waiting = iter(rows)
+    helpers = [pool.submit(work, thread, waiting) for thread in range(1, threads)]
+    work(0, waiting)
+    for helper in helpers:
+        helper.result()
+
+
 class BatchedPhysics:
     """B independent copies of `model`, stepped `substeps` physics steps per control step.
 
@@ -76,9 +94,7 @@ class BatchedPhysics:
         self._watched = watched_geoms
         self._measure = measure
         self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))
-        after_time, end = 1 + model.nq, 1 + model.nq + model.nv
-        self.qpos: Floats = self.state[:, 1:after_time]
-        self.qvel: Floats = self.state[:, after_time:end]
+        self.qpos, self.qvel = views(model, self.state)
         self.touching: Bools = np.zeros(num_envs, dtype=bool)
         self._control: Floats = self.state[:, self.state.shape[1] - model.nu :]
         self._rows = list(self.state)
@@ -104,14 +120,11 @@ class BatchedPhysics:
     def step(self, control: Floats, active: Bools | None = None) -> None:
         """Apply `control` (B, nu) for one control step to the copies in `active` (B,), by default to all."""
         self._control[:] = control
-        # All threads take rows from one iterator (its `next` is atomic), so that none waits for a slower one.
-        waiting = iter(range(self.num_envs) if active is None else np.flatnonzero(active).tolist())
-        helpers = [self._pool.submit(self._step_rows, data, waiting) for data in self._data[1:]]
-        self._step_rows(self._data[0], waiting)
-        for helper in helpers:
-            helper.result()
+        rows = range(self.num_envs) if active is None else np.flatnonzero(active).tolist()
+        share_out(rows, self._pool, self._step_rows, self.num_threads)
 
-    def _step_rows(self, data: mujoco.MjData, rows: Iterator[int]) -> None:
+    def _step_rows(self, thread: int, rows: Iterator[int]) -> None:
+        data = self._data[thread]
         model, substeps, watched, measure = self.model, self.substeps, self._watched, self._measure
         get_state, set_state, step = mujoco.mj_getState, mujoco.mj_setState, mujoco.mj_step
         for row in rows:

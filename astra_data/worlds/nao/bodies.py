@@ -7,13 +7,14 @@ robot's own friction and stiffness are first written into the thread's copy of t
 import copy
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from math import atan2
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.worlds.batched_mujoco import wall_geoms
+from astra_data.worlds.batched_mujoco import share_out, views, wall_geoms
 from astra_data.worlds.nao.body import STIFFNESS_NM_PER_RAD, SUBSTEPS
 from astra_data.worlds.nao.kinematics import TO_MOTORS
 from astra_data.worlds.nao.steps import Bools, Floats
@@ -65,9 +66,7 @@ class BatchedBodies:
         self.style = style
         count = len(traits.stiffness)
         self.state: Floats = np.zeros((count, mujoco.mj_stateSize(model, _STATE)))
-        after_time, end = 1 + model.nq, 1 + model.nq + model.nv
-        self.qpos: Floats = self.state[:, 1:after_time]
-        self.qvel: Floats = self.state[:, after_time:end]
+        self.qpos, self.qvel = views(model, self.state)
         self.sent: Floats = np.zeros((count, longest_delay_ticks + TICKS, MOTORS))
         self.tilting: Floats = np.zeros((count, 2))
         self.held: Floats = np.zeros((count, MOTORS))
@@ -111,19 +110,12 @@ class BatchedBodies:
         before = self.sent.shape[1] - TICKS
         self.sent[rows, :before] = self.sent[rows, TICKS:]
         followed = np.zeros(len(self.fallen), dtype=np.intp)
-        # All threads take rows from one iterator (its `next` is atomic), so that none waits for a slower one.
-        waiting = iter(rows.tolist())
-        helpers = [
-            self._pool.submit(self._step_rows, thread, waiting, targets, noise, followed)
-            for thread in range(1, len(self._models))
-        ]
-        self._step_rows(0, waiting, targets, noise, followed)
-        for helper in helpers:
-            helper.result()
+        work = partial(self._step_rows, targets, noise, followed)
+        share_out(rows.tolist(), self._pool, work, len(self._models))
         return followed
 
     def _step_rows(
-        self, thread: int, rows: Iterator[int], targets: Targets, noise: Floats, followed: NDArray[np.intp]
+        self, targets: Targets, noise: Floats, followed: NDArray[np.intp], thread: int, rows: Iterator[int]
     ) -> None:
         model, data, traits = self._models[thread], self._data[thread], self.traits
         floor = model.geom("floor").id
