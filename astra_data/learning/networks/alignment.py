@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from astra_data.core.numbers import normalised
 from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures
+from astra_data.learning.networks.scales import add_scales, take_scales
 
 
 class TargetEncoder(nn.Module):
@@ -45,9 +46,7 @@ class TargetEncoder(nn.Module):
             embedding_size=embedding_size,
             latent_size=latent_size,
         )
-        for name, size in {"state": state_size, "goal": goal_size}.items():
-            self.register_buffer(f"{name}_mean", torch.zeros(size))
-            self.register_buffer(f"{name}_std", torch.ones(size))
+        add_scales(self, {"state": state_size, "goal": goal_size})
         self.state_mean: Tensor
         self.state_std: Tensor
         self.goal_mean: Tensor
@@ -58,11 +57,7 @@ class TargetEncoder(nn.Module):
 
         The entries `unseen` of states are given an infinite deviation, so that they are always 0 as inputs.
         """
-        for name, values in {"state": state, "goal": goal}.items():
-            if not values.numel():
-                continue
-            getattr(self, f"{name}_mean").copy_(values.mean(0))
-            getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
+        take_scales(self, {"state": state, "goal": goal})
         self.state_std[list(unseen)] = torch.inf
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:

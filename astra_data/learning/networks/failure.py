@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from astra_data.core.numbers import normalised
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
+from astra_data.learning.networks.scales import add_scales, take_scales
 
 AVERAGED_S = (0.25, 0.5, 1.0)
 """Time constants of the averages of the magnitudes, beside their present values."""
@@ -72,8 +73,7 @@ class FailureModel(nn.Module):
         )
         for name in ("wanted", "moved", "missed"):
             self.register_buffer(f"{name}_std", torch.ones(shape.state_size))
-        self.register_buffer("input_mean", torch.zeros(sizes))
-        self.register_buffer("input_std", torch.ones(sizes))
+        add_scales(self, {"input": sizes})
         self.register_buffer("log_odds_shift", torch.zeros(()))
         self.register_buffer("clearance", torch.zeros(shape.maze_cells))
         self.register_buffer("half_extent", torch.zeros(2))
@@ -101,8 +101,7 @@ class FailureModel(nn.Module):
 
     def set_input_scales(self, inputs: Tensor) -> None:
         """Take the means and deviations of inputs (N, I)."""
-        self.input_mean.copy_(inputs.mean(0))
-        self.input_std.copy_(inputs.std(0).clamp_min(1e-3))
+        take_scales(self, {"input": inputs})
 
     def initial_memory(
         self, state: Tensor, previous_action: Tensor, averages: Tensor | None = None

@@ -15,6 +15,7 @@ from torch.nn import functional
 from astra_data.core.numbers import normalised
 from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures, mlp
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
+from astra_data.learning.networks.scales import add_scales, take_scales
 
 TargetKind = Literal["ema", "detach", "online"]
 
@@ -89,9 +90,7 @@ class GroundingModel(nn.Module):
             for parameter in list(head.parameters())[-2:]:
                 nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
-        for name, size in {"state": states, "goal": shape.goal_size, "correction": states}.items():
-            self.register_buffer(f"{name}_mean", torch.zeros(size))
-            self.register_buffer(f"{name}_std", torch.ones(size))
+        add_scales(self, {"state": states, "goal": shape.goal_size, "correction": states})
         self.register_buffer("reward_mean", torch.zeros(()))
         self.register_buffer("reward_std", torch.ones(()))
         self.register_buffer("failure_cost", torch.zeros(()))
@@ -112,11 +111,7 @@ class GroundingModel(nn.Module):
 
     def set_scales(self, columns: Mapping[str, Tensor]) -> None:
         """Take means and deviations from training steps: state, goal, correction (N, ...)."""
-        for name, values in columns.items():
-            if not values.numel():
-                continue  # no goals
-            getattr(self, f"{name}_mean").copy_(values.mean(0))
-            getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(1e-3))
+        take_scales(self, columns)
 
     @torch.no_grad()
     def set_reward_scales(
