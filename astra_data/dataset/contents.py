@@ -16,7 +16,7 @@ from astra_data.dataset.lerobot_rows import RecordedFiles
 from astra_data.dataset.meta_files import read_description, read_info, read_subsets
 from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import data_files, episodes_files, read_footer, read_tasks
-from astra_data.dataset.seal import altered_files
+from astra_data.dataset.seal import SEALED, altered_files
 
 Ints = NDArray[np.int64]
 _LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
@@ -63,14 +63,7 @@ def read_contents(root: Path) -> Contents:
     Raises:
         CorruptDatasetError: files are missing or contradict each other; lists every fault.
     """
-    needed = (
-        layout.INFO_PATH,
-        layout.STATS_PATH,
-        layout.TASKS_PATH,
-        layout.DATASET_PATH,
-        layout.METADATA_PATH,
-        layout.SUBSETS_PATH,
-    )
+    needed = [layout.DATASET_PATH, *(path for path in SEALED if path != layout.DIGESTS_PATH)]
     missing = [path for path in needed if not (root / path).is_file()]
     if missing:
         raise CorruptDatasetError(f"{', '.join(missing)} missing")
