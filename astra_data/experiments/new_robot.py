@@ -157,14 +157,14 @@ def _toml(value: str | Sequence[str] | Sequence[float]) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _drive(folder: Path, drives: int = 60, steps: int = 150) -> None:
+def _drive(folder: Path) -> None:
     """Record a made-up cart that lags behind its commands and tips over in fast curves."""
     folder.mkdir()
     rng = np.random.default_rng(0)
     header = "t_s,x_m,y_m,heading_x,heading_y,v_m_s,w_rad_s,cmd_v_m_s,cmd_w_rad_s,tipped"
-    for drive in range(drives):
+    for drive in range(60):
         x, y, yaw, v, w, left, tilt, rows = 0.0, 0.0, rng.uniform(-math.pi, math.pi), 0.0, 0.0, 0, 0.0, []
-        for step in range(steps):
+        for step in range(150):
             if left == 0:
                 command, left = rng.uniform([-0.2, -1.5], [1.0, 1.5]), int(rng.integers(1, 21))
             left -= 1

@@ -72,7 +72,6 @@ def summary(
     squared: Mapping[str, Floats],
     piece: NDArray[np.int64],
     horizons_s: Sequence[float],
-    seed: int = 0,
     axes: Sequence[str] = AXES,
     judged: Sequence[str] = BODY_AXES,
 ) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
@@ -82,7 +81,6 @@ def summary(
         squared: squared errors of each model, (seeds, N, K, E), at the same N starts; "raw" among them.
         piece: index of the piece of each start, (N,).
         horizons_s: the K horizons.
-        seed: of the bootstrap, which resamples pieces: starts within a piece are not independent.
         axes: names of the E errors.
         judged: those that are averaged, the first of them.
 
@@ -92,7 +90,8 @@ def summary(
         models. The axis "mean" holds the means of these reductions over `judged`.
     """
     pieces, number = np.unique(piece, return_inverse=True)
-    rng = generator(seed, "walk bootstrap")
+    # The bootstrap resamples pieces: starts within a piece are not independent.
+    rng = generator(0, "walk bootstrap")
     weight = rng.multinomial(len(pieces), np.full(len(pieces), 1 / len(pieces)), REPLICATES).astype(float)
     weight = np.vstack([np.ones(len(pieces)), weight])
     rmse = {name: _rmse(values.mean(0), number, weight) for name, values in squared.items()}

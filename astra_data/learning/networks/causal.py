@@ -10,6 +10,8 @@ from torch.nn.functional import elu
 
 from astra_data.core.config import AtOnce, Config, Count, NotNegative, Positive, Share
 
+_HIDDEN_SIZE, _FEATURE_SIZE = 64, 32
+
 _STEPS = 200
 """Gradient steps that move causes."""
 
@@ -40,15 +42,15 @@ class CausalModel(nn.Module):
         logits: of the mask's probabilities, (I, J).
     """
 
-    def __init__(self, causes: int, effects: int, *, hidden_size: int = 64, feature_size: int = 32) -> None:
+    def __init__(self, causes: int, effects: int) -> None:
         super().__init__()
         self.logits = nn.Parameter(torch.full((causes, effects), 3.0))
-        self.cause_code = nn.Parameter(torch.randn(causes, hidden_size))
-        self.cause_weight = nn.Parameter(torch.randn(hidden_size))
-        self.encoder = nn.Linear(hidden_size, feature_size)
-        self.effect_code = nn.Parameter(torch.randn(effects, hidden_size))
-        self.decoder = nn.Linear(feature_size, hidden_size)
-        self.output = nn.Linear(hidden_size, 1)
+        self.cause_code = nn.Parameter(torch.randn(causes, _HIDDEN_SIZE))
+        self.cause_weight = nn.Parameter(torch.randn(_HIDDEN_SIZE))
+        self.encoder = nn.Linear(_HIDDEN_SIZE, _FEATURE_SIZE)
+        self.effect_code = nn.Parameter(torch.randn(effects, _HIDDEN_SIZE))
+        self.decoder = nn.Linear(_FEATURE_SIZE, _HIDDEN_SIZE)
+        self.output = nn.Linear(_HIDDEN_SIZE, 1)
 
     @property
     def probability(self) -> Tensor:

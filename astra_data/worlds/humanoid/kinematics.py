@@ -75,9 +75,11 @@ class HumanoidKinematics(FreeStates):
     )
     abstraction = staticmethod(humanoid_to_kinematics)
 
-    def __init__(self, num_envs: int, *, ranges: CommandRanges | None = None, device: str = "cpu") -> None:
-        """Set B humanoids' joints to zero; `ranges` are the joint angles of commands."""
-        self.ranges = ranges or CommandRanges()
+    ranges = CommandRanges()
+    """Joint angles of commands."""
+
+    def __init__(self, num_envs: int, *, device: str = "cpu") -> None:
+        """Set B humanoids' joints to zero."""
         standing = type(self).abstraction(torch.tensor(STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
         self._damping = torch.from_numpy(humanoid_model().dof_damping[-_COUNT:]).float().to(device)
@@ -138,23 +140,15 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
     )
     abstraction = staticmethod(humanoid_to_extended_kinematics)
 
-    def __init__(
-        self,
-        num_envs: int,
-        *,
-        ranges: CommandRanges | None = None,
-        follow_s: float = 0.3,
-        device: str = "cpu",
-    ) -> None:
+    def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
         """Build B standing humanoids.
 
         Args:
             num_envs: B.
-            ranges: joint angles of commands.
             follow_s: time constant of the body's velocity and angular velocity, above 0.
             device: torch device.
         """
-        super().__init__(num_envs, ranges=ranges, device=device)
+        super().__init__(num_envs, device=device)
         self.follow_s = follow_s
 
     @property

@@ -66,8 +66,6 @@ class BatchedNao:
         maze: Maze | None = None,
         ball: bool = False,
         spread: TraitSpread | None = None,
-        limits: WalkLimits | None = None,
-        style: WalkStyle | None = None,
         num_threads: int | None = None,
     ) -> None:
         """Build B robots standing at the origin.
@@ -78,14 +76,12 @@ class BatchedNao:
             maze: walls, by default none.
             ball: give each robot a ball.
             spread: ranges of the traits.
-            limits: of the walk.
-            style: of the walk.
             num_threads: by default one per core.
         """
         self.num_robots = num_robots
         self.spread = spread or TraitSpread()
         self.has_ball = ball
-        self._limits, style = limits or WalkLimits(), style or WalkStyle()
+        self._limits, style = WalkLimits(), WalkStyle()
         self._seed, self._steps = seed, 0
         rng = np.random.default_rng(seed)
         self.traits = Traits.draw(self.spread, num_robots, rng)
