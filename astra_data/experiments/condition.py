@@ -19,13 +19,13 @@ from astra_data.dataset.lineage import Ancestor, lineage
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
+from astra_data.exchange.sharing.address import is_address
 from astra_data.experiments.execution import Item
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment
 from astra_data.experiments.plan import stage_of
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.reports.artefacts import Evaluation, read_json
 from astra_data.reports.choice import Judged
-from astra_data.stages.label import is_address
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.training.policy_file import PolicyFile
 

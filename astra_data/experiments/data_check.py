@@ -8,11 +8,12 @@ from astra_data.dataset.edit import share
 from astra_data.dataset.lineage import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
+from astra_data.exchange.sharing.address import is_address
 from astra_data.experiments.condition import Condition
 from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.paired_episodes import divided
 from astra_data.methods import method_named
-from astra_data.stages.label import check_fits, is_address, remarks
+from astra_data.stages.label import check_fits, remarks
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.registry import task_named
 

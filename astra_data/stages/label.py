@@ -28,9 +28,9 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.endings import outcome_of
 from astra_data.dataset.expected_columns import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import open_dataset, successor
+from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.exchange.sharing.pull import pull
+from astra_data.exchange.sharing.pull import opened
 from astra_data.worlds.expecting import judged, paid
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.registry import task_named
@@ -72,7 +72,7 @@ def label(
         >>> from astra_data import label
         >>> labelled = label("antmaze-umaze", data="walks", out=Path("labelled"))  # lacks nothing: a link
     """
-    world, source = task_named(task), _opened(data)
+    world, source = task_named(task), opened(data)
     check_fits(source, world)
     more = [
         column
@@ -188,18 +188,6 @@ def _failed_at_its_goal(task: Task, labelled: Episode) -> bool:
     after = torch.from_numpy(np.ascontiguousarray(task.abstraction(last[NEXT_STATE]), dtype=np.float32))
     goal = torch.from_numpy(last.get(GOAL, np.empty((1, 0), np.float32)))
     return bool(judged(task.objective, "reached", after, goal))
-
-
-def _opened(data: str | Path) -> Dataset:
-    """Open a dataset here, or pull it."""
-    return pull(str(data)) if is_address(data) else open_dataset(data)
-
-
-def is_address(data: str | Path) -> bool:
-    """Return whether `data` is an address to pull from, such as user/name or s3://…, and no folder here."""
-    if Path(data).is_dir():
-        return False
-    return "://" in str(data) or (len(Path(data).parts) == 2 and not str(data).startswith((".", "/")))
 
 
 def _goals(task: Task, episode: Episode, seed: int) -> Tensor:

@@ -67,3 +67,10 @@ def parse_source(text: str) -> tuple[Place, Version | None]:
     if named is None:
         return parse_place(text), None
     return parse_place(text[: named.start()]), Version.parse(named["version"])
+
+
+def is_address(data: str | Path) -> bool:
+    """Return whether `data` is an address to pull from, such as user/name or s3://…, and no folder here."""
+    if Path(data).is_dir():
+        return False
+    return "://" in str(data) or (len(Path(data).parts) == 2 and not str(data).startswith((".", "/")))

@@ -13,8 +13,8 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.atomic import publish
 from astra_data.dataset.description import NAME
 from astra_data.dataset.doctor.check import check
-from astra_data.dataset.versions import Version, home_of
-from astra_data.exchange.sharing.address import Hub, parse_source
+from astra_data.dataset.versions import Version, home_of, open_dataset
+from astra_data.exchange.sharing.address import Hub, is_address, parse_source
 from astra_data.exchange.sharing.fetch import fetch, refuse_planted
 from astra_data.exchange.sharing.hub import HubStore
 from astra_data.exchange.sharing.store import RemoteFolder, Store
@@ -93,6 +93,15 @@ def pull(
     except OSError as error:
         raise BadInputError(f"{target} cannot be written ({error}); choose another folder.") from error
     return Dataset.open(target)
+
+
+def opened(data: str | Path) -> Dataset:
+    """Open a dataset here, or pull it.
+
+    Raises:
+        BadInputError, CorruptDatasetError, SharingError: as `open_dataset` and `pull`.
+    """
+    return pull(str(data)) if is_address(data) else open_dataset(data)
 
 
 def _fetch_all(
