@@ -4,7 +4,7 @@ from functools import partial
 from typing import get_args
 
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE, Column
-from astra_data.worlds.abstraction import ant_beyond_point_mass, ant_to_point_mass
+from astra_data.worlds.ant.abstraction import ant_beyond_point_mass, ant_to_point_mass
 from astra_data.worlds.ant.body import TIMESTEP_S, WALL_REACH_M
 from astra_data.worlds.ant.target import AntMazeEnv
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze

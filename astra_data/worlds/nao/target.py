@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.abstraction import NAO_STATE_SIZE
 from astra_data.worlds.batched import Step
+from astra_data.worlds.nao.abstraction import STATE_SIZE
 from astra_data.worlds.nao.perception import BallSight, Localisation, PerceptionErrors
 from astra_data.worlds.nao.robot import CONTROL_STEP_S, BatchedNao
 from astra_data.worlds.objective import PlanarObjective
@@ -29,10 +29,6 @@ _STANDING = 0.05
 """Robots do not turn at shorter commands."""
 _FOOT_LOAD_N = 50.0
 """Scale of the pressures on the soles."""
-STATE_SIZE = NAO_STATE_SIZE
-"""Estimated x, y, cos and sin of the heading, planned velocity x, y in the world, angles (11) of the legs'
-joints, gyroscope (3), tilt (2), load (2) of the feet, phase (2) of the step, planned velocity (3) in the
-body."""
 BALL_SIZE = 5
 """With a ball there follow its estimated position (2) and velocity (2), and the time since it was seen."""
 

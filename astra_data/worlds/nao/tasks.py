@@ -9,11 +9,11 @@ from functools import partial
 from typing import Any
 
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE, Column
-from astra_data.worlds.abstraction import nao_beyond, nao_to_ball_agent, nao_to_point_mass
+from astra_data.worlds.nao.abstraction import STATE_SIZE, nao_beyond, nao_to_ball_agent, nao_to_point_mass
 from astra_data.worlds.nao.body import TICK_S
 from astra_data.worlds.nao.kinematics import JOINTS
 from astra_data.worlds.nao.robot import CONTROL_STEP_S
-from astra_data.worlds.nao.target import BALL_SIZE, SPEED_M_S, STATE_SIZE, NaoEnv
+from astra_data.worlds.nao.target import BALL_SIZE, SPEED_M_S, NaoEnv
 from astra_data.worlds.plane.ball_agent import BallAgent
 from astra_data.worlds.plane.kicking import Kicking
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
