@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
@@ -121,6 +121,23 @@ def understood(
         raise BadInputError(
             f"{path}: expected {what} as this version writes it, found {found}: run that stage again"
         ) from error
+
+
+def as_part(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """Return the tensors of a `part` of what a file holds, by their names in the file."""
+    return {f"{part}.{name}": tensor for name, tensor in tensors.items()}
+
+
+def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """Return the tensors of a `part`, by their names within it: what `as_part` was given."""
+    prefix = f"{part}."
+    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
+
+
+def loaded[Module: nn.Module](model: Module, weights: Mapping[str, Tensor], device: str = "cpu") -> Module:
+    """Return `model` with these weights, on `device`, frozen and out of training."""
+    model.load_state_dict(weights)
+    return model.to(device).requires_grad_(False).eval()
 
 
 def _is_usable(name: str, tensor: Tensor) -> bool:

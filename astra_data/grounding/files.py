@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import cast
 
-from astra_data.core.checkpoint import save_tensors, understood
+from astra_data.core.checkpoint import loaded, save_tensors, understood
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -73,6 +73,4 @@ def load_target_encoder(path: Path | str) -> TargetEncoder:
         BadInputError: the file is missing, holds something else, or is from an older version.
     """
     with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), "cpu") as (tensors, metadata):
-        encoder = TargetEncoder(**metadata["sizes"])
-        encoder.load_state_dict(tensors)
-    return encoder.requires_grad_(False).eval()
+        return loaded(TargetEncoder(**metadata["sizes"]), tensors)

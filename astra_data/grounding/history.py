@@ -5,9 +5,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
+from astra_data.core.checkpoint import as_part, loaded, part_of
 from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
@@ -97,14 +98,14 @@ class HistoryGrounding(FittedGrounding):
         metadata: dict[str, Any] = {"shape": asdict(self.model.shape), "target": self.model.target}
         for part, model in ((_FAILURES, self.failures), (_SCATTER, self.scatter_model)):
             if model is not None:
-                tensors |= _named(part, model)
+                tensors |= as_part(model.state_dict(), part)
                 metadata[part] = asdict(model.shape)
         if self.clearance_m is not None:
             metadata["clearance_m"] = self.clearance_m
         if self.members:
             metadata[_MEMBERS] = len(self.members)
         for number, member in enumerate(self.members):
-            tensors |= _named(f"{_MEMBERS}.{number}", member)
+            tensors |= as_part(member.state_dict(), f"{_MEMBERS}.{number}")
         return tensors, metadata
 
     @classmethod
@@ -115,31 +116,15 @@ class HistoryGrounding(FittedGrounding):
         shape, failures, scatter_model = GroundingShape(**_tuples(metadata["shape"])), None, None
         if _FAILURES in metadata:
             failures = FailureModel(FailureShape(**_tuples(metadata[_FAILURES])))
-            failures = _loaded(failures, _within(tensors, _FAILURES), device)
+            failures = loaded(failures, part_of(tensors, _FAILURES), device)
         if _SCATTER in metadata:
             scatter_model = ScatterModel(ScatterShape(**_tuples(metadata[_SCATTER])))
-            scatter_model = _loaded(scatter_model, _within(tensors, _SCATTER), device)
-        others = [_within(tensors, f"{_MEMBERS}.{number}") for number in range(metadata.get(_MEMBERS, 0))]
+            scatter_model = loaded(scatter_model, part_of(tensors, _SCATTER), device)
+        others = [part_of(tensors, f"{_MEMBERS}.{number}") for number in range(metadata.get(_MEMBERS, 0))]
         model, *members = (
-            _loaded(GroundingModel(shape, metadata["target"]), weights, device) for weights in (own, *others)
+            loaded(GroundingModel(shape, metadata["target"]), weights, device) for weights in (own, *others)
         )
         return cls(model, failures, tuple(members), metadata.get("clearance_m"), scatter_model)
-
-
-def _loaded[Module: nn.Module](model: Module, weights: Mapping[str, Tensor], device: str) -> Module:
-    model.load_state_dict(weights)
-    return model.to(device).requires_grad_(False).eval()
-
-
-def _named(part: str, model: nn.Module) -> dict[str, Tensor]:
-    """Return the tensors of a model that is a `part` of a grounding, by their names in files."""
-    return {f"{part}.{name}": one for name, one in model.state_dict().items()}
-
-
-def _within(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    """Return the tensors of a `part`, by their names within it: what `_named` was given."""
-    prefix = f"{part}."
-    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
 def _tuples(shape: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from astra_data.core.checkpoint import loaded
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding
 from astra_data.grounding.simulator import EpisodeSimulator
@@ -101,6 +102,4 @@ class ResidualGrounding(FittedGrounding):
     @classmethod
     def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
         """Read what `to_file` returned."""
-        model = ResidualModel(ResidualShape(**metadata["shape"]))
-        model.load_state_dict(tensors)
-        return cls(model.to(device).requires_grad_(False).eval())
+        return cls(loaded(ResidualModel(ResidualShape(**metadata["shape"])), tensors, device))

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.core.checkpoint import save_tensors, understood
+from astra_data.core.checkpoint import as_part, part_of, save_tensors, understood
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
@@ -29,8 +29,8 @@ _KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
     "adaptive": (Student, AdaptiveShape),
     "soft_actor": (SoftActor, PolicyShape),
 }
-_PREFIX = "policy."
-"""Of the names of a policy's tensors."""
+_PART = "policy"
+"""Of the tensors of a file: the policy's networks."""
 
 
 def add_policy_kind(made: type[SavedPolicy]) -> None:
@@ -84,7 +84,7 @@ class PolicyFile:
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
         kind, networks, own = _taken_apart(self.policy)
-        tensors = {f"{_PREFIX}{name}": tensor for name, tensor in networks.items()}
+        tensors = as_part(networks, _PART)
         metadata: dict[str, Any] = own | {
             "kind": kind,
             "shape": asdict(self.policy.shape),
@@ -111,12 +111,7 @@ class PolicyFile:
             BadInputError: the file is missing, holds something else, or is from an older version.
         """
         with understood(Path(path), "a policy", {**_KINDS, **KINDS}, device) as (tensors, metadata):
-            networks = {
-                name.removeprefix(_PREFIX): value
-                for name, value in tensors.items()
-                if name.startswith(_PREFIX)
-            }
-            policy = _put_together(networks, metadata)
+            policy = _put_together(part_of(tensors, _PART), metadata)
             simulation = None
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
