@@ -95,6 +95,12 @@ class Logs:
             return 1 / usual, 1 / float(regular.mean())
         return ()
 
+    @property
+    def failed(self) -> list[bool]:
+        """Whether a field says of each episode that it fails; never without such a field."""
+        flags = self.of("failure")
+        return [any(bool(episode[field.name].any()) for field in flags) for episode in self.episodes]
+
     def of(self, role: Role) -> tuple[Field, ...]:
         """Return the fields with a role."""
         return tuple(field for field in self.fields if field.role == role)

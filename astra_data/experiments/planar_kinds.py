@@ -93,7 +93,7 @@ class Planar:
             )
         poses = self.states()
         starts = np.array([pose[0] for pose in poses])
-        goal, close = typical([pose[:, :2] for pose in poses])
+        goal, close = typical([pose[:, :2] for pose in poses], self.logs.failed)
         before = np.array([[0.0, 0.0, math.pi / 2]])
         command = np.array([[float(meaning != "turn") for meaning in self.meanings]])
         along, is_in_world = self._along(), "east" in self.meanings

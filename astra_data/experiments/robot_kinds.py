@@ -91,7 +91,7 @@ class Direct:
         episodes = self.states()
         starts = np.array([values[0] for values in episodes])
         span = np.ptp(np.concatenate(episodes), axis=0)
-        goal, close = typical([values / span for values in episodes])
+        goal, close = typical([values / span for values in episodes], self.logs.failed)
         actions, moved = len(self.logs.of("command")), len(self.moved)
         command = "command" if actions == moved else f"command[:, :{moved}]"
         rate = f"self.state + TIMESTEP_S * {command}"

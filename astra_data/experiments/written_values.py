@@ -1,24 +1,25 @@
 """Values of logs as they are written into the files of a new robot."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from astra_data.exchange.logs import Floats
 
 
-def typical(episodes: list[Floats]) -> tuple[Floats, float]:
+def typical(episodes: Sequence[Floats], failed: Sequence[bool]) -> tuple[Floats, float]:
     """Return the end (D,) of the episode whose way from its start is the median, and a tenth of the way.
 
-    Where that ends as it began, it is a tenth of the farthest way that an episode went, or else of how far
-    episodes lie apart.
+    Episodes that failed have no say in that, unless all did. Where the episode ends as it began, it is a
+    tenth of the farthest way that any went, or else of how far they lie apart.
     """
-    ways = [float(np.linalg.norm(values[-1] - values[0])) for values in episodes]
+    kept = [values for values, fails in zip(episodes, failed, strict=True) if not fails] or episodes
+    ways = [float(np.linalg.norm(values[-1] - values[0])) for values in kept]
     typical = int(np.argsort(ways)[len(ways) // 2])
     farthest = max(float(np.linalg.norm(values - values[0], axis=1).max()) for values in episodes)
     apart = float(np.linalg.norm(np.ptp(np.concatenate(episodes), axis=0)))
-    return episodes[typical][-1], (ways[typical] or farthest or apart) / 10
+    return kept[typical][-1], (ways[typical] or farthest or apart) / 10
 
 
 def numbers(values: Iterable[float] | Floats, brackets: str = "[]") -> str:

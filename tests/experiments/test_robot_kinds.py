@@ -77,6 +77,23 @@ def test_starts_and_the_goal_are_those_of_the_episodes(tmp_path: Path) -> None:
     assert (values["range"], values["close"]) == ("(98.0,)", f"{28 / 98 / 10:.2g}")  # of the range
 
 
+@pytest.mark.parametrize(
+    ("crashed", "end"),
+    [((), 24), ((1,), 49), ((1, 2), 9), ((0, 1, 2), 24)],
+)
+def test_the_goal_is_no_place_of_a_collision_unless_all_ended_so(
+    tmp_path: Path, crashed: tuple[int, ...], end: int
+) -> None:
+    lengths = [10, 15, 25]  # the second one goes as far as the median
+    episode, last = np.repeat([0, 1, 2], lengths), np.isin(T, np.cumsum(lengths) - 1)
+    flags = {"collision": last & np.isin(episode, crashed)} if crashed else {}
+    pose = {"x": 2 * T, "y": -T, "yaw": T % 5 / 9}
+    planar = Planar.of(logs(tmp_path, episode=episode, **pose, cmd_v=T % 5, cmd_w=T % 2, **flags))
+    assert planar is not None and planar.values()["goal"] == f"({2.0 * end}, {-1.0 * end})"
+    direct = Direct.of(logs(tmp_path, episode=episode, a=2 * T, cmd_a=T % 5, **flags))
+    assert direct.values()["goal"] == f"({2.0 * end},)"
+
+
 def test_others_are_no_unicycle(tmp_path: Path) -> None:
     pose = {"x": T, "y": T % 9, "yaw": T % 3}
     for columns in (
