@@ -29,7 +29,7 @@ def new(
     """Begin with a robot of your own: a task, a recipe, a mapping of its logs, a test and a page."""
     from rich.table import Table
 
-    from astra_data.experiments.kind_errors import JUDGED_STEPS, is_of_no_use
+    from astra_data.experiments.kind_errors import JUDGED_STEPS, badly_predicted
     from astra_data.experiments.new_robot import write_robot
 
     folder = out or Path(name)
@@ -40,9 +40,10 @@ def new(
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
     show_table(table)
     typer.echo(f"abstract simulator: {kind.simulator}")
-    if is_of_no_use(kind):
+    if worse := badly_predicted(kind):
+        which = "each state" if len(worse) == len(kind.names) else " and ".join(worse)
         typer.echo(
-            f"after {JUDGED_STEPS} steps it predicts each state of the logs worse than standing still does: "
+            f"after {JUDGED_STEPS} steps it predicts {which} of the logs worse than standing still does: "
             f"edit `step` in {folder}/{name}.py"
         )
     if not found.of("time"):

@@ -9,6 +9,8 @@ from astra_data.exchange.logs import Floats, Logs
 
 JUDGED_STEPS = 10
 """After so many steps a simulator should be better than nothing."""
+_CLEARLY = 1.05
+"""Errors that are larger by less than this factor may be chance."""
 
 
 class Kind(Protocol):
@@ -17,6 +19,11 @@ class Kind(Protocol):
     @property
     def logs(self) -> Logs:
         """What was recorded."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What the states are called."""
         ...
 
     @property
@@ -33,10 +40,11 @@ class Kind(Protocol):
         ...
 
 
-def is_of_no_use(kind: Kind) -> bool:
-    """Return whether standing still predicts each state better after `JUDGED_STEPS`."""
+def badly_predicted(kind: Kind) -> list[str]:
+    """Return the names of the states that standing still predicts clearly better after `JUDGED_STEPS`."""
     simulated, still = errors(kind, JUDGED_STEPS)
-    return bool((simulated > still).all())
+    worse = simulated > _CLEARLY * still
+    return [name for name, is_worse in zip(kind.names, worse, strict=True) if is_worse]
 
 
 def errors(kind: Kind, steps: int) -> tuple[Floats, Floats]:

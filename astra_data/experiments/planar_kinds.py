@@ -44,6 +44,12 @@ class Planar:
         return f"a {self.called}: {moved}, driven by {commands}"
 
     @property
+    def names(self) -> tuple[str, str, str]:
+        """What x, y and the angle are called in the logs."""
+        x, y, heading = (field.short for field in (*self.position, self.heading[0]))
+        return x, y, heading if len(self.heading) == 1 else heading.removesuffix("_x")
+
+    @property
     def meanings(self) -> list[str]:
         """What each command is: "turn" for a rate of turning, and for others names of speeds."""
         commands = self.logs.of("command")

@@ -46,6 +46,11 @@ class Direct:
         )
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """What the states are called."""
+        return tuple(field.short for field in self.moved)
+
+    @property
     def angles(self) -> tuple[bool, ...]:
         """Which of the states are headings, of which whole turns do not count."""
         return tuple(HEADING.fullmatch(field.short) is not None for field in self.moved)
@@ -105,7 +110,7 @@ class Direct:
         }[tuple(sorted(set(self.is_rate)))]
         before, given = np.arange(moved, dtype=float), np.ones(actions)
         return {
-            "names": texts(field.short for field in self.moved),
+            "names": texts(self.names),
             "units": texts(field.unit for field in self.moved),
             "goal": numbers(goal * span, "()"),
             "close": f"{close:.2g}",
