@@ -21,7 +21,7 @@ from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TER
 from astra_data.exchange.field_names import Role
 from astra_data.exchange.guessing import guess
 from astra_data.exchange.logs import Logs
-from astra_data.experiments.planar_kinds import Holonomic, Planar
+from astra_data.experiments.planar_kinds import Bicycle, Holonomic, Planar
 from astra_data.experiments.robot_kinds import Direct
 from astra_data.experiments.written_values import significant, texts
 
@@ -56,7 +56,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
         if not places:
             _drive(folder / "logs")
         found = guess(places or [folder / "logs"])
-        kind = Holonomic.of(found) or Planar.of(found) or Direct.of(found)
+        kind = Holonomic.of(found) or Bicycle.of(found) or Planar.of(found) or Direct.of(found)
         values = _common(name, found) | kind.values()
         values["simulator"] = kind.simulator
         values["logs"] = shlex.join(map(str, places)) or "logs"

@@ -14,6 +14,7 @@ from astra_data.experiments.kind_errors import errors
 from astra_data.experiments.written_values import numbers, typical
 
 _TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|(?<!th)rot|steer).*")
+_STEERING = re.compile(r"(.+_)?steer(ing)?(_?(angle|ang))?")
 _SPEED_AXIS = re.compile(r"(.+_)?(v|vel|velocity|linear)_?[xy]")
 
 
@@ -74,14 +75,18 @@ class Planar:
         """Return where x, y and the angle (B, 3) land by commands (B, A)."""
         given = dict(zip(self.meanings, command.T, strict=True))
         east, north = self._speeds(given, np.cos(state[:, 2]), np.sin(state[:, 2]))
-        return state + np.stack([east, north, given["turn"]], axis=-1) / self.logs.rate
+        return state + np.stack([east, north, self._turn(given)], axis=-1) / self.logs.rate
 
     def _speeds(self, given: dict[str, Floats], cos: Floats, sin: Floats) -> tuple[Floats, Floats]:
         """Return the speeds (B,) along x and y, of commands (B,) by their meaning."""
         return given["speed"] * cos, given["speed"] * sin
 
+    def _turn(self, given: dict[str, Floats]) -> Floats:
+        """Return the rate of turning (B,), of commands (B,) by their meaning."""
+        return given["turn"]
+
     def _along(self) -> str:
-        """Return the line of code that `_speeds` is in a simulator."""
+        """Return the lines of code that `_speeds` and `_turn` are in a simulator."""
         return "east, north = speed * yaw.cos(), speed * yaw.sin()"
 
     def values(self) -> dict[str, str]:
@@ -112,6 +117,8 @@ class Planar:
             "along": f"\n        {along}" if along else "",
             "seen": "east, north" if is_in_world else seen,
             "seen_from": "from where the robot is" if is_in_world else "as the robot sees it",
+            "constant": "",
+            "parameter": "",
             "goal": numbers(goal, "()"),
             "close": f"{close:.2g}",
             "lows": numbers(starts.min(axis=0)),
@@ -121,6 +128,65 @@ class Planar:
             "command": numbers(command[0]),
             "after": numbers(_unit_vector(self.step(before, command)[0]).round(9)),
         }
+
+
+@dataclass(frozen=True)
+class Bicycle(Planar):
+    """A position, a heading, and commands of speed and of a steering angle: a car.
+
+    Attributes:
+        wheelbase_m: from axle to axle, as fitted to the logs; negative where it steers to the right.
+    """
+
+    wheelbase_m: float = 1.0
+
+    called = "bicycle"
+
+    @property
+    def simulator(self) -> str:
+        """What it is and what moves it, in a few words."""
+        side = ", steered to the right" if self.wheelbase_m < 0 else ""
+        return f"{super().simulator}, wheelbase {abs(self.wheelbase_m):g} m{side}"
+
+    @property
+    def meanings(self) -> list[str]:
+        """What each command is: "angle" for that of steering, and "speed"."""
+        return ["angle" if meaning == "turn" else meaning for meaning in super().meanings]
+
+    @classmethod
+    def of(cls, logs: Logs) -> Self | None:
+        """Return how it fits; None if it does not, or turns less like the logs than a unicycle."""
+        unicycle = Planar.of(logs)
+        if unicycle is None:
+            return None
+        steering = logs.of("command")[unicycle.meanings.index("turn")]
+        if steering.unit not in ("1", "rad") or not _STEERING.fullmatch(steering.short):
+            return None
+        unit = cls(logs, unicycle.position, unicycle.heading)
+        expected, turned = [], []
+        for states, commands in zip(unit.states(), logs.values(logs.of("command")), strict=True):
+            expected.append((unit.step(states[:-1], commands[:-1]) - states[:-1])[:, 2])
+            turned.append(np.diff(states[:, 2]))
+        by_metre, rates = np.concatenate(expected), np.concatenate(turned)
+        share = float(by_metre @ np.arctan2(np.sin(rates), np.cos(rates)))
+        if share == 0:
+            return None
+        wheelbase_m = float(f"{by_metre @ by_metre / share:.3g}")
+        bicycle = cls(logs, unicycle.position, unicycle.heading, wheelbase_m)
+        return bicycle if errors(bicycle, 1)[0][2] < errors(unicycle, 1)[0][2] else None
+
+    def values(self) -> dict[str, str]:
+        """Return what its templates name."""
+        constant = f"\nWHEELBASE_M = {abs(self.wheelbase_m)!r}  # CHECK: fitted to the logs"
+        return super().values() | {"constant": constant, "parameter": ', "wheelbase_m": WHEELBASE_M'}
+
+    def _turn(self, given: dict[str, Floats]) -> Floats:
+        turn: Floats = given["speed"] * np.tan(given["angle"]) / self.wheelbase_m
+        return turn
+
+    def _along(self) -> str:
+        speed = "-speed" if self.wheelbase_m < 0 else "speed"
+        return f"turn = {speed} * angle.tan() / WHEELBASE_M\n        {super()._along()}"
 
 
 @dataclass(frozen=True)
