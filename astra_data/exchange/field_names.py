@@ -35,6 +35,8 @@ UNCLEAR = "done|truncated|timeout"
 """Ends of which the name does not say whether they are successes, failures or neither."""
 FORCE = re.compile(r"(.+_)?(tau|torque|effort)(_.+|\d+)?")
 """A command where there is no other."""
+PEDAL = re.compile(r"throttle|brake|steer(ing)?(_angle)?")
+"""Likewise, in a car."""
 UNITS: tuple[tuple[str, str, float], ...] = (
     ("mm_s", "m/s", 1e-3),
     ("cm_s", "m/s", 1e-2),

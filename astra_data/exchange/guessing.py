@@ -24,6 +24,7 @@ from astra_data.exchange.field_names import (
     GOAL,
     LENGTH,
     NAMES,
+    PEDAL,
     PLACE_TO_GO,
     TIMES,
     UNCLEAR,
@@ -97,15 +98,15 @@ def _filled(table: dict[str, Floats]) -> list[str]:
 
 
 def _distinct(fields: list[Field]) -> tuple[Field, ...]:
-    """Return the fields, with forces as commands where there are no others.
+    """Return the fields, with forces, or pedals and a wheel, as commands where there are no others.
 
     Raises:
         BadInputError: two states, or two commands, come to the same name.
     """
     if not any(field.role == "command" for field in fields):
         fields = [
-            replace(field, role="command", why="a force, and no other command") if _is_force(field) else field
-            for field in fields
+            replace(field, role="command", why=f"{why}, and no other command") if why else field
+            for field, why in ((field, _may_command(field)) for field in fields)
         ]
     ends = set[Role]()
     # What is a failure for want of another one comes last.
@@ -145,7 +146,7 @@ def _places_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) 
         for field, body in zip(fields, bodies, strict=True)
         if field.role == "command" and PLACE_TO_GO.fullmatch(body) and _stays(field.name, tables)
     }
-    if not any(field.role == "command" or _is_force(field) for field in fields if field.name not in stay):
+    if not any(field.role == "command" or _may_command(field) for field in fields if field.name not in stay):
         return list(fields)
     return [
         replace(field, role="goal", why="one place in each episode") if field.name in stay else field
@@ -153,8 +154,11 @@ def _places_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) 
     ]
 
 
-def _is_force(field: Field) -> bool:
-    return field.role == "state" and FORCE.fullmatch(field.short) is not None
+def _may_command(field: Field) -> str:
+    """Return why a state is a command where there is no other; nothing for what is none."""
+    if field.role != "state":
+        return ""
+    return "a force" if FORCE.fullmatch(field.short) else "its name" if PEDAL.fullmatch(field.short) else ""
 
 
 def _times_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> list[Field]:

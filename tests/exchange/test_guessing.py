@@ -165,6 +165,25 @@ def test_forces_are_commands_where_there_are_no_others(tmp_path: Path) -> None:
     assert taken[2:] == ["state tau1", "state tau2", "command u1", "command u2"]
 
 
+def test_pedals_and_a_wheel_are_commands_where_there_are_no_others(tmp_path: Path) -> None:
+    car = {"x": RAMP, "throttle": RAMP % 3, "steering_angle": 10 * RAMP, "brake": RAMP % 4}
+    fields = guess([write(tmp_path / "a.csv", car)]).fields
+    assert [field.taken_for for field in fields] == [
+        "state x",
+        "command throttle",
+        "command steering_angle",
+        "command brake",
+    ]
+    assert (fields[1].why, fields[2].unit) == ("its name, and no other command", "rad")  # 50 are degrees
+    for name in ("steer", "steering", "Steering Angle", "steer_angle", "steering_deg"):
+        assert roles(tmp_path / "b", {"x": RAMP, name: RAMP})[name] == "command"
+    for name in ("cmd_v", "u1", "target_speed"):
+        found = roles(tmp_path / "c", car | {name: -RAMP})
+        assert [*found.values()] == ["state"] * 4 + ["command"]
+    placed = roles(tmp_path / "d", *({**car, "target_x": 1.0 + number} for number in range(2)))
+    assert (placed["target_x"], placed["throttle"]) == ("goal", "command")
+
+
 def test_an_axis_is_no_unit(tmp_path: Path) -> None:
     columns = {"x": RAMP, "cmd_v": RAMP, "u_a": RAMP, "motor_v": RAMP, "cmd_deg": RAMP}
     logs = guess([write(tmp_path / "log.csv", columns)])
