@@ -8,4 +8,4 @@ from astra_data.experiments.written_values import typical
 
 def test_where_an_episode_ends_as_it_began_the_farthest_way_counts() -> None:
     episodes = [np.array(xs, float)[:, None] for xs in ([5, 7, 5], [0, 4, 0], [1, 1, 1])]
-    assert typical(episodes)[1] == pytest.approx(0.4)
+    assert typical(episodes, [False] * len(episodes))[1] == pytest.approx(0.4)

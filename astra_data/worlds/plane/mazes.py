@@ -96,7 +96,7 @@ class Maze:
 
     @cached_property
     def clearance_field(self) -> Floats:
-        """Distance in m from each fine grid cell to the nearest wall, indexed [y, x]."""
+        """Distance in m from each fine grid cell to the centre of the nearest wall cell, indexed [y, x]."""
         return np.asarray(scipy.ndimage.distance_transform_edt(~self.fine_walls)) * self.fine_m
 
     def fine_index(self, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -106,7 +106,7 @@ class Maze:
         return cells[..., 1].clip(0, height - 1), cells[..., 0].clip(0, width - 1)
 
     def clearance(self, points: Floats) -> Floats:
-        """Return the distance in m from `points` (..., 2) to the nearest wall."""
+        """Return the distance in m from `points` (..., 2) to the nearest wall, up to `fine_m` too large."""
         return np.asarray(self.clearance_field[self.fine_index(points)])
 
     def distance_field(self, goal: Floats, *, radius: float = 0.0, margin: float = 0.0) -> Floats:
