@@ -16,8 +16,8 @@ from astra_data.exchange.recording import Block
 Mask = NDArray[np.bool_]
 EXACT = 2**53
 """Floats represent whole numbers below this exactly."""
-_LARGE = 2**24
-"""The same of float32."""
+_LARGE = 2**16
+"""From here on float32 tells apart steps of 1/128 or more, which positions of an offset fall below."""
 _ENOUGH = 10
 """Changes of a value, in rows that come together, of which one can say that most are lost."""
 _KINDS = {"U": "text", "S": "text", "O": "what no number can hold, such as nothing"}
@@ -174,13 +174,18 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
 
 def _check_distinct(values: Array, cast: Array, column: Column) -> None:
     """Refuse large `values` (n, size) most of whose changes are lost as they are `cast` to float32."""
-    size = np.abs(values.astype(np.float64)).max(axis=0, initial=0.0)
+    exact = values.astype(np.float64)
+    size = np.abs(exact).max(axis=0, initial=0.0)
     large = size > _LARGE
     if not large.any():
         return
     changes = np.diff(values, axis=0) != 0
-    with np.errstate(invalid="ignore"):
-        lost = changes & (np.diff(cast, axis=0) == 0) & large
+    steps = np.diff(exact, axis=0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        held = np.diff(cast.astype(np.float64), axis=0)
+        small = (np.abs(steps) < np.spacing(size.astype(np.float32))) & (held != steps)
+    # Counts that go on by less than float32 tells apart still do so in every second row.
+    lost = changes & ((held == 0) | (small & (exact != np.floor(exact)).any(axis=0))) & large
     enough = changes.sum(axis=0) >= _ENOUGH
     [entries] = np.nonzero(enough & (2 * lost.sum(axis=0) > changes.sum(axis=0)))
     if len(entries):

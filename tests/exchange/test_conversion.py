@@ -207,3 +207,27 @@ def test_numbers_that_float32_cannot_tell_apart_are_refused(dtype: type) -> None
     counter: Array = (2**24 + np.arange(100)).astype(dtype)
     for sound in (1e6 * few, np.full(11, 1.7e12), 1.0 + 1e-12 * few, 2.0**24 + 2 * few, counter, counter[:2]):
         convert({}, sound.tolist())
+
+
+@pytest.mark.parametrize(("offset", "step"), [(5.3e6, 0.02), (5.3e6, 0.3), (-4.2e6, 0.1), (1e5, 0.004)])
+def test_positions_far_from_their_origin_are_refused(offset: float, step: float) -> None:
+    """Such as northings, and positions from the centre of the Earth; not what float32 came with."""
+    away = offset + step * np.arange(40)
+    with pytest.raises(BadInputError, match=r"columns\.c: entry 0: .* set an offset that makes them small"):
+        convert({}, away.tolist())
+    values, _ = convert({"offset": (-offset,)}, away.tolist())
+    np.testing.assert_allclose(values, step * np.arange(40), atol=1e-6)
+    convert({}, away.astype(np.float32).tolist())
+
+
+def test_large_numbers_whose_steps_float32_holds_are_taken() -> None:
+    rows = np.arange(40)
+    for sound in (
+        100_000 + rows,
+        5.3e6 + 0.5 * rows,
+        5.3e6 + 3.3 * rows,
+        2.0**23 + rows,
+        65_000 + 0.01 * rows,
+    ):
+        values, _ = convert({}, sound.tolist())
+        np.testing.assert_allclose(np.diff(values.astype(float)), np.diff(sound), atol=0.5)
