@@ -92,6 +92,8 @@ def import_dataset(
     chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
+    if settings:
+        settings.refuse_timeless(chosen, str(mapping))
     sources = bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes)
     strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
     if strange:

@@ -174,6 +174,13 @@ class ImportMapping(Config):
             raise ValueError("; ".join(faults))
         return self
 
+    def refuse_timeless(self, file_format: str, origin: str) -> None:
+        """Raise RecipeError where keys of the mapping `origin` say what `time` means, but there is none."""
+        given = {"split.gap_s": self.split.gap_s is not None, "time_scale": self.time_scale != 1.0}
+        if self.time is None and file_format != "mcap" and any(given.values()):
+            keys = " and ".join(key for key, is_given in given.items() if is_given)
+            raise RecipeError(f"{origin}: {keys} without `time`: set time to the field with the times")
+
     @property
     def fields(self) -> list[str]:
         """The fields with numbers that the mapping needs, each once."""

@@ -338,3 +338,21 @@ def test_a_scale_of_zero_is_refused(tmp_path: Path) -> None:
     mapping.write_text(mapping.read_text() + "scale = [0.0]\n")
     with pytest.raises(RecipeError, match=r"columns\.action\.scale\.0: expected a factor other than 0"):
         import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("set_keys", "told"),
+    [
+        ("[split]\ngap_s = 0.5", r"split\.gap_s without `time`"),
+        ("time_scale = 0.001\n[split]", "time_scale without `time`"),
+        ("time_scale = 0.001\n[split]\ngap_s = 0.5", r"split\.gap_s and time_scale without `time`"),
+    ],
+)
+def test_keys_about_times_need_a_time(tmp_path: Path, set_keys: str, told: str) -> None:
+    mapping = csv_logs(tmp_path, drive(9))
+    text = mapping.read_text().replace('time = "t"\n', "")
+    mapping.write_text(text.replace("[split]\ngap_s = 0.5", set_keys))
+    with pytest.raises(RecipeError, match=f"logs.toml: {told}: set time to the field with the times"):
+        import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    mapping.write_text(text.replace("[split]\ngap_s = 0.5", "time_scale = 1.0\n[split]"))
+    assert import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out").episodes == 1
