@@ -191,21 +191,25 @@ class Cutter:
         if split.field:
             now["field"] = fields[split.field]
         if self._mapping.time:
-            now["gap"] = fields[self._mapping.time][:, :1].astype(np.float64) * self._mapping.time_scale
+            recorded = fields[self._mapping.time][:, :1].astype(np.float64) * self._mapping.time_scale
+            # As they are, held over rows without a time, and over those that are dropped.
+            now["gap"] = np.repeat(recorded, 3, axis=1)
+            if self._mapping.not_finite == "drop":
+                now["gap"][rejected, 2] = np.nan
         continues = not (is_apart or block.starts)
         for key, values in now.items():
             series = np.concatenate([self._before[key] if continues else values[:1], values])
             if key == "field":
                 masks[key] = (series[:-1] != values).any(axis=1)
             elif key == "gap":
-                times = _held(series)
-                steps_s = np.diff(times[:, 0])
-                masks["back"], masks[key] = steps_s < 0, self._gaps(steps_s)
+                series[:, 1:] = _held(series[:, 1:])
+                steps_s, kept_s = np.diff(series[:, 1:], axis=0).T
+                masks["back"], masks[key] = steps_s < 0, self._gaps(steps_s, kept_s)
                 known = np.isfinite(series[:, 0])
                 stands = (steps_s == 0) & known[:-1] & known[1:]
                 stands[0] &= continues
                 self.tally.count_times(masks["back"], stands, lambda at: row_name(block.origin, row + at))
-                now[key] = times[1:]
+                now[key] = series[1:]
             else:
                 masks["end"] |= (np.nan_to_num(series[:-1]) != 0).any(axis=1)
         masks["file"][0], masks["source"][0] = is_apart, block.starts
@@ -216,11 +220,14 @@ class Cutter:
         self._counters = counters[:, -1]
         return counters
 
-    def _gaps(self, steps_s: Array) -> Mask:
-        """Return which steps in time are longer than `gap_s`, and measure the others that go on."""
+    def _gaps(self, steps_s: Array, kept_s: Array) -> Mask:
+        """Return which steps in time (n,), of all rows or of those that are kept, are longer than `gap_s`.
+
+        The others of those that are kept, and that go on, are measured.
+        """
         longest = self._mapping.split.gap_s
-        gaps = np.zeros(len(steps_s), bool) if longest is None else steps_s > longest
-        regular = steps_s[~gaps & (steps_s > 0)]
+        gaps = np.zeros(len(steps_s), bool) if longest is None else (steps_s > longest) | (kept_s > longest)
+        regular = kept_s[~gaps & (kept_s > 0)]
         if len(regular):
             self._seconds += float(regular.sum())
             self._usual_seconds += float(np.median(regular)) * len(regular)
@@ -258,7 +265,7 @@ class Cutter:
 
 
 def _held(times: Array) -> Array:
-    """Replace values of `times` (n, 1) that are not finite by the last finite one, so that gaps are seen."""
-    rows = np.where(np.isfinite(times[:, 0]), np.arange(len(times)), 0)
-    held: Array = times[np.maximum.accumulate(rows)]
+    """Replace values of `times` (n, k) that are not finite by the last finite one, so that gaps are seen."""
+    rows = np.where(np.isfinite(times), np.arange(len(times))[:, None], 0)
+    held: Array = np.take_along_axis(times, np.maximum.accumulate(rows, axis=0), axis=0)
     return held

@@ -156,6 +156,36 @@ def test_no_gap_hides_behind_a_time_that_is_not_finite(block_rows: int) -> None:
 
 
 @BLOCKS
+def test_gaps_are_measured_between_the_rows_that_are_kept(block_rows: int) -> None:
+    """Over a row without a state too: no step from there to there is longer than 0.5 s."""
+    nan, split = np.nan, {"gap_s": 0.5}
+    x, t = [0, 0, nan, nan, 0, 0, 0, 0], [0, 0.1, 0.4, 0.7, 1.0, 1.1, 1.2, 1.3]
+    cutting = cutter(time="t", split=split, not_finite="drop")
+    assert rows(cut(cutting, block_rows, x=x, t=t)) == [[0], [4, 5, 6]]
+    assert cutting.tally.split_points == {"gap": 1}
+    cutting.check_rate()
+    alone = [0, nan, nan, 0.0]
+    assert rows(cut(cutter(time="t", split=split, not_finite="drop"), block_rows, x=alone, t=t[:4])) == []
+    small = cutter(time="t", split={"gap_s": 1.0}, not_finite="drop")
+    assert rows(cut(small, block_rows, x=x, t=t)) == [[0, 1, 4, 5, 6]]
+
+
+@BLOCKS
+def test_a_rate_is_that_of_the_rows_that_are_kept(block_rows: int) -> None:
+    cutting = cutter(time="t", not_finite="drop")
+    cut(cutting, block_rows, x=np.where(np.arange(60) % 2, np.nan, 1.0), t=np.arange(60) / 20)
+    cutting.check_rate()
+    assert cutting.tally.clock.startswith("10 Hz declared, 10 Hz by t")
+
+
+@pytest.mark.parametrize("block_rows", [1, 4, 6])
+def test_a_time_that_is_missing_does_not_stand_still(block_rows: int) -> None:
+    cutting = cutter(time="t", not_finite="drop")
+    cut(cutting, block_rows, x=np.zeros(6), t=[0, 0.1, 0.2, np.nan, 0.2, 0.3])
+    assert (cutting.tally.still_rows, cutting.tally.back_rows) == (0, 0)
+
+
+@BLOCKS
 def test_gaps_that_are_not_cut_and_jitter_are_tallied(block_rows: int) -> None:
     seconds = np.arange(200) / 10
     seconds[1::2] += 0.004
