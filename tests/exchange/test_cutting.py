@@ -195,7 +195,10 @@ def test_gaps_that_are_not_cut_and_jitter_are_tallied(block_rows: int) -> None:
     cut(cutting, block_rows, x=np.zeros(200), t=seconds)
     cutting.check_rate()
     assert cutting.tally.split_points == {"gap": 1}
-    assert cutting.tally.clock == "10 Hz declared, 9.994 Hz by t; gaps: 1, jitter 4.1 % of a period"
+    assert (
+        cutting.tally.clock
+        == "10 Hz declared, 9.994 Hz by t; gaps within episodes: 1, jitter 4.1 % of a period"
+    )
 
 
 def test_a_rate_that_is_not_fps_is_told() -> None:

@@ -16,7 +16,9 @@ def test_what_was_dropped_is_counted_aloud() -> None:
 
 
 def test_the_recorded_rate_is_told_where_there_is_one() -> None:
-    tally = Tally(rows=9, clock="10 Hz declared, 9.9 Hz by t; gaps: 1, jitter 4.0 % of a period")
+    tally = Tally(
+        rows=9, clock="10 Hz declared, 9.9 Hz by t; gaps within episodes: 1, jitter 4.0 % of a period"
+    )
     assert f"\nrate: {tally.clock}\nrejected rows" in str(ImportReport(Path("out"), 2, 7, tally, 0.25))
     assert "rate" not in str(ImportReport(Path("out"), 2, 7, Tally(rows=9), 0.25))
 

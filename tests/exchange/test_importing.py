@@ -308,7 +308,7 @@ def test_rows_that_are_missing_are_told_with_the_rate(tmp_path: Path) -> None:
         tmp_path, "".join(line for number, line in enumerate(lines) if number % 5 or not number)
     )
     report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
-    assert "gaps: 39 (25 % of the steps: rows are missing), jitter" in str(report)
+    assert "gaps within episodes: 39 (25 % of the steps: rows are missing), jitter" in str(report)
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ class Clock:
         share, rate = self.gaps / int(self._bins.sum()), f"{1 / self.period_s:.4g} Hz by {self._name}"
         missing = f" ({100 * share:.0f} % of the steps: rows are missing)" if share >= MANY_GAPS else ""
         jitter = f"jitter {100 * self.jitter:.1f} % of a period"
-        return f"{self._fps} Hz declared, {rate}; gaps: {self.gaps}{missing}, {jitter}"
+        return f"{self._fps} Hz declared, {rate}; gaps within episodes: {self.gaps}{missing}, {jitter}"
 
     def findings(self, called: str) -> list[Finding]:
         """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""

@@ -19,7 +19,7 @@ def test_good_logs_have_no_findings(tmp_path: Path) -> None:
         (
             "endings: 30 after 100 steps, the longest (a time limit)",
             "commands: held 0.5 s (median), 0.5 s (95 %); steps at the edge of the range: v 0.7 %, w 0.7 %",
-            "rate: 20 Hz declared, 20 Hz by time; gaps: 0, jitter 0.0 % of a period",
+            "rate: 20 Hz declared, 20 Hz by time; gaps within episodes: 0, jitter 0.0 % of a period",
         ),
         (),
     )
