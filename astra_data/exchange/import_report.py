@@ -23,6 +23,7 @@ class ImportReport:
         tally: of the rows that were read and dropped.
         wall_seconds: duration of the import.
         unused: the files of which no episode was made.
+        unread: the files of folders and archives that have other endings than the format's.
     """
 
     root: Path
@@ -31,6 +32,7 @@ class ImportReport:
     tally: Tally
     wall_seconds: float
     unused: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Summarise it in a few lines."""
@@ -46,6 +48,8 @@ class ImportReport:
             else ""
         )
         unused = f"files without an episode: {first_few(self.unused, _SHOWN)}\n" if self.unused else ""
+        if self.unread:
+            unused += f"files of other endings, not read: {first_few(self.unread, _SHOWN)}\n"
         return (
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"

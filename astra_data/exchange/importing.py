@@ -29,6 +29,7 @@ from astra_data.exchange.recording import (
     find_sources,
     identities,
     is_archive,
+    other_files,
 )
 from astra_data.exchange.restoring import read_record, restored, write_restored
 from astra_data.exchange.tally import Tally
@@ -146,7 +147,8 @@ def import_dataset(
     # Where episodes are parts of files, their origins are no files' names.
     are_files = settings.split.files and origins <= set(names)
     unused = tuple(name for name in names if are_files and name not in origins)
-    return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began, unused)
+    unread = () if chosen == "minari" else other_files(recordings, _suffixes(FORMATS[chosen]))
+    return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began, unused, unread)
 
 
 def _record(source: Source, file_format: str) -> ExportRecord | None:

@@ -109,20 +109,25 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
         raise BadInputError(f"{recording} does not exist")
     if not (recording.is_file() or recording.is_dir()):
         raise BadInputError(f"{recording} is a device or a pipe, expected a file or a folder")
-    if recording.is_dir():
-        files = [path for path in files_below(recording) if _is_seen(path.relative_to(recording))]
-        sources = [Source(path, None, recording) for path in files]
-    elif is_archive(recording):
-        members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]
-        sources = [Source(recording, member, recording) for member in members]
-    else:
+    if not (recording.is_dir() or is_archive(recording)):
         return [Source(recording, None, recording)]
-    sources = [source for source in sources if str(source).lower().endswith(tuple(suffixes))]
+    sources = [source for source in _inside(recording) if str(source).lower().endswith(tuple(suffixes))]
     if not sources:
         endings = " or ".join(filter(None, suffixes))
         expected = f"files that end with {endings}" if endings else "files"
         raise BadInputError(f"{recording}: expected {expected}, found none")
     return sorted(sources, key=lambda source: natural(f"{source.path}/{source}"))
+
+
+def other_files(recordings: Sequence[Path], suffixes: Sequence[str]) -> tuple[str, ...]:
+    """Name the files in folders and archives that `find_sources` leaves out by their endings.
+
+    Mappings and texts for people are none of them.
+    """
+    beside = (*suffixes, ".toml", ".md")
+    inside = [source for path in recordings if path.is_dir() or is_archive(path) for source in _inside(path)]
+    names = [name for name in map(str, inside) if not name.lower().endswith(beside)]
+    return tuple(sorted((name for name in names if not _is_readme(name)), key=natural))
 
 
 def is_archive(path: Path) -> bool:
@@ -133,6 +138,19 @@ def is_archive(path: Path) -> bool:
 def natural(name: str) -> list[tuple[int, str]]:
     """Return a sort key that orders numbers in names by value."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
+
+
+def _inside(recording: Path) -> list[Source]:
+    """Return the files in a folder or an archive, without hidden ones."""
+    if recording.is_dir():
+        files = [path for path in files_below(recording) if _is_seen(path.relative_to(recording))]
+        return [Source(path, None, recording) for path in files]
+    members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]
+    return [Source(recording, member, recording) for member in members]
+
+
+def _is_readme(name: str) -> bool:
+    return PurePosixPath(name).name.lower().partition(".")[0] == "readme"
 
 
 def _is_seen(path: PurePath) -> bool:

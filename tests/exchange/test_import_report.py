@@ -41,3 +41,14 @@ def test_time_that_stands_still_is_told_with_its_place() -> None:
     told = str(ImportReport(Path("out"), 2, 7, tally, 0.25))
     assert "\ntime stands still in 4 rows, first in a.csv line 3: expected one row at a time" in told
     assert "still" not in str(ImportReport(Path("out"), 2, 7, Tally(rows=9), 0.25))
+
+
+def test_files_that_were_not_read_are_told_shortly() -> None:
+    unread = tuple(f"{number}.txt" for number in range(10))
+    told = str(ImportReport(Path("out"), 2, 7, Tally(), 0.25, ("a.csv",), unread))
+    listed = ", ".join(unread[:8])
+    assert (
+        f"\nfiles without an episode: a.csv\nfiles of other endings, not read: {listed} and 2 more\nrej"
+        in told
+    )
+    assert "not read" not in str(ImportReport(Path("out"), 2, 7, Tally(), 0.25))

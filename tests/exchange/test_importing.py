@@ -261,6 +261,31 @@ def test_files_of_which_nothing_is_left_are_named(tmp_path: Path) -> None:
     assert "\nfiles without an episode: 1.csv\n" in str(report)
 
 
+def test_files_of_other_endings_are_named(tmp_path: Path) -> None:
+    mapping = csv_logs(tmp_path, drive(9))
+    logs = tmp_path / "logs"
+    names = (
+        "drive_10.txt",
+        "drive_3.csv.gz",
+        "drive_4.TSV",
+        "map.toml",
+        "README",
+        "readme.txt",
+        "notes.md",
+        ".x",
+    )
+    for name in names:
+        (logs / name).write_text(drive(9).replace(",", "\t"))
+    report = import_dataset([logs], mapping, out=tmp_path / "out")
+    assert report.unread == ("drive_3.csv.gz", "drive_10.txt")
+    assert "\nfiles of other endings, not read: drive_3.csv.gz, drive_10.txt\n" in str(report)
+    with tarfile.open(tmp_path / "logs.tar", "w") as archive:
+        archive.add(logs, "logs")
+    report = import_dataset([tmp_path / "logs.tar"], mapping, out=tmp_path / "again")
+    assert report.unread == ("logs.tar/logs/drive_3.csv.gz", "logs.tar/logs/drive_10.txt")
+    assert import_dataset([logs / "0.csv"], mapping, out=tmp_path / "one").unread == ()
+
+
 def test_files_that_go_on_are_not_said_to_be_without_an_episode(tmp_path: Path) -> None:
     mapping = csv_logs(tmp_path, drive(9), drive(5))
     mapping.write_text(mapping.read_text().replace("[split]", "[split]\nfiles = false"))
