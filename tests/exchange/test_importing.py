@@ -261,6 +261,15 @@ def test_files_of_which_nothing_is_left_are_named(tmp_path: Path) -> None:
     assert "\nfiles without an episode: 1.csv\n" in str(report)
 
 
+@pytest.mark.parametrize("begun", ["", "t,x", "t,x,a", "t,x,a\n"])
+def test_a_file_without_a_row_is_one_without_an_episode(tmp_path: Path, begun: str) -> None:
+    mapping = csv_logs(tmp_path, begun, drive(9), begun, drive(5))
+    report = import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
+    assert (report.episodes, report.unused) == (2, ("0.csv", "2.csv"))
+    with pytest.raises(BadInputError, match=r"0\.csv: no episodes"):
+        import_dataset([tmp_path / "logs/0.csv"], mapping, out=tmp_path / "none")
+
+
 def test_files_of_other_endings_are_named(tmp_path: Path) -> None:
     mapping = csv_logs(tmp_path, drive(9))
     logs = tmp_path / "logs"

@@ -45,6 +45,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     Raises:
         BadInputError: fields are missing, duplicated or not numeric.
     """
+    if _is_cut_in_header(source):
+        return
     with source.open() as stream:
         # As text first, since the type of a column may change after its first block.
         reader = csv.open_csv(
@@ -67,6 +69,13 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             row += len(batch)
             if len(batch):
                 yield Block(values, str(source))
+
+
+def _is_cut_in_header(source: Source) -> bool:
+    """Return whether a file ends before the end of its first line, as one that was only just begun."""
+    with source.open() as stream:
+        first = stream.readline(_LONGEST_HEADER)
+    return len(first) < _LONGEST_HEADER and b"\n" not in first and b"\r" not in first
 
 
 def _checked(source: Source, mapping: ImportMapping) -> list[str]:
