@@ -82,6 +82,7 @@ class Cutter:
             first = row + int(np.argmax(rejected))
             self.tally.rejected_first = self.tally.rejected_first or row_name(block.origin, first)
             self.tally.rejected_rows += int(rejected.sum())
+        self.tally.count_torn(block.torn, row_name(block.origin, row + len(block)))
         counters = self._count(block, row, columns, rejected, is_apart=is_apart)
         self._keep_ends(columns, counters[:-1], finite)
         if not finite.any():
@@ -217,7 +218,9 @@ class Cutter:
         if self._mapping.not_finite == "split":
             masks["rejected"] = rejected
         counters: NDArray[np.int64] = self._counters[:, None] + np.cumsum(list(masks.values()), axis=1)
-        self._counters = counters[:, -1]
+        self._counters = counters[:, -1].copy()
+        if self._mapping.not_finite != "drop":
+            self._counters[-1] += block.torn
         return counters
 
     def _gaps(self, steps_s: Array, kept_s: Array) -> Mask:

@@ -39,6 +39,10 @@ class ImportReport:
         tally = self.tally
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
         first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""
+        if tally.torn_rows:
+            first += (
+                f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
+            )
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
         rate = f"rate: {tally.clock}\n" if tally.clock else ""
         still = (

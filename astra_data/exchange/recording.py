@@ -1,5 +1,6 @@
 """Recordings in other formats: their files, and the blocks of rows that importers read from them."""
 
+import os
 import re
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -83,11 +84,13 @@ class Block:
         values: field to n rows, (n,) or (n, ...).
         origin: the file and part of the file that they come from.
         starts: whether an episode of the format itself begins with the first row.
+        torn: how many rows after the last one are cut off at the end of the file, 0 or 1.
     """
 
     values: Mapping[str, Array]
     origin: str
     starts: bool = False
+    torn: int = 0
 
     def __len__(self) -> int:
         """Return n."""
@@ -175,6 +178,16 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
     if faults:
         raise BadInputError(f"{archive}: expected plain files; {'; '.join(faults)}")
     return members
+
+
+def is_tail(source: Source, line: str) -> bool:
+    """Return whether a file ends with `line`, without the end of a line behind it."""
+    tail = line.encode()
+    with source.open() as stream:
+        if stream.seek(0, os.SEEK_END) <= len(tail):
+            return False
+        stream.seek(-len(tail) - 1, os.SEEK_END)
+        return stream.read() in (b"\n" + tail, b"\r" + tail)
 
 
 def row_name(origin: str, row: int) -> str:

@@ -17,8 +17,9 @@ class Tally:
 
     Attributes:
         rows: how many were read.
-        rejected_rows: those with a value that is not finite.
-        rejected_first: where the first of them is.
+        rejected_rows: those with a value that is not finite, and those that are torn.
+        rejected_first: where the first of those with such a value is.
+        torn_rows: those that are cut off at the end of their files. torn_first: where the first of them is.
         split_points: number of boundaries between episodes, by reason.
         last_rows: last rows of episodes, dropped because their next state was not recorded.
         last_terminated: those of them that were terminated.
@@ -35,6 +36,8 @@ class Tally:
     rows: int = 0
     rejected_rows: int = 0
     rejected_first: str = ""
+    torn_rows: int = 0
+    torn_first: str = ""
     split_points: dict[str, int] = field(default_factory=dict)
     last_rows: int = 0
     last_terminated: int = 0
@@ -48,6 +51,14 @@ class Tally:
     rows_after_end: int = 0
     endings: Endings = field(default_factory=Endings)
     clock: str = ""
+
+    def count_torn(self, rows: int, place: str) -> None:
+        """Count `rows` that are cut off, at the `place` of the first, where there are any."""
+        if rows:
+            self.rows += rows
+            self.rejected_rows += rows
+            self.torn_rows += rows
+            self.torn_first = self.torn_first or place
 
     def count_times(self, back: Mask, stands: Mask, row_name: Callable[[int], str]) -> None:
         """Count the rows (n,) at which time goes back, or stands still; `row_name` tells where one is."""

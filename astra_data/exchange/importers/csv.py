@@ -1,7 +1,9 @@
 """CSV: one row per step, a header with the fields' names; read block by block."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +13,7 @@ from pyarrow import csv
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Source, row_count
+from astra_data.exchange.recording import Block, Source, is_tail, row_count
 
 SUFFIXES = (".csv", ".tsv")
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
@@ -47,11 +49,14 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     if _is_cut_in_header(source):
         return
+    torn, last = _TornLine(source), None
     with source.open() as stream:
         # As text first, since the type of a column may change after its first block.
         reader = csv.open_csv(
             stream,
-            parse_options=csv.ParseOptions(delimiter=delimiter_of(str(source))[0]),
+            parse_options=csv.ParseOptions(
+                delimiter=delimiter_of(str(source))[0], invalid_row_handler=torn.skip
+            ),
             convert_options=csv.ConvertOptions(
                 column_types=dict.fromkeys(mapping.all_fields, pa.string()),
                 strings_can_be_null=True,
@@ -67,8 +72,26 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
                 else:
                     values[field] = np.array(batch.column(field).to_pylist(), dtype=str)
             row += len(batch)
-            if len(batch):
-                yield Block(values, str(source))
+            if last is not None:
+                yield last
+            last = Block(values, str(source)) if len(batch) else None
+    if last is not None:
+        yield replace(last, torn=torn.found)
+
+
+class _TornLine:
+    """Skips a last line that ends within a row, as one that was written when a battery went empty."""
+
+    def __init__(self, source: Source) -> None:
+        self.found = 0
+        self._source = source
+
+    def skip(self, row: Any) -> str:  # noqa: ANN401 - of pyarrow
+        """Answer pyarrow what to do about a row of another number of fields than the header's."""
+        if self.found or row.actual_columns > row.expected_columns or not is_tail(self._source, row.text):
+            return "error"
+        self.found = 1
+        return "skip"
 
 
 def _is_cut_in_header(source: Source) -> bool:
@@ -88,7 +111,7 @@ def _checked(source: Source, mapping: ImportMapping) -> list[str]:
             "write it with commas, or with tabs as .tsv"
         )
     with source.open() as stream:
-        options = csv.ParseOptions(delimiter=delimiter)
+        options = csv.ParseOptions(delimiter=delimiter, invalid_row_handler=_TornLine(source).skip)
         header = csv.open_csv(stream, parse_options=options).schema.names
     row_count(str(source), mapping.all_fields, dict.fromkeys(header, (0,)))
     doubled = sorted({name for name in mapping.all_fields if header.count(name) > 1})

@@ -1,3 +1,4 @@
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -120,3 +121,48 @@ def test_fields_of_a_log_without_names_are_listed_once(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as caught:
         imported(tmp_path, log)
     assert str(caught.value).count("known: 10, 20, 30") == 1
+
+
+TORN = (
+    'name = "log"\ntask = "t"\nfps = 10\n[columns."observation.state"]\nfields = ["x"]\n'
+    '[columns.action]\nfields = ["y"]\n'
+)
+
+
+@pytest.mark.parametrize("rows", [3, 200_000])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_last_line_that_is_cut_off_is_rejected_alone(tmp_path: Path, rows: int, end: str) -> None:
+    """In the first block of 1 MB, or in one after it; in a file, and in an archive."""
+    whole = f"x,y,z{end}" + "".join(f"{row},{row}.5,0{end}" for row in range(rows))
+    for number, torn in enumerate((f"{rows},", f"{rows}")):
+        log = tmp_path / "log.csv"
+        log.write_bytes((whole + torn).encode())
+        archive = tmp_path / "logs.tar.gz"
+        with tarfile.open(archive, "w:gz") as packed:
+            packed.add(log, "log.csv")
+        for recording in (log, archive):
+            dataset, report = imported(tmp_path / f"{number}{recording.suffix}", recording, TORN)
+            assert dataset.lengths.tolist() == [rows - 1]
+            tally = report.tally
+            assert (tally.rows, tally.rejected_rows, tally.torn_rows) == (rows + 1, 1, 1)
+            assert tally.torn_first.endswith(f"log.csv line {rows + 2}")
+        assert "rejected rows: 1; cut off at the end of their files: 1, the first is " in str(report)
+
+
+@pytest.mark.parametrize(
+    "lines", ["1,2,3\n1,2\n1,2,3\n", "1,2,3\n1,2\n", "1,2,3\n1,2,3,4", "1,2,3\n2\n1,2,2"]
+)
+def test_other_lines_of_too_few_or_many_fields_are_refused(tmp_path: Path, lines: str) -> None:
+    (tmp_path / "log.csv").write_text(f"x,y,z\n{lines}")
+    with pytest.raises(BadInputError, match=r"log\.csv cannot be read as csv: .*Expected 3 columns, got"):
+        imported(tmp_path, tmp_path / "log.csv", TORN)
+
+
+def test_a_cut_off_line_begins_a_new_episode_where_files_go_on(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    for name in ("1.csv", "2.csv"):
+        (tmp_path / f"logs/{name}").write_text("x,y,z\n1,2,3\n1,2,3\n1,2,3\n1,2")
+    for number, (keys, lengths) in enumerate((("refuse", [2, 2]), ("split", [2, 2]), ("drop", [5]))):
+        mapping = f'not_finite = "{keys}"\n{TORN}[split]\nfiles = false\n'
+        dataset, _ = imported(tmp_path / str(number), tmp_path / "logs", mapping)
+        assert dataset.lengths.tolist() == lengths
