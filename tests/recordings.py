@@ -18,7 +18,7 @@ from astra_data.exchange.importing import import_dataset
 LENGTHS = (6, 9, 5)
 STEPS = (5, 9, 4)
 """Of each trial: nobody recorded the next state of its last row, but the second ends in a fall."""
-TABLES = ("log.csv", "log.npz", "log.h5", "log.json", "log.parquet")
+TABLES = ("log.csv", "log.npz", "log.h5", "log.json", "log.jsonl", "log.parquet")
 
 MAPPING = """
 name = "log"
@@ -79,6 +79,10 @@ def write_table(path: Path, fields: Mapping[str, Array]) -> Path:
                 file[name] = values
     elif path.suffix == ".parquet":
         pq.write_table(pa.table({name: values.tolist() for name, values in fields.items()}), path)
+    elif path.suffix in (".jsonl", ".ndjson"):
+        lists = zip(*(values.tolist() for values in fields.values()), strict=True)
+        lines = [json.dumps(dict(zip(fields, row, strict=True))) for row in lists]
+        path.write_text("\n".join([*lines, ""]))
     else:
         path.write_text(json.dumps({name: values.tolist() for name, values in fields.items()}))
     return path

@@ -191,8 +191,10 @@ def is_tail(source: Source, line: str) -> bool:
 
 
 def row_name(origin: str, row: int) -> str:
-    """Name a row, counted from 0 in its part of a file; of CSV the line, as an editor numbers it."""
-    return f"{origin} line {row + 2}" if origin.lower().endswith((".csv", ".tsv")) else f"{origin} row {row}"
+    """Name a row, counted from 0 in its part of a file; of CSV and JSON Lines the line, as an editor does."""
+    if not origin.lower().endswith((".csv", ".tsv", ".jsonl", ".ndjson")):
+        return f"{origin} row {row}"
+    return f"{origin} line {row + (2 if origin.lower().endswith('sv') else 1)}"
 
 
 def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int, ...]]) -> int:

@@ -1,29 +1,36 @@
-"""JSON: one object that maps each field to its rows, as the NAO's logs are.
+"""JSON: one object that maps each field to its rows, as the NAO's logs are, or lines with an object a row.
 
-A file is read whole, since JSON cannot be parsed in blocks; files larger than `LIMIT_BYTES` are refused.
+The former is read whole, since JSON cannot be parsed in blocks; files larger than `LIMIT_BYTES` are refused.
+Lines, of at most as many bytes, are read block by block.
 """
 
 import json
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import replace
+from itertools import batched
+from typing import IO, Any
 
 import numpy as np
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, in_short
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Source, row_count
+from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, row_count
 
-SUFFIXES = (".json", ".log")
+LINES = (".jsonl", ".ndjson")
+SUFFIXES = (".json", ".log", *LINES)
 LIMIT_BYTES = 2**28
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield all rows as one block.
+    """Yield all rows as one block, or lines in several.
 
     Raises:
         BadInputError: the file is too large or no object; fields are missing, doubled or differ in length.
     """
+    if str(source).lower().endswith(LINES):
+        yield from _read_lines(source, mapping)
+        return
     with source.open() as stream:
         text = stream.read(LIMIT_BYTES + 1)
     if len(text) > LIMIT_BYTES:
@@ -34,6 +41,55 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     shapes = {name: (len(rows),) if isinstance(rows, list) else () for name, rows in fields.items()}
     if row_count(str(source), mapping.all_fields, shapes):
         yield Block({field: np.array(fields[field]) for field in mapping.all_fields}, str(source))
+
+
+def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows of lines with an object each; a last line that is cut off is left out and counted."""
+    last: Block | None = None
+    with source.open() as stream:
+        for lines in batched(enumerate(_lines(stream, source), start=1), BLOCK_ROWS):
+            torn = int(_is_torn(lines[-1][1]))
+            whole = [(number, line) for number, line in lines[: len(lines) - torn] if line.strip()]
+            rows = [_row(line, f"{source} line {number}", mapping) for number, line in whole]
+            if rows:
+                if last is not None:
+                    yield last
+                columns = {field: np.array([row[field] for row in rows]) for field in mapping.all_fields}
+                last = Block(columns, str(source))
+            if last is not None:
+                last = replace(last, torn=torn)
+    if last is not None:
+        yield last
+
+
+def _lines(stream: IO[bytes], source: Source) -> Iterator[bytes]:
+    while line := stream.readline(LIMIT_BYTES + 1):
+        if len(line) > LIMIT_BYTES:
+            raise BadInputError(f"{source}: expected lines of at most {LIMIT_BYTES // 2**20} MB of JSON")
+        yield line
+
+
+def _row(line: bytes, origin: str, mapping: ImportMapping) -> dict[str, Any]:
+    try:
+        row = json.loads(line, object_pairs_hook=_once)
+    except (ValueError, BadInputError) as error:
+        raise BadInputError(f"{origin}: expected an object of fields ({in_short(error)})") from error
+    if not isinstance(row, dict):
+        raise BadInputError(f"{origin}: expected an object of fields, got {type(row).__name__}")
+    if not row.keys() >= set(mapping.all_fields):
+        row_count(origin, mapping.all_fields, dict.fromkeys(row, (1,)))
+    return row
+
+
+def _is_torn(line: bytes) -> bool:
+    """Return whether a line has no end and is no JSON, as one that was written when a battery went empty."""
+    if line.endswith(b"\n") or not line.strip():
+        return False
+    try:
+        json.loads(line)
+    except ValueError:
+        return True
+    return False
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

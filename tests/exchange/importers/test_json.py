@@ -1,10 +1,14 @@
+import tarfile
 from pathlib import Path
 
+import numpy as np
 import pytest
-from recordings import imported, rows, write_table
+from recordings import LENGTHS, MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.importers import json
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import BLOCK_ROWS, Source
 
 
 def test_json_that_is_too_large_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,3 +23,72 @@ def test_a_field_that_comes_twice_is_told(tmp_path: Path) -> None:
     path.write_text(path.read_text().rstrip().removesuffix("}") + ', "x": [0]}')
     with pytest.raises(BadInputError, match="an object has x more than once"):
         imported(tmp_path, path)
+
+
+LISTS = ImportMapping.model_validate(
+    {"name": "n", "task": "t", "fps": 1, "columns": {name: {"fields": (name,)} for name in ("x", "on")}}
+)
+
+
+@pytest.mark.parametrize("name", ["log.jsonl", "LOG.NDJSON"])
+def test_lines_are_read_block_by_block(tmp_path: Path, name: str) -> None:
+    """With fields of several values, blank lines, and others that the mapping does not name."""
+    path, n = tmp_path / name, BLOCK_ROWS + 2
+    path.write_text("\n" + "".join(f'{{"x": [{row}, 0.5], "on": true, "a": "b"}}\n' for row in range(n)))
+    first, second = json.read(Source(path, None, path), LISTS)
+    assert (len(first), len(second), first.origin) == (BLOCK_ROWS - 1, 3, name)
+    x = np.concatenate([first.values["x"], second.values["x"]])
+    np.testing.assert_array_equal(x, np.stack([np.arange(n), np.full(n, 0.5)], axis=1))
+    assert second.values["on"].tolist() == [True] * 3
+
+
+def test_a_folder_and_an_archive_of_lines_become_episodes(tmp_path: Path) -> None:
+    mapping = MAPPING.replace('field = "trial"', "")
+    for name in ("1.jsonl", "2.jsonl"):
+        write_table(tmp_path / "logs" / name, {k: v[: LENGTHS[0]] for k, v in rows().items()})
+    with tarfile.open(tmp_path / "logs.tar.gz", "w:gz") as archive:
+        archive.add(tmp_path / "logs", "logs")
+    for recording in ("logs", "logs.tar.gz"):
+        dataset, _ = imported(tmp_path / f"of_{recording}", tmp_path / recording, mapping)
+        assert dataset.lengths.tolist() == [LENGTHS[0] - 1] * 2
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('{"x": 1}', r"no field 'on'; known: x"),
+        ("[1, 2]", "expected an object of fields, got list"),
+        ('{"x": 1, "on": tru}', r"expected an object of fields \(Expecting value"),
+        ('{"x": 1, "x": 2, "on": 1}', r"expected an object of fields \(an object has x more than once\)"),
+    ],
+)
+def test_a_line_that_is_no_row_is_told_with_its_place(tmp_path: Path, line: str, told: str) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text(f'{{"x": 1, "on": true}}\n{line}\n{{"x": 1, "on": true}}\n')
+    with pytest.raises(BadInputError, match=rf"log\.jsonl line 2: {told}"):
+        list(json.read(Source(path, None, path), LISTS))
+
+
+@pytest.mark.parametrize("n", [3, BLOCK_ROWS])
+def test_a_last_line_that_is_cut_off_is_counted(tmp_path: Path, n: int) -> None:
+    path = tmp_path / "log.jsonl"
+    for tail, torn, more in (("", 0, 0), ('{"x": 1, "on": tr', 1, 0), ('{"x": 1, "on": true}', 0, 1)):
+        path.write_text('{"x": 1, "on": true}\n' * n + tail)
+        blocks = list(json.read(Source(path, None, path), LISTS))
+        assert sum(map(len, blocks)) == n + more
+        assert [block.torn for block in blocks] == [0] * (len(blocks) - 1) + [torn]
+
+
+def test_a_line_that_is_too_long_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(json, "LIMIT_BYTES", 100)
+    with pytest.raises(BadInputError, match=r"log\.jsonl: expected lines of at most"):
+        imported(tmp_path, write_table(tmp_path / "log.jsonl", rows()))
+
+
+def test_a_rejected_row_is_named_by_its_line(tmp_path: Path) -> None:
+    fields = rows()
+    fields["x"][3] = np.nan
+    _, report = imported(
+        tmp_path, write_table(tmp_path / "log.jsonl", fields), 'not_finite = "split"\n' + MAPPING
+    )
+    assert report.tally.rejected_first == "log.jsonl line 4"
