@@ -1,6 +1,5 @@
 """Recordings in other formats: their files, and the blocks of rows that importers read from them."""
 
-import os
 import re
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -178,16 +177,6 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
     if faults:
         raise BadInputError(f"{archive}: expected plain files; {'; '.join(faults)}")
     return members
-
-
-def is_tail(source: Source, line: str) -> bool:
-    """Return whether a file ends with `line`, without the end of a line behind it."""
-    tail = line.encode()
-    with source.open() as stream:
-        if stream.seek(0, os.SEEK_END) <= len(tail):
-            return False
-        stream.seek(-len(tail) - 1, os.SEEK_END)
-        return stream.read() in (b"\n" + tail, b"\r" + tail)
 
 
 def row_name(origin: str, row: int) -> str:

@@ -1,9 +1,12 @@
 """CSV: one row per step, a header with the fields' names; read block by block."""
 
+import io
+import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +16,7 @@ from pyarrow import csv
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Source, is_tail, row_count
+from astra_data.exchange.recording import Block, Source, row_count
 
 SUFFIXES = (".csv", ".tsv")
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
@@ -49,18 +52,17 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     if _is_cut_in_header(source):
         return
-    torn, last = _TornLine(source), None
-    with source.open() as stream:
+    torn = _torn_bytes(source)
+    last: Block | None = None
+    with _without_end(source, torn) as stream:
         # As text first, since the type of a column may change after its first block.
         reader = csv.open_csv(
             stream,
-            parse_options=csv.ParseOptions(
-                delimiter=delimiter_of(str(source))[0], invalid_row_handler=torn.skip
-            ),
+            parse_options=csv.ParseOptions(delimiter=delimiter_of(str(source))[0]),
             convert_options=csv.ConvertOptions(
                 column_types=dict.fromkeys(mapping.all_fields, pa.string()),
                 strings_can_be_null=True,
-                include_columns=_checked(source, mapping),
+                include_columns=_checked(source, mapping, torn),
             ),
         )
         row = 0
@@ -76,22 +78,52 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
                 yield last
             last = Block(values, str(source)) if len(batch) else None
     if last is not None:
-        yield replace(last, torn=torn.found)
+        yield replace(last, torn=int(torn > 0))
 
 
-class _TornLine:
-    """Skips a last line that ends within a row, as one that was written when a battery went empty."""
+def _torn_bytes(source: Source) -> int:
+    """Return how long a last line is that ends within a row, as where a battery went empty; 0 if it is whole.
 
-    def __init__(self, source: Source) -> None:
-        self.found = 0
-        self._source = source
+    It has no end, and fewer fields than the header; with quotes it is left to the parser.
+    """
+    with source.open() as stream:
+        first = stream.readline(_LONGEST_HEADER)
+        end = stream.seek(0, os.SEEK_END)
+        stream.seek(max(len(first), end - _LONGEST_HEADER) - 1)
+        _, line_end, tail = stream.read().replace(b"\r", b"\n").rpartition(b"\n")
+    delimiter = delimiter_of(str(source))[0].encode()
+    is_short = tail.count(delimiter) < first.count(delimiter)
+    return len(tail) if line_end and is_short and b'"' not in first + tail else 0
 
-    def skip(self, row: Any) -> str:  # noqa: ANN401 - of pyarrow
-        """Answer pyarrow what to do about a row of another number of fields than the header's."""
-        if self.found or row.actual_columns > row.expected_columns or not is_tail(self._source, row.text):
-            return "error"
-        self.found = 1
-        return "skip"
+
+@contextmanager
+def _without_end(source: Source, size: int) -> Iterator[IO[bytes]]:
+    """Open a file for reading, without its last `size` bytes."""
+    with source.open() as stream:
+        if size:
+            end = stream.seek(0, os.SEEK_END)
+            stream.seek(0)
+            yield io.BufferedReader(_Part(stream, end - size))
+        else:
+            yield stream
+
+
+class _Part(io.RawIOBase):
+    """The first `size` bytes of a stream."""
+
+    def __init__(self, stream: IO[bytes], size: int) -> None:
+        self._stream, self._left = stream, size
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 - what Python's own streams fill
+        """Fill `buffer`, and return with how many bytes."""
+        read = self._stream.read(min(len(buffer), self._left))
+        buffer[: len(read)] = read
+        self._left -= len(read)
+        return len(read)
 
 
 def _is_cut_in_header(source: Source) -> bool:
@@ -101,7 +133,7 @@ def _is_cut_in_header(source: Source) -> bool:
     return len(first) < _LONGEST_HEADER and b"\n" not in first and b"\r" not in first
 
 
-def _checked(source: Source, mapping: ImportMapping) -> list[str]:
+def _checked(source: Source, mapping: ImportMapping, torn: int) -> list[str]:
     delimiter, mark = delimiter_of(str(source))
     with source.open() as stream:
         first = stream.readline(_LONGEST_HEADER).decode("utf-8", "replace")
@@ -110,8 +142,8 @@ def _checked(source: Source, mapping: ImportMapping) -> list[str]:
             f"{source}: expected fields parted by {mark}, got {others[0]} in its header: "
             "write it with commas, or with tabs as .tsv"
         )
-    with source.open() as stream:
-        options = csv.ParseOptions(delimiter=delimiter, invalid_row_handler=_TornLine(source).skip)
+    with _without_end(source, torn) as stream:
+        options = csv.ParseOptions(delimiter=delimiter)
         header = csv.open_csv(stream, parse_options=options).schema.names
     row_count(str(source), mapping.all_fields, dict.fromkeys(header, (0,)))
     doubled = sorted({name for name in mapping.all_fields if header.count(name) > 1})

@@ -150,12 +150,19 @@ def test_a_last_line_that_is_cut_off_is_rejected_alone(tmp_path: Path, rows: int
 
 
 @pytest.mark.parametrize(
-    "lines", ["1,2,3\n1,2\n1,2,3\n", "1,2,3\n1,2\n", "1,2,3\n1,2,3,4", "1,2,3\n2\n1,2,2"]
+    "lines", ["1,2,3\n1,2\n1,2,3\n", "1,2,3\n1,2\n", "1,2,3\n1,2,3,4", "1,2,3\n2\n1,2,2", '1,2,3\n2,"a']
 )
 def test_other_lines_of_too_few_or_many_fields_are_refused(tmp_path: Path, lines: str) -> None:
     (tmp_path / "log.csv").write_text(f"x,y,z\n{lines}")
     with pytest.raises(BadInputError, match=r"log\.csv cannot be read as csv: .*Expected 3 columns, got"):
         imported(tmp_path, tmp_path / "log.csv", TORN)
+
+
+def test_a_last_line_without_an_end_is_whole_with_as_many_fields(tmp_path: Path) -> None:
+    for number, text in enumerate(('"x",y,"a,b"\n1,2,3\n1,2,3', "x,y,z\n1,2,3\n1,2,", "x,y\n1,2\n1,2")):
+        (tmp_path / f"{number}.csv").write_text(text)
+        dataset, report = imported(tmp_path / str(number), tmp_path / f"{number}.csv", TORN)
+        assert (dataset.lengths.tolist(), report.tally.rejected_rows) == ([1], 0)
 
 
 def test_a_cut_off_line_begins_a_new_episode_where_files_go_on(tmp_path: Path) -> None:
