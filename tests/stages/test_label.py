@@ -27,7 +27,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.sharing.push import push
-from astra_data.stages.label import check_fits, label, labels
+from astra_data.stages.label import check_fits, label, labels, remarks
 from astra_data.worlds.registry import task_named
 
 CART = f"{Path(__file__).parents[1] / 'small_cart.py'}:LOGS_ALONE"
@@ -108,6 +108,20 @@ def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
         **{"driver": "Ada", "success": False, "failed": True},
         "return": pytest.approx(-9.0),
     }
+
+
+def test_names_that_are_not_the_tasks_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    columns = [Column(name, size=2, names=("north", "heading")) for name in (STATE, NEXT_STATE)]
+    description = {"name": "logs", "stage": "import"}
+    with DatasetWriter(
+        tmp_path / "logs", [*columns, COLUMNS[1]], fps=10, task="drive", description=description
+    ) as writer:
+        writer.add(Episode(0, drive(0.1, 3), {}))
+    logs = Dataset.open(tmp_path / "logs")
+    told = "takes north, heading of observation.state as "
+    assert any(told in remark for remark in remarks(logs, task_named(CART)))
+    label(CART, data=logs.root, out=tmp_path / "labelled")
+    assert told in caplog.text
 
 
 @pytest.mark.parametrize(("distance", "is_told"), [(0.95, True), (1.9, False)])
