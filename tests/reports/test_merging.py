@@ -98,6 +98,18 @@ def test_what_is_found_anew_replaces_what_is_published(root: Path) -> None:
     assert astra.gap is not None and astra.gap.horizons == [1, 10]
 
 
+def test_gaps_of_other_quantities_are_not_averaged(root: Path) -> None:
+    published = assembled(root, seeds=(1,))
+    for method in ALL:
+        remove(root, method, 1)
+    for seed in (0, 2):
+        edit_json(
+            root / f"ground/astra/seed_{seed}/gap.json", grounded={"x_m": band(0.1)}, raw={"x_m": band(1)}
+        )
+    gap = assembled(root, published=published).gaps()["astra"]
+    assert (gap.seeds, list(gap.grounded)) == ([0, 2], ["x_m"])
+
+
 def test_of_gaps_over_as_many_seeds_the_newer_one_counts(root: Path) -> None:
     published = assembled(root)
     for seed in SEEDS:

@@ -136,6 +136,22 @@ def test_who_terminates_at_the_goal_is_told(
     label(CART, data=write(tmp_path / "logs", [ended, ended], more), out=tmp_path / "labelled")
     told = "2 episodes terminate at their goal and are labelled as failures"
     assert (told in caplog.text) == is_told
+    caplog.clear()
+    known = ended | {SUCCESS: np.zeros(10, bool)}
+    more = (Column(GOAL), *(column for column in OUTCOME_COLUMNS if column.name in (TERMINATED, SUCCESS)))
+    label(CART, data=write(tmp_path / "more", [known], more), out=tmp_path / "known")
+    assert caplog.text == ""
+
+
+def test_who_falls_while_it_lasts_is_at_no_goal(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = replace(task_named(CART), objective=Last(horizon=10))
+    monkeypatch.setattr("astra_data.stages.label.task_named", lambda _: task)
+    fell = drive(0.01, 5) | {TERMINATED: np.arange(5) == 4}
+    more = tuple(column for column in OUTCOME_COLUMNS if column.name == TERMINATED)
+    out = label(CART, data=write(tmp_path / "logs", [fell], more), out=tmp_path / "labelled")
+    assert Dataset.open(out).metadata["failed"] == [True] and "at their goal" not in caplog.text
 
 
 def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:

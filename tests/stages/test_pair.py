@@ -160,6 +160,34 @@ def test_data_of_another_rate_are_refused(collected: Path, tmp_path: Path) -> No
     pair(simulator, PairConfig(), dataset=slow, out=tmp_path / "out", progress=silent)
 
 
+def rewritten(source: Dataset, out: Path, changed: dict[str, Column]) -> Path:
+    """Write the first episode of a dataset with some columns called, and cut, as `changed` has them."""
+    columns = [changed.get(column.name, column) for column in source.schema]
+    description = {"name": "other", "stage": "import", "environment": source.description["environment"]}
+    with DatasetWriter(out, columns, fps=20, task="other", description=description) as writer:
+        episode = next(source.episodes())
+        cut = {name: episode.columns[name][:, : column.size] for name, column in changed.items()}
+        writer.add(replace(episode, columns={**episode.columns, **cut}))
+    return out
+
+
+def test_names_that_are_not_the_tasks_are_told(
+    collected: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    action = next(column for column in Dataset.open(collected).schema if column.name == ACTION)
+    other = replace(action, names=("left", "right"))
+    source = rewritten(Dataset.open(collected), tmp_path / "other", {ACTION: other})
+    pair("antmaze-umaze", PairConfig(), dataset=source, out=tmp_path / "out", progress=silent)
+    assert "takes left, right of action as " in caplog.text
+
+
+def test_commands_of_another_robot_are_refused(collected: Path, tmp_path: Path) -> None:
+    other = Column(ACTION, size=1, names=("throttle",))
+    source = rewritten(Dataset.open(collected), tmp_path / "other", {ACTION: other})
+    with pytest.raises(BadInputError, match=r"action has 1 values, expected those of antmaze-umaze: 2"):
+        pair("antmaze-umaze", PairConfig(), dataset=source, out=tmp_path / "out", progress=silent)
+
+
 @pytest.mark.parametrize(
     ("state", "told"),
     [
@@ -176,13 +204,8 @@ def test_data_of_another_robot_are_refused(
         names = columns[STATE].names
         assert names is not None
         state = replace(columns[STATE], names=(names[1], names[0], *names[2:]))
-    columns |= {STATE: state, NEXT_STATE: replace(state, name=NEXT_STATE)}
-    description = {"name": "other", "stage": "import", "environment": source.description["environment"]}
-    other, size = tmp_path / "other", state.size
-    with DatasetWriter(other, [*columns.values()], fps=20, task="other", description=description) as writer:
-        episode = next(source.episodes())
-        cut = {name: episode.columns[name][:, :size] for name in (STATE, NEXT_STATE)}
-        writer.add(replace(episode, columns={**episode.columns, **cut}))
+    changed = {STATE: state, NEXT_STATE: replace(state, name=NEXT_STATE)}
+    other = rewritten(source, tmp_path / "other", changed)
     with pytest.raises(BadInputError, match=told):
         pair("antmaze-umaze", PairConfig(), dataset=other, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()

@@ -53,7 +53,7 @@ def test_robomimics_masks_share_the_episodes(tmp_path: Path) -> None:
         assert train | valid == {name.encode() for name in file["data"]}
 
 
-@pytest.mark.parametrize("held_out", [None, 3])
+@pytest.mark.parametrize("held_out", [None, 3, 4])
 def test_copies_of_a_recording_are_on_its_side_of_robomimics_masks(
     tmp_path: Path, held_out: int | None
 ) -> None:
