@@ -180,7 +180,7 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
 
 def _failed_at_its_goal(task: Task, labelled: Episode) -> bool:
     """Whether an episode failed in a step that reached the goal."""
-    if not labelled.metadata["failed"] or task.objective.is_lasting:
+    if not labelled.metadata["failed"]:
         return False
     last = {
         name: as_rows(labelled.columns[name][-1:]) for name in (NEXT_STATE, GOAL) if name in labelled.columns
