@@ -126,7 +126,7 @@ def _world(
     **options: Any,  # noqa: ANN401 - checked as a recipe's are
 ) -> tuple[SimulatorEnv, Simulation, Training]:
     """Return the environment that `train` builds for a row, and what it builds it from."""
-    learn = _method_of(run, row).learn
+    learn = _method_of(settings_of(run), row).learn
     if not isinstance(learn, InSimulator):
         raise BadInputError(
             f"{row} is not trained in a simulator: expected a row that is, such as nas, or "
@@ -152,9 +152,9 @@ def training_of(
     Raises:
         BadInputError: the row trains nothing, an artefact is not there, or a change does not fit.
     """
-    if _method_of(run, row).learn is None:
-        raise BadInputError(f"{row} trains nothing: expected a row that is trained")
     settings, table = settings_of(run), "plus" if is_plus(row) else "train"
+    if _method_of(settings, row).learn is None:
+        raise BadInputError(f"{row} trains nothing: expected a row that is trained")
     changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | dict(changes)}
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     _check_made(of_train, ("dataset", "grounding"))
@@ -172,9 +172,9 @@ def training_of(
     )
 
 
-def _method_of(run: str | Path, row: str) -> Method:
-    """Return the method of a row of a run, whose own methods are added first."""
-    add_all(settings_of(run).get("own_methods", {}))
+def _method_of(settings: Mapping[str, Any], row: str) -> Method:
+    """Return the method of a row of a run with these settings, whose own methods are added first."""
+    add_all(settings.get("own_methods", {}))
     return method_named(row)
 
 

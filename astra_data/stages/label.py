@@ -105,7 +105,7 @@ def label(
             steps += len(labelled)
             successes += bool(labelled.metadata["success"])
             failures += bool(labelled.metadata["failed"])
-            at_goal += SUCCESS not in episode.columns and _failed_at_its_goal(world, labelled)
+            at_goal += SUCCESS not in episode.columns and _failed_at_its_goal(world, labelled, seed)
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
         writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
     if at_goal:
@@ -119,9 +119,8 @@ def label(
 
 def remarks(source: Dataset, task: Task) -> list[str]:
     """Say what is to be checked of a dataset that fits a task."""
-    return [
-        *filter(None, (names_apart(source, (task.state, task.action), task.name), _drawn_goals(source, task)))
-    ]
+    named = names_apart(source, (task.state, task.action), task.name)
+    return [remark for remark in (named, _drawn_goals(source, task)) if remark]
 
 
 def _drawn_goals(source: Dataset, task: Task) -> str:
@@ -142,11 +141,7 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     What it has of them is kept.
     """
     given = episode.columns
-    with explained("abstraction (φ) of the recorded states"):
-        before, after = (
-            torch.from_numpy(np.ascontiguousarray(task.abstraction(as_rows(given[key])), dtype=np.float32))
-            for key in (STATE, NEXT_STATE)
-        )
+    before, after = (_abstracted(task, given[key]) for key in (STATE, NEXT_STATE))
     goal = _goals(task, episode, seed)
     over = torch.zeros(len(episode), dtype=torch.bool)
     if TERMINATED in given:
@@ -178,16 +173,18 @@ def labels(task: Task, episode: Episode, seed: int) -> Episode:
     return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
 
 
-def _failed_at_its_goal(task: Task, labelled: Episode) -> bool:
+def _failed_at_its_goal(task: Task, labelled: Episode, seed: int) -> bool:
     """Whether an episode failed in a step that reached the goal."""
     if not labelled.metadata["failed"]:
         return False
-    last = {
-        name: as_rows(labelled.columns[name][-1:]) for name in (NEXT_STATE, GOAL) if name in labelled.columns
-    }
-    after = torch.from_numpy(np.ascontiguousarray(task.abstraction(last[NEXT_STATE]), dtype=np.float32))
-    goal = torch.from_numpy(last.get(GOAL, np.empty((1, 0), np.float32)))
-    return bool(judged(task.objective, "reached", after, goal))
+    after = _abstracted(task, labelled.columns[NEXT_STATE][-1:])
+    return bool(judged(task.objective, "reached", after, _goals(task, labelled, seed)[-1:]))
+
+
+def _abstracted(task: Task, states: Array) -> Tensor:
+    """Return φ (T, X) of recorded states."""
+    with explained("abstraction (φ) of the recorded states"):
+        return torch.from_numpy(np.ascontiguousarray(task.abstraction(as_rows(states)), dtype=np.float32))
 
 
 def _goals(task: Task, episode: Episode, seed: int) -> Tensor:

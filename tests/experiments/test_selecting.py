@@ -107,34 +107,30 @@ def test_what_is_not_there_is_asked_for(folder: Path) -> None:
         select(folder)
 
 
-def test_policies_of_every_size_are_judged(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe, sizes = folder / "recipe.json", list[Any]()
-    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | {"sweep": {"percent": [50, 100]}}))
+def asked(folder: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]) -> Any:  # noqa: ANN401
+    """What a run whose recipe has these `changes` asks to be judged."""
+    recipe, told = folder / "recipe.json", list[Any]()
+    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | changes))
 
     def noted(asked: Any, *_: object, **more: object) -> None:  # noqa: ANN401
-        sizes.append(asked.percents)
+        told.append(asked)
         raise StopIteration
 
     monkeypatch.setattr("astra_data.experiments.selecting.judge_all", noted)
     with pytest.raises(StopIteration):
         select(folder)
-    assert sizes == [(50, 100)]
+    [one] = told
+    return one
+
+
+def test_policies_of_every_size_are_judged(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert asked(folder, monkeypatch, {"sweep": {"percent": [50, 100]}}).percents == (50, 100)
 
 
 @pytest.mark.usefixtures("forgotten_methods")
 def test_rows_are_judged_with_the_groundings_that_they_share(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe, told = folder / "recipe.json", list[Any]()
     ensemble = f"{Path(__file__).parents[2]}/recipes/examples/methods/residual_ensemble.py:METHOD"
-    more = {"methods": ["nas_plus", "mine"], "own_methods": {"mine": {"method": ensemble}}}
-    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | more))
-
-    def noted(asked: Any, *_: object, **more: object) -> None:  # noqa: ANN401
-        told.append(asked.groundings)
-        raise StopIteration
-
-    monkeypatch.setattr("astra_data.experiments.selecting.judge_all", noted)
-    with pytest.raises(StopIteration):
-        select(folder)
-    assert told == [{"nas_plus": "nas", "mine": "mine"}]
+    changes = {"methods": ["nas_plus", "mine"], "own_methods": {"mine": {"method": ensemble}}}
+    assert asked(folder, monkeypatch, changes).groundings == {"nas_plus": "nas", "mine": "mine"}
