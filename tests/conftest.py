@@ -26,6 +26,24 @@ def fsync(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def disk_order(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What comes to the disk, in its order: "fsync NAME" of files and folders, and "replace"."""
+    done, fsync, replace = list[str](), os.fsync, os.replace
+
+    def note_fsync(handle: int) -> None:
+        done.append(f"fsync {os.path.basename(os.readlink(f'/proc/self/fd/{handle}'))}")
+        fsync(handle)
+
+    def note_replace(source: Path, target: Path) -> None:
+        done.append("replace")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", note_fsync)
+    monkeypatch.setattr(os, "replace", note_replace)
+    return done
+
+
+@pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of datasets that are known by name."""
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))

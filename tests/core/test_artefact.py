@@ -240,25 +240,12 @@ def test_what_a_kill_left_in_the_working_folder_is_not_published(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("fsync")
-def test_the_disk_has_what_a_folder_holds_before_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done, fsync, replace = list[str](), os.fsync, os.replace
-
-    def note_fsync(handle: int) -> None:
-        done.append(Path(os.readlink(f"/proc/self/fd/{handle}")).name)
-        fsync(handle)
-
-    def note_replace(source: Path, target: Path) -> None:
-        done.append("replace")
-        replace(source, target)
-
-    monkeypatch.setattr(os, "fsync", note_fsync)
-    monkeypatch.setattr(os, "replace", note_replace)
+def test_the_disk_has_what_a_folder_holds_before_its_name(tmp_path: Path, disk_order: list[str]) -> None:
     with finished_folder(tmp_path / "out") as folder:
         (folder / "model").write_text("weights")
-        done.clear()
-    assert sorted(done[: done.index("replace")]) == [".out.partial", "model"]
+        disk_order.clear()
+    before = disk_order[: disk_order.index("replace")]
+    assert sorted(before) == ["fsync .out.partial", "fsync model"]
 
 
 def test_a_linked_folder_in_what_is_replaced_is_unlinked_alone(tmp_path: Path) -> None:

@@ -86,33 +86,20 @@ def test_what_is_no_plain_file_is_written_to_and_not_replaced(tmp_path: Path) ->
 
 
 def test_the_disk_has_each_file_before_its_name_and_each_name_before_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, disk_order: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done: list[str] = []
-    fsync, replace = os.fsync, os.replace
-
-    def note_fsync(handle: int) -> None:
-        done.append(f"fsync {os.path.basename(os.readlink(f'/proc/self/fd/{handle}'))}")
-        fsync(handle)
-
-    def note_replace(source: Path, target: Path) -> None:
-        done.append("replace")
-        replace(source, target)
-
-    monkeypatch.setattr(os, "fsync", note_fsync)
-    monkeypatch.setattr(os, "replace", note_replace)
     write_file(tmp_path / "new" / "file", "text")
-    assert done == [f"fsync {tmp_path.name}", "fsync file", "replace", "fsync new"]
-    done.clear()
+    assert disk_order == [f"fsync {tmp_path.name}", "fsync file", "replace", "fsync new"]
+    disk_order.clear()
     make_folder(tmp_path / "a" / "b")
-    assert sorted(done) == sorted([f"fsync {tmp_path.name}", "fsync a"])
-    done.clear()
+    assert sorted(disk_order) == sorted([f"fsync {tmp_path.name}", "fsync a"])
+    disk_order.clear()
     sync_tree(tmp_path / "new")
-    assert sorted(done) == ["fsync file", "fsync new"]
+    assert sorted(disk_order) == ["fsync file", "fsync new"]
     monkeypatch.setenv(NO_FSYNC, "1")
-    done.clear()
+    disk_order.clear()
     write_file(tmp_path / "file", "text")
-    assert done == ["replace"]
+    assert disk_order == ["replace"]
 
 
 def test_a_folder_is_whole_or_gone_whenever_its_removal_is_killed(tmp_path: Path) -> None:
