@@ -6,6 +6,7 @@ schema        Results: what results.json holds
 seed_table    Results as a tidy table: one line per row and seed
 costs         times and speeds of the artefacts
 assembly      artefacts → Results
+mean_bands    errors by horizon, averaged over seeds
 merging       Results of several places → one
 comparing     summaries over seeds, comparisons of rows, predictive validity
 choice        the choice without the target: who was judged how, and what it is worth there

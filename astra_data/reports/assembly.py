@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError
@@ -29,6 +28,7 @@ from astra_data.reports.artefacts import (
 from astra_data.reports.choice import Judged, choice_of, read_judged
 from astra_data.reports.comparing import SHARED_WORLDS
 from astra_data.reports.costs import DATASET_STAGES, Files, seconds, seed_cost, throughput, with_first
+from astra_data.reports.mean_bands import mean_band
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs
@@ -256,15 +256,7 @@ def mean_gap(of_seeds: Mapping[int, Gap]) -> GapMeans:
     places = [[gap.horizons.index(horizon) for horizon in shared] for gap in gaps]
 
     def mean(bands: Sequence[Band]) -> BandMeans:
-        ends = np.mean(
-            [
-                np.array([band.mean, band.low, band.high], dtype=float)[:, kept]
-                for band, kept in zip(bands, places, strict=True)
-            ],
-            axis=0,
-        )
-        low, high = ([None if np.isnan(end) else end for end in of.tolist()] for of in ends[1:])
-        return BandMeans(mean=ends[0].tolist(), low=low, high=high)
+        return mean_band(bands, places)
 
     def mean_still(of_each: Sequence[dict[str, Band] | None]) -> dict[str, BandMeans] | None:
         known = [still for still in of_each if still is not None]

@@ -1,15 +1,13 @@
 """Results of one recipe from several places → Results: a later seed of a row replaces an earlier one."""
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Any
 
-import numpy as np
-
 from astra_data.core.errors import BadInputError
 from astra_data.methods import method_title
 from astra_data.reports.comparing import improvement, summarised, validity
+from astra_data.reports.mean_bands import mean_band
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.schema import BandMeans, DatasetOrigin, GapMeans, Results, shared_horizons
 from astra_data.reports.seed_table import lines_of, row_of
@@ -111,18 +109,11 @@ def _joined(known: GapMeans, found: GapMeans) -> GapMeans:
     if not (shared and alike) or set(known.seeds) & set(found.seeds):
         return known if len(known.seeds) > len(found.seeds) else found
 
+    places = [[gap.horizons.index(horizon) for horizon in shared] for gap in (known, found)]
+    weights = [len(known.seeds), len(found.seeds)]
+
     def mean(one: Mapping[str, BandMeans], other: Mapping[str, BandMeans]) -> dict[str, BandMeans]:
-        bands = {}
-        for quantity in one:
-            ends = [
-                [gap.at(band, horizon) for horizon in shared]
-                for gap, band in ((known, one[quantity]), (found, other[quantity]))
-            ]
-            weights = [len(known.seeds), len(found.seeds)]
-            means, lows, highs = np.average(np.array(ends, dtype=float), axis=0, weights=weights).T.tolist()
-            low, high = ([None if math.isnan(end) else end for end in of] for of in (lows, highs))
-            bands[quantity] = BandMeans(mean=means, low=low, high=high)
-        return bands
+        return {name: mean_band([one[name], other[name]], places, weights) for name in one}
 
     return GapMeans(
         seeds=sorted([*known.seeds, *found.seeds]),
