@@ -10,7 +10,7 @@ from astra_data.experiments.plan import plan, stage_of, stages_until
 from astra_data.learning.descent import DescentConfig
 
 
-def run_here(path: Path, until: str | None = None) -> Path:
+def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
     """Run a recipe in this process, to `runs` beside it; return its folder.
 
     A process of its own takes seconds to load what this one has loaded.
@@ -18,7 +18,7 @@ def run_here(path: Path, until: str | None = None) -> Path:
     experiment, stages = load_experiment(path, path.parent / "runs"), stages_until(until)
     experiment.folder.mkdir(parents=True)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
-    for item in plan(experiment.recipe, path, experiment.folder):
+    for item in plan(experiment.recipe, path, experiment.folder, device=device):
         if stage_of(item) in stages:
             item.call(progress=silent)
     return experiment.folder

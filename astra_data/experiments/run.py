@@ -154,10 +154,10 @@ def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict
     return conditions if data is None else {"data": data, **conditions}
 
 
-def _check_task(experiment: Experiment) -> None:
-    """Refuse a task that has faults; list them all."""
+def _check_task(experiment: Experiment, device: str = "cpu") -> None:
+    """Refuse a task that has faults on a device; list them all."""
     name = experiment.recipe.task
-    if faults := check_task(task_named(name)):
+    if faults := check_task(task_named(name), device):
         raise BadInputError("\n".join(f"{experiment.path}: task {name}: {fault}" for fault in faults))
 
 
@@ -200,7 +200,7 @@ def make(
     with folder_for(folder / RECORD), alone_in(folder):
         experiment.check_unchanged()
         if is_own_code(recipe.task):
-            _check_task(experiment)
+            _check_task(experiment, "cpu" if cluster else device)
         clean(folder)
         again = to_make_again(items, experiment)
         for key, reason in again.items():

@@ -8,7 +8,13 @@ from astra_data.worlds.objective import Objective
 from astra_data.worlds.own_code import explained
 
 
-def expect(what: str, found: object, shape: tuple[int, ...], dtype: torch.dtype | None = None) -> Tensor:
+def expect(
+    what: str,
+    found: object,
+    shape: tuple[int, ...],
+    dtype: torch.dtype | None = None,
+    device: torch.device | None = None,
+) -> Tensor:
     """Return `found`, a finite tensor of `shape`, where -1 stands for any length.
 
     Raises:
@@ -24,6 +30,10 @@ def expect(what: str, found: object, shape: tuple[int, ...], dtype: torch.dtype 
         raise BadInputError(f"{what}: expected shape {expected}, got {tuple(found.shape)}")
     if dtype is not None and found.dtype != dtype:
         raise BadInputError(f"{what}: expected {dtype}, got {found.dtype}")
+    if device is not None and found.device != device:
+        raise BadInputError(
+            f"{what}: expected a tensor on {device}, where its inputs are, got {found.device}"
+        )
     if not found.isfinite().all():
         raise BadInputError(f"{what}: expected finite numbers, got {first(found[~found.isfinite()])}")
     return found
@@ -43,7 +53,7 @@ def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tens
     what = f"objective.{name}(state, goal)"
     with explained(what):
         found = getattr(objective, name)(state, goal)
-    return expect(what, found, (len(state),), torch.bool)
+    return expect(what, found, (len(state),), torch.bool, state.device)
 
 
 def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
@@ -55,4 +65,4 @@ def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, fail
     what = "objective.reward(before, after, goal, failed)"
     with explained(what):
         found = objective.reward(before, after, goal, failed)
-    return expect(what, found, (len(after),))
+    return expect(what, found, (len(after),), device=after.device)

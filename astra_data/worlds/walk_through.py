@@ -19,11 +19,15 @@ _TOLERANCE = 1e-4
 """Between states, relative to their size: simulators compute in single precision."""
 
 
-def check_task(task: Task) -> list[str]:
+def check_task(task: Task, device: str = "cpu") -> list[str]:
     """Return one line for each piece of a task that is not as it should be; none if all is well.
 
     Three states are drawn, set, stepped and judged. A robot is reset once and is given no command; target
     environments that the task builds itself are left out.
+
+    Args:
+        task: what to walk through.
+        device: torch device on which policies would be trained for it.
     """
     faults: list[str] = []
 
@@ -34,15 +38,16 @@ def check_task(task: Task) -> list[str]:
             faults.append(str(error))
             return None
 
-    starts, goals, simulator = tried(_starts), tried(_goals), tried(_simulator)
+    starts, goals, simulator = tried(_starts), tried(_goals), tried(_simulator, device)
     tried(_abstraction)
     tried(_robot)
     if starts is not None and simulator is not None and tried(_reset, simulator, starts):
-        landed = tried(_step, simulator, starts)
+        landed = tried(_step, simulator, starts, device)
         if landed is not None and goals is not None:
-            tried(_observation, landed, goals)
-            if tried(_ends, landed, goals):
-                tried(_reward, starts, landed, goals)
+            before, after, goals = (values.to(device) for values in (starts, landed, goals))
+            tried(_observation, after, goals)
+            if tried(_ends, after, goals):
+                tried(_reward, before, after, goals)
     return faults
 
 
@@ -93,35 +98,36 @@ def _robot(task: Task) -> None:
     expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
 
 
-def _simulator(task: Task) -> AbstractSimulator:
+def _simulator(task: Task, device: str) -> AbstractSimulator:
     what = f"make_simulator({_COUNT})"
     with explained(what):
-        simulator = task.own_simulator(_COUNT)
+        simulator = task.own_simulator(_COUNT, device)
         state = simulator.state
     expect(f"{what}.state, {_COUNT} states at once", state, (_COUNT, task.abstract_state.size))
     return simulator
 
 
 def _reset(task: Task, simulator: AbstractSimulator, starts: Tensor) -> bool:
+    starts = starts.to(simulator.state.device)
     with explained("make_simulator: reset_to(state)"):
         simulator.reset_to(starts.clone())
         shown = simulator.state
     _same("make_simulator: after reset_to(state), state", shown, starts)
     with explained("make_simulator: reset_to(state, rows)"):
-        simulator.reset_to(starts[[0, 1]], torch.tensor([2, 0]))
+        simulator.reset_to(starts[[0, 1]], torch.tensor([2, 0], device=starts.device))
         shown = simulator.state
     _same("make_simulator: after reset_to(state, rows), state", shown, starts[[1, 1, 0]])
     return True
 
 
-def _step(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
-    what = "make_simulator: step(command)"
+def _step(task: Task, simulator: AbstractSimulator, starts: Tensor, device: str) -> Tensor:
+    what, starts = "make_simulator: step(command)", starts.to(simulator.state.device)
     drawn = generator(0, "actions").uniform(-1.0, 1.0, (_COUNT, len(task.limits)))
-    command = task.limits.in_units(torch.from_numpy(drawn).float())
+    command = task.limits.in_units(torch.from_numpy(drawn).float().to(starts.device))
 
     def stepped(rows: slice) -> Tensor:
         count = len(starts[rows])
-        batch = simulator if count == _COUNT else task.own_simulator(count)
+        batch = simulator if count == _COUNT else task.own_simulator(count, device)
         with explained(what):
             batch.reset_to(starts[rows].clone())
             before = batch.state
@@ -155,7 +161,7 @@ def _observation(task: Task, state: Tensor, goal: Tensor) -> None:
     what = "objective.observe(state, goal)"
     with explained(what):
         found = task.objective.observe(state, goal)
-    expect(what, found, (_COUNT, -1))
+    expect(what, found, (_COUNT, -1), device=state.device)
 
 
 def _ends(task: Task, state: Tensor, goal: Tensor) -> bool:
@@ -166,4 +172,4 @@ def _ends(task: Task, state: Tensor, goal: Tensor) -> bool:
 
 def _reward(task: Task, before: Tensor, after: Tensor, goal: Tensor) -> None:
     for failed in (False, True):
-        paid(task.objective, before, after, goal, torch.full((_COUNT,), failed))
+        paid(task.objective, before, after, goal, torch.full((_COUNT,), failed, device=after.device))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from on_meta import places
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
@@ -66,6 +67,7 @@ def test_a_new_robot_runs_by_the_words_of_its_page(tmp_path: Path, monkeypatch: 
     assert len(Dataset.open("runs/my_cart/pair/seed_0")) == 60
     command(lines[6].removeprefix("astra-data ") + " --help")
     assert len(Path("my_cart.py").read_text().splitlines()) < 75
+    assert places(task_named("my_cart.py:TASK")) == {"meta"}
 
 
 def test_logs_of_an_arm_give_its_task(tmp_path: Path) -> None:
@@ -74,6 +76,7 @@ def test_logs_of_an_arm_give_its_task(tmp_path: Path) -> None:
     assert shown.exit_code == 0 and "command q2" in shown.output, shown.output
     task = task_named("robots/arm/arm.py:TASK")
     assert task.timestep_s == 0.05 and task.state.names == ("q1", "q2", "q3")
+    assert places(task) == {"meta"}
     least, largest = task.limits["q1"]
     assert -np.radians(30) - 1e-3 <= least < 0 < largest <= np.radians(30) + 1e-3
     command(f"import {log} --mapping robots/arm/logs.toml --out imported")

@@ -68,3 +68,22 @@ def test_an_objective_that_fails_or_returns_something_else_is_named() -> None:
 
     with pytest.raises(BadInputError, match=r"^objective.missed\(state, goal\)"):
         judged(_objective(missed=failing), "missed", STATE, STATE)
+
+
+def test_answers_come_where_the_states_are() -> None:
+    """Else they meet no other tensor of a training on a GPU; "meta" stands for one."""
+    there = torch.empty(3, 2, device="meta")
+    objective = _objective(
+        reached=lambda state, goal: torch.zeros(3, dtype=torch.bool),
+        missed=lambda state, goal: state[:, 0] > torch.ones(3),
+        reward=lambda *_: torch.zeros(3),
+    )
+    expected = "expected a tensor on meta, where its inputs are, got cpu"
+    with pytest.raises(BadInputError, match=rf"^objective.reached\(state, goal\): {expected}$"):
+        judged(objective, "reached", there, there)
+    with pytest.raises(BadInputError, match=rf"^objective.reward\(.*\): {expected}$"):
+        paid(objective, there, there, there, there[:, 0] > 0)
+    with pytest.raises(
+        BadInputError, match=r"^objective.missed\(state, goal\) fails with RuntimeError: .*device"
+    ):
+        judged(objective, "missed", there, there)

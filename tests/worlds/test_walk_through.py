@@ -2,22 +2,40 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from on_meta import places
 from small_cart import TASK, Cart, Rail, Reach
 from torch import Tensor
 
-from astra_data.worlds.registry import TASKS
+from astra_data.worlds.registry import TASKS, task_named
 from astra_data.worlds.task import Task
 from astra_data.worlds.walk_through import check_task
+
+EXAMPLE_FILES = Path(__file__).parents[2] / "recipes" / "examples"
 
 
 @pytest.mark.parametrize("task", [TASK, *TASKS.values()], ids=lambda task: task.name)
 def test_nothing_is_wrong_with_the_tasks_of_the_package(task: Task) -> None:
     assert check_task(task) == []
+
+
+EXAMPLES = [f"{EXAMPLE_FILES}/{file}.py:TASK" for file in ("cart/cart", "fetch/push", "fetch/reach")]
+
+
+@pytest.mark.parametrize("name", [*TASKS, *EXAMPLES])
+def test_objectives_compute_where_states_are(name: str) -> None:
+    assert places(task_named(name)) == {"meta"}
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+@pytest.mark.parametrize("name", [*TASKS, *EXAMPLES])
+def test_nothing_is_wrong_with_them_on_a_gpu(name: str) -> None:
+    assert check_task(task_named(name), "cuda") == []
 
 
 def simulator(**methods: object) -> Task:

@@ -16,8 +16,8 @@ class Unicycle:
     abstract_state = Column("abstract.state", size=4, **POSE)
     parameters = {"timestep_s": TIMESTEP_S}
 
-    def __init__(self, num_envs):
-        self.state = torch.tensor([0.0, 0.0, 1.0, 0.0]).repeat(num_envs, 1)
+    def __init__(self, num_envs, device="cpu"):
+        self.state = torch.tensor([0.0, 0.0, 1.0, 0.0], device=device).repeat(num_envs, 1)
 
     @staticmethod
     def abstraction(state):  # φ: of [pose, v, w, tilt, tilt rate] keep the pose
@@ -50,7 +50,7 @@ class Deliver(Objective):
         return torch.stack([ahead, left], dim=-1) / 3.0
 
     def far(self, state):
-        return (state[:, :2] - torch.tensor(DOCK_M)).norm(dim=-1)
+        return (state[:, :2] - state.new_tensor(DOCK_M)).norm(dim=-1)
 
     def reached(self, state, goal):
         return self.far(state) < 0.3

@@ -27,8 +27,8 @@ class GripperAndPuck:
     abstract_state = Column("abstract.state", size=4, names=NAMES, astra={"unit": ["m"] * 4})
     parameters = {"timestep_s": TIMESTEP_S, "step_m": STEP_M, "contact_m": CONTACT_M}
 
-    def __init__(self, num_envs):
-        self.state = torch.tensor([0.0, 0.0, 1.0, 0.0]).repeat(num_envs, 1)
+    def __init__(self, num_envs, device="cpu"):
+        self.state = torch.tensor([0.0, 0.0, 1.0, 0.0], device=device).repeat(num_envs, 1)
 
     @staticmethod
     def abstraction(state):  # φ: of gripper, puck, angles and speeds keep where both are in the plane

@@ -20,8 +20,8 @@ class Point:
     abstract_state = Column("abstract.state", size=3, **AXES)
     parameters = {"timestep_s": TIMESTEP_S, "step_m": STEP_M}
 
-    def __init__(self, num_envs):
-        self.state = torch.zeros(num_envs, 3)
+    def __init__(self, num_envs, device="cpu"):
+        self.state = torch.zeros(num_envs, 3, device=device)
 
     @staticmethod
     def abstraction(state):  # φ: of gripper, fingers and their velocities keep where the gripper is
