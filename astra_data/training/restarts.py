@@ -58,7 +58,11 @@ def _attempt(training: Training, seed: int, number: int) -> Training:
     tries = training.config.tries
     folder = training.folder / f"try_{number}" if number else training.folder
     folder.mkdir(exist_ok=True)
-    progress = part(training.progress, number / tries, (number + 1) / tries)
+    share = part(training.progress, number / tries, (number + 1) / tries)
+
+    def progress(fraction: float, note: str) -> None:
+        share(fraction, f"try {number + 1} of {tries}  {note}")
+
     return replace(training, seed=seed, folder=folder, progress=progress)
 
 

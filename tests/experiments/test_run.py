@@ -10,7 +10,7 @@ from fake_stages import asked
 
 from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.run import check, run, run_stage
+from astra_data.experiments.run import check, make, run, run_stage
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
 
@@ -124,6 +124,23 @@ def test_networks_compute_on_the_device_that_is_asked_for(
     run(recipe, root=tmp_path, device="cuda:0", until="ground")
     run_stage(recipe, "ground", root=tmp_path, device="cuda:0")
     assert told == [("ground/astra/seed_0", "cuda:0")] * 2
+
+
+@pytest.mark.parametrize(("cluster", "walked"), [(None, "cuda:0"), ("auto", "cpu")])
+def test_a_task_is_walked_through_where_its_policies_are_trained(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cluster: str | None, walked: str
+) -> None:
+    """A cluster's machines have GPUs that this one may lack."""
+    told: list[str] = []
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("astra_data.experiments.run.is_own_code", lambda _: True)
+    monkeypatch.setattr("astra_data.experiments.run.check_task", lambda _, device: told.append(device) or [])
+    for way in ("execute", "execute_on_cluster"):
+        monkeypatch.setattr(f"astra_data.experiments.run.{way}", lambda *_, **__: None)
+    device = "cuda" if cluster else "cuda:0"
+    experiment = load_experiment(recipe, tmp_path)
+    make(experiment, (), jobs=1, device=device, cluster=cluster)
+    assert told == [walked]
 
 
 @pytest.mark.parametrize("stage", ["ground", "align"])

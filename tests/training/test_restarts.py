@@ -80,15 +80,19 @@ def test_a_policy_that_masters_its_simulator_is_kept(tmp_path: Path) -> None:
 
 
 def test_it_is_trained_again_until_it_does(tmp_path: Path) -> None:
-    shares: list[float] = []
-    command, curve, seeds = restarted(
-        tmp_path, [-1.0, 0.9, 1.0], lambda share, note: shares.append(share), tries=3
-    )
+    shares, notes = list[float](), list[str]()
+
+    def progress(share: float, note: str) -> None:
+        shares.append(share)
+        notes.append(note.partition("  ")[0])
+
+    command, curve, seeds = restarted(tmp_path, [-1.0, 0.9, 1.0], progress, tries=3)
     assert (command, seeds) == (0.9, SEEDS[:2])
     assert [one["success"] for one in curve["tries"]] == [0.0, 1.0]
     # Forward at 3.75 m/s goals from 1 to 2 m are reached in 3 to 6 steps; backward none in all 40.
     assert curve["tries"][0]["episode_steps"] == 40 and 3 < curve["tries"][1]["episode_steps"] < 6
     assert shares == sorted(shares) and max(shares) == pytest.approx(2 / 3)
+    assert sorted(set(notes)) == ["try 1 of 3", "try 2 of 3"]
     assert not (tmp_path / "try_1").exists()
 
 
