@@ -11,6 +11,7 @@ from fake_stages import asked
 from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.run import check, make, run, run_stage
+from astra_data.worlds.task import Task
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
 
@@ -134,7 +135,12 @@ def test_a_task_is_walked_through_where_its_policies_are_trained(
     told: list[str] = []
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     monkeypatch.setattr("astra_data.experiments.run.is_own_code", lambda _: True)
-    monkeypatch.setattr("astra_data.experiments.run.check_task", lambda _, device: told.append(device) or [])
+
+    def walked_through(task: Task, device: str) -> list[str]:
+        told.append(device)
+        return []
+
+    monkeypatch.setattr("astra_data.experiments.run.check_task", walked_through)
     for way in ("execute", "execute_on_cluster"):
         monkeypatch.setattr(f"astra_data.experiments.run.{way}", lambda *_, **__: None)
     device = "cuda" if cluster else "cuda:0"

@@ -84,7 +84,8 @@ def data_efficiency(
         axes.set_xlabel("size of the dataset")
         score_axis(axes, score)
         axes.set_ylabel(f"{score.quantity} {tested}")
-        axes.legend(loc="lower right", ncols=2)
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
         return figure
 
 
