@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from spending import SPENT, spend
+from stopping import Stopped, stop_past
 from torch import Tensor
 from toy_episodes import toy_episodes
 
@@ -117,22 +118,13 @@ def test_the_mask_tells_causes_from_bystanders(found: tuple[Variation, dict[str,
     assert mask["timestep_scale"]["velocity_m_s"] < QUICK.mask_threshold < mask["friction"]["velocity_m_s"]
 
 
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
-
-
-def stop(fraction: float, note: str) -> None:
-    if fraction >= 0.5:
-        raise Stopped
-
-
 def test_after_an_interruption_it_goes_on(tmp_path: Path) -> None:
     settings = QUICK.model_copy(update={"contexts": 8, "updates": 20, "iterations": 4})
     for name in ("whole", "interrupted"):
         (tmp_path / name).mkdir()
     whole, expected = identify(fitting(tmp_path / "whole", settings))
     with pytest.raises(Stopped):
-        identify(fitting(tmp_path / "interrupted", settings, stop))
+        identify(fitting(tmp_path / "interrupted", settings, stop_past(0.49)))
     spend(tmp_path / "interrupted" / "checkpoint.safetensors")
     seen: list[str] = []
     resumed, metrics = identify(

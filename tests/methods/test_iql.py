@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from spending import SPENT, spend
+from stopping import Stopped
 from toy_episodes import toy_episodes
 
 from astra_data.core.checkpoint import flatten, save_tensors
@@ -168,10 +169,6 @@ def test_cloning_needs_no_steps_to_look_ahead(learn: Learn, episodes: PairedEpis
     with pytest.raises(BadInputError, match=r"at least 10 steps \(return_steps\)"):
         learn(temperature=0.0, critic_updates=1, return_steps=10)
     assert learn(how=clone_behavior, return_steps=10)
-
-
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
 
 
 def test_after_an_interruption_it_goes_on(

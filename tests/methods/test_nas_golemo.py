@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 from spending import SPENT, spend
+from stopping import Stopped, stop_past
 from torch import Tensor
 from toy_episodes import toy_episodes
 
@@ -154,21 +155,12 @@ def test_what_lies_beyond_an_episodes_end_teaches_nothing(tmp_path: Path) -> Non
         assert torch.equal(ours, theirs)
 
 
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
-
-
-def stop(fraction: float, note: str) -> None:
-    if fraction > 0.5:
-        raise Stopped
-
-
 def test_the_time_before_an_interruption_counts(tmp_path: Path) -> None:
     torch.manual_seed(0)
     both = episodes(32, torch.randn(32, STEPS, 4), torch.randn(32, STEPS, 2))
     given = fitting(both, tmp_path, GolemoConfig(epochs=2, hidden_size=4, layers=1))
     with pytest.raises(Stopped):
-        fit_residual(replace(given, progress=stop))
+        fit_residual(replace(given, progress=stop_past(0.5)))
     spend(tmp_path / "checkpoint.safetensors")
     _, metrics = fit_residual(given)
     assert all(seconds < metrics[clock] < seconds + 500 for clock, seconds in SPENT.items())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from small_run import ALIGN
+from stopping import Stopped
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
@@ -99,10 +100,6 @@ def test_where_phi_drops_the_place_the_encoder_does_not_see_it(
     torch.testing.assert_close(
         scale[2:], load_target_encoder(aligned / "target_encoder.safetensors").state_std[2:]
     )
-
-
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
 
 
 def stop(fraction: float, note: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from small_run import COLLECT, TASK
+from stopping import Stopped
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
@@ -245,10 +246,6 @@ def test_too_few_episodes_for_the_steps_are_told(task: str, tmp_path: Path) -> N
     with pytest.raises(BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: take more"):
         collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()
-
-
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
 
 
 @pytest.mark.usefixtures("small_training")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from small_run import GOLEMO, GROUND, TRAIN
+from stopping import Stopped
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
@@ -41,10 +42,6 @@ def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
     ground(task, method, GROUND, dataset=dataset, seed=0, out=out, device="cpu", progress=progress)
     return (out / "grounding.safetensors").read_bytes()
-
-
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
 
 
 def stop_after(updates: int) -> Progress:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_run import TRAIN
+from stopping import Stopped, stop_past
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.digest import file_digest
@@ -39,15 +40,6 @@ def make(
     inputs = {"dataset": dataset, "grounding": grounding, "settings": RMA if method == "rma" else None}
     train(task, method, config, **inputs, seed=0, out=out, device="cpu", progress=progress)  # type: ignore[arg-type]
     return (out / "policy.safetensors").read_bytes()
-
-
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
-
-
-def stop(fraction: float, note: str) -> None:
-    if fraction > 0.7:
-        raise Stopped
 
 
 def test_the_artefact_is_complete(task: str, grounded: Path, trained: Path) -> None:
@@ -136,7 +128,7 @@ def test_after_an_interruption_it_goes_on(
     expected = make(task, method, paired, grounding, tmp_path / "whole", config)
     out = tmp_path / "interrupted"
     with pytest.raises(Stopped):
-        make(task, method, paired, grounding, out, config, stop)
+        make(task, method, paired, grounding, out, config, stop_past(0.7))
     assert not out.exists()
     seen: list[float] = []
     resumed = make(task, method, paired, grounding, out, config, lambda done, note: seen.append(done))
@@ -171,7 +163,7 @@ def test_sac_goes_on_after_an_interruption(
     expected = make(task, method, paired, grounding, tmp_path / "whole", config)
     out = tmp_path / "interrupted"
     with pytest.raises(Stopped):
-        make(task, method, paired, grounding, out, config, stop)
+        make(task, method, paired, grounding, out, config, stop_past(0.7))
     assert make(task, method, paired, grounding, out, config) == expected
     assert isinstance(PolicyFile.load(out / "policy.safetensors").policy, SoftActor)
 
@@ -181,7 +173,7 @@ def test_a_checkpoint_of_another_version_is_told(
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Stopped):
-        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop)
+        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop_past(0.7))
     (checkpoint,) = tmp_path.rglob("checkpoint.safetensors")
     tensors, told = load_tensors(checkpoint)
     save_tensors(checkpoint, {name: value for name, value in tensors.items() if "acting" not in name}, told)
@@ -196,7 +188,7 @@ def test_what_was_begun_with_other_settings_is_left_alone(
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Stopped):
-        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop)
+        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop_past(0.7))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
     longer = TRAIN.model_copy(update={"total_steps": 2 * TRAIN.total_steps})
     with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
@@ -214,7 +206,7 @@ def test_what_was_begun_with_another_grounding_is_refused(
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Stopped):
-        make(task, "nas", paired, grounded, tmp_path / "out", TRAIN, stop)
+        make(task, "nas", paired, grounded, tmp_path / "out", TRAIN, stop_past(0.7))
     with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
         make(task, "nas", paired, grounded_anew, tmp_path / "out")
     make(task, "nas", paired, grounded, tmp_path / "out")

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 from small_run import TRAIN
+from stopping import Stopped, stop_past
 
 from astra_data.core.progress import Progress, silent
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
@@ -13,15 +14,6 @@ from astra_data.training.train_in_target import TargetConfig
 CONFIG = TRAIN.model_copy(update={"data_start_share": 0.5, "episode_steps": 1})
 MEMORY = {"target": None, "full_obs": 0}
 """Sizes of the policies' memories; None is the recipe's."""
-
-
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
-
-
-def stop(fraction: float, note: str) -> None:
-    if fraction > 0.7:
-        raise Stopped
 
 
 def make(task: str, row: str, dataset: Path, out: Path, progress: Progress = silent) -> bytes:
@@ -55,7 +47,7 @@ def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     expected = make(task, row, paired, whole)
     with pytest.raises(Stopped):
-        make(task, row, paired, broken, stop)
+        make(task, row, paired, broken, stop_past(0.7))
     seen: list[float] = []
     assert make(task, row, paired, broken, lambda done, note: seen.append(done)) == expected
     assert seen == pytest.approx([5 / 6, 1.0])

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from small_cart import TASK as CART
+from stopping import Stopped, stop_past
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
@@ -86,16 +87,9 @@ def test_it_goes_on_from_its_checkpoint(
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
 
-    class Stopped(Exception):  # noqa: N818 - stands for a kill
-        pass
-
-    def stop(share: float, note: str) -> None:
-        if share > 0.7:
-            raise Stopped
-
     given: dict[str, Any] = {"steps": 250, "seed": 7, "folder": tmp_path, "num_threads": 1}
     with pytest.raises(Stopped):
-        suboptimal_by_ppo(task, **given, progress=stop)
+        suboptimal_by_ppo(task, **given, progress=stop_past(0.7))
     _, metadata = suboptimal_by_ppo(task, **given, progress=silent)
     assert [one.went_on_from for one in Counting.made] == [0, 100]
     assert Counting.made[-1].goes_on == episodes_go_on

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from humanoid_recipe import RECIPE
 from quick_runs import run_here
+from stopping import Stopped, stop_past
 
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.files import load_grounding
@@ -85,15 +86,6 @@ def short() -> Iterator[None]:
     del TASKS[TASK]
 
 
-class Stopped(Exception):  # noqa: N818 - stands for a kill
-    pass
-
-
-def stop(fraction: float, note: str) -> None:
-    if fraction > 0.4:
-        raise Stopped
-
-
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("method", ["compass_uniform", "rma"])
 def test_training_goes_on_after_an_interruption(
@@ -115,5 +107,5 @@ def test_training_goes_on_after_an_interruption(
 
     expected = trained(tmp_path / "whole")
     with pytest.raises(Stopped):
-        trained(tmp_path / "interrupted", stop)
+        trained(tmp_path / "interrupted", stop_past(0.4))
     assert trained(tmp_path / "interrupted") == expected
