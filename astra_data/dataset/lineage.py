@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.naming import RECORD
 from astra_data.core.wording import shortened
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.meta_files import read_description
@@ -41,7 +42,7 @@ class Ancestor:
 
 
 def lineage(dataset: Dataset) -> Ancestor:
-    """Return `dataset` with all its ancestors, looked up in `versions.home()` and in the folders beside it.
+    """Return `dataset` with all its ancestors, looked up in `versions.home()`, beside it, and in its run.
 
     An ancestor is found where name, version and content hash are those that its descendant lists.
 
@@ -96,7 +97,11 @@ def _ancestor(
 
 
 def _found(identity: Mapping[str, str], beside: Path) -> _Described | None:
-    neighbours = sorted(path.parents[2] for path in beside.glob(f"*/{DATASET_PATH}"))
+    places = [beside.glob(f"*/{DATASET_PATH}")]
+    for folder in beside.parents[:2]:
+        if (folder / RECORD).exists():
+            places += [folder.glob(f"{depth}/{DATASET_PATH}") for depth in ("*/*", "*/*/*")]
+    neighbours = [path.parents[2] for place in places for path in sorted(place)]
     for folder in (home_of(identity), *neighbours):
         try:
             found = read_description(folder)

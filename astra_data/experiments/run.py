@@ -138,8 +138,8 @@ def run_stage(
 def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict[str, Condition]:
     """Validate a recipe without running it; return each planned artefact and its condition.
 
-    A task of the user's own is walked through, as by `check_task`. With `verify`, every byte of the artefacts is read;
-    otherwise their sizes are compared.
+    A task of the user's own is walked through, as by `check_task`. With `verify`, every byte of the artefacts
+    is read; otherwise their sizes are compared.
 
     Raises:
         RecipeError: the recipe has faults.

@@ -142,6 +142,8 @@ class Task:
         commands = Commands.recorded(bounds) if isinstance(bounds, str | Path) else Commands(bounds)
         if (size := self.objective.action_size) != len(commands):
             faults.append(f"objective: action_size {size}, expected that of commands, {len(commands)}")
+        if self.action and {*self.action.labels} == {*commands} and self.action.labels != (*commands,):
+            faults.append(f"action: names {', '.join(self.action.labels)}, expected {', '.join(commands)}")
         if (horizon := self.objective.horizon) < 1:
             faults.append(f"objective: horizon {horizon}, expected 1 step or more")
         if not 0 < self.timestep_s < 2:
@@ -152,11 +154,10 @@ class Task:
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
         abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]
-        size = self.objective.goal_size
         usual = {
             "instruction": self.name,
             "action": Column(ACTION, size=len(commands), names=tuple(commands)),
-            "goal": Column(GOAL, size=size) if size else None,
+            "goal": Column(GOAL, size=size) if (size := self.objective.goal_size) else None,
             "abstraction": getattr(self.make_simulator, "abstraction", None),
             "abstract_state": replace(abstract, name=ABSTRACT_STATE),
             "quantities": {name: (index,) for index, name in enumerate(_with_units(abstract))},
@@ -215,9 +216,8 @@ class Task:
     def without_maze(self) -> BadInputError:
         """Return the error for settings that need a maze."""
         return BadInputError(
-            f"expected a task in a maze, got '{self.name}', which has none: leave out what needs "
-            "one (augment, follower, support_penalty, command_limit, "
-            "clearance_m, start 'anywhere')"
+            f"expected a task in a maze, got '{self.name}', which has none: leave out what needs one "
+            "(augment, follower, support_penalty, command_limit, clearance_m, start 'anywhere')"
         )
 
     @property

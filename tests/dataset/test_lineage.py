@@ -31,6 +31,17 @@ def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize("place", ["pair/seed_0", "subset/percent_050/seed_0"])
+def test_ancestors_are_found_in_the_run(tmp_path: Path, place: str) -> None:
+    """In the folders of its other stages, wherever there is a run."""
+    first = write_fake(tmp_path / "run/label/seed_0")
+    made = Dataset.open(delete(first, [13], out=tmp_path / "run" / place))
+    found = f"└── fake@data-1.0.0  {first.content_hash[:8]}  "
+    assert list(tree_lines(lineage(made)))[1:] == [f"{found}(not found here)"]
+    (tmp_path / "run/recipe.json").write_text("{}")
+    assert list(tree_lines(lineage(made)))[1:] == [f"{found}collect: episodes 5, noise_m 0.1"]
+
+
 def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
     first = write_fake(tmp_path / "elsewhere/first")
     made = Dataset.open(delete(first, [13, 4], out=tmp_path / "made"))

@@ -167,6 +167,13 @@ def test_a_task_without_a_target_says_so() -> None:
     [
         ({"commands": {"v": (0.0, 1.0), "w": (0.0, 1.0)}}, "objective: action_size 1, expected .* 2"),
         ({"commands": {"v": (1.0, 0.0)}}, "commands: v: expected"),
+        (
+            {
+                "commands": {"v": (0.0, 1.0), "w": (0.0, 1.0)},
+                "action": Column("action", size=2, names=("w", "v")),
+            },
+            "action: names w, v, expected v, w$",
+        ),
         ({"timestep_s": 0.0}, "timestep_s: expected above 0 and below 2 s.*: got 0.0"),
         ({"timestep_s": 2.0}, "timestep_s: expected above 0 and below 2 s.*: got 2.0"),
         ({"name": "my rail"}, "name: expected letters, digits"),

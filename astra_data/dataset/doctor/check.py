@@ -59,7 +59,9 @@ def check(root: Path) -> Report:
         report.fault(INFO_PATH, f"{INFO_PATH} {info}: nothing else was checked")
         return report
     is_ours = (root / DATASET_PATH).exists()
-    if not is_ours:
+    if not is_ours and any((root / DATASET_PATH).parent.glob("*")):
+        report.fault("origin", f"{DATASET_PATH} is missing: the dataset is incomplete; copy it again")
+    elif not is_ours:
         report.note("origin", f"no {DATASET_PATH}: a plain LeRobot dataset of unknown provenance")
     columns = _info_faults(info, report)
     if columns and _files_are_readable(root, info, columns, report):

@@ -40,7 +40,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         raise BadInputError(f"{source}: expected an object of fields, got {type(fields).__name__}")
     shapes = {name: (len(rows),) if isinstance(rows, list) else () for name, rows in fields.items()}
     if row_count(str(source), mapping.all_fields, shapes):
-        yield Block({field: np.array(fields[field]) for field in mapping.all_fields}, str(source))
+        yield _block(fields, mapping, str(source))
 
 
 def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -54,8 +54,8 @@ def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             if rows:
                 if last is not None:
                     yield last
-                columns = {field: np.array([row[field] for row in rows]) for field in mapping.all_fields}
-                last = Block(columns, str(source))
+                fields = {field: [row[field] for row in rows] for field in mapping.all_fields}
+                last = _block(fields, mapping, str(source))
             if last is not None:
                 last = replace(last, torn=torn)
     if last is not None:
@@ -79,6 +79,20 @@ def _row(line: bytes, origin: str, mapping: ImportMapping) -> dict[str, Any]:
     if not row.keys() >= set(mapping.all_fields):
         row_count(origin, mapping.all_fields, dict.fromkeys(row, (1,)))
     return row
+
+
+def _block(fields: dict[str, list[Any]], mapping: ImportMapping, origin: str) -> Block:
+    """Return the rows of the mapping's fields; null among numbers is NaN, as an empty cell of CSV is."""
+    columns = {}
+    for field in mapping.all_fields:
+        try:
+            values = np.array(fields[field])
+        except ValueError:
+            raise BadInputError(f"{origin}: field '{field}': expected as many values in each row") from None
+        if values.dtype == object and all(isinstance(value, int | float | None) for value in values.flat):
+            values = values.astype(float)
+        columns[field] = values
+    return Block(columns, origin)
 
 
 def _is_torn(line: bytes) -> bool:

@@ -1,5 +1,6 @@
 import hashlib
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -46,6 +47,17 @@ def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
     report = check(write_fake(tmp_path / "set").root)
     assert (report.faults, report.notes) == ([], [])
     assert (report.episodes, report.frames) == (5, 55)
+
+
+def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
+    """A dataset of LeRobot's has no folder of ours, and is."""
+    root = write_fake(tmp_path / "set").root
+    (root / "meta/astra/dataset.json").unlink()
+    assert [str(fault) for fault in check(root).faults] == [
+        "meta/astra/dataset.json is missing: the dataset is incomplete; copy it again"
+    ]
+    shutil.rmtree(root / "meta/astra")
+    assert check(root).faults == []
 
 
 def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import tarfile
+from json import dumps
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,31 @@ def test_lines_are_read_block_by_block(tmp_path: Path, name: str) -> None:
     x = np.concatenate([first.values["x"], second.values["x"]])
     np.testing.assert_array_equal(x, np.stack([np.arange(n), np.full(n, 0.5)], axis=1))
     assert second.values["on"].tolist() == [True] * 3
+
+
+@pytest.mark.parametrize("name", ["log.json", "log.jsonl"])
+def test_null_among_numbers_is_no_number_as_an_empty_cell_is(tmp_path: Path, name: str) -> None:
+    """Also in lists; text beside it stays what it is."""
+    path = tmp_path / name
+    x: list[object] = [[1, 0.5], [None, 2], [3, None]]
+    on = [True, None, "a"]
+    lines = "".join(f"{dumps({'x': x[row], 'on': on[row]})}\n" for row in range(3))
+    path.write_text(lines if name.endswith("l") else dumps({"x": x, "on": on}))
+    [block] = json.read(Source(path, None, path), LISTS)
+    np.testing.assert_array_equal(block.values["x"], [[1.0, 0.5], [np.nan, 2.0], [3.0, np.nan]])
+    assert block.values["on"].tolist() == on
+
+
+@pytest.mark.parametrize("name", ["log.json", "log.jsonl"])
+def test_rows_with_more_or_fewer_values_are_told_with_their_field(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    rows: list[dict[str, object]] = [{"x": [1, 2], "on": 0}, {"x": 1, "on": 1}]
+    lines = "".join(f"{dumps(row)}\n" for row in rows)
+    path.write_text(
+        lines if name.endswith("l") else dumps({key: [row[key] for row in rows] for key in rows[0]})
+    )
+    with pytest.raises(BadInputError, match=f"^{name}: field 'x': expected as many values in each row$"):
+        list(json.read(Source(path, None, path), LISTS))
 
 
 def test_a_folder_and_an_archive_of_lines_become_episodes(tmp_path: Path) -> None:
