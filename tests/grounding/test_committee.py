@@ -184,3 +184,20 @@ def test_one_correction_alone_cannot_disagree() -> None:
         Committee.of(
             TASK, [HistoryGrounding(shifted(0.1)), IdentifiedParameters.__new__(IdentifiedParameters)]
         )
+
+
+def test_progress_is_told_after_each_step() -> None:
+    told = list[float]()
+    start, goal = torch.zeros(2, 1), torch.full((2, 1), 9.0)
+    committee().follow(start, goal, torch.zeros(4, 2, 1), lambda done, note: told.append(done))
+    assert told == [0.25, 0.5, 0.75, 1.0]
+
+
+def test_what_hardly_scatters_beside_the_rest_is_not_lost_to_rounding() -> None:
+    """Two values that scatter together, as a place and the speed that is computed from it."""
+    model = GroundingModel(GroundingShape(2, 1, 1, latent_size=4)).requires_grad_(False)
+    model.residual_factor.copy_(torch.tensor([[1.0, 0.0], [1.0, 1e-5]]))
+    of = Committee.of(TASK, [HistoryGrounding(model, members=(model,))])
+    np.testing.assert_allclose(
+        of.whitened(torch.tensor([[0.0, 1e-5], [1.0, 1.0]])), [[0, 1], [1, 0]], rtol=1e-4
+    )

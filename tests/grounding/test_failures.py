@@ -405,3 +405,45 @@ def test_who_cross_fits_has_not_seen_the_fold(monkeypatch: pytest.MonkeyPatch) -
     steps = int(episodes.windows.mask.sum())
     assert len(fails[0]) == steps
     assert sum(steps - len(one) for one in fails[1:]) == steps  # each step is left out once
+
+
+def test_copies_of_one_failure_are_not_cross_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that fail are of the same recording: whoever is fitted to the others has seen no failure."""
+    monkeypatch.setattr(module, "_DESCENT", DescentConfig(updates=4))
+    monkeypatch.setattr(module, "calibration", lambda *_: pytest.fail("nothing was left out"))
+    each = torch.arange(10)
+    copied = replace(hurried(10, 0), recordings=torch.where(each % 2 == 0, 0, each))
+    fit_failures(TASK, HistoryGrounding(grounding_model()), copied, 1, seed=0)
+
+
+def test_where_whole_episodes_are_before_their_failure_probabilities_are_still_numbers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of three episodes two fail, from their first step on: half of what is left out tells nothing."""
+    monkeypatch.setattr(module, "_DESCENT", DescentConfig(updates=4))
+    episodes = hurried(3, 0)
+    model = fit_failures(TASK, HistoryGrounding(grounding_model()), episodes, 1, 0, 100)
+    said = episodes.steps(said_of(model, episodes))
+    assert ((said > 0) & (said < 1)).all()
+
+
+def test_rewards_beyond_those_of_certain_failures_are_certainties(monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes, model = hurried(4, 0), grounding_model()
+    soon = episodes.windows.fails_soon
+    model.failure_weight.fill_(1.0)
+    model.failure_cost.fill_(-10.0)
+    failing = torch.where(soon.bool(), -30.0, 5.0) / RISK_STEPS
+    parts = torch.stack([torch.ones_like(soon), failing], dim=-1)
+    monkeypatch.setattr(model, "predict_reward_parts", lambda latent, action: parts)
+    found = compared_foresight(TASK, HistoryGrounding(model), episodes, predicts_reward=True)
+    assert found["predicted_reward"]["brier_skill"] == pytest.approx(1.0)
+
+
+def test_reliability_is_what_was_said_beside_what_happened() -> None:
+    """By the bins of 0.1 to 0.2 and 0.5 to 1: of the former nothing fails."""
+    episodes = hurried(4, 0)
+    soon = episodes.windows.fails_soon.bool()
+    safe = episodes.windows.mask.bool() & ~soon & (torch.arange(100) % 2 == 0)
+    found = foresight(torch.where(safe, 0.125, 0.75), episodes)["reliability"]
+    calm, others = int(safe.sum()), int((episodes.windows.mask.bool() & ~safe).sum())
+    assert found == [[0.125, 0.0, calm], [0.75, pytest.approx(int(soon.sum()) / others), others]]

@@ -276,3 +276,27 @@ def test_members_cost_time_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     given = Fitting(TASKS["antmaze-umaze"], config, None, *parts, 0, "cpu", tmp_path, silent)
     _, metrics = HistoryFit(latent=True, reward=True)(given)
     assert (metrics["wall_seconds"], metrics["cpu_seconds"]) == (6.0, 9.0)
+
+
+def test_states_without_a_place_are_seen_without_waves(tmp_path: Path) -> None:
+    config = GroundConfig(updates=1, batch_windows=4, window=5, latent_size=8)
+    nowhere = replace(TASKS["antmaze-umaze"], plane=None)
+    fitting = Fitting(nowhere, config, None, episodes(0), episodes(1, 3), 0, "cpu", tmp_path, silent)
+    assert HistoryFit(latent=True, reward=True)(fitting)[0].model.shape.position_octaves == 0
+
+
+def test_each_model_has_its_share_of_the_progress(tmp_path: Path) -> None:
+    config = GroundConfig(updates=20, batch_windows=1, window=2, latent_size=8, members=1)
+    task, shares = TASKS["antmaze-umaze"], list[float]()
+    parts = (episodes(0), episodes(1, 3))
+    given = Fitting(task, config, None, *parts, 0, "cpu", tmp_path, lambda share, _: shares.append(share))
+    HistoryFit(latent=False, reward=False)(given)
+    assert shares == [0.25, 0.5, 0.75, 1.0]
+
+
+def test_the_speed_of_a_fit_is_of_all_its_windows(tmp_path: Path) -> None:
+    config = GroundConfig(updates=20, batch_windows=4, window=5, latent_size=8)
+    parts = (episodes(0), episodes(1, 3))
+    given = Fitting(TASKS["antmaze-umaze"], config, None, *parts, 0, "cpu", tmp_path, silent)
+    _, metrics = HistoryFit(latent=True, reward=True)(given)
+    assert metrics["windows_per_second"] * metrics["wall_seconds"] == pytest.approx(20 * 4, rel=0.5)

@@ -264,3 +264,14 @@ def test_within_a_history_a_failure_model_knows_the_action_before_and_what_it_is
     states = torch.zeros(1, 5, 4)
     of = toy_episodes(states, torch.zeros(1, 5, 2), next_state=states).windows
     assert HistoryGrounding(used, failures).hidden_before(of).shape == (1, 5, 8)
+
+
+def test_what_was_saved_stays_as_it_was() -> None:
+    one = simulator(model())
+    one.step(actions(1)[0])
+    saved = {name: values.clone() for name, values in one.state_dict().items()}
+    kept = {name: values.clone() for name, values in saved.items()}
+    one.load_state_dict(saved)
+    one.start(HERE, ROWS[:1], torch.ones(1, 2))
+    assert not torch.equal(one.goal, kept["goal"])
+    assert all(torch.equal(saved[name], values) for name, values in kept.items())

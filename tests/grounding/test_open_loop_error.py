@@ -187,3 +187,10 @@ def test_a_simulator_that_diverges_is_told() -> None:
     task = replace(TASK, make_simulator=lambda count: Exploding(TASK.maze, count, timestep_s=TASK.timestep_s))
     with pytest.raises(BadInputError, match=r"the raw simulator of antmaze-umaze diverges: .* in step 1 of"):
         gap_report(task, NO_GROUNDING, episodes(speed=0.9), seed=0)
+
+
+def test_the_seed_decides_the_gap_of_parameters_that_vary() -> None:
+    found, given = IdentifiedParameters(PlanarVariation(friction=(0.5, 1.0))), episodes(speed=0.9)
+    one, same, other = (gap_report(TASK, found, given, seed=seed)["grounded"] for seed in (0, 0, 1))
+    assert one == same
+    assert one["position_m"]["mean"] != other["position_m"]["mean"]

@@ -50,10 +50,14 @@ def write(
     *,
     made_up: bool = False,
     sources: dict[int, int] | None = None,
+    commands: dict[str, tuple[float, float]] | None = None,
+    lacks: str = "",
 ) -> Path:
-    columns = [*(Column(name, size=size) for name, size in sizes.items()), *OUTCOME_COLUMNS]
+    outcomes = [column for column in OUTCOME_COLUMNS if column.name != lacks]
+    columns = [*(Column(name, size=size) for name, size in sizes.items()), *outcomes]
     description = {"name": "toy", "stage": "pair", "config": {}, "seeds": {"collect": 0}}
-    description |= {"environment": {"id": "toy"}, "simulator": {"id": "toy"}, "parents": []}
+    simulator = {"id": "toy"} | ({"commands": commands} if commands else {})
+    description |= {"environment": {"id": "toy"}, "simulator": simulator, "parents": []}
     with DatasetWriter(folder, columns, fps=20, task="toy", description=description) as writer:
         for episode, length in enumerate(LENGTHS):
             steps = np.array([label(episode, step) for step in range(length)], dtype=np.float32)
@@ -70,7 +74,9 @@ def write(
                 )
             metadata: dict[str, int] = {} if held_out is None else {"held_out": episode in held_out}
             metadata |= {"source_episode": sources[episode]} if sources and episode in sources else {}
-            writer.add(Episode(episode, values | {SUCCESS: last & (episode == 2)}, metadata))
+            values |= {SUCCESS: last & (episode == 2)}
+            values.pop(lacks, None)
+            writer.add(Episode(episode, values, metadata))
     return folder
 
 
@@ -85,6 +91,7 @@ def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
     assert merged.reward[2, :11].tolist() == [*(-label(2, step) for step in range(10)), -621.0]
     assert merged.windows.reward[3, 28].tolist() == [0.0, -label(3, 28) - label(3, 29)]
     assert merged.windows.next_state[3, 28, 0] == label(3, 28)
+    assert merged.windows.failed.nonzero().tolist() == [[3, 28]]  # the third still succeeds
     assert merged.held_out is not None and merged.held_out.tolist() == [False, True, False, True, False]
 
 
@@ -308,3 +315,19 @@ def test_chosen_episodes_keep_their_names(tmp_path: Path) -> None:
 def test_copies_of_the_first_episode_are_of_its_recording(tmp_path: Path) -> None:
     episodes = PairedEpisodes.load(write(tmp_path / "copies", SIZES, sources={1: 0, 3: 0}))
     assert episodes.recordings is not None and episodes.recordings.tolist() == [0, 0, 1, 0, 2]
+
+
+def test_commands_are_multiples_of_their_bounds(root: Path, tmp_path: Path) -> None:
+    bounds = {"v": (0.0, 1000.0), "w": (-500.0, 500.0)}
+    given = PairedEpisodes.load(write(tmp_path / "bounded", SIZES, commands=bounds))
+    recorded, mask = PairedEpisodes.load(root).windows.action, given.windows.mask.bool()
+    expected = (recorded - torch.tensor([500.0, 0.0])) / 500
+    torch.testing.assert_close(given.windows.action[mask], expected[mask])
+    assert not given.windows.action[~mask].any() and not given.windows.previous_action[:, 0].any()
+    assert given.commands is not None and dict(given.commands) == bounds
+
+
+def test_where_successes_are_not_recorded_no_end_is_taken_for_a_failure(tmp_path: Path) -> None:
+    given = PairedEpisodes.load(write(tmp_path / "untold", SIZES, lacks=SUCCESS))
+    assert len(given.terminated.nonzero()) == 2
+    assert not given.windows.failed.any() and not given.windows.fails_soon.any()

@@ -67,3 +67,11 @@ def test_nothing_is_remembered() -> None:
     assert grounding.hidden_before(episodes.windows) is None
     assert grounding.encoder is None
     assert NO_GROUNDING.for_replay() is NO_GROUNDING
+
+
+def test_units_in_which_values_are_large_have_a_factor_too() -> None:
+    torch.manual_seed(0)
+    moved = 1e6 * torch.randn(200, 1)
+    residual = torch.cat([moved, moved, 2 * moved], dim=1)
+    factor = scatter_factor(residual)
+    torch.testing.assert_close(factor @ factor.T, torch.cov(residual.T), rtol=1e-4, atol=0)

@@ -10,7 +10,7 @@ from toy_episodes import no_episodes, toy_episodes
 
 from astra_data.core.progress import silent
 from astra_data.grounding import scatter
-from astra_data.grounding.failures import replayed_inputs
+from astra_data.grounding.failures import averages_before, replayed_inputs
 from astra_data.grounding.files import load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
@@ -251,3 +251,14 @@ def test_rpred_learns_failures_only_where_no_failure_model_replaces_it(
     assert (grounding.failures is not None) == foresees
     assert (float(grounding.model.failure_weight) == 0.0) == foresees
     assert float(grounding.model.failure_cost) < 0
+
+
+def test_what_a_failure_model_remembers_is_the_same_whatever_was_drawn_before() -> None:
+    episodes = scattered_episodes(0, episodes=4)
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    failures.set_move_scales(episodes.windows)
+    grounding, averages = HistoryGrounding(grounding_model(), scatter_model=even()), []
+    for drawn in (3, 4):
+        torch.manual_seed(drawn)
+        averages.append(averages_before(TASK, grounding, failures, episodes))
+    assert torch.equal(*averages) and averages[0].any()

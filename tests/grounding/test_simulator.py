@@ -111,3 +111,9 @@ def test_a_saved_state_holds_what_a_simulator_remembers() -> None:
     memory = torch.rand_like(one.state_dict()["memory"])
     one.load_state_dict(one.state_dict() | {"memory": memory})
     assert torch.equal(one.state_dict()["memory"], memory)
+
+
+def test_what_a_simulator_remembers_is_held_where_its_parameters_vary_as_well() -> None:
+    walker = TASKS["humanoid-walker2d"]
+    one = EpisodeSimulator(abstract_simulator(walker, 2, "cpu", walker.varied.wide))
+    assert one.state_dict().keys() == {"state", "true", "parameters", "memory"}

@@ -12,9 +12,11 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.residual import ResidualGrounding
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.residual import ResidualModel, ResidualShape
 from astra_data.training.build_env import EnvConfig, env_parts, training_env
 from astra_data.training.ramp import Ramp
 from astra_data.worlds.plane.free_space import FreeSpace
@@ -247,3 +249,17 @@ def test_the_usual_density_is_that_of_the_free_space() -> None:
     assert thinness is not None
     cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     assert float(thinness[cells(HERE[None])]) == pytest.approx(0.5, abs=0.02)
+
+
+def test_episodes_begin_at_every_so_many_steps_as_the_grounding_says(episodes: PairedEpisodes) -> None:
+    """A residual model's memory is large: it is kept for every tenth step."""
+    used = ResidualGrounding(ResidualModel(ResidualShape(4, 2, hidden_size=8, layers=1)))
+    starts = env_parts(TASK, EnvConfig(data_start_share=1.0), episodes, used).starts
+    windows = episodes.windows
+    assert starts is not None and starts.hidden is not None and len(starts.hidden) == 40 + 30
+    for found, recorded in (
+        (starts.state, windows.state),
+        (starts.goal, windows.goal),
+        (starts.previous_action, windows.previous_action),
+    ):
+        assert torch.equal(found, torch.cat([recorded[0, ::10], recorded[1, :300:10]]))
