@@ -291,3 +291,13 @@ def test_the_policys_learning_rate_falls_along_a_half_cosine() -> None:
         iql.iterate()
         rates.append(iql._optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-2 * share for share in (1.0, 0.85355, 0.5, 0.14645)], rel=1e-3)
+
+
+def test_the_critics_learn_at_a_rate_of_their_own() -> None:
+    """The first step of Adam is as long as its rate, in all directions in which there is a gradient."""
+    iql = learner(walks(), config(critic_learning_rate=3e-3, learning_rate=0.1))
+    before = [values.detach().clone() for values in iql._critics.value.parameters()]
+    iql.iterate()
+    pairs = zip(before, iql._critics.value.parameters(), strict=True)
+    moved = max(float((now.detach() - then).abs().max()) for then, now in pairs)
+    assert moved == pytest.approx(3e-3, rel=0.01)

@@ -235,9 +235,10 @@ def test_an_untrained_critic_may_begin_near_zero() -> None:
     assert torch.equal(small.policy(seen)[0], plain.policy(seen)[0])
 
 
-def test_returns_may_be_normalized() -> None:
+@pytest.mark.parametrize(("length", "horizon"), [(8.0, 10**6), (math.inf, 8)])
+def test_returns_may_be_normalized(length: float, horizon: int) -> None:
     """A unit each step for 8 steps: discounted sums by the age of the row, of a deviation below 2.3."""
-    learner = ppo(ConstantReward(64, 8.0), 20, horizon=10**6, normalize_returns=True, discount=0.9)
+    learner = ppo(ConstantReward(64, length), 20, horizon=horizon, normalize_returns=True, discount=0.9)
     train(learner)
     sums = [(1 - 0.9**age) / 0.1 for age in range(1, 9)]
     deviation = math.sqrt(fmean(value**2 for value in sums) - fmean(sums) ** 2)
@@ -308,3 +309,20 @@ def test_a_loss_is_all_on_the_device_of_the_policy(memory: int) -> None:
     loss, moved = learner._loss({name: values.to("meta") for name, values in rollout.items()})
     loss.backward()
     assert (loss.device.type, moved.device.type) == ("meta", "meta")
+
+
+def test_actions_that_scatter_less_than_is_tested_are_left_so() -> None:
+    learner = ppo(GoToZero(8), 4, horizon=7, final_std=0.5, entropy_weight=0.0)
+    with torch.no_grad():
+        learner.policy.log_std.fill_(math.log(0.1))
+    assert max(point["std"] for point in train(learner)) < 0.2
+
+
+def test_where_it_begins_is_of_the_seed_whatever_was_drawn_before() -> None:
+    begun = []
+    for drawn, seed in ((5, 1), (6, 1), (5, 2)):
+        torch.manual_seed(drawn)
+        policy = ActorCritic(ActorCriticShape(1, 1, hidden_sizes=(8,)))
+        acting = Ppo(GoToZero(8), policy, PpoConfig(), horizon=100, seed=seed).acting
+        begun.append(torch.cat([acting.observation[:, 0], acting.state_dict()["age"]]))
+    assert torch.equal(begun[0], begun[1]) and not torch.equal(begun[0], begun[2])

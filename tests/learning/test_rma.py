@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from pydantic import ValidationError
@@ -103,3 +105,16 @@ def test_resuming_gives_the_same_parameters_to_the_bit() -> None:
 def test_too_short_a_history_is_refused() -> None:
     with pytest.raises(ValidationError, match="greater than or equal to 40"):
         RmaConfig(history_length=39)
+
+
+def test_the_learning_rate_falls_to_zero_along_a_line() -> None:
+    learner, rates = begin(4, 4), list[float]()
+    while not learner.done:
+        learner.iterate()
+        rates.append(learner._optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([3e-3 * left for left in (1.0, 0.75, 0.5, 0.25)])
+
+
+def test_where_nothing_varies_there_is_nothing_to_explain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Slope, "draw", lambda world: torch.zeros(world.num_envs, 2))
+    assert math.isnan(begin(4, 1).iterate()["r2_extrinsics"])

@@ -359,17 +359,18 @@ def still(steps: int = 9) -> Recorded:
     return Recorded(nothing, nothing, nothing + 0.5, torch.full((2,), steps))
 
 
-@pytest.mark.parametrize(("memory", "windows"), [(0, 64), (8, 10)])
+@pytest.mark.parametrize(("memory", "windows"), [(0, (64, 1, 0)), (8, (10, 6, 2))])
 def test_an_update_takes_as_many_windows_as_its_steps_make(
-    memory: int, windows: int, monkeypatch: pytest.MonkeyPatch
+    memory: int, windows: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Their number, their steps, and those that only warm up a memory."""
     learner = sac(GoToZero(8), 40, horizon=9, memory=memory, window=6, burn_in=2, recorded=still())
-    drawn: list[int] = []
+    drawn: list[tuple[int, ...]] = []
     for of in (type(learner._replay), Recorded):
         draw = of.windows
 
         def counted(self: Any, count: int, *sizes: int, draw: Any = draw) -> Any:  # noqa: ANN401
-            drawn.append(count)
+            drawn.append((count, *sizes))
             return draw(self, count, *sizes)
 
         monkeypatch.setattr(of, "windows", counted)
@@ -405,3 +406,22 @@ def test_imitation_weighs_as_much_as_values_are_large_and_leaves_them_alone(
     (size, of_costs), (_, of_distance) = parts
     for parameter, one, other in zip(parameters, of_costs, of_distance, strict=True):
         torch.testing.assert_close(parameter.grad, one + (0.0 if other is None else 0.4 * size * other))
+
+
+def test_where_every_step_runs_out_of_time_nothing_is_learned() -> None:
+    learner = sac(GoToZero(8), 20, horizon=1)
+    before = copy.deepcopy(learner.policy)
+    assert [point["temperature"] for point in train(learner)] == pytest.approx([0.2] * 2)
+    pairs = zip(before.parameters(), learner.policy.parameters(), strict=True)
+    assert all(torch.equal(*pair) for pair in pairs)
+
+
+def test_where_it_begins_is_of_the_seed_whatever_was_drawn_before() -> None:
+    begun = []
+    for drawn, seed in ((5, 1), (6, 1), (5, 2)):
+        torch.manual_seed(drawn)
+        policy, config = SoftActor(PolicyShape(1, 1, hidden_sizes=(8,))), SacConfig(buffer_size=1000)
+        learner = Sac(GoToZero(8), policy, config, horizon=7, seed=seed)
+        critics = [values.detach().flatten() for values in learner._critics.parameters()]
+        begun.append(torch.cat([*critics, learner.acting.observation[:, 0]]))
+    assert torch.equal(begun[0], begun[1]) and not torch.equal(begun[0], begun[2])
