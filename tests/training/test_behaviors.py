@@ -3,7 +3,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.training.behaviors import MixedBehavior, RandomCommands, StressCommands, WallWatch
+from astra_data.training.behaviors import (
+    MixedBehavior,
+    RandomCommands,
+    StressCommands,
+    WallWatch,
+    held_steps,
+)
 from astra_data.worlds.registry import task_named
 
 TASK = task_named("nao-navigation")
@@ -144,3 +150,17 @@ def test_batches_of_any_size_have_the_share_of_one(batch: int) -> None:
         acting.start(len(rows), seed=first)
         found += acting.is_random[:, 0].tolist()
     assert found == mixed.is_random[:, 0].tolist()
+
+
+def test_a_command_is_held_for_a_step_at_least() -> None:
+    assert held_steps((0.0, 0.01), 0.2) == (1, 1)
+    assert held_steps((0.5, 3.0), 0.2) == (2, 15)
+
+
+def test_commands_that_all_keep_clear_are_not_chosen_among() -> None:
+    """Otherwise robots in a corridor would be told to keep to its middle."""
+    behavior = RandomCommands(2, HOLD, WallWatch(TASK, 0.1))
+    behavior.start(400, seed=0)
+    command = behavior.act(believed(STARTS[1:2].expand(400, 2)), torch.zeros(400, 2))
+    for along_axis in command.T:
+        assert float(along_axis.std()) == pytest.approx(1 / 3**0.5, rel=0.1)

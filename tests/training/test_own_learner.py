@@ -1,6 +1,7 @@
 """A learner of the user's in the simulator of a row."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from constant_policy import Constant
-from small_cart import TASK
+from small_cart import TASK, Last
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
@@ -167,3 +168,11 @@ def test_another_learners_kind_is_not_replaced() -> None:
         add_policy_kind(other)
     add_policy_kind(Constant)
     assert KINDS["constant"] is Constant
+
+
+def test_where_it_is_to_last_no_success_is_told(tmp_path: Path) -> None:
+    """Ends within the horizon are failures there, whatever the simulator says of them."""
+    given = training(tmp_path)
+    object.__setattr__(given, "task", replace(TASK, objective=Last(horizon=40)))
+    _, curve = driving(1.0, steps=400)(given)
+    assert {point["success"] for point in curve["points"]} == {None}

@@ -90,3 +90,16 @@ def test_it_starts_where_the_task_does() -> None:
     world = own_world(TASK, simulation, NO_GROUNDING, 5)
     world.reset()
     assert world.starts is None and not world.simulator.state.any()
+
+
+def test_what_was_told_of_episodes_stays_when_others_follow_in_the_same_simulator() -> None:
+    world, acting = own_world(TASK, SIMULATION, NO_GROUNDING, 3), running(TASK, constant(1.0), NO_GROUNDING)
+    begin = partial(started, acting, acting.act_in_simulator)
+    (_, first), (_, second), (_, again) = (in_simulator(world, begin, 40, seed) for seed in (0, 1, 0))
+    assert torch.equal(first["goal"], again["goal"]) and not torch.equal(first["goal"], second["goal"])
+
+
+def test_its_parameters_vary_as_they_did_when_it_was_trained() -> None:
+    varied = replace(SIMULATION, variation=TASK.varied.randomized)
+    shown = [own_world(TASK, known, NO_GROUNDING, 5).simulator.parameters for known in (SIMULATION, varied)]
+    assert shown[0] is None and shown[1] is not None and float(shown[1].std()) > 0

@@ -132,3 +132,22 @@ def test_a_step_teaches_as_much_as_the_nearest_leaves_of_it() -> None:
 def test_a_copy_of_a_long_way_teaches_nothing() -> None:
     places = torch.tensor([[0.0, 5.0]]).expand(2, 2)[..., None]
     assert chosen(torch.ones(2, 2), places, 2, reach=0.5)[1] == pytest.approx([2.0, 0.0])
+
+
+def test_what_never_varies_tells_no_proposals_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    committee, follow = Committee.of(TASK, [HistoryGrounding(shifted(*OFFSETS_M))]), Committee.follow
+
+    def still(self: Committee, *given: Any) -> Rollouts:  # noqa: ANN401 - handed on
+        known = follow(self, *given)
+        return replace(known, state=torch.zeros_like(known.state))
+
+    monkeypatch.setattr(Committee, "follow", still)
+    made = suggested(TASK, committee, CONFIG, seed=1)
+    assert np.isfinite(made.information).all() and (made.information > 0).all()
+
+
+def test_progress_is_of_the_rollouts_first_and_of_the_choice_then() -> None:
+    committee, told = Committee.of(TASK, [HistoryGrounding(shifted(*OFFSETS_M))]), list[float]()
+    suggested(TASK, committee, CONFIG, seed=1, progress=lambda done, note: told.append(done))
+    assert len(told) == 10 + 3 and told == sorted(told)
+    assert told[9:] == pytest.approx([0.9, 0.9 + 0.1 / 3, 0.9 + 0.2 / 3, 1.0])

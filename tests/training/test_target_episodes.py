@@ -104,3 +104,24 @@ def test_progress_is_told_by_the_horizon() -> None:
 def test_a_robot_of_ones_own_has_one_length_of_legs() -> None:
     with pytest.raises(BadInputError, match="leg_scale: the robot of rail-cart has one length of legs"):
         in_target(TASK, lambda goal: driving(0.9), 1, seed=3, leg_scale=1.25)
+
+
+class Apart(Cart):
+    """A robot that begins a metre behind the one that was built before."""
+
+    made = 0
+
+    def __init__(self) -> None:
+        self.behind = float(type(self).made)
+        type(self).made += 1
+
+    def reset(self) -> list[float]:
+        super().reset()
+        self.x = -self.behind
+        return [self.x, self.speed]
+
+
+def test_the_film_begins_where_the_first_robot_does() -> None:
+    found = in_target(replace(TASK, robot=Apart), lambda goal: driving(0.9), 3, seed=3)
+    assert Apart.made == 3
+    assert found.filmed[:2, 0].tolist() == pytest.approx([0.0, 0.081])

@@ -30,6 +30,7 @@ from astra_data.training.train import (
     PpoTrainConfig,
     SacTrainConfig,
     Training,
+    _lately,
     optimise,
     train_in,
 )
@@ -333,3 +334,9 @@ def test_what_was_recorded_is_imitated_where_the_learner_imitates(
     assert torch.equal(recorded.action, episodes.windows.action)
     assert torch.equal(recorded.previous_action, episodes.windows.previous_action)
     assert recorded.lengths.tolist() == [6, 6]
+
+
+def test_what_is_told_on_the_way_is_of_the_last_ten_points() -> None:
+    points = [{"success": value} for value in (*[0.0] * 5, *[1.0] * 9, None)]
+    assert _lately(points, "success").endswith("1.00")
+    assert _lately(points[:-1], "success").endswith("0.90")
