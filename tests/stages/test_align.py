@@ -7,13 +7,17 @@ import pytest
 import torch
 from small_run import ALIGN
 from stopping import Stopped
+from toy_episodes import no_episodes
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
-from astra_data.grounding.files import load_history_model, load_target_encoder
+from astra_data.grounding.files import load_history_model, load_target_encoder, save_grounding
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.learning.networks.alignment import gaussian_mmd
+from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.stages.align import align
 
 
@@ -39,15 +43,22 @@ def test_the_agreement_is_that_of_held_out_episodes_alone(
     model = load_history_model(grounded / "grounding.safetensors")
     encoder = load_target_encoder(aligned / "target_encoder.safetensors")
     _, held_out = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)
-    windows, squares = held_out.windows, []
+    windows, squares, discrepancies = held_out.windows, [], []
+    bandwidths = 4.0 * torch.tensor(ALIGN.bandwidths)  # of 16 latents
     for row, length in enumerate(held_out.lengths.tolist()):
         steps = slice(row, row + 1), slice(0, length)
         history = [windows.goal[steps], windows.previous_action[steps]]
         source, _ = model.encoder(model.encoder_input(windows.state[steps], *history))
         target, _ = encoder.encoder(encoder.encoder_input(held_out.target_state[steps], *history))
         squares.append((target - source).square().flatten())
+        (mean, log_variance), (other, other_log_variance) = (
+            model.predict_latent(latent, windows.action[steps]) for latent in (source, target)
+        )
+        apart = gaussian_mmd(mean, log_variance.exp(), other, other_log_variance.exp(), bandwidths)
+        discrepancies.append(apart.flatten())
     metrics = json.loads((aligned / "metrics.json").read_text())
     assert metrics["latent_rmse"] == pytest.approx(float(torch.cat(squares).mean().sqrt()), rel=1e-4)
+    assert metrics["mmd"] == pytest.approx(float(torch.cat(discrepancies).mean()), rel=1e-3)
 
 
 def test_states_are_scaled_by_training_episodes_alone(paired: Path, aligned: Path) -> None:
@@ -137,3 +148,13 @@ def test_what_was_begun_with_another_grounding_is_refused(
         begin(grounded, stop)
     with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
         begin(grounded_anew, silent)
+
+
+def test_the_encoder_is_as_large_as_the_source_and_sees_as_many_waves(paired: Path, tmp_path: Path) -> None:
+    shape = GroundingShape(4, 2, 2, latent_size=8, embedding_size=24, position_octaves=1)
+    made = HistoryGrounding(GroundingModel(shape))
+    save_grounding(tmp_path / "grounding.safetensors", made, no_episodes())
+    config = ALIGN.model_copy(update={"updates": 1})
+    align(config, dataset=paired, grounding=tmp_path, out=tmp_path / "out", progress=silent)
+    sizes = load_target_encoder(tmp_path / "out/target_encoder.safetensors").sizes
+    assert (sizes["latent_size"], sizes["embedding_size"], sizes["position_octaves"]) == (8, 24, 1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from small_run import COLLECT, TASK
 from stopping import Stopped
 
@@ -28,6 +29,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.doctor.check import check
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.training import suboptimal
+from astra_data.training.behaviors import WallWatch
 from astra_data.training.recording import record
 from astra_data.worlds.registry import TASKS
 
@@ -358,6 +360,9 @@ def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: 
     told = dataset.description["behavior"]
     assert told["policy_dataset"] == f"{TASK}-random-seed0@data-2.0.0"
     actions = dataset.columns([ACTION])[ACTION]
+    by_source = TINY.model_copy(update=config.model_dump() | {"target_encoder": None})
+    collect(task, by_source, seed=0, out=tmp_path / "source", progress=silent)
+    assert (Dataset.open(tmp_path / "source").columns([ACTION])[ACTION][0] != actions[0]).any()
     # Drawn, not the mean: alike starts would give alike commands.
     assert np.abs(np.diff(actions, axis=0)).min() > 0
     assert np.abs(actions).max() <= 1.0
@@ -416,3 +421,20 @@ def test_a_plan_and_its_behaviour_come_together() -> None:
         with pytest.raises(ValueError, match=r'plan: expected with behavior "planned" and only then'):
             CollectConfig(**given)  # type: ignore[arg-type]
     assert "plan" not in CollectConfig().model_dump()
+
+
+@pytest.mark.parametrize("behavior", ["random", "stress"])
+def test_commands_that_lead_to_walls_are_replaced_where_it_is_asked_for(
+    behavior: str, task: str, tmp_path: Path
+) -> None:
+    foreseen = {}
+    for clearance_m in (0.0, 1.0):
+        settings = {"behavior": behavior, "hold_s": (0.05, 0.05), "clearance_m": clearance_m}
+        out = tmp_path / str(clearance_m)
+        collect(task, TINY.model_copy(update=settings), seed=0, out=out, progress=silent)
+        columns = Dataset.open(out).columns([STATE, ACTION])
+        watch = WallWatch(TASKS[task], 1.0)
+        commands = columns[ACTION][:, None].astype(np.float64)
+        near = watch.clearance(torch.from_numpy(columns[STATE]), commands) < 1.0
+        foreseen[clearance_m] = near.mean()
+    assert foreseen[1.0] < 0.5 * foreseen[0.0]

@@ -27,6 +27,7 @@ from astra_data.learning.rma import RmaConfig
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.stages.train import train
 from astra_data.training.policy_file import PolicyFile
+from astra_data.training.recorded_range import RecordedRange
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import TASKS
 
@@ -274,3 +275,21 @@ def test_what_does_not_fit_is_refused_before_any_episode(
     monkeypatch.setattr("astra_data.stages.evaluate.task_named", lambda name: pytest.fail("work was begun"))
     with pytest.raises(BadInputError, match=r"out is finished already: remove it"):
         make(task, "follower", tmp_path / "out")
+
+
+def test_commands_are_counted_in_the_world_that_is_reported_alone(
+    task: str, trained: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    columns, nothing = [Column(name, size=2) for name in (STATE, NEXT_STATE, ACTION)], np.zeros((2, 2), "f4")
+    with writer(tmp_path / "set", columns=columns) as made:
+        made.add(Episode(0, dict.fromkeys((STATE, NEXT_STATE, ACTION), nothing), {}))
+    count, steps = RecordedRange.count, list[int]()
+
+    def noted(asked: RecordedRange, action: Tensor, active: Tensor) -> None:
+        steps.append(int(active.sum()))
+        count(asked, action, active)
+
+    monkeypatch.setattr(RecordedRange, "count", noted)
+    inputs = {"policy": trained, "grounding": grounded, "recorded": tmp_path / "set"}
+    told, _ = make(task, "astra", tmp_path / "out", inputs)
+    assert sum(steps) == sum(told["target"]["steps"])

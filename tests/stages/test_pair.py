@@ -1,4 +1,5 @@
 import hashlib
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -98,8 +99,9 @@ def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(columns[ABSTRACT_SIMULATED_NEXT_STATE], expected)
 
 
+@pytest.mark.parametrize("size", ["_BLOCK", "BATCH"])
 def test_the_largest_reset_error_of_all_blocks_is_recorded(
-    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    size: str, collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "settling.py").write_text(
         f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
@@ -109,8 +111,8 @@ def test_the_largest_reset_error_of_all_blocks_is_recorded(
         "        super().reset_to(state + self.error, rows)\n"
         "        self.error /= 2\n"
     )
-    # A block for each of the eight episodes.
-    monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
+    # A block for each of the eight episodes, or all in one and a batch for each ten steps.
+    monkeypatch.setattr(f"astra_data.stages.pair.{size}", {"_BLOCK": 1, "BATCH": 10}[size])
     config = PairConfig(reset_tolerance=0.1)
     simulator = f"{tmp_path}/settling.py:Settling"
     pair(simulator, config, dataset=collected, out=tmp_path / "out", progress=silent)
@@ -225,3 +227,26 @@ def test_a_damaged_dataset_is_refused(task: str, collected: Path, tmp_path: Path
         pair(task, PairConfig(), dataset=damaged, out=tmp_path / "out", progress=silent)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_step_that_is_told_is_that_of_the_dataset(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A simulator that is reset rightly once, for the first episode, and never again."""
+    (tmp_path / "tiring.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
+        "class Tiring(Glider):\n"
+        "    error = 0.0\n"
+        "    def reset_to(self, state, rows=None):\n"
+        "        super().reset_to(state + self.error, rows)\n"
+        "        self.error = 0.5\n"
+    )
+    monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
+    simulator, out = f"{tmp_path}/tiring.py:Tiring", tmp_path / "out"
+    with pytest.raises(BadInputError) as caught:
+        pair(simulator, PairConfig(), dataset=collected, out=out, progress=silent)
+    told = re.search(r"of step (\d+), shows ([xy]) = .* and not (\S+) \(", str(caught.value))
+    assert told is not None
+    source, step, entry = Dataset.open(collected), int(told[1]), "xy".index(told[2])
+    assert source.lengths[0] <= step < source.lengths[:2].sum()
+    assert float(told[3]) == pytest.approx(source.columns([STATE])[STATE][step, entry], rel=1e-5)

@@ -428,3 +428,20 @@ def test_a_published_choice_stays_where_there_is_no_other(root: Path, tmp_path: 
     assert json.loads((published / "antmaze_u.json").read_text())["choice"] == before
     make(root, published)
     assert "choice" not in json.loads((published / "antmaze_u.json").read_text())
+
+
+def test_how_failures_are_foreseen_is_drawn_of_the_largest_size(tasks: None, tmp_path: Path) -> None:
+    """At the smaller one nothing tells failures."""
+    rates = [(0.005, 0.0, 90)]
+    foreseen = {"failures": 3, "auc": {"1-20": 0.9}, "brier_skill": 0.25, "reliability": rates}
+    error = {"position_m": {"mean": [0.1], "low": [0.1], "high": [0.1]}}
+    for percent, failures in ((50, {}), (100, {"failures": {"failure_model": foreseen}})):
+        for seed in SEEDS:
+            write_evaluation(tmp_path, "astra", seed, percent)
+            ground = tmp_path / "ground/astra" / seed_folder(seed, percent)
+            write_json(ground / "gap.json", {"horizons": [1], "grounded": error, "raw": error})
+            spent = {"windows_per_second": 1.0, "wall_seconds": 1.0, "cpu_seconds": 1.0}
+            write_json(ground / "metrics.json", spent | failures)
+    make(tmp_path, recipe=FakeRecipe("sizes", methods=("astra",), percents=(50, 100)))
+    page = read_page((tmp_path / "report/results.html").read_text())
+    assert len(page.attributes("img")) == 1 + len(images(tmp_path / "report"))

@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_dataset import write_fake
@@ -27,3 +28,12 @@ def test_episodes_are_never_repeated(tmp_path: Path) -> None:
     write_fake(tmp_path / "pair")
     with pytest.raises(BadInputError, match="has 5 episodes, a subset of 150 % of 4 = 6"):
         subset(tmp_path / "pair", percent=150, of=4, out=tmp_path / "out", progress=silent)
+
+
+def test_how_many_there_are_of_how_many_is_told(tmp_path: Path) -> None:
+    write_fake(tmp_path / "pair")
+    notes = list[str]()
+    for of in (None, 4, 2):
+        given: dict[str, Any] = {"percent": 100, "of": of, "out": tmp_path / f"{of}"}
+        subset(tmp_path / "pair", **given, progress=lambda _, note: notes.append(note))
+    assert notes == ["5 of 5 episodes", "4 of 5 episodes", "2 of 5 episodes"]

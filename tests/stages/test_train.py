@@ -272,7 +272,7 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
 
 
 def test_data_without_goals_are_refused_where_policies_meet_them(
-    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    task: str, paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loaded = PairedEpisodes.load
 
@@ -282,9 +282,13 @@ def test_data_without_goals_are_refused_where_policies_meet_them(
 
     monkeypatch.setattr(PairedEpisodes, "load", without_goals)
     from_data, from_the_start = (TRAIN.model_copy(update={"data_start_share": share}) for share in (0.5, 0.0))
-    for method, config in (("iql", from_the_start), ("direct_transfer", from_data)):
+    for method, grounding, config in (
+        ("iql", None, from_the_start),
+        ("nas", grounded, from_the_start),
+        ("direct_transfer", None, from_data),
+    ):
         with pytest.raises(BadInputError, match=r"has no goals, those of .*: run `astra-data label` first"):
-            make(task, method, paired, None, tmp_path / "out", config)
+            make(task, method, paired, grounding, tmp_path / "out", config)
     assert make(task, "direct_transfer", paired, None, tmp_path / "out", from_the_start)
 
 
