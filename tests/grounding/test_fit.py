@@ -300,3 +300,49 @@ def test_the_speed_of_a_fit_is_of_all_its_windows(tmp_path: Path) -> None:
     given = Fitting(TASKS["antmaze-umaze"], config, None, *parts, 0, "cpu", tmp_path, silent)
     _, metrics = HistoryFit(latent=True, reward=True)(given)
     assert metrics["windows_per_second"] * metrics["wall_seconds"] == pytest.approx(20 * 4, rel=0.5)
+
+
+def failing_soon(count: int) -> PairedEpisodes:
+    """Return episodes of 10 steps of which `count` fail within the last 4."""
+    made = episodes(0)
+    soon = torch.zeros_like(made.windows.mask)
+    soon[:count, -4:] = 1
+    windows = replace(made.windows, fails_soon=soon, mask=torch.ones_like(soon))
+    return replace(made, windows=windows)
+
+
+@pytest.mark.usefixtures("quick_failures")
+def test_whether_failures_can_be_told_is_asked_of_as_many_steps_as_they_are_foreseen_in(
+    tmp_path: Path,
+) -> None:
+    """All four fail within less than a second: each step is before a failure, but not just before it."""
+    config = GroundConfig(updates=1, batch_windows=4, window=5, latent_size=8, failure_members=1)
+    for steps, is_told in ((3, True), (20, False)):
+        (tmp_path / str(steps)).mkdir()
+        asked = config.model_copy(update={"failure_steps": steps})
+        parts = failing_soon(4), episodes(1, 3)
+        folder = tmp_path / str(steps)
+        given = Fitting(TASKS["antmaze-umaze"], asked, None, *parts, 0, "cpu", folder, silent)
+        assert (HistoryFit(latent=False, reward=False)(given)[0].failures is not None) == is_told
+
+
+def test_all_parts_of_a_fit_are_of_its_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: dict[str, int] = {}
+
+    def scatter(*given: Any) -> tuple[None, dict[str, Any]]:  # noqa: ANN401
+        seeds["scatter"] = given[-1]
+        return None, {}
+
+    def failures(*given: Any) -> None:  # noqa: ANN401
+        seeds["failures"] = given[-2]
+
+    monkeypatch.setattr(fit_module, "fit_scatter", scatter)
+    monkeypatch.setattr(fit_module, "fit_failures", failures)
+    monkeypatch.setattr(fit_module, "compared_foresight", lambda *_: {})
+    config = GroundConfig(
+        updates=1, batch_windows=4, window=5, latent_size=8, failure_members=1, scatter=True
+    )
+    parts = failing_soon(1), episodes(1, 3)
+    given = Fitting(TASKS["antmaze-umaze"], config, None, *parts, 5, "cpu", tmp_path, silent)
+    HistoryFit(latent=False, reward=False)(given)
+    assert seeds == {"scatter": 5, "failures": 5}

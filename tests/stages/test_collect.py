@@ -438,3 +438,17 @@ def test_commands_that_lead_to_walls_are_replaced_where_it_is_asked_for(
         near = watch.clearance(torch.from_numpy(columns[STATE]), commands) < 1.0
         foreseen[clearance_m] = near.mean()
     assert foreseen[1.0] < 0.5 * foreseen[0.0]
+
+
+@pytest.mark.usefixtures("small_training")
+@pytest.mark.parametrize("behavior", ["random", "suboptimal_ppo"])
+def test_progress_goes_on_from_the_training_and_from_batch_to_batch(
+    behavior: str, task: str, tmp_path: Path
+) -> None:
+    settings = {"behavior": behavior, "ppo_steps": 1, "episodes": 4, "num_envs": 2, "max_steps": 3}
+    told = list[float]()
+    config = TINY.model_copy(update=settings)
+    collect(task, config, seed=0, out=tmp_path / "out", progress=lambda share, _: told.append(share))
+    assert told == sorted(told) and told[-1] == 1.0 and len(told) >= 2 * 3
+    if behavior == "random":
+        assert told[:6] == pytest.approx([(step + 1) / 6 for step in range(6)])

@@ -135,6 +135,10 @@ def test_a_judge_without_a_failure_model_gets_one_where_its_episodes_fail(
     assert failures_of(lacking, episodes, 0) is None
     never = replace(episodes.windows, fails_soon=torch.zeros_like(episodes.windows.fails_soon))
     assert failures_of(lacking, replace(episodes, windows=never), 3) is None
+    # Of short episodes all steps are within 20 of a failure, but not within 4.
+    mask = episodes.windows.mask * (torch.arange(episodes.windows.mask.shape[1]) < 10)
+    short = replace(episodes.windows, mask=mask, fails_soon=mask)
+    assert failures_of(lacking, replace(episodes, windows=short), 3) is not None
     monkeypatch.setattr(type(TASK.objective), "missed", lambda _, state, goal: state[:, 0] == state[:, 0])
     assert failures_of(lacking, episodes, 3) is None  # the simulator sees these failures itself
 

@@ -176,3 +176,9 @@ def test_where_it_is_to_last_no_success_is_told(tmp_path: Path) -> None:
     object.__setattr__(given, "task", replace(TASK, objective=Last(horizon=40)))
     _, curve = driving(1.0, steps=400)(given)
     assert {point["success"] for point in curve["points"]} == {None}
+
+
+def test_whoever_takes_more_steps_than_were_asked_for_is_done_all_the_same(tmp_path: Path) -> None:
+    shares = list[float]()
+    driving(1.0, steps=500)(training(tmp_path, lambda share, note: shares.append(share)))
+    assert shares == sorted(shares) and shares[-1] == 1.0

@@ -45,7 +45,7 @@ def test_proposals_are_drawn_as_episodes_are_collected() -> None:
     assert first.action.shape == (10, 16, 1) and first.start.tolist() == [[0.0]] * 16
     assert (first.goal >= 1.0).all() and (first.goal <= 2.0).all()
     torch.testing.assert_close(first.action, again.action)
-    assert (first.action != other.action).any()
+    assert (first.action != other.action).any() and (first.goal != other.goal).any()
     for commands in first.action[..., 0].T:
         held = np.diff(np.flatnonzero(np.diff(commands, prepend=np.nan, append=np.nan) != 0))
         assert set(held[:-1]) <= {2, 3, 4}
@@ -59,6 +59,7 @@ def test_the_shorter_hold_comes_first() -> None:
 def test_starts_are_anywhere_in_a_maze_and_only_there() -> None:
     maze = TASKS["antmaze-umaze"]
     anywhere = drawn(maze, CONFIG.model_copy(update={"start": "anywhere"}), 0).start
+    assert (drawn(maze, CONFIG.model_copy(update={"start": "anywhere"}), 1).start != anywhere).any()
     usual = drawn(maze, CONFIG, 0).start
     assert anywhere[:, :2].std(0).min() > 2 * usual[:, :2].std(0).max()
     with pytest.raises(BadInputError, match="expected a task in a maze"):
