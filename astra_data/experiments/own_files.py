@@ -5,6 +5,7 @@ from pathlib import Path
 
 from astra_data.core.config import read_written
 from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
 from astra_data.experiments.recipe import Recipe
 from astra_data.worlds.own_code import code_digest
 
@@ -31,6 +32,20 @@ def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
         else Path(_places(recipe)[name].rpartition(":")[0]).name
         for name in changed
     }
+
+
+def check_task_unchanged(task: str, run: Path) -> None:
+    """Refuse a task whose code is another than that which was recorded in the folder of a run.
+
+    Raises:
+        BadInputError: it is another, or the record is damaged.
+    """
+    now = code_digest(task)
+    if now and now != _recorded(run / CODE).get("task", now):
+        raise BadInputError(
+            f"{task.rpartition(':')[0]} changed since {run} was made: "
+            "bring it back as it was then, or run the recipe under another name"
+        )
 
 
 def record_code(recipe: Recipe, folder: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RECORD, seed_folder
+from astra_data.experiments.own_files import check_task_unchanged
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
@@ -26,8 +27,8 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         percent: the size of the dataset, where the recipe sweeps over sizes.
 
     Raises:
-        BadInputError: the run has no such row or seed, the row trains no policy, or an artefact of it is not
-            there.
+        BadInputError: the run has no such row or seed, the row trains no policy, an artefact of it is not
+            there, or the code of the task changed since the run was made.
 
     Example:
         >>> from astra_data import load_policy
@@ -48,7 +49,7 @@ def task_of(run: str | Path) -> str:
     """Return the task that a run's recipe names.
 
     Raises:
-        BadInputError: it is not the folder of a run.
+        BadInputError: as `settings_of`.
     """
     return str(settings_of(run)["task"])
 
@@ -56,10 +57,11 @@ def task_of(run: str | Path) -> str:
 def settings_of(run: str | Path) -> dict[str, Any]:
     """Return the settings of a run's recipe, as it recorded them.
 
-    Files of the user's that it names are looked up here, and else in the run's folder and those above it.
+    Files of the user's that it names are looked up in the run's folder and those above it, and else here.
 
     Raises:
-        BadInputError: it is not the folder of a run, or its record is damaged.
+        BadInputError: it is not the folder of a run, its record is damaged, or the code of its task changed
+            since.
     """
     folder = Path(run)
     if not (folder / RECORD).is_file():
@@ -68,6 +70,7 @@ def settings_of(run: str | Path) -> dict[str, Any]:
         )
     settings = recorded_settings(folder)
     settings["task"] = found_near(settings["task"], folder)
+    check_task_unchanged(settings["task"], folder)
     for own in settings.get("own_methods", {}).values():
         own["method"] = found_near(own["method"], folder)
     return settings

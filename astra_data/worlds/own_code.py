@@ -21,6 +21,8 @@ _PREFIX = "astra_data_own_"
 """Of the names of modules that are files of the user's."""
 _READ = (".csv", ".json", ".mjcf", ".npy", ".npz", ".obj", ".stl", ".toml", ".txt", ".urdf", ".xml", ".yaml")
 """Endings of files that code reads."""
+_WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) else {}
+"""What makes `ast.dump` write the same in each version of Python, for digests."""
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -36,13 +38,12 @@ def place_beside(name: str, folder: Path) -> str:
 
 
 def found_near(name: str, folder: Path) -> str:
-    """Return `name` with its file, if it is one, looked up here, and else in `folder` and those above it."""
-    place = Path(name.rpartition(":")[0])
-    if place.suffix != ".py" or place.is_file():
+    """Return `name` with its file, if it is one, looked up in `folder` and those above it, and else here."""
+    place, folder = Path(name.rpartition(":")[0]), folder.resolve()
+    if place.suffix != ".py":
         return name
-    folder = folder.resolve()
-    above = (folder, *folder.parents)
-    return next((str(one / name) for one in above if (one / place).is_file()), name)
+    found = next((one for one in (folder, *folder.parents) if (one / place).is_file()), Path.cwd())
+    return name if found == Path.cwd() else str(found / name)
 
 
 def own_object(name: str) -> Any:  # noqa: ANN401 - any object
@@ -86,7 +87,7 @@ def code_digest(name: str) -> str | None:
     digest = hashlib.sha256()
     for path, tree in _with_neighbours(place):
         name = path.relative_to(place.parent).as_posix()
-        digest.update(f"{name}\n{ast.dump(tree)}\n".encode())
+        digest.update(f"{name}\n{ast.dump(tree, **_WHOLE)}\n".encode())
         for file in _named_beside(path, tree):
             digest.update(f"{file.name}\n{file_digest(file)}\n".encode())
     return digest.hexdigest()

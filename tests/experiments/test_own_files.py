@@ -2,13 +2,18 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.experiment import Experiment, load_experiment
-from astra_data.experiments.own_files import CODE, record_code
+from astra_data.experiments.grounded_env import training_of
+from astra_data.experiments.own_files import CODE, check_task_unchanged, record_code
+from astra_data.experiments.trained_policy import load_policy, task_of
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
@@ -136,6 +141,61 @@ def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:
     edit(made / "rail.py", "0.1 * command", "0.2 * command")
     (load(made).folder / CODE).unlink()
     load(made).check_unchanged()
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        "deploy runs/rail --row nas --out out",
+        "suggest runs/rail --out out",
+        "suggest rail.toml --out out",
+        "select runs/rail",
+        "select runs/rail --trials 50",
+        "view runs/rail --save out",
+    ],
+)
+def test_no_command_takes_a_run_of_another_task(
+    asked: str, made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(made)
+    edit(made / "rail.py", '"v": (-1.0, 4.0)', '"v": (-1.0, 9.0)')
+    before = sorted(made.rglob("*"))
+    shown = CliRunner().invoke(app, asked.split())
+    assert shown.exit_code == 1 and isinstance(shown.exception, BadInputError)
+    assert str(shown.exception) == (
+        f"{made}/rail.py changed since runs/rail was made: "
+        "bring it back as it was then, or run the recipe under another name"
+    )
+    assert sorted(made.rglob("*")) == before
+
+
+def test_no_policy_and_no_environment_is_of_another_task(made: Path) -> None:
+    edit(made / "rail.py", "0.1 * command", "0.2 * command")
+    run = made / "runs/rail"
+    for load in (load_policy, partial(training_of, seed=0)):
+        with pytest.raises(BadInputError, match=f"^{made}/rail.py changed since {run} was made: bring it"):
+            load(run, "nas")
+
+
+def test_a_run_is_taken_with_comments_and_methods_that_are_others(made: Path) -> None:
+    edit(made / "rail.py", "class Rail:", "# On a rail.\n\nclass Rail:")
+    edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
+    assert task_of(made / "runs/rail") == f"{made}/rail.py:TASK"
+
+
+def test_only_what_was_recorded_can_be_another_task(
+    made: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    run, task = made / "runs/rail", f"{made}/rail.py:TASK"
+    for unknown in ("antmaze-umaze", "package.module:TASK", "gone.py:TASK"):
+        check_task_unchanged(unknown, run)
+    edit(made / "rail.py", "0.1 * command", "0.2 * command")
+    check_task_unchanged(task, tmp_path_factory.mktemp("older"))
+    (run / CODE).write_text('{"mine": "0"}')
+    check_task_unchanged(task, run)
+    (run / CODE).write_text("[]")
+    with pytest.raises(BadInputError, match=r"rail/code\.json is not what a run writes"):
+        check_task_unchanged(task, run)
 
 
 def test_built_in_tasks_have_no_record(tmp_path: Path) -> None:

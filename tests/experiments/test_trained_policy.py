@@ -16,6 +16,7 @@ from astra_data.stages.ground import ground
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.train import train
 from astra_data.training.policy_file import PolicyFile, running
+from astra_data.worlds.own_code import code_digest
 from astra_data.worlds.registry import TASKS
 
 
@@ -68,6 +69,28 @@ def test_files_of_the_users_are_found_from_everywhere(
     found = settings_of(run)
     assert found["task"] == task_of(run) == f"{tmp_path}/cart.py:TASK"
     assert found["own_methods"] == {"damped": {"method": f"{tmp_path}/damped.py:METHOD", "gain": 2.0}}
+
+
+def test_a_file_of_the_same_name_here_is_not_that_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, elsewhere = tmp_path / "cart/runs/cart", tmp_path / "elsewhere"
+    for folder in (run, elsewhere):
+        folder.mkdir(parents=True)
+    settings = {"task": "cart.py:TASK", "own_methods": {"damped": {"method": "damped.py:METHOD"}}}
+    (run / "recipe.json").write_text(json.dumps(settings))
+    for folder in (tmp_path / "cart", elsewhere):
+        for name in ("cart.py", "damped.py"):
+            (folder / name).write_text(f"TASK = METHOD = '{folder.name}'")
+    (run / "code.json").write_text(json.dumps({"task": code_digest(f"{tmp_path}/cart/cart.py:TASK")}))
+    monkeypatch.chdir(elsewhere)
+    found = settings_of("../cart/runs/cart")
+    assert found["task"] == f"{tmp_path}/cart/cart.py:TASK"
+    assert found["own_methods"]["damped"]["method"] == f"{tmp_path}/cart/damped.py:METHOD"
+    # With none but the wrong one, that is told by its place.
+    (tmp_path / "cart/cart.py").unlink()
+    with pytest.raises(BadInputError, match=r"^cart\.py changed since \.\./cart/runs/cart was made"):
+        settings_of("../cart/runs/cart")
 
 
 def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> None:

@@ -104,7 +104,7 @@ def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
         own_object("none.py:TASK")
 
 
-def test_a_file_is_looked_up_here_and_then_above_a_folder(
+def test_a_file_is_looked_up_above_a_folder_and_then_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here, project = tmp_path / "here", tmp_path / "project"
@@ -113,18 +113,29 @@ def test_a_file_is_looked_up_here_and_then_above_a_folder(
         folder.mkdir(parents=True)
     monkeypatch.chdir(here)
     assert found_near("cart.py:TASK", run) == "cart.py:TASK"
+    (here / "cart.py").touch()
+    assert found_near("cart.py:TASK", run) == "cart.py:TASK"
     (project / "cart.py").touch()
     assert found_near("cart.py:TASK", run) == f"{project}/cart.py:TASK"
     (project / "runs/cart.py").touch()
     assert found_near("cart.py:TASK", run) == f"{project}/runs/cart.py:TASK"
-    (here / "cart.py").touch()
-    assert found_near("cart.py:TASK", run) == "cart.py:TASK"
+    monkeypatch.chdir(project / "runs")
+    assert found_near("cart.py:TASK", Path("cart")) == "cart.py:TASK"
+    assert found_near(f"{here}/cart.py:TASK", run) == f"{here}/cart.py:TASK"
     assert found_near("antmaze-umaze", run) == "antmaze-umaze"
 
 
 def test_a_file_is_known_by_its_digest() -> None:
     assert file_of(f"{CART}:TASK") == {"file_sha256": hashlib.sha256(CART.read_bytes()).hexdigest()}
     assert file_of("antmaze-umaze") == file_of("package.module:TASK") == {}
+
+
+def test_code_has_one_digest_in_every_version_of_python(tmp_path: Path) -> None:
+    (tmp_path / "cart.py").write_text("TASK = 1\n")
+    assigned = "Assign(targets=[Name(id='TASK', ctx=Store())], value=Constant(value=1))"
+    parsed = f"Module(body=[{assigned}], type_ignores=[])"
+    told = hashlib.sha256(f"cart.py\n{parsed}\n".encode()).hexdigest()
+    assert code_digest(f"{tmp_path}/cart.py:TASK") == told
 
 
 def test_code_is_known_by_what_it_does_and_imports_beside_it(tmp_path: Path) -> None:
