@@ -122,7 +122,11 @@ def test_a_file_is_looked_up_above_a_folder_and_then_here(
     monkeypatch.chdir(project / "runs")
     assert found_near("cart.py:TASK", Path("cart")) == "cart.py:TASK"
     assert found_near(f"{here}/cart.py:TASK", run) == f"{here}/cart.py:TASK"
-    assert found_near("antmaze-umaze", run) == "antmaze-umaze"
+    (run / "cart.py").touch()
+    assert found_near("cart.py:TASK", run) == f"{run}/cart.py:TASK"
+    (run / "package.module").touch()
+    for no_file in ("antmaze-umaze", "package.module:TASK"):
+        assert found_near(no_file, run) == no_file
 
 
 def test_a_file_is_known_by_its_digest() -> None:
