@@ -1,8 +1,10 @@
 """The abstract simulator of a new robot of any other kind: values that commands move."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -30,7 +32,10 @@ class Direct:
     moved: tuple[Field, ...]
     is_rate: tuple[bool, ...]
 
-    template = "direct.py"
+    @property
+    def template(self) -> str:
+        """The file that it is written as."""
+        return "turning.py" if any(self.angles) else "direct.py"
 
     @property
     def simulator(self) -> str:
@@ -41,19 +46,28 @@ class Direct:
             listed["change" if is_rate else "are where they are put"].append(
                 f"{state.short} by {command.short}"
             )
-        return "; ".join(
+        told = [
             f"values that {what} as commanded: {', '.join(pairs)}" for what, pairs in listed.items() if pairs
-        )
+        ]
+        return "; ".join(told + [f"{heading} as cosine and sine" for heading in self._headings])
 
     @property
     def names(self) -> tuple[str, ...]:
         """What the states are called."""
         return tuple(field.short for field in self.moved)
 
-    @property
+    @cached_property
     def angles(self) -> tuple[bool, ...]:
-        """Which of the states are headings, of which whole turns do not count."""
-        return tuple(HEADING.fullmatch(field.short) is not None for field in self.moved)
+        """Which of the states are headings that go round in the logs: whole turns do not count."""
+        spans = np.ptp(np.concatenate(self.states()), axis=0).tolist()
+        return tuple(
+            field.unit == "rad" and HEADING.fullmatch(field.short) is not None and span > math.pi
+            for field, span in zip(self.moved, spans, strict=True)
+        )
+
+    @property
+    def _headings(self) -> list[str]:
+        return [name for name, is_angle in zip(self.names, self.angles, strict=True) if is_angle]
 
     @classmethod
     def of(cls, logs: Logs) -> Self:
@@ -91,41 +105,63 @@ class Direct:
         return np.where(self.is_rate, state + command / self.logs.rate, command)
 
     def values(self) -> dict[str, str]:
-        """Return what its templates name."""
-        order = {field.name: number for number, field in enumerate(self.logs.of("state"))}
-        episodes = self.states()
-        starts = np.array([values[0] for values in episodes])
+        """Return what its templates name: states without headings first, and then headings."""
+        fields = [field.name for field in self.logs.of("state")]
+        order = sorted(range(len(self.moved)), key=lambda number: self.angles[number])
+        plain = self.angles.count(False)
+        recorded = [values[:, order] for values in self.states()]
+        starts = np.array([values[0] for values in recorded])
+        episodes = [_shown(values, plain) for values in recorded]
         span = np.ptp(np.concatenate(episodes), axis=0)
+        span[plain:] = np.tile(span[plain:].reshape(2, -1).max(axis=0), 2)  # the same of cosine and sine
         goal, close = typical([values / span for values in episodes], self.logs.failed)
         actions, moved = len(self.logs.of("command")), len(self.moved)
-        command = "command" if actions == moved else f"command[:, :{moved}]"
-        rate = f"self.state + TIMESTEP_S * {command}"
+        taken = f":{moved}" if order == [*range(moved)] else str(order)
+        command = "command" if order == [*range(actions)] else f"command[:, {taken}]"
+        rate = f"{'values' if self._headings else 'self.state'} + TIMESTEP_S * {command}"
+        is_rate = [self.is_rate[number] for number in order]
         sentence, step = {
             (True,): ("Values that change as they are commanded to.", rate),
             (False,): ("Values that are where they are commanded to be.", command),
             (False, True): (
                 "Values that change as they are commanded to, or are where they are commanded to be.",
-                f"torch.where(torch.tensor({[*self.is_rate]}), {rate}, {command})",
+                f"torch.where(torch.tensor({is_rate}), {rate}, {command})",
             ),
-        }[tuple(sorted(set(self.is_rate)))]
-        before, given = np.arange(moved, dtype=float), np.ones(actions)
+        }[tuple(sorted(set(is_rate)))]
+        before, given = np.arange(moved, dtype=float)[None], np.ones((1, actions))
+        after = self.step(before, given)
         return {
-            "names": texts(self.names),
-            "units": texts(field.unit for field in self.moved),
+            "names": texts(
+                [self.names[number] for number in order[:plain]]
+                + [f"{heading}_{axis}" for axis in "xy" for heading in self._headings]
+            ),
+            "units": texts(
+                [self.moved[number].unit for number in order[:plain]] + ["1"] * (len(span) - plain)
+            ),
+            "headings": " and ".join(self._headings),
+            "plain": str(plain),
+            "around": str(moved - plain),
+            "moved": str(moved),
             "goal": numbers(goal * span, "()"),
             "close": f"{close:.2g}",
             "range": numbers(span, "()"),
             "sentence": sentence,
-            "indices": str([order[field.name] for field in self.moved]),
+            "indices": str([fields.index(self.moved[number].name) for number in order]),
             "step": step,
             "actions": str(actions),
             "lows": numbers(starts.min(axis=0)),
             "highs": numbers(starts.max(axis=0)),
             "phi": numbers(episodes[0][0]),
-            "before": numbers(before),
-            "command": numbers(given),
-            "after": numbers(self.step(before, given[None])[0]),
+            "before": numbers(_shown(before[:, order], plain)[0]),
+            "command": numbers(given[0]),
+            "after": numbers(_shown(after[:, order], plain)[0]),
         }
+
+
+def _shown(values: Floats, plain: int) -> Floats:
+    """Return states (T, D) with cosines and sines in place of the headings, which begin at `plain`."""
+    around = values[:, plain:]
+    return np.concatenate([values[:, :plain], np.cos(around), np.sin(around)], axis=1)
 
 
 def _names(command: Field, states: Mapping[str, Field]) -> list[str]:

@@ -1,6 +1,7 @@
 """Pair: reset the abstract simulator to φ(s), step it with the recorded action, and store its next state."""
 
 import logging
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -103,6 +104,7 @@ def pair(
     }
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps, simulating, reset_error = 0, 0.0, 0.0
+    jumps = np.zeros(added[0].size, np.int64)
     with DatasetWriter.like(source, out, description, more=added) as writer:
         for episodes in in_blocks(source.episodes(), _BLOCK):
             before = time.perf_counter()
@@ -115,6 +117,8 @@ def pair(
             )
             simulating += time.perf_counter() - before
             reset_error = max(reset_error, error)
+            apart = paired[ABSTRACT_NEXT_STATE] - paired[ABSTRACT_SIMULATED_NEXT_STATE]
+            jumps += (np.abs(apart) > math.pi).sum(axis=0)
             first = 0
             for episode in episodes:
                 values = {
@@ -133,6 +137,16 @@ def pair(
             "simulated_pairs_per_second": steps / simulating,
             "machine": machine(),
         }
+    wrapped = [
+        f"{_name(pairing, entry)} in {jumps[entry]} of {steps} rows"
+        for entry, unit in enumerate(pairing.abstract_state.units)
+        if unit == "rad" and jumps[entry]
+    ]
+    if wrapped:
+        _log.warning(
+            f"{pairing.id} lands more than π from where the robot was: {', '.join(wrapped)}; "
+            "a heading that wraps: make cos and sin of it in φ"
+        )
     return out
 
 

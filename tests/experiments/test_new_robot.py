@@ -101,6 +101,43 @@ def test_a_rate_and_a_target_are_stepped_as_the_logs_were(tmp_path: Path) -> Non
     np.testing.assert_allclose(landed, table[1:, 1:3], atol=1e-4)
 
 
+def test_a_heading_that_wraps_is_shown_without_jumps(tmp_path: Path) -> None:
+    """A drone whose turn rate stands between its speeds, and a mast that is put where it is commanded."""
+    rng = np.random.default_rng(0)
+    commands = rng.uniform([-3, -1, 1, -1], [3, 1, 2, 1], (200, 4))  # it turns around some times
+    ways = 3 + np.cumsum(0.1 * commands, axis=0) - 0.1 * commands
+    yaw = np.arctan2(np.sin(ways[:, 2]), np.cos(ways[:, 2]))
+    mast = np.concatenate([[0], commands[:-1, 0]])
+    x, z = ways[:, 1], ways[:, 3]
+    table = np.column_stack([np.arange(200) / 10, yaw, x, z, mast, commands])
+    header = "time,yaw,x,z,mast_yaw,cmd_mast_yaw,cmd_vx,cmd_yaw_rate,cmd_vz"
+    np.savetxt("log.csv", table, "%.6f", ",", header=header, comments="")
+    kind = write_robot("drone", Path("drone"), [Path("log.csv")])
+    assert kind.simulator.endswith("; mast_yaw as cosine and sine; yaw as cosine and sine")
+    task = task_named("drone/drone.py:TASK")
+    assert task.abstract_state.names == ("x", "z", "mast_yaw_x", "yaw_x", "mast_yaw_y", "yaw_y")
+    assert [*task.abstract_state.units] == ["m", "m", "1", "1", "1", "1"]
+    angles = np.column_stack([mast, yaw])
+    expected = np.column_stack([x, z, np.cos(angles), np.sin(angles)])
+    np.testing.assert_allclose(task.abstraction(table[:, 1:5]), expected, atol=1e-9)
+    simulator = task.make_simulator(199)
+    simulator.reset_to(task.abstraction(torch.from_numpy(table[:-1, 1:5]).float()))
+    landed = simulator.step(torch.from_numpy(commands[:-1]).float())
+    np.testing.assert_allclose(landed, expected[1:], atol=1e-4)
+    assert np.abs(np.diff(yaw)).max() > 6  # it wraps
+    starts = task.objective.draw_starts(rng, 9)
+    np.testing.assert_allclose(starts[:, 2:4] ** 2 + starts[:, 4:] ** 2, 1)
+    goal = torch.tensor([runpy.run_path("drone/drone.py")["GOAL"]])
+    away = goal * torch.tensor([1, 1, -1, 1, -1, 1])  # by half a turn, which is the whole range
+    far = task.objective.far(torch.cat([goal, away]))  # type: ignore[attr-defined]
+    torch.testing.assert_close(far, torch.tensor([0.0, 1.0]), atol=0.01, rtol=0)
+    assert check_task(task) == [] and places(task) == {"meta"}
+    tests = runpy.run_path("drone/test_drone.py")
+    tests["test_a_step_of_the_simulator"]()
+    tests["test_phi_of_the_first_row_of_the_logs"]()
+    assert len(Path("drone/drone.py").read_text().splitlines()) < 75
+
+
 def test_torques_of_an_arm_give_a_task(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     columns = {f"q{joint}": rng.normal(size=60) for joint in range(1, 7)}

@@ -206,3 +206,22 @@ def test_states_that_move_between_logs_alone_have_a_goal_of_some_size(tmp_path: 
         np.savetxt(tmp_path / f"{number}.csv", table, "%.6f", ",", header="x,cmd_x", comments="")
     kind = Direct.of(guess([tmp_path]))
     assert float(kind.values()["close"]) == pytest.approx(0.1)
+
+
+def test_a_heading_is_an_angle_as_it_is_unless_it_goes_round(tmp_path: Path) -> None:
+    turned = np.cumsum(T % 5 / 10) - T % 5 / 10
+    for yaw, template in ((turned / 4, "direct.py"), (turned, "turning.py"), (turned % 6, "turning.py")):
+        kind = Direct.of(logs(tmp_path, z=T, yaw=yaw, cmd_vz=T % 3, cmd_yaw_rate=T % 5))
+        assert [field.short for field in kind.moved] == ["z", "yaw"] and kind.template == template
+    for name in ("yaw_m", "mast_angle"):  # no angle, and no heading
+        kind = Direct.of(logs(tmp_path, **{name: turned}, cmd_a=T % 5))
+        assert kind.template == "direct.py"
+
+
+def test_cosine_and_sine_of_a_heading_have_one_range(tmp_path: Path) -> None:
+    off = 0.2 * np.sin(T)  # from where it wraps: 0.02 of the cosine, 0.4 of the sine
+    wrapped = np.arctan2(-np.sin(off), -np.cos(off))
+    values = Direct.of(logs(tmp_path, z=T, yaw=wrapped, cmd_z=T, cmd_yaw=wrapped)).values()
+    assert values["names"] == '("z", "yaw_x", "yaw_y")'
+    z, cosine, sine = (float(value) for value in values["range"].strip("()").split(","))
+    assert z == 49 and cosine == sine == pytest.approx(2 * np.sin(0.2), rel=1e-3)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_logs import write_logs
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.progress import silent
@@ -250,3 +251,35 @@ def test_the_step_that_is_told_is_that_of_the_dataset(
     source, step, entry = Dataset.open(collected), int(told[1]), "xy".index(told[2])
     assert source.lengths[0] <= step < source.lengths[:2].sum()
     assert float(told[3]) == pytest.approx(source.columns([STATE])[STATE][step, entry], rel=1e-5)
+
+
+def test_a_heading_that_wraps_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
+    (tmp_path / "cart.py").write_text(
+        "import torch\nfrom astra_data import Column\n"
+        "class Turning:\n"
+        "    abstract_state = Column('abstract.state', size=2, names=('x', 'yaw'), "
+        "astra={'unit': ('m', 'rad')})\n"
+        "    parameters = {}\n"
+        "    def __init__(self, num_envs):\n"
+        "        self.state = torch.zeros(num_envs, 2)\n"
+        "    def abstraction(state):\n"
+        "        return state[..., [0, 2]]\n"
+        "    def reset_to(self, state, rows=None):\n"
+        "        self.state = state.clone()\n"
+        "    def step(self, command):\n"
+        "        self.state = self.state + command[:, [0, 1]] * torch.tensor([100.0, 0.05])\n"
+        "        return self.state\n"
+    )
+    logs = write_logs(tmp_path / "logs")
+    yaw, turned = (logs.columns([name])[name][:, 2] for name in (STATE, NEXT_STATE))
+    wraps = int((np.abs(turned - yaw) > 6).sum())
+    assert wraps > 3
+    pair(f"{tmp_path}/cart.py:Turning", dataset=logs.root, out=tmp_path / "out")
+    (told,) = [record.getMessage() for record in caplog.records if "φ" in record.getMessage()]
+    assert told == (
+        f"Turning lands more than π from where the robot was: yaw in {wraps} of 3000 rows; "
+        "a heading that wraps: make cos and sin of it in φ"
+    )
