@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from astra_data.core.errors import BadInputError, in_short
-from astra_data.exchange.importers.csv import delimiter_of, without_blanks
+from astra_data.exchange.importers.csv import check_separator, delimiter_of, without_blanks
 
 Floats = NDArray[np.float64]
 MOSTLY = 0.9
@@ -26,10 +26,13 @@ def read_numbers(path: Path, numbered: re.Pattern[str]) -> dict[str, Floats]:
     have the same number.
 
     Raises:
-        BadInputError: it is no CSV, has no numbers, or a field of numbers has a text or the name of another.
+        BadInputError: it is no CSV, is parted by other marks, has no numbers, or a field of numbers has a
+            text or the name of another.
     """
     delimiter, mark = delimiter_of(path.name)
     try:
+        with path.open("rb") as stream:
+            check_separator(str(path), stream)
         table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
     except FileNotFoundError:
         raise BadInputError(f"{path}: there is no such file") from None
@@ -74,8 +77,8 @@ def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:
 
 
 def plain_name(name: str) -> str:
-    """Return a field's name in small letters, digits and single underscores."""
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    """Return a field's name in small letters, digits and single underscores; ° is deg."""
+    return re.sub(r"[^a-z0-9]+", "_", name.lower().replace("°", " deg ")).strip("_")
 
 
 def _no_number(values: Sequence[str]) -> tuple[int, str] | None:

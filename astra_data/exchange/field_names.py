@@ -11,7 +11,7 @@ WEAK_FAILURE = re.compile(r"bump(ed|er)?|e_?stop")
 """A failure where it ever comes, and where there is no other."""
 NAMES: tuple[tuple[Role, str], ...] = (
     ("time", r"t|(.+_)?(time|stamp|timestamp|secs?|seconds)"),
-    ("episode", r"episode(_?(id|index|nr))?|trial|drive|run|rollout|traj(ectory)?"),
+    ("episode", r"(episode|trial|drive|run|rollout|traj(ectory)?|flight|lap|session|bag)(_?(id|index|nr))?"),
     ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?"),
     (
         "failure",
@@ -41,8 +41,15 @@ UNITS: tuple[tuple[str, str, float], ...] = (
     ("mm_s", "m/s", 1e-3),
     ("cm_s", "m/s", 1e-2),
     ("m_s", "m/s", 1.0),
+    ("m_per_s", "m/s", 1.0),
+    ("mps", "m/s", 1.0),
+    ("km_h", "m/s", 1 / 3.6),
+    ("kmh", "m/s", 1 / 3.6),
     ("deg_s", "rad/s", math.pi / 180),
+    ("deg_per_s", "rad/s", math.pi / 180),
+    ("dps", "rad/s", math.pi / 180),
     ("rad_s", "rad/s", 1.0),
+    ("rad_per_s", "rad/s", 1.0),
     ("rpm", "rad/s", math.pi / 30),
     ("mm", "m", 1e-3),
     ("cm", "m", 1e-2),
@@ -67,5 +74,7 @@ ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*
 LENGTH = re.compile(
     r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
 )
+QUATERNION = re.compile(r"((.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?)[wxyz]")
+"""Where all four are there, by what is before w, x, y and z."""
 EPISODE = re.compile(dict(NAMES)["episode"])
 COMMAND = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")

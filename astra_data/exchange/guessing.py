@@ -193,7 +193,7 @@ def _steps(name: str, table: dict[str, Floats]) -> Floats:
     values: Floats = np.where(np.isfinite(table[name]), table[name], np.nan)
     goes_on = np.ones(len(values) - 1, bool)
     for other, numbers in table.items():
-        if EPISODE.fullmatch(plain_name(other)):
+        if EPISODE.fullmatch(plain_name(other)) and _is_whole(numbers):
             goes_on &= np.diff(numbers) == 0
     steps: Floats = np.diff(values)[goes_on]
     return steps
@@ -225,6 +225,8 @@ def _field(name: str, values: Floats) -> Field:
         if re.fullmatch(pattern, plain) or re.fullmatch(pattern, body):
             if role in ("failure", "success") and not is_flag:
                 continue
+            if role == "episode" and not _is_whole(values):
+                continue
             if WEAK_FAILURE.fullmatch(body) and not values.any():
                 return left_out("never changes")
             if role != "command":
@@ -241,6 +243,11 @@ def _field(name: str, values: Floats) -> Field:
     if is_flag:
         return left_out("0 or 1: name it success or failed if it is an end")
     return _with_unit(name, "state", f"s{body}" if body[0].isdigit() else body, ending, values)
+
+
+def _is_whole(values: Floats) -> bool:
+    finite = values[np.isfinite(values)]
+    return bool((finite == np.rint(finite)).all())
 
 
 def _check_finite(name: str, role: Role, values: Floats) -> None:

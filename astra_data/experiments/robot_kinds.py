@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.field_names import HEADING
+from astra_data.exchange.field_names import HEADING, QUATERNION
 from astra_data.exchange.logs import Field, Floats, Logs
 from astra_data.experiments.kind_errors import errors
 from astra_data.experiments.written_values import numbers, texts, typical
@@ -49,7 +49,13 @@ class Direct:
         told = [
             f"values that {what} as commanded: {', '.join(pairs)}" for what, pairs in listed.items() if pairs
         ]
-        return "; ".join(told + [f"{heading} as cosine and sine" for heading in self._headings])
+        told += [f"{heading} as cosine and sine" for heading in self._headings]
+        quaternion = [
+            field.short for field in self.logs.of("state") if field.short in _quaternions(self.logs)
+        ]
+        if quaternion:
+            told.append(f"{', '.join(quaternion)} are a quaternion: make yaw of it in φ")
+        return "; ".join(told)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -77,7 +83,8 @@ class Direct:
         for command in logs.of("command"):
             names = _names(command, left)
             moved.append(next((left.pop(name) for name in names if name in left), None))
-        rest = [field for short, field in left.items() if not _SPEED.match(short)]
+        parts = _quaternions(logs)
+        rest = [field for short, field in left.items() if not _SPEED.match(short) and short not in parts]
         filled = []
         for command, named in zip(logs.of("command"), moved, strict=True):
             field = named or next((one for one in rest if _may_move(command, one)), None)
@@ -164,6 +171,14 @@ def _shown(values: Floats, plain: int) -> Floats:
     return np.concatenate([values[:, :plain], np.cos(around), np.sin(around)], axis=1)
 
 
+def _quaternions(logs: Logs) -> set[str]:
+    """Return the names of states that are parts of whole quaternions, such as qw, qx, qy and qz."""
+    names = {field.short for field in logs.of("state")}
+    stems = {found[1] for found in map(QUATERNION.fullmatch, names) if found}
+    quaternions = [{f"{stem}{axis}" for axis in "wxyz"} for stem in stems]
+    return {name for parts in quaternions if parts <= names for name in parts}
+
+
 def _names(command: Field, states: Mapping[str, Field]) -> list[str]:
     """Return the names of the states that a command moves first of all."""
     named = _SPEED.sub("", command.short)
@@ -183,8 +198,9 @@ def _is_same(state: Field, command: Field) -> bool:
 
 
 def _may_move(command: Field, state: Field) -> bool:
-    """Return whether the units, where both are known, are the same but for a time."""
-    return "1" in (command.unit, state.unit) or command.unit.removesuffix("/s") == state.unit
+    """Return whether the units, where both are known, are the same but for a time; a turn rate's is."""
+    unit = "rad/s" if command.is_turn_rate else command.unit
+    return "1" in (unit, state.unit) or unit.removesuffix("/s") == state.unit
 
 
 def _length(filled: list[Field | None]) -> int:

@@ -37,9 +37,10 @@ def test_a_log_of_texts_alone_is_refused(tmp_path: Path) -> None:
 
 
 def test_plain_names_are_small_letters_digits_and_single_underscores() -> None:
-    assert [plain_name(name) for name in ("Run ID", "pose.x [m]", "θ", "_a__B2")] == [
+    assert [plain_name(name) for name in ("Run ID", "pose.x [m]", "θ", "_a__B2", "yaw°/s")] == [
         "run_id",
         "pose_x_m",
         "",
         "a_b2",
+        "yaw_deg_s",
     ]

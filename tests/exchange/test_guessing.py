@@ -60,6 +60,32 @@ def test_roles_and_units_are_told_by_names_and_values(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("ending", "unit", "scale"),
+    [
+        ("_mps", "m/s", 1),
+        ("_m_per_s", "m/s", 1),
+        (" [m/s]", "m/s", 1),
+        ("_kmh", "m/s", 1000 / 3600),
+        (" [km/h]", "m/s", 1000 / 3600),
+        ("_dps", "rad/s", math.tau / 360),
+        ("_deg_per_s", "rad/s", math.tau / 360),
+        (" [°/s]", "rad/s", math.tau / 360),
+        ("_rad_per_s", "rad/s", 1),
+        ("[°]", "rad", math.tau / 360),
+        ("°", "rad", math.tau / 360),
+    ],
+)
+def test_a_unit_has_many_spellings(tmp_path: Path, ending: str, unit: str, scale: float) -> None:
+    log = tmp_path / "log.csv"
+    header = f"motion{ending},cmd_motion{ending}"
+    log.write_text(header + "\n" + "".join(f"{row},{row}\n" for row in range(6)), "utf-8")
+    fields = guess([log]).fields
+    assert [field.taken_for for field in fields] == ["state motion", "command motion"]
+    assert [field.unit for field in fields] == [unit, unit]
+    assert [field.scale for field in fields] == pytest.approx([scale, scale])
+
+
+@pytest.mark.parametrize(
     ("step", "unit", "rate"), [(0.1, "s", 10), (20, "ms", 50), (5e4, "us", 20), (1e7, "ns", 100)]
 )
 def test_a_unit_of_time_is_told_by_its_steps(tmp_path: Path, step: float, unit: str, rate: int) -> None:
@@ -227,8 +253,8 @@ def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
         ("x_mm,x_cm,cmd\n0,0,0\n1,1,1\n2,2,2\n", "x_mm and x_cm are both taken for state x: rename one"),
         ("x,cmd_v,u_v\n0,0,0\n1,1,1\n", "cmd_v and u_v are both taken for command v: rename one"),
         (
-            "x;cmd\n0;1\n1;2\n",
-            "expected a header of different names, and rows of numbers below it, parted by commas",
+            "x;cmd\n0,5;1\n1;2\n",
+            "expected fields parted by commas, got semicolons in its header: write it with commas, or with",
         ),
     ],
 )
@@ -333,6 +359,17 @@ def test_texts_tell_episodes_apart(tmp_path: Path) -> None:
     logs = guess([log])
     assert logs.fields[0].role == "episode"
     assert [len(values) for values in logs.values(logs.of("state"))] == [8, 12]
+
+
+@pytest.mark.parametrize("name", ["flight", "Lap", "session_id", "bag nr", "run_index", "traj"])
+def test_whole_numbers_of_what_is_flown_or_driven_tell_episodes_apart(tmp_path: Path, name: str) -> None:
+    log = write(tmp_path / "log.csv", {name: RAMP // 3, "x": RAMP, "cmd": RAMP})
+    logs = guess([log])
+    assert logs.fields[0].role == "episode" and len(logs.episodes) == 2
+    shares = {name: RAMP / 3, "goal_x": RAMP, "x": RAMP, "cmd": RAMP}  # which part of a lap is behind it
+    logs = guess([write(tmp_path / "log.csv", shares)])
+    assert [field.role for field in logs.fields] == ["state", "state", "state", "command"]
+    assert len(logs.episodes) == 1
 
 
 def test_a_name_without_letters_or_digits_is_left_out(tmp_path: Path) -> None:

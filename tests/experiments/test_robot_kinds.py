@@ -147,6 +147,25 @@ def test_no_command_moves_a_state_of_another_unit(tmp_path: Path) -> None:
         Direct.of(logs(tmp_path, x_m=T, cmd_w_rad_s=T % 2))
 
 
+def test_a_turn_rate_moves_no_length_whatever_its_unit(tmp_path: Path) -> None:
+    columns = {"x_m": T, "tilt": T % 3 / 9, "cmd_yaw_rate": T % 2, "cmd_v": T % 3}
+    assert [field.short for field in Direct.of(logs(tmp_path, **columns)).moved] == ["tilt", "x"]
+
+
+@pytest.mark.parametrize("stem", ["q", "quat_", "pose.orientation.", "imu_quaternion_"])
+def test_no_command_moves_a_part_of_a_quaternion(tmp_path: Path, stem: str) -> None:
+    parts = {f"{stem}{axis}": np.sin(T + number) for number, axis in enumerate("xyzw")}
+    commands = {"cmd_vx": T % 5, "cmd_yaw_rate": T % 3, "cmd_vy": T % 2}
+    kind = Direct.of(logs(tmp_path, x=T, y=T % 9, **parts, **commands))
+    assert [field.short for field in kind.moved] == ["x"]
+    names = [f"{stem}{axis}".replace(".", "_") for axis in "xyzw"]
+    assert kind.simulator.endswith(f"x by vx; {', '.join(names)} are a quaternion: make yaw of it in φ")
+    del parts[f"{stem}w"]  # three are none
+    kind = Direct.of(logs(tmp_path, x=T, y=T % 9, **parts, **commands))
+    assert [field.short for field in kind.moved] == ["x", names[0], "y"]
+    assert "make yaw of it" not in kind.simulator
+
+
 def test_positions_may_be_called_px_and_py(tmp_path: Path) -> None:
     kind = Planar.of(logs(tmp_path, px=T, py=T % 9, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
     assert kind is not None and [field.short for field in kind.position] == ["px", "py"]

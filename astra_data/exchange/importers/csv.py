@@ -28,6 +28,21 @@ def delimiter_of(name: str) -> tuple[str, str]:
     return ("\t", "tabs") if name.lower().endswith(".tsv") else (",", "commas")
 
 
+def check_separator(name: str, stream: IO[bytes]) -> None:
+    """Refuse the file `name`, read from its beginning, if its header is parted by other marks.
+
+    Raises:
+        BadInputError: it is; says by which.
+    """
+    delimiter, mark = delimiter_of(name)
+    first = stream.readline(_LONGEST_HEADER).decode("utf-8", "replace")
+    if delimiter not in first and (others := [other for part, other in _MARKS.items() if part in first]):
+        raise BadInputError(
+            f"{name}: expected fields parted by {mark}, got {others[0]} in its header: "
+            "write it with commas, or with tabs as .tsv"
+        )
+
+
 def csv_files(place: Path) -> list[Path]:
     """Return the CSV files in a folder, or the one that `place` is.
 
@@ -134,16 +149,10 @@ def _is_cut_in_header(source: Source) -> bool:
 
 
 def _checked(source: Source, mapping: ImportMapping, torn: int) -> list[str]:
-    delimiter, mark = delimiter_of(str(source))
     with source.open() as stream:
-        first = stream.readline(_LONGEST_HEADER).decode("utf-8", "replace")
-    if delimiter not in first and (others := [name for part, name in _MARKS.items() if part in first]):
-        raise BadInputError(
-            f"{source}: expected fields parted by {mark}, got {others[0]} in its header: "
-            "write it with commas, or with tabs as .tsv"
-        )
+        check_separator(str(source), stream)
     with _without_end(source, torn) as stream:
-        options = csv.ParseOptions(delimiter=delimiter)
+        options = csv.ParseOptions(delimiter=delimiter_of(str(source))[0])
         header = csv.open_csv(stream, parse_options=options).schema.names
     row_count(str(source), mapping.all_fields, dict.fromkeys(header, (0,)))
     doubled = sorted({name for name in mapping.all_fields if header.count(name) > 1})
