@@ -74,7 +74,7 @@ ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*
 LENGTH = re.compile(
     r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
 )
-QUATERNION = re.compile(r"((.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?)[wxyz]")
-"""Where all four are there, by what is before w, x, y and z."""
+QUATERNION = re.compile(r"(.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?[wxyz]")
+"""A part of one, where all four are there."""
 EPISODE = re.compile(dict(NAMES)["episode"])
 COMMAND = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")

@@ -46,16 +46,13 @@ class Direct:
             listed["change" if is_rate else "are where they are put"].append(
                 f"{state.short} by {command.short}"
             )
-        told = [
+        clauses = [
             f"values that {what} as commanded: {', '.join(pairs)}" for what, pairs in listed.items() if pairs
         ]
-        told += [f"{heading} as cosine and sine" for heading in self._headings]
-        quaternion = [
-            field.short for field in self.logs.of("state") if field.short in _quaternions(self.logs)
-        ]
-        if quaternion:
-            told.append(f"{', '.join(quaternion)} are a quaternion: make yaw of it in φ")
-        return "; ".join(told)
+        clauses += [f"{heading} as cosine and sine" for heading in self._headings]
+        if parts := _quaternions(self.logs):
+            clauses.append(f"{', '.join(parts)} are a quaternion: make yaw of it in φ")
+        return "; ".join(clauses)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -132,7 +129,7 @@ class Direct:
             (False,): ("Values that are where they are commanded to be.", command),
             (False, True): (
                 "Values that change as they are commanded to, or are where they are commanded to be.",
-                f"torch.where(torch.tensor({is_rate}), {rate}, {command})",
+                f"torch.where(torch.tensor({is_rate}, device=command.device), {rate}, {command})",
             ),
         }[tuple(sorted(set(is_rate)))]
         before, given = np.arange(moved, dtype=float)[None], np.ones((1, actions))
@@ -171,12 +168,10 @@ def _shown(values: Floats, plain: int) -> Floats:
     return np.concatenate([values[:, :plain], np.cos(around), np.sin(around)], axis=1)
 
 
-def _quaternions(logs: Logs) -> set[str]:
+def _quaternions(logs: Logs) -> list[str]:
     """Return the names of states that are parts of whole quaternions, such as qw, qx, qy and qz."""
-    names = {field.short for field in logs.of("state")}
-    stems = {found[1] for found in map(QUATERNION.fullmatch, names) if found}
-    quaternions = [{f"{stem}{axis}" for axis in "wxyz"} for stem in stems]
-    return {name for parts in quaternions if parts <= names for name in parts}
+    parts = [field.short for field in logs.of("state") if QUATERNION.fullmatch(field.short)]
+    return [part for part in parts if {f"{part[:-1]}{axis}" for axis in "wxyz"} <= {*parts}]
 
 
 def _names(command: Field, states: Mapping[str, Field]) -> list[str]:

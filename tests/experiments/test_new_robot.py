@@ -99,6 +99,8 @@ def test_a_rate_and_a_target_are_stepped_as_the_logs_were(tmp_path: Path) -> Non
     simulator.reset_to(torch.from_numpy(table[:-1, 1:3]).float())
     landed = simulator.step(torch.from_numpy(commands[:-1]).float())
     np.testing.assert_allclose(landed, table[1:, 1:3], atol=1e-4)
+    elsewhere = runpy.run_path("grip/grip.py")["Direct"](59, device="meta")
+    assert elsewhere.step(torch.empty(59, 2, device="meta")).device.type == "meta"
 
 
 def test_a_heading_that_wraps_is_shown_without_jumps(tmp_path: Path) -> None:
@@ -132,6 +134,8 @@ def test_a_heading_that_wraps_is_shown_without_jumps(tmp_path: Path) -> None:
     far = task.objective.far(torch.cat([goal, away]))  # type: ignore[attr-defined]
     torch.testing.assert_close(far, torch.tensor([0.0, 1.0]), atol=0.01, rtol=0)
     assert check_task(task) == [] and places(task) == {"meta"}
+    elsewhere = runpy.run_path("drone/drone.py")["Direct"](9, device="meta")
+    assert elsewhere.step(torch.empty(9, 4, device="meta")).device.type == "meta"
     tests = runpy.run_path("drone/test_drone.py")
     tests["test_a_step_of_the_simulator"]()
     tests["test_phi_of_the_first_row_of_the_logs"]()

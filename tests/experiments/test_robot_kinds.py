@@ -164,6 +164,8 @@ def test_no_command_moves_a_part_of_a_quaternion(tmp_path: Path, stem: str) -> N
     kind = Direct.of(logs(tmp_path, x=T, y=T % 9, **parts, **commands))
     assert [field.short for field in kind.moved] == ["x", names[0], "y"]
     assert "make yaw of it" not in kind.simulator
+    pose = {"x": T, "y": T % 9, "z": T % 4, "w": T % 7}  # a position and a turn rate
+    assert "make yaw of it" not in Direct.of(logs(tmp_path, **pose, **commands)).simulator
 
 
 def test_positions_may_be_called_px_and_py(tmp_path: Path) -> None:
@@ -188,7 +190,8 @@ def test_each_command_is_a_rate_or_a_target_by_itself(tmp_path: Path) -> None:
         "values that change as commanded: x by vx; "
         "values that are where they are put as commanded: grip by grip"
     )
-    step = "torch.where(torch.tensor([True, False]), self.state + TIMESTEP_S * command, command)"
+    is_rate = "torch.tensor([True, False], device=command.device)"
+    step = f"torch.where({is_rate}, self.state + TIMESTEP_S * command, command)"
     assert kind.values()["step"] == step
     assert (kind.values()["before"], kind.values()["after"]) == ("[0.0, 1.0]", "[0.1, 1.0]")
 
