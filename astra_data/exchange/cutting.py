@@ -77,6 +77,7 @@ class Cutter:
         """
         columns, finite = self._converter.convert(block)
         self.tally.rows += len(block)
+        self.tally.notes += block.notes
         rejected = ~finite
         if rejected.any():
             first = row + int(np.argmax(rejected))

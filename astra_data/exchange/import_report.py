@@ -9,7 +9,7 @@ from astra_data.dataset.endings import Endings
 from astra_data.exchange.tally import Tally
 
 _SHOWN = 8
-"""Files that are listed."""
+"""Files, and lines on rates, that are listed."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,9 @@ class ImportReport:
             )
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
         rate = f"rate: {tally.clock}\n" if tally.clock else ""
+        notes = "".join(f"{note}\n" for note in tally.notes[:_SHOWN])
+        if len(tally.notes) > _SHOWN:
+            notes += f"and {len(tally.notes) - _SHOWN} more lines on rates\n"
         still = (
             f"time stands still in {tally.still_rows} rows, first in {tally.still_first}: expected one row "
             "at a time; they are of several robots, or written twice\n"
@@ -58,7 +61,7 @@ class ImportReport:
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
             f"split points: {points}\n"
-            f"{ends}{rate}{still}{unused}"
+            f"{ends}{rate}{notes}{still}{unused}"
             f"rejected rows: {tally.rejected_rows}{first}\n"
             f"last rows without a next state: {_last_rows(tally)}; "
             f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}"

@@ -84,12 +84,14 @@ class Block:
         origin: the file and part of the file that they come from.
         starts: whether an episode of the format itself begins with the first row.
         torn: how many rows after the last one are cut off at the end of the file, 0 or 1.
+        notes: what the import's report tells of them, in a line each.
     """
 
     values: Mapping[str, Array]
     origin: str
     starts: bool = False
     torn: int = 0
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return n."""

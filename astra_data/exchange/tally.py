@@ -31,6 +31,7 @@ class Tally:
         rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
         endings: how the episodes end.
         clock: the recorded rate, gaps and jitter, where the mapping names the times.
+        notes: what is strange about the rates of files and topics, in a line each.
     """
 
     rows: int = 0
@@ -51,6 +52,7 @@ class Tally:
     rows_after_end: int = 0
     endings: Endings = field(default_factory=Endings)
     clock: str = ""
+    notes: list[str] = field(default_factory=list)
 
     def count_torn(self, rows: int, place: str) -> None:
         """Count `rows` that are cut off, at the `place` of the first, where there are any."""

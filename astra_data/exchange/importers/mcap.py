@@ -1,15 +1,15 @@
 """MCAP: messages of asynchronous topics, as JSON, protobuf or ROS 2 (CDR), resampled to fps.
 
-From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
-topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s` ends the
-episode, and the next begins when all have sent a message again; where all are silent for as long, it ends
-with the last message. Times are the messages' log times. Files are read message by message.
+Times are the messages' log times. Files are read message by message, twice: how often topics come decides
+when rows are taken (`exchange/resampling.py`).
 """
 
 import json
 import logging
-from collections import Counter
+from array import array
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,92 +20,11 @@ from astra_data.core.optional import optional
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
+from astra_data.exchange.resampling import Resampler
 
 SUFFIXES = (".mcap",)
 
 _log = logging.getLogger(__name__)
-
-MOST_HELD_ROWS = 10**6
-"""Most rows in which the same values may be held: five hours at 50 Hz."""
-
-
-class Resampler:
-    """Holds the last values of all topics and samples rows from them.
-
-    Attributes:
-        topics: topic to its fields.
-        times: topic to the time of its last message, in ns.
-        silences: topic to how often it ended an episode: it was silent for too long, and others were not.
-    """
-
-    def __init__(self, mapping: ImportMapping, origin: str) -> None:
-        """Sample the fields of `mapping` from the file `origin`."""
-        self._origin = origin
-        self.topics: dict[str, list[str]] = {}
-        self.times: dict[str, int] = {}
-        self.silences: Counter[str] = Counter()
-        for field in mapping.all_fields:
-            self.topics.setdefault(field.partition(":")[0], []).append(field)
-        expiring = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
-        self._expiring = {field.partition(":")[0] for field in expiring}
-        self._gap_ns = round((mapping.split.gap_s or 0) * 1e9)
-        self._fps = mapping.fps
-        self._values: dict[str, Array] = {}
-        self._start: int | None = None
-        self._row = 0
-
-    def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
-        """Update the values of `topic` with a message at `time` ns."""
-        self._values |= values
-        self.times[topic] = time
-        if self._start is None and self._is_complete(time):
-            self._start, self._row = time, 0
-
-    def rows_before(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
-        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode.
-
-        Raises:
-            BadInputError: these are more than `MOST_HELD_ROWS`.
-        """
-        if self._is_pause(time):
-            yield from self.rows_before(max(self._heard()) + 1)
-            self._start = None
-        self._refuse_gap(time)
-        while self._start is not None:
-            moment = self._start + self._row * 10**9 // self._fps
-            if moment >= time:
-                return
-            if silent := self._silent(moment):
-                self._start = None
-                self.silences.update(silent)
-                return
-            yield self._row == 0, dict(self._values)
-            self._row += 1
-
-    def _refuse_gap(self, time: int) -> None:
-        if self._start is None:
-            return
-        moment = self._start + self._row * 10**9 // self._fps
-        end = min(time, *(self.times[topic] + self._gap_ns for topic in self._expiring))
-        if (rows := (end - moment) * self._fps // 10**9) > MOST_HELD_ROWS:
-            raise BadInputError(
-                f"{self._origin}: nothing new comes between {moment} and {time} ns, which would be {rows} "
-                f"equal rows, expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
-            )
-
-    def _is_pause(self, time: int) -> bool:
-        """Return whether all topics that are not latched were silent for too long before `time`."""
-        return bool(heard := self._heard()) and time - max(heard) > self._gap_ns
-
-    def _heard(self) -> list[int]:
-        return [self.times[topic] for topic in self._expiring & self.times.keys()]
-
-    def _is_complete(self, time: int) -> bool:
-        return self.times.keys() == self.topics.keys() and not self._silent(time)
-
-    def _silent(self, time: int) -> list[str]:
-        """Return the topics that may not be silent for so long as they were before `time`; all were heard."""
-        return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns]
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -117,28 +36,41 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     _check_mapping(mapping, str(source))
     starts = False
     rows: list[dict[str, Array]] = []
-    for begins, row in _rows(source, mapping):
+    resampler = Resampler(mapping, str(source), _periods(source, mapping))
+    for begins, row in _rows(source, resampler):
         if rows and (begins or len(rows) == BLOCK_ROWS):
             yield _block(source, rows, starts)
             starts, rows = False, []
         starts |= begins
         rows.append(row)
     if rows:
-        yield _block(source, rows, starts)
+        yield replace(_block(source, rows, starts), notes=resampler.unevenness())
 
 
-def _rows(source: Source, mapping: ImportMapping) -> Iterator[tuple[bool, dict[str, Array]]]:
+def _periods(source: Source, mapping: ImportMapping) -> dict[str, float]:
+    """Return the usual time between messages of each topic that has three or more, in ns."""
+    topics = list(dict.fromkeys(field.partition(":")[0] for field in mapping.all_fields))
+    times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
+    with source.open() as stream:
+        reader = optional("mcap.reader", "mcap").make_reader(stream)
+        _check_topics(reader.get_summary(), topics, str(source))
+        for _, channel, message in reader.iter_messages(topics=topics):
+            times[channel.topic].append(message.log_time)
+    steps = {topic: np.diff(np.array(moments)) for topic, moments in times.items()}
+    return {topic: float(np.median(step[step > 0])) for topic, step in steps.items() if (step > 0).sum() > 1}
+
+
+def _rows(source: Source, resampler: Resampler) -> Iterator[tuple[bool, dict[str, Array]]]:
     reading = optional("mcap.reader", "mcap")
     factories = [
         _Json(),
         optional("mcap_protobuf.decoder", "mcap").DecoderFactory(),
         optional("mcap_ros2.decoder", "mcap").DecoderFactory(),
     ]
-    resampler, time = Resampler(mapping, str(source)), 0
+    time = 0
     sizes: dict[str, tuple[int, ...]] = {}
     with source.open() as stream:
         reader = reading.make_reader(stream, validate_crcs=True, decoder_factories=factories)
-        _check_topics(reader.get_summary(), list(resampler.topics), str(source))
         for _, channel, message, content in reader.iter_decoded_messages(topics=list(resampler.topics)):
             time = message.log_time
             values = _values(
@@ -149,7 +81,7 @@ def _rows(source: Source, mapping: ImportMapping) -> Iterator[tuple[bool, dict[s
                 raise BadInputError(f"{source} at {time} ns: {', '.join(changed)} changes in size")
             yield from resampler.rows_before(time)
             resampler.receive(channel.topic, time, values)
-    yield from resampler.rows_before(time + 1)
+    yield from resampler.last_rows(time)
     silent = sorted(resampler.topics.keys() - resampler.times.keys())
     if silent:
         raise BadInputError(f"{source}: no messages on {', '.join(silent)}")

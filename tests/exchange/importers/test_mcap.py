@@ -180,3 +180,25 @@ def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
     [warning] = caplog.messages
     assert "log.mcap: /command is silent for over split.gap_s 3 times while others are not" in warning
     assert "latched = true" in warning
+
+
+def test_messages_that_come_a_little_late_make_even_steps(tmp_path: Path) -> None:
+    """Every third pose is 1 ms late."""
+    messages = [command(0.09 + k / 10, k) for k in range(30)]
+    messages += [pose(0.1 + k / 10 + (k % 3 == 1) / 1000, k) for k in range(30)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    dataset, report = imported(tmp_path, path, MAPPING)
+    values = dataset.columns([STATE, ACTION])
+    assert values[STATE][:, 0].tolist() == values[ACTION].tolist() == list(range(29))
+    assert "times a second" not in str(report)
+
+
+def test_a_rate_that_is_not_that_of_a_topic_is_told_in_the_report(tmp_path: Path) -> None:
+    messages = [m for k in range(51) for m in (pose(k / 5, k), command(k / 5, k))]
+    dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", messages), MAPPING)
+    assert len(dataset.columns([ACTION])[ACTION]) == 100
+    for topic in ("/pose", "/command"):
+        told = (
+            f"\nlog.mcap: {topic} comes 5 times a second, fps is 10: 50 of 100 rows repeat its message before"
+        )
+        assert told in str(report)

@@ -1,0 +1,179 @@
+"""Rows at fps of the messages of asynchronous topics.
+
+From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
+topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s` ends the
+episode, and the next begins when all have sent a message again; where all are silent for as long, it ends
+with the last message.
+
+Where a state comes as often as rows, or a whole number of times as often, rows are taken midway between its
+messages and those of the commands: jitter changes no row, and a state meets the command that is in force for
+most of its step.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import STATE, Array
+from astra_data.exchange.cutting import RATE_TOLERANCE
+from astra_data.exchange.mapping import ImportMapping
+
+MOST_HELD_ROWS = 10**6
+"""Most rows in which the same values may be held: five hours at 50 Hz."""
+MOST_UNEVEN = 0.05
+"""Largest share of rows that repeat a message of a topic, or of messages in no row, that is not told."""
+
+
+class Resampler:
+    """Holds the last values of all topics and samples rows from them.
+
+    Attributes:
+        topics: topic to its fields.
+        times: topic to the time of its last message, in ns.
+        silences: topic to how often it ended an episode: it was silent for too long, and others were not.
+        repeated: topic to how many rows of an episode hold the same message as the row before.
+        skipped: topic to how many messages within episodes are in no row.
+    """
+
+    def __init__(self, mapping: ImportMapping, origin: str, periods: Mapping[str, float]) -> None:
+        """Sample the fields of `mapping` from the file `origin`.
+
+        Args:
+            mapping: says which fields of which topics become which columns.
+            origin: the file's name, for messages.
+            periods: topic to the usual time between its messages, in ns; of those that have one.
+        """
+        self._origin, self._periods = origin, periods
+        self.topics: dict[str, list[str]] = {}
+        self.times: dict[str, int] = {}
+        self.silences: Counter[str] = Counter()
+        self.repeated: Counter[str] = Counter()
+        self.skipped: Counter[str] = Counter()
+        self._messages: Counter[str] = Counter()
+        self._rows = 0
+        self._fresh: set[str] = set()
+        for field in mapping.all_fields:
+            self.topics.setdefault(field.partition(":")[0], []).append(field)
+        expiring = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
+        self._expiring = {field.partition(":")[0] for field in expiring}
+        self._gap_ns = round((mapping.split.gap_s or 0) * 1e9)
+        self._fps = mapping.fps
+        self._values: dict[str, Array] = {}
+        self._start: int | None = None
+        self._row = 0
+        often = {topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in periods.items()}
+        of_state = mapping.columns[STATE].fields if STATE in mapping.columns else ()
+        states = self._expiring & {field.partition(":")[0] for field in of_state}
+        self._states = [topic for topic in states if often.get(topic)]
+        most = max((often[topic] for topic in self._states), default=0)
+        self._in_step = [topic for topic in self._expiring if 0 < often.get(topic, 0) <= most]
+        self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
+        self._delay_ns = 0
+
+    def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
+        """Update the values of `topic` with a message at `time` ns."""
+        if self._start is not None:
+            self._messages[topic] += 1
+            self.skipped[topic] += topic in self._fresh
+        self._fresh.add(topic)
+        self._values |= values
+        self.times[topic] = time
+        if self._start is None and self._is_complete(time):
+            self._delay_ns = self._midway(time)
+            self._start, self._row = time + self._delay_ns, 0
+
+    def rows_before(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
+        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode.
+
+        Raises:
+            BadInputError: these are more than `MOST_HELD_ROWS`.
+        """
+        if self._is_pause(time):
+            yield from self._sampled(self._end(max(self._heard())))
+            self._start = None
+        yield from self._sampled(time)
+
+    def last_rows(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
+        """Yield the rows that are left after the last message, at `time` ns.
+
+        Raises:
+            BadInputError: as `rows_before`.
+        """
+        yield from self._sampled(self._end(time))
+
+    def unevenness(self) -> tuple[str, ...]:
+        """Tell each topic that many rows repeat, or of which many messages are in no row."""
+        return tuple(
+            f"{self._origin}: {topic} comes {1e9 / self._periods[topic]:.4g} times a second, "
+            f"fps is {self._fps}: {self.repeated[topic]} of {self._rows} rows repeat its message before, "
+            f"{self.skipped[topic]} of {self._messages[topic]} messages are in no row"
+            for topic in sorted(self._expiring & self._periods.keys())
+            if self.repeated[topic] > MOST_UNEVEN * self._rows
+            or self.skipped[topic] > MOST_UNEVEN * self._messages[topic]
+        )
+
+    def _sampled(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
+        self._refuse_gap(time)
+        while self._start is not None:
+            moment = self._start + self._row * 10**9 // self._fps
+            if moment >= time:
+                return
+            if silent := self._silent(moment - self._delay_ns):
+                self._start = None
+                self.silences.update(silent)
+                return
+            if self._row:
+                self._rows += 1
+                self.repeated.update(self.topics.keys() - self._fresh)
+            self._fresh.clear()
+            yield self._row == 0, dict(self._values)
+            self._row += 1
+
+    def _midway(self, time: int) -> int:
+        """Return how long after `time` the widest gap between the messages that are in step is half over."""
+        if not self._states:
+            return 0
+        phases = sorted((self.times[topic] - time) % self._spacing_ns for topic in self._in_step)
+        gaps = pairwise([*phases, phases[0] + self._spacing_ns])
+        before, after = max(gaps, key=lambda gap: gap[1] - gap[0])
+        return round((before + after) / 2 % self._spacing_ns)
+
+    def _end(self, time: int) -> int:
+        """Return before when the last row is, of an episode whose last message is at `time`."""
+        if not self._states:
+            return time + 1
+        return max(self.times[topic] for topic in self._states) + round(self._spacing_ns)
+
+    def _refuse_gap(self, time: int) -> None:
+        if self._start is None:
+            return
+        moment = self._start + self._row * 10**9 // self._fps
+        end = min(time, *(self.times[topic] + self._gap_ns for topic in self._expiring))
+        if (rows := (end - moment) * self._fps // 10**9) > MOST_HELD_ROWS:
+            raise BadInputError(
+                f"{self._origin}: nothing new comes between {moment} and {time} ns, which would be {rows} "
+                f"equal rows, expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
+            )
+
+    def _is_pause(self, time: int) -> bool:
+        """Return whether all topics that are not latched were silent for too long before `time`."""
+        return bool(heard := self._heard()) and time - max(heard) > self._gap_ns
+
+    def _heard(self) -> list[int]:
+        return [self.times[topic] for topic in self._expiring & self.times.keys()]
+
+    def _is_complete(self, time: int) -> bool:
+        return self.times.keys() == self.topics.keys() and not self._silent(time)
+
+    def _silent(self, time: int) -> list[str]:
+        """Return the topics that may not be silent for so long as they were before `time`; all were heard."""
+        return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns]
+
+
+def _messages_per_row(ratio: float) -> int:
+    """Return the whole number that `ratio` is about, 1 where its inverse is, else 0."""
+    most = max(ratio, 1 / ratio)
+    if abs(most / round(most) - 1) > RATE_TOLERANCE:
+        return 0
+    return max(round(ratio), 1)

@@ -1,0 +1,89 @@
+"""Which message of each topic a row takes, where it is known which one is due."""
+
+import numpy as np
+import pytest
+
+from astra_data.dataset.columns import ACTION, STATE, Array
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.resampling import Resampler
+
+MS = 10**6
+
+
+def sampled(fps: int, odom: Array, commands: Array) -> tuple[Resampler, list[tuple[int, int]]]:
+    """Return, for each row, which message of each topic it holds; times are in ms."""
+    mapping = ImportMapping.model_validate(
+        {
+            "name": "log",
+            "task": "drive",
+            "fps": fps,
+            "columns": {STATE: {"fields": ("/odom:k",)}, ACTION: {"fields": ("/cmd:k",)}},
+            "split": {"gap_s": 0.4},
+        }
+    )
+    times = {"/odom": odom, "/cmd": commands}
+    periods = {topic: float(np.median(np.diff(t))) * MS for topic, t in times.items()}
+    resampler = Resampler(mapping, "log", periods)
+    messages = sorted((t, topic, k) for topic, series in times.items() for k, t in enumerate(series))
+    rows = []
+    for t, topic, k in messages:
+        rows += [row for _, row in resampler.rows_before(round(t * MS))]
+        resampler.receive(topic, round(t * MS), {f"{topic}:k": np.array(k)})
+    rows += [row for _, row in resampler.last_rows(round(messages[-1][0] * MS))]
+    return resampler, [(int(row["/odom:k"]), int(row["/cmd:k"])) for row in rows]
+
+
+@pytest.mark.parametrize("late_ms", [1.0, 12.0, -12.0])
+@pytest.mark.parametrize(("phase_ms", "lead"), [(0.0, 0), (1.0, 0), (10.0, 0), (40.0, 1), (49.0, 1)])
+def test_jitter_neither_repeats_nor_skips_a_state(phase_ms: float, lead: int, late_ms: float) -> None:
+    """At 20 Hz, every third state is late; it meets the command that is in force for most of its step."""
+    odom = 1000 + 50.0 * np.arange(100)
+    odom[1::3] += late_ms
+    resampler, rows = sampled(20, odom, 1000 + phase_ms + 50.0 * np.arange(-3, 97))
+    # The command of the same number came 150 ms before, less its phase.
+    expected = [(k, k + 3 - lead) for k in range(97 + lead)]
+    assert rows[: len(expected)] == expected
+    assert resampler.unevenness() == ()
+
+
+def test_jitter_changes_no_row_of_a_state_that_comes_five_times_a_row() -> None:
+    odom = 20.0 * np.arange(100)
+    odom[5::10] += 1
+    _, rows = sampled(10, odom, 100.0 * np.arange(20))
+    assert rows == [(5 * k, k) for k in range(20)]
+
+
+def test_a_topic_out_of_step_is_held_as_it_is_at_the_time_of_the_row() -> None:
+    """A state at 25 Hz, of which each row takes the last one."""
+    odom, commands = 40.0 * np.arange(100), 100.0 * np.arange(40)
+    _, rows = sampled(10, odom, commands)
+    assert rows == [(int(100 * k // 40), k) for k in range(40)]
+
+
+def test_no_row_is_made_up_after_the_last_state() -> None:
+    """The last command came just before a state that was not recorded any more."""
+    _, rows = sampled(20, 50.0 * np.arange(20), 49 + 50.0 * np.arange(20))
+    assert rows == [(k, k - 1) for k in range(1, 20)]
+
+
+def test_a_topic_that_rows_repeat_is_told_with_its_rate_and_counts() -> None:
+    resampler, rows = sampled(40, 50.0 * np.arange(101), 25.0 * np.arange(201))
+    assert len(rows) == 201
+    assert resampler.unevenness() == (
+        "log: /odom comes 20 times a second, fps is 40: 100 of 200 rows repeat its message before, "
+        "0 of 100 messages are in no row",
+    )
+
+
+def test_a_topic_of_which_messages_are_skipped_is_told_with_its_rate_and_counts() -> None:
+    resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100))
+    assert resampler.unevenness() == (
+        "log: /odom comes 100 times a second, fps is 20: 0 of 99 rows repeat its message before, "
+        "396 of 495 messages are in no row",
+    )
+
+
+def test_a_clock_that_is_a_little_off_is_not_told() -> None:
+    """20.2 Hz: one message in a hundred is in no row."""
+    resampler, _ = sampled(20, 49.5 * np.arange(400), 50.0 * np.arange(396))
+    assert 3 <= resampler.skipped["/odom"] <= 5 and resampler.unevenness() == ()
