@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.wording import first_few
 from astra_data.dataset.checkup.clock import Clock
 from astra_data.dataset.checkup.jumps import full_turns, shortest
 from astra_data.dataset.columns import (
@@ -56,7 +57,7 @@ class Cutter:
         self._pieces: list[dict[str, Array]] = []
         self._metadata: dict[str, Scalar] = {}
         self._ended = False
-        self._seconds, self._usual_seconds, self._steps = 0.0, 0.0, 0
+        self._spent: list[tuple[str, NDArray[np.float64]]] = []
         self._clock = Clock(mapping.time or "", mapping.fps)
 
     @property
@@ -78,6 +79,8 @@ class Cutter:
         columns, finite = self._converter.convert(block)
         self.tally.rows += len(block)
         self.tally.notes += block.notes
+        if is_apart or not self._spent or self._spent[-1][0] != block.origin:
+            self._spent.append((block.origin, np.zeros(3)))
         rejected = ~finite
         if rejected.any():
             first = row + int(np.argmax(rejected))
@@ -161,25 +164,35 @@ class Cutter:
     def check_rate(self) -> None:
         """Compare fps to the rates measured from the times, and tally what the clock tells.
 
-        They are the mean rate, and the usual one without pauses.
+        They are the mean rate, and the usual one without pauses, of all files and of each, or of each episode
+        of formats that have their own.
 
         Raises:
-            BadInputError: both differ by more than `RATE_TOLERANCE`.
+            BadInputError: both differ by more than `RATE_TOLERANCE` over all files; names those that differ.
         """
-        fps, spent = self._mapping.fps, [time for time in (self._seconds, self._usual_seconds) if time > 0]
-        rates = [self._steps / time for time in spent]
-        if rates and all(abs(rate / fps - 1) > RATE_TOLERANCE for rate in rates):
+        origins = [origin for origin, spent in self._spent if spent.any()]
+        if not origins:
+            return
+        fps, spent = self._mapping.fps, np.array([spent for _, spent in self._spent if spent.any()])
+        rates = spent[:, 2:] / spent[:, :2]
+        off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1)
+        named = [f"{origin}: {rates[at, 1]:.4g} Hz" for at, origin in enumerate(origins) if off[at]]
+        seconds, usual_seconds, steps = spent.sum(axis=0)
+        pooled = steps / seconds, steps / usual_seconds
+        if all(abs(rate / fps - 1) > RATE_TOLERANCE for rate in pooled):
             cure = "correct fps or time_scale, or resample the recording"
             if self.tally.back_rows:
                 cure += (
                     f"; time goes back in {self.tally.back_rows} rows, first in {self.tally.back_first}: "
                     "sort them if they belong together"
                 )
+            if len(origins) > 1:
+                cure += f"; {first_few(named, 8)}"
             raise BadInputError(
-                f"'{self._mapping.time}' gives {rates[0]:.4g} rows per second, but fps is {fps}: {cure}"
+                f"'{self._mapping.time}' gives {pooled[0]:.4g} rows per second, but fps is {fps}: {cure}"
             )
-        if self._steps:
-            self.tally.clock = str(self._clock)
+        self.tally.notes += [f"{name}, {fps} Hz declared" for name in named]
+        self.tally.clock = str(self._clock)
 
     def _count(
         self, block: Block, row: int, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
@@ -227,15 +240,15 @@ class Cutter:
     def _gaps(self, steps_s: Array, kept_s: Array) -> Mask:
         """Return which steps in time (n,), of all rows or of those that are kept, are longer than `gap_s`.
 
-        The others of those that are kept, and that go on, are measured.
+        The others of those that are kept, and that go on, are measured: the seconds that they took, those
+        that they would have taken if all were as long as the median, and how many they are.
         """
         longest = self._mapping.split.gap_s
         gaps = np.zeros(len(steps_s), bool) if longest is None else (steps_s > longest) | (kept_s > longest)
         regular = kept_s[~gaps & (kept_s > 0)]
         if len(regular):
-            self._seconds += float(regular.sum())
-            self._usual_seconds += float(np.median(regular)) * len(regular)
-            self._steps += len(regular)
+            measured = np.array([regular.sum(), np.median(regular) * len(regular), len(regular)])
+            self._spent[-1][1][:] += measured
             self._clock.count(regular)
         return gaps
 

@@ -1,6 +1,7 @@
 """What the cutter makes of rows whose outcome is known."""
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -206,6 +207,43 @@ def test_a_rate_that_is_not_fps_is_told() -> None:
     cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)
     with pytest.raises(BadInputError, match="'t' gives 50 rows per second, but fps is 10"):
         cutting.check_rate()
+
+
+def fed(rates: Sequence[tuple[str, float]]) -> Cutter:
+    """Return a cutter that has read a file of 50 rows at each of these rates."""
+    cutting = cutter(time="t")
+    for origin, rate in rates:
+        values = {"x": np.zeros(50), "a": np.zeros(50), "t": np.arange(50) / rate}
+        list(cutting.feed(Block(values, origin), 0, is_apart=True))
+    return cutting
+
+
+def test_files_of_other_rates_among_many_are_named() -> None:
+    good = [(f"{number}.csv", rate) for number, rate in enumerate(np.linspace(9.2, 10.8, 30))]
+    cutting = fed([("fast.csv", 20.0), *good, ("slow.csv", 5.0)])
+    cutting.check_rate()
+    assert cutting.tally.notes == ["fast.csv: 20 Hz, 10 Hz declared", "slow.csv: 5 Hz, 10 Hz declared"]
+
+
+def test_a_refusal_of_a_rate_names_the_files_that_are_off() -> None:
+    with pytest.raises(BadInputError, match=r"fps is 10: .*; fast\.csv: 20 Hz, faster\.csv: 40 Hz$"):
+        fed([("fast.csv", 20.0), ("good.csv", 10.0), ("faster.csv", 40.0)]).check_rate()
+
+
+def test_files_of_one_name_are_measured_one_by_one() -> None:
+    """As those of `runs/*/log.csv`."""
+    cutting = fed([("log.csv", 10.0)] * 20 + [("log.csv", 5.0)] + [("log.csv", 10.0)] * 20)
+    cutting.check_rate()
+    assert cutting.tally.notes == ["log.csv: 5 Hz, 10 Hz declared"]
+
+
+def test_a_file_with_rows_missing_or_pauses_has_its_usual_rate() -> None:
+    cutting = cutter(time="t")
+    kept = np.arange(50)[np.arange(50) % 4 > 0]
+    values = {"x": np.zeros(len(kept)), "a": np.zeros(len(kept)), "t": kept / 10}
+    list(cutting.feed(Block(values, "log"), 0, is_apart=True))
+    cutting.check_rate()
+    assert cutting.tally.notes == []
 
 
 @BLOCKS

@@ -52,3 +52,11 @@ def test_files_that_were_not_read_are_told_shortly() -> None:
         in told
     )
     assert "not read" not in str(ImportReport(Path("out"), 2, 7, Tally(), 0.25))
+
+
+def test_strange_rates_are_told_in_lines_of_their_own_and_shortly() -> None:
+    notes = [f"{number}.csv: 40 Hz, 20 Hz declared" for number in range(10)]
+    told = str(ImportReport(Path("out"), 2, 7, Tally(notes=notes[:8]), 0.25))
+    assert "\n".join(["", *notes[:8], "rejected"]) in told
+    told = str(ImportReport(Path("out"), 2, 7, Tally(notes=notes), 0.25))
+    assert "\n".join(["", *notes[:8], "and 2 more lines on rates", "rejected"]) in told
