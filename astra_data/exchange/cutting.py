@@ -186,7 +186,7 @@ class Cutter:
                     f"; time goes back in {self.tally.back_rows} rows, first in {self.tally.back_first}: "
                     "sort them if they belong together"
                 )
-            if len(origins) > 1:
+            if named and len(origins) > 1:
                 cure += f"; {first_few(named, 8)}"
             raise BadInputError(
                 f"'{self._mapping.time}' gives {pooled[0]:.4g} rows per second, but fps is {fps}: {cure}"

@@ -14,7 +14,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.checkup.clock import GAP
 from astra_data.dataset.columns import STATE, Array
 from astra_data.exchange.cutting import RATE_TOLERANCE
 from astra_data.exchange.mapping import ImportMapping
@@ -67,7 +71,7 @@ class Resampler:
         states = self._expiring & {field.partition(":")[0] for field in of_state}
         self._states = [topic for topic in states if often.get(topic)]
         most = max((often[topic] for topic in self._states), default=0)
-        self._in_step = [topic for topic in self._expiring if 0 < often.get(topic, 0) <= most]
+        self._in_step = [topic for topic in self._expiring if often.get(topic)]
         self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
         self._delay_ns = 0
 
@@ -143,7 +147,8 @@ class Resampler:
         """Return before when the last row is, of an episode whose last message is at `time`."""
         if not self._states:
             return time + 1
-        return max(self.times[topic] for topic in self._states) + round(self._spacing_ns)
+        next_state = max(self.times[topic] + round(self._periods[topic]) for topic in self._states)
+        return min(next_state, time + round(self._spacing_ns))
 
     def _refuse_gap(self, time: int) -> None:
         if self._start is None:
@@ -169,6 +174,16 @@ class Resampler:
     def _silent(self, time: int) -> list[str]:
         """Return the topics that may not be silent for so long as they were before `time`; all were heard."""
         return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns]
+
+
+def usual_periods(times: Mapping[str, ArrayLike]) -> dict[str, float]:
+    """Return the mean step, gaps aside, of the times of each topic that has three or more."""
+    steps = {topic: np.diff(np.unique(moments)) for topic, moments in times.items()}
+    return {
+        topic: float(step[step <= GAP * np.median(step)].mean())
+        for topic, step in steps.items()
+        if len(step) > 1
+    }
 
 
 def _messages_per_row(ratio: float) -> int:

@@ -225,6 +225,15 @@ def test_files_of_other_rates_among_many_are_named() -> None:
     assert cutting.tally.notes == ["fast.csv: 20 Hz, 10 Hz declared", "slow.csv: 5 Hz, 10 Hz declared"]
 
 
+def test_episodes_of_other_rates_are_named_where_a_format_has_its_own() -> None:
+    cutting = cutter(time="t")
+    for number, rate in enumerate([10.0] * 20 + [5.0]):
+        values = {"x": np.zeros(50), "a": np.zeros(50), "t": np.arange(50) / rate}
+        list(cutting.feed(Block(values, f"demo_{number}", starts=True), 0, is_apart=number == 0))
+    cutting.check_rate()
+    assert cutting.tally.notes == ["demo_20: 5 Hz, 10 Hz declared"]
+
+
 def test_a_refusal_of_a_rate_names_the_files_that_are_off() -> None:
     with pytest.raises(BadInputError, match=r"fps is 10: .*; fast\.csv: 20 Hz, faster\.csv: 40 Hz$"):
         fed([("fast.csv", 20.0), ("good.csv", 10.0), ("faster.csv", 40.0)]).check_rate()
@@ -237,13 +246,33 @@ def test_files_of_one_name_are_measured_one_by_one() -> None:
     assert cutting.tally.notes == ["log.csv: 5 Hz, 10 Hz declared"]
 
 
-def test_a_file_with_rows_missing_or_pauses_has_its_usual_rate() -> None:
+MISSING = (np.arange(50) + np.arange(50) // 3) / 10
+"""Times at 10 Hz, of which every fourth is missing."""
+BURSTS = np.arange(50) // 4 * 0.4 + np.arange(50) % 4 * 0.01
+"""Times of 10 rows a second that come four at once."""
+PAUSES = np.arange(50) / 20 + np.arange(50) // 25 * 3.0
+"""Times at 20 Hz with a pause."""
+
+
+def timed(*files: Array) -> Cutter:
+    """Return a cutter that has read a file of each of these times."""
     cutting = cutter(time="t")
-    kept = np.arange(50)[np.arange(50) % 4 > 0]
-    values = {"x": np.zeros(len(kept)), "a": np.zeros(len(kept)), "t": kept / 10}
-    list(cutting.feed(Block(values, "log"), 0, is_apart=True))
+    for number, times in enumerate(files):
+        values = {"x": np.zeros(len(times)), "a": np.zeros(len(times)), "t": times}
+        list(cutting.feed(Block(values, f"{number}.csv"), 0, is_apart=True))
+    return cutting
+
+
+def test_a_file_is_of_another_rate_only_where_both_its_mean_and_its_usual_rate_are() -> None:
+    cutting = timed(MISSING, BURSTS, PAUSES, np.arange(1000) / 10)
     cutting.check_rate()
-    assert cutting.tally.notes == []
+    assert cutting.tally.notes == ["2.csv: 20 Hz, 10 Hz declared"]
+
+
+@pytest.mark.parametrize("files", [(MISSING, BURSTS), (np.arange(50) / 20,)])
+def test_a_refusal_of_a_rate_names_no_file_where_none_stands_out(files: tuple[Array, ...]) -> None:
+    with pytest.raises(BadInputError, match=r"or resample the recording$"):
+        timed(*files).check_rate()
 
 
 @BLOCKS

@@ -5,25 +5,27 @@ import pytest
 
 from astra_data.dataset.columns import ACTION, STATE, Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.resampling import Resampler
+from astra_data.exchange.resampling import Resampler, usual_periods
 
 MS = 10**6
 
 
-def sampled(fps: int, odom: Array, commands: Array) -> tuple[Resampler, list[tuple[int, int]]]:
+def sampled(
+    fps: int, odom: Array, commands: Array, *, latched: bool = False
+) -> tuple[Resampler, list[tuple[int, int]]]:
     """Return, for each row, which message of each topic it holds; times are in ms."""
+    command = {"fields": ("/cmd:k",), "latched": latched}
     mapping = ImportMapping.model_validate(
         {
             "name": "log",
             "task": "drive",
             "fps": fps,
-            "columns": {STATE: {"fields": ("/odom:k",)}, ACTION: {"fields": ("/cmd:k",)}},
+            "columns": {STATE: {"fields": ("/odom:k",)}, ACTION: command},
             "split": {"gap_s": 0.4},
         }
     )
     times = {"/odom": odom, "/cmd": commands}
-    periods = {topic: float(np.median(np.diff(t))) * MS for topic, t in times.items()}
-    resampler = Resampler(mapping, "log", periods)
+    resampler = Resampler(mapping, "log", usual_periods({topic: t * MS for topic, t in times.items()}))
     messages = sorted((t, topic, k) for topic, series in times.items() for k, t in enumerate(series))
     rows = []
     for t, topic, k in messages:
@@ -53,6 +55,43 @@ def test_jitter_changes_no_row_of_a_state_that_comes_five_times_a_row() -> None:
     assert rows == [(5 * k, k) for k in range(20)]
 
 
+@pytest.mark.parametrize("phase_ms", [18.0, 32.0])
+def test_jitter_moves_no_command_to_another_state(phase_ms: float) -> None:
+    commands = phase_ms + 50.0 * np.arange(100)
+    commands[1::3] += 12
+    commands[2::3] -= 12
+    resampler, rows = sampled(20, 50.0 * np.arange(100), commands)
+    assert {k - command for k, command in rows} == {0 if phase_ms < 25 else 1}
+    assert resampler.unevenness() == ()
+
+
+def test_jitter_changes_no_row_of_a_state_that_comes_every_other_row() -> None:
+    odom = 50.0 * np.arange(100)
+    odom[1::3] += 8
+    _, rows = sampled(40, odom, 25.0 * np.arange(200))
+    assert rows == [(row // 2, row) for row in range(200)]
+
+
+def test_a_command_out_of_step_moves_no_row_towards_the_states() -> None:
+    """Commands at 16 Hz, the first of them 20 ms after the first state."""
+    odom = 50.0 * np.arange(100)
+    odom[1::3] += 20
+    odom[2::3] -= 20
+    _, rows = sampled(20, odom, 20 + 62.5 * np.arange(79))
+    assert [k for k, _ in rows] == list(range(100))
+
+
+def test_a_state_that_falls_silent_is_held_for_as_long_as_it_may_be() -> None:
+    """The last state is at 500 ms; the row of 900 ms is 400 ms after it, as long as the longest gap."""
+    resampler, rows = sampled(20, 50.0 * np.arange(11), 50.0 * np.arange(60))
+    assert len(rows) == 19 and resampler.silences == {"/odom": 1}
+
+
+def test_a_latched_topic_may_be_repeated() -> None:
+    resampler, _ = sampled(20, 50.0 * np.arange(100), 500.0 * np.arange(10), latched=True)
+    assert resampler.repeated["/cmd"] == 90 and resampler.unevenness() == ()
+
+
 def test_a_topic_out_of_step_is_held_as_it_is_at_the_time_of_the_row() -> None:
     """A state at 25 Hz, of which each row takes the last one."""
     odom, commands = 40.0 * np.arange(100), 100.0 * np.arange(40)
@@ -64,6 +103,22 @@ def test_no_row_is_made_up_after_the_last_state() -> None:
     """The last command came just before a state that was not recorded any more."""
     _, rows = sampled(20, 50.0 * np.arange(20), 49 + 50.0 * np.arange(20))
     assert rows == [(k, k - 1) for k in range(1, 20)]
+
+
+def test_no_row_is_made_up_after_the_last_message() -> None:
+    """The next state, at 5 Hz, was not recorded any more, and neither were commands."""
+    _, rows = sampled(20, 200.0 * np.arange(10), 50.0 * np.arange(37))
+    assert rows == [(row // 4, row) for row in range(37)]
+
+
+def test_a_period_is_the_mean_one_of_the_messages_that_go_on() -> None:
+    """Jitter, a pause, a message that is lost, and one that is written twice change nothing."""
+    times = 50.0 * np.arange(99)
+    times[1::3] += 20
+    times[2::3] -= 20
+    times = np.concatenate([times, times[-1] + 60_000 + 50.0 * np.arange(90), times[:5]])
+    periods = usual_periods({"/odom": np.sort(np.delete(times, 120)), "/map": [0, 10**9], "/goal": [3]})
+    assert periods == {"/odom": pytest.approx(50, rel=0.01)}
 
 
 def test_a_topic_that_rows_repeat_is_told_with_its_rate_and_counts() -> None:

@@ -20,7 +20,7 @@ from astra_data.core.optional import optional
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
-from astra_data.exchange.resampling import Resampler
+from astra_data.exchange.resampling import Resampler, usual_periods
 
 SUFFIXES = (".mcap",)
 
@@ -48,7 +48,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def _periods(source: Source, mapping: ImportMapping) -> dict[str, float]:
-    """Return the usual time between messages of each topic that has three or more, in ns."""
+    """Return the usual time between the messages of topics, in ns."""
     topics = list(dict.fromkeys(field.partition(":")[0] for field in mapping.all_fields))
     times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
     with source.open() as stream:
@@ -56,8 +56,7 @@ def _periods(source: Source, mapping: ImportMapping) -> dict[str, float]:
         _check_topics(reader.get_summary(), topics, str(source))
         for _, channel, message in reader.iter_messages(topics=topics):
             times[channel.topic].append(message.log_time)
-    steps = {topic: np.diff(np.array(moments)) for topic, moments in times.items()}
-    return {topic: float(np.median(step[step > 0])) for topic, step in steps.items() if (step > 0).sum() > 1}
+    return usual_periods(times)
 
 
 def _rows(source: Source, resampler: Resampler) -> Iterator[tuple[bool, dict[str, Array]]]:

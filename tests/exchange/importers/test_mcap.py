@@ -194,7 +194,8 @@ def test_messages_that_come_a_little_late_make_even_steps(tmp_path: Path) -> Non
 
 
 def test_a_rate_that_is_not_that_of_a_topic_is_told_in_the_report(tmp_path: Path) -> None:
-    messages = [m for k in range(51) for m in (pose(k / 5, k), command(k / 5, k))]
+    """Poses are written twice, at one time."""
+    messages = [m for k in range(51) for m in (pose(k / 5, k), pose(k / 5, k), command(k / 5, k))]
     dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", messages), MAPPING)
     assert len(dataset.columns([ACTION])[ACTION]) == 100
     for topic in ("/pose", "/command"):
