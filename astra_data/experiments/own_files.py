@@ -34,16 +34,16 @@ def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
     }
 
 
-def check_task_unchanged(task: str, run: Path) -> None:
-    """Refuse a task whose code is another than that which was recorded in the folder of a run.
+def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
+    """Refuse code at a `place` that is not what the folder of a run has recorded of its task, or of a method.
 
     Raises:
         BadInputError: it is another, or the record is damaged.
     """
-    now = code_digest(task)
-    if now and now != _recorded(run / CODE).get("task", now):
+    now = code_digest(place)
+    if now and now != _recorded(run / CODE).get(name, now):
         raise BadInputError(
-            f"{task.rpartition(':')[0]} changed since {run} was made: "
+            f"{place.rpartition(':')[0]} changed since {run} was made: "
             "bring it back as it was then, or run the recipe under another name"
         )
 

@@ -6,7 +6,7 @@ from typing import Any
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RECORD, seed_folder
-from astra_data.experiments.own_files import check_task_unchanged
+from astra_data.experiments.own_files import check_unchanged
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
@@ -28,7 +28,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
 
     Raises:
         BadInputError: the run has no such row or seed, the row trains no policy, an artefact of it is not
-            there, or the code of the task changed since the run was made.
+            there, or the code of the task or of the row's method changed since the run was made.
 
     Example:
         >>> from astra_data import load_policy
@@ -70,7 +70,7 @@ def settings_of(run: str | Path) -> dict[str, Any]:
         )
     settings = recorded_settings(folder)
     settings["task"] = found_near(settings["task"], folder)
-    check_task_unchanged(settings["task"], folder)
+    check_unchanged(settings["task"], folder)
     for own in settings.get("own_methods", {}).values():
         own["method"] = found_near(own["method"], folder)
     return settings
@@ -82,9 +82,9 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     Raises:
         BadInputError: as `load_policy`.
     """
-    settings = settings_of(run)
-    add_all(settings.get("own_methods", {}))
-    folder, where = Path(run), seed_folder(seed, percent)
+    settings, folder, where = settings_of(run), Path(run), seed_folder(seed, percent)
+    own_methods = settings.get("own_methods", {})
+    add_all(own_methods)
     files = {"train": folder / "train" / row / where / POLICY}
     if not files["train"].is_file():
         _check_asked(settings, row, seed)
@@ -96,6 +96,8 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
         wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"
         raise BadInputError(f"{run}: percent: expected {wanted}, got {percent or 'none'}")
     base = grounded_as(row)
+    for name in own_methods.keys() & {method.name, base}:
+        check_unchanged(own_methods[name]["method"], folder, name=name)
     if method.grounds:
         files["ground"] = folder / "ground" / base / where / GROUNDING
     if method.aligns:

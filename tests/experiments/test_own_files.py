@@ -12,7 +12,7 @@ from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.experiment import Experiment, load_experiment
 from astra_data.experiments.grounded_env import training_of
-from astra_data.experiments.own_files import CODE, check_task_unchanged, record_code
+from astra_data.experiments.own_files import CODE, check_unchanged, record_code
 from astra_data.experiments.trained_policy import load_policy, task_of
 
 ROOT = Path(__file__).parents[2]
@@ -177,6 +177,29 @@ def test_no_policy_and_no_environment_is_of_another_task(made: Path) -> None:
             load(run, "nas")
 
 
+@pytest.mark.parametrize("row", ["mine", "mine_plus"])
+def test_no_policy_is_of_another_method(made: Path, row: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor of a grounding that another method fits; other rows are."""
+    edit(made / "rail.toml", '"mine"]', '"mine", "mine_plus"]')
+    run = made / "runs/rail"
+    (run / "recipe.json").write_text(load(made).recipe.model_dump_json())
+
+    def refused(row: str) -> str:
+        with pytest.raises(BadInputError) as caught:
+            load_policy(run, row)
+        return str(caught.value)
+
+    assert refused(row).endswith("run the recipe first")
+    edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
+    told = f"{made}/mine.py changed since {run} was made: bring it back"
+    assert refused(row).startswith(told)
+    assert refused("nas").endswith("run the recipe first")
+    monkeypatch.setattr("astra_data.experiments.trained_policy.grounded_as", lambda _: "mine")
+    assert refused("nas").startswith(told)
+    monkeypatch.setattr("astra_data.experiments.trained_policy.grounded_as", lambda _: "nas")
+    assert refused(row).startswith(told)
+
+
 def test_a_run_is_taken_with_comments_and_methods_that_are_others(made: Path) -> None:
     edit(made / "rail.py", "class Rail:", "# On a rail.\n\nclass Rail:")
     edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
@@ -188,14 +211,14 @@ def test_only_what_was_recorded_can_be_another_task(
 ) -> None:
     run, task = made / "runs/rail", f"{made}/rail.py:TASK"
     for unknown in ("antmaze-umaze", "package.module:TASK", "gone.py:TASK"):
-        check_task_unchanged(unknown, run)
+        check_unchanged(unknown, run)
     edit(made / "rail.py", "0.1 * command", "0.2 * command")
-    check_task_unchanged(task, tmp_path_factory.mktemp("older"))
+    check_unchanged(task, tmp_path_factory.mktemp("older"))
     (run / CODE).write_text('{"mine": "0"}')
-    check_task_unchanged(task, run)
+    check_unchanged(task, run)
     (run / CODE).write_text("[]")
     with pytest.raises(BadInputError, match=r"rail/code\.json is not what a run writes"):
-        check_task_unchanged(task, run)
+        check_unchanged(task, run)
 
 
 def test_built_in_tasks_have_no_record(tmp_path: Path) -> None:
