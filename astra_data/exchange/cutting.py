@@ -35,6 +35,8 @@ back, a jump, rows that were rejected."""
 
 RATE_TOLERANCE = 0.1
 """Largest relative difference between fps and the rate measured from the times."""
+_ENOUGH = 20
+"""Steps of a file of which its rate can be told."""
 
 Cut = tuple[dict[str, Array], dict[str, Scalar]]
 
@@ -175,7 +177,7 @@ class Cutter:
             return
         fps, spent = self._mapping.fps, np.array([spent for _, spent in self._spent if spent.any()])
         rates = spent[:, 2:] / spent[:, :2]
-        off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1)
+        off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1) & (spent[:, 2] >= _ENOUGH)
         named = [f"{origin}: {rates[at, 1]:.4g} Hz" for at, origin in enumerate(origins) if off[at]]
         seconds, usual_seconds, steps = spent.sum(axis=0)
         pooled = steps / seconds, steps / usual_seconds

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.clock import GAP
@@ -27,6 +27,8 @@ MOST_HELD_ROWS = 10**6
 """Most rows in which the same values may be held: five hours at 50 Hz."""
 MOST_UNEVEN = 0.05
 """Largest share of rows that repeat a message of a topic, or of messages in no row, that is not told."""
+_AVERAGED = 20
+"""Messages of a topic over which jitter is averaged; over many more, a rate that is a little off counts."""
 
 
 class Resampler:
@@ -40,15 +42,15 @@ class Resampler:
         skipped: topic to how many messages within episodes are in no row.
     """
 
-    def __init__(self, mapping: ImportMapping, origin: str, periods: Mapping[str, float]) -> None:
+    def __init__(self, mapping: ImportMapping, origin: str, moments: Mapping[str, ArrayLike]) -> None:
         """Sample the fields of `mapping` from the file `origin`.
 
         Args:
             mapping: says which fields of which topics become which columns.
             origin: the file's name, for messages.
-            periods: topic to the usual time between its messages, in ns; of those that have one.
+            moments: topic to the times of all its messages, in their order, in ns.
         """
-        self._origin, self._periods = origin, periods
+        self._origin = origin
         self.topics: dict[str, list[str]] = {}
         self.times: dict[str, int] = {}
         self.silences: Counter[str] = Counter()
@@ -62,16 +64,20 @@ class Resampler:
         expiring = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
         self._expiring = {field.partition(":")[0] for field in expiring}
         self._gap_ns = round((mapping.split.gap_s or 0) * 1e9)
+        self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
+        self._periods = usual_periods(self._moments, self._gap_ns)
         self._fps = mapping.fps
         self._values: dict[str, Array] = {}
         self._start: int | None = None
         self._row = 0
-        often = {topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in periods.items()}
+        often = {
+            topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()
+        }
         of_state = mapping.columns[STATE].fields if STATE in mapping.columns else ()
         states = self._expiring & {field.partition(":")[0] for field in of_state}
         self._states = [topic for topic in states if often.get(topic)]
         most = max((often[topic] for topic in self._states), default=0)
-        self._in_step = [topic for topic in self._expiring if often.get(topic)]
+        self._in_step = [topic for topic in self._expiring if 0 < often.get(topic, 0) <= most]
         self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
         self._delay_ns = 0
 
@@ -138,10 +144,17 @@ class Resampler:
         """Return how long after `time` the widest gap between the messages that are in step is half over."""
         if not self._states:
             return 0
-        phases = sorted((self.times[topic] - time) % self._spacing_ns for topic in self._in_step)
+        phases = sorted(self._phase(topic, time) for topic in self._in_step)
         gaps = pairwise([*phases, phases[0] + self._spacing_ns])
         before, after = max(gaps, key=lambda gap: gap[1] - gap[0])
         return round((before + after) / 2 % self._spacing_ns)
+
+    def _phase(self, topic: str, time: int) -> float:
+        """Return how long after `time`, in ns below the spacing, messages of `topic` come but for jitter."""
+        first = np.searchsorted(self._moments[topic], self.times[topic])
+        moments = self._moments[topic][first : first + _AVERAGED]
+        step = self._spacing_ns * max(1, round(self._periods[topic] / self._spacing_ns))
+        return float(np.median(moments - time - step * np.arange(len(moments))) % self._spacing_ns)
 
     def _end(self, time: int) -> int:
         """Return before when the last row is, of an episode whose last message is at `time`."""
@@ -176,14 +189,20 @@ class Resampler:
         return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns]
 
 
-def usual_periods(times: Mapping[str, ArrayLike]) -> dict[str, float]:
-    """Return the mean step, gaps aside, of the times of each topic that has three or more."""
-    steps = {topic: np.diff(np.unique(moments)) for topic, moments in times.items()}
-    return {
-        topic: float(step[step <= GAP * np.median(step)].mean())
-        for topic, step in steps.items()
-        if len(step) > 1
-    }
+def usual_periods(moments: Mapping[str, NDArray[np.int64]], gap_ns: int) -> dict[str, float]:
+    """Return the mean step between the messages of each topic that has two steps or more up to `gap_ns`.
+
+    Steps that are far longer than the median are left out, as of lost messages, unless they are most of the
+    time, as of messages that come in bursts.
+    """
+    periods = {}
+    for topic, times in moments.items():
+        steps = np.diff(np.unique(times))
+        steps = steps[steps <= gap_ns]
+        if len(steps) > 1:
+            usual = steps[steps <= GAP * np.median(steps)]
+            periods[topic] = float((usual if 2 * usual.sum() >= steps.sum() else steps).mean())
+    return periods
 
 
 def _messages_per_row(ratio: float) -> int:

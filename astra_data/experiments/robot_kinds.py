@@ -75,13 +75,13 @@ class Direct:
     @classmethod
     def of(cls, logs: Logs) -> Self:
         """Return how it fits: commands move the states of their names, or else the first that may be."""
-        left = {field.short: field for field in logs.of("state")}
+        parts = _quaternions(logs)
+        left = {field.short: field for field in logs.of("state") if field.short not in parts}
         moved: list[Field | None] = []
         for command in logs.of("command"):
             names = _names(command, left)
             moved.append(next((left.pop(name) for name in names if name in left), None))
-        parts = _quaternions(logs)
-        rest = [field for short, field in left.items() if not _SPEED.match(short) and short not in parts]
+        rest = [field for short, field in left.items() if not _SPEED.match(short)]
         filled = []
         for command, named in zip(logs.of("command"), moved, strict=True):
             field = named or next((one for one in rest if _may_move(command, one)), None)
@@ -89,9 +89,8 @@ class Direct:
             filled.append(field)
         found = tuple(field for field in filled[: _length(filled)] if field)
         if not found:
-            raise BadInputError(
-                "found no state that a command could move: name it as its command, cmd_q1 and q1"
-            )
+            cure = "make yaw of the quaternion" if parts else "name it as its command, cmd_q1 and q1"
+            raise BadInputError(f"found no state that a command could move: {cure}")
         rates, targets = (
             errors(cls(logs, found, (is_rate,) * len(found)), 1)[0] for is_rate in (True, False)
         )
@@ -132,6 +131,10 @@ class Direct:
                 f"torch.where(torch.tensor({is_rate}, device=command.device), {rate}, {command})",
             ),
         }[tuple(sorted(set(is_rate)))]
+        apart = (
+            f"\n        values, cosine, sine = self.state.split({[plain, moved - plain, moved - plain]}, -1)"
+            "\n        values = torch.cat([values, torch.atan2(sine, cosine)], -1)"
+        )
         before, given = np.arange(moved, dtype=float)[None], np.ones((1, actions))
         after = self.step(before, given)
         return {
@@ -144,7 +147,7 @@ class Direct:
             ),
             "headings": " and ".join(self._headings),
             "plain": str(plain),
-            "around": str(moved - plain),
+            "apart": apart if "values" in step else "",
             "moved": str(moved),
             "goal": numbers(goal * span, "()"),
             "close": f"{close:.2g}",

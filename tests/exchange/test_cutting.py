@@ -209,13 +209,25 @@ def test_a_rate_that_is_not_fps_is_told() -> None:
         cutting.check_rate()
 
 
-def fed(rates: Sequence[tuple[str, float]]) -> Cutter:
-    """Return a cutter that has read a file of 50 rows at each of these rates."""
+def timed(*files: Array, names: Sequence[str] = ()) -> Cutter:
+    """Return a cutter that has read a file of each of these times."""
     cutting = cutter(time="t")
-    for origin, rate in rates:
-        values = {"x": np.zeros(50), "a": np.zeros(50), "t": np.arange(50) / rate}
+    for number, times in enumerate(files):
+        values = {"x": np.zeros(len(times)), "a": np.zeros(len(times)), "t": times}
+        origin = names[number] if names else f"{number}.csv"
         list(cutting.feed(Block(values, origin), 0, is_apart=True))
     return cutting
+
+
+def fed(rates: Sequence[tuple[str, float]]) -> Cutter:
+    """Return a cutter that has read a file of 50 rows at each of these rates."""
+    return timed(*(np.arange(50) / rate for _, rate in rates), names=[name for name, _ in rates])
+
+
+def test_files_of_a_few_rows_tell_no_rate() -> None:
+    cutting = timed(np.arange(20) / 5, np.arange(21) / 5, np.arange(1000) / 10)
+    cutting.check_rate()
+    assert cutting.tally.notes == ["1.csv: 5 Hz, 10 Hz declared"]
 
 
 def test_files_of_other_rates_among_many_are_named() -> None:
@@ -252,15 +264,6 @@ BURSTS = np.arange(50) // 4 * 0.4 + np.arange(50) % 4 * 0.01
 """Times of 10 rows a second that come four at once."""
 PAUSES = np.arange(50) / 20 + np.arange(50) // 25 * 3.0
 """Times at 20 Hz with a pause."""
-
-
-def timed(*files: Array) -> Cutter:
-    """Return a cutter that has read a file of each of these times."""
-    cutting = cutter(time="t")
-    for number, times in enumerate(files):
-        values = {"x": np.zeros(len(times)), "a": np.zeros(len(times)), "t": times}
-        list(cutting.feed(Block(values, f"{number}.csv"), 0, is_apart=True))
-    return cutting
 
 
 def test_a_file_is_of_another_rate_only_where_both_its_mean_and_its_usual_rate_are() -> None:

@@ -25,7 +25,7 @@ def sampled(
         }
     )
     times = {"/odom": odom, "/cmd": commands}
-    resampler = Resampler(mapping, "log", usual_periods({topic: t * MS for topic, t in times.items()}))
+    resampler = Resampler(mapping, "log", {topic: t * MS for topic, t in times.items()})
     messages = sorted((t, topic, k) for topic, series in times.items() for k, t in enumerate(series))
     rows = []
     for t, topic, k in messages:
@@ -46,6 +46,28 @@ def test_jitter_neither_repeats_nor_skips_a_state(phase_ms: float, lead: int, la
     expected = [(k, k + 3 - lead) for k in range(97 + lead)]
     assert rows[: len(expected)] == expected
     assert resampler.unevenness() == ()
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("phase_ms", [20.0, 25.0, 30.0])
+def test_jitter_of_the_first_messages_moves_no_row(phase_ms: float, seed: int) -> None:
+    """Up to 8 ms of it, of states at 20 Hz with commands about half a step after them."""
+    odom = 1000 + 50.0 * np.arange(500) + np.random.default_rng(seed).uniform(-8, 8, 500)
+    resampler, rows = sampled(20, odom, 1000 + phase_ms + 50.0 * np.arange(-3, 497))
+    states = np.array(rows)[:, 0]
+    assert (np.diff(states) == 1).all() and len(states) > 497
+    assert resampler.repeated["/odom"] == resampler.skipped["/odom"] == 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_jitter_moves_no_row_towards_fast_commands_or_slow_states(seed: int) -> None:
+    """Commands at 100 Hz; states at 10 Hz, each in two rows."""
+    jitter = np.random.default_rng(seed).uniform(-8, 8, 500)
+    _, rows = sampled(20, 1000 + 50.0 * np.arange(500) + 2.4 * jitter, 900.0 + 10 * np.arange(2500))
+    assert (np.diff(np.array(rows)[:, 0]) == 1).all()
+    _, rows = sampled(20, 1000 + 100.0 * np.arange(500) + jitter, 1025 + 50.0 * np.arange(-3, 997))
+    _, held = np.unique(np.array(rows)[:, 0], return_counts=True)
+    assert (held[1:-1] == 2).all()
 
 
 def test_jitter_changes_no_row_of_a_state_that_comes_five_times_a_row() -> None:
@@ -117,8 +139,16 @@ def test_a_period_is_the_mean_one_of_the_messages_that_go_on() -> None:
     times[1::3] += 20
     times[2::3] -= 20
     times = np.concatenate([times, times[-1] + 60_000 + 50.0 * np.arange(90), times[:5]])
-    periods = usual_periods({"/odom": np.sort(np.delete(times, 120)), "/map": [0, 10**9], "/goal": [3]})
+    moments = {"/odom": np.sort(np.delete(times, 120)), "/map": np.array([0, 300]), "/goal": np.array([3])}
+    periods = usual_periods({topic: each.astype(np.int64) for topic, each in moments.items()}, 400)
     assert periods == {"/odom": pytest.approx(50, rel=0.01)}
+
+
+@pytest.mark.parametrize(("size", "period"), [(5, 20.0), (2, 40.0)])
+def test_a_period_of_messages_in_bursts_is_the_mean_one(size: int, period: float) -> None:
+    times = np.add.outer(size * period * np.arange(50), np.arange(size)).flatten()
+    periods = usual_periods({"/odom": times.astype(np.int64)}, 400)
+    assert periods == {"/odom": pytest.approx(period, rel=0.02)}
 
 
 def test_a_topic_that_rows_repeat_is_told_with_its_rate_and_counts() -> None:

@@ -160,6 +160,10 @@ def test_no_command_moves_a_part_of_a_quaternion(tmp_path: Path, stem: str) -> N
     assert [field.short for field in kind.moved] == ["x"]
     names = [f"{stem}{axis}".replace(".", "_") for axis in "xyzw"]
     assert kind.simulator.endswith(f"x by vx; {', '.join(names)} are a quaternion: make yaw of it in φ")
+    with pytest.raises(
+        BadInputError, match=r"no state that a command could move: make yaw of the quaternion$"
+    ):
+        Direct.of(logs(tmp_path, **parts, **{f"cmd_{name}": values for name, values in parts.items()}))
     del parts[f"{stem}w"]  # three are none
     kind = Direct.of(logs(tmp_path, x=T, y=T % 9, **parts, **commands))
     assert [field.short for field in kind.moved] == ["x", names[0], "y"]
@@ -245,5 +249,6 @@ def test_cosine_and_sine_of_a_heading_have_one_range(tmp_path: Path) -> None:
     wrapped = np.arctan2(-np.sin(off), -np.cos(off))
     values = Direct.of(logs(tmp_path, z=T, yaw=wrapped, cmd_z=T, cmd_yaw=wrapped)).values()
     assert values["names"] == '("z", "yaw_x", "yaw_y")'
+    assert (values["step"], values["apart"]) == ("command", "")  # no heading is stepped from where it was
     z, cosine, sine = (float(value) for value in values["range"].strip("()").split(","))
     assert z == 49 and cosine == sine == pytest.approx(2 * np.sin(0.2), rel=1e-3)

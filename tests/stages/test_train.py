@@ -242,14 +242,9 @@ def test_rma_goes_on_after_an_interruption_in_either_phase(
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     expected = make(task, "rma", paired, None, tmp_path / "whole")
-
-    def stop_at_share(fraction: float, note: str) -> None:
-        if fraction > share:
-            raise Stopped
-
     out = tmp_path / "interrupted"
     with pytest.raises(Stopped):
-        make(task, "rma", paired, None, out, progress=stop_at_share)
+        make(task, "rma", paired, None, out, progress=stop_past(share))
     seen: list[float] = []
     resumed = make(task, "rma", paired, None, out, progress=lambda done, note: seen.append(done))
     assert seen == pytest.approx([tenth / 10 for tenth in range(5 if share < 0.6 else 9, 11)])

@@ -20,7 +20,7 @@ from astra_data.core.optional import optional
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
-from astra_data.exchange.resampling import Resampler, usual_periods
+from astra_data.exchange.resampling import Resampler
 
 SUFFIXES = (".mcap",)
 
@@ -36,7 +36,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     _check_mapping(mapping, str(source))
     starts = False
     rows: list[dict[str, Array]] = []
-    resampler = Resampler(mapping, str(source), _periods(source, mapping))
+    resampler = Resampler(mapping, str(source), _moments(source, mapping))
     for begins, row in _rows(source, resampler):
         if rows and (begins or len(rows) == BLOCK_ROWS):
             yield _block(source, rows, starts)
@@ -47,8 +47,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         yield replace(_block(source, rows, starts), notes=resampler.unevenness())
 
 
-def _periods(source: Source, mapping: ImportMapping) -> dict[str, float]:
-    """Return the usual time between the messages of topics, in ns."""
+def _moments(source: Source, mapping: ImportMapping) -> dict[str, "array[int]"]:
+    """Return the log times of the messages of each topic, in ns."""
     topics = list(dict.fromkeys(field.partition(":")[0] for field in mapping.all_fields))
     times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
     with source.open() as stream:
@@ -56,7 +56,7 @@ def _periods(source: Source, mapping: ImportMapping) -> dict[str, float]:
         _check_topics(reader.get_summary(), topics, str(source))
         for _, channel, message in reader.iter_messages(topics=topics):
             times[channel.topic].append(message.log_time)
-    return usual_periods(times)
+    return times
 
 
 def _rows(source: Source, resampler: Resampler) -> Iterator[tuple[bool, dict[str, Array]]]:
