@@ -36,9 +36,10 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         >>> policy.start(1)
         >>> velocity = policy.command(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
     """
-    files = policy_files(run, row, seed=seed, percent=percent)
+    settings = settings_of(run)
+    files = _files(settings, Path(run), row, seed, percent)
     return running(
-        task_named(task_of(run)),
+        task_named(settings["task"]),
         PolicyFile.load(files["train"]),
         grounding_at(files.get("ground")),
         load_target_encoder(files["align"]) if "align" in files else None,
@@ -82,8 +83,13 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     Raises:
         BadInputError: as `load_policy`.
     """
-    settings, folder, where = settings_of(run), Path(run), seed_folder(seed, percent)
-    own_methods = settings.get("own_methods", {})
+    return _files(settings_of(run), Path(run), row, seed, percent)
+
+
+def _files(
+    settings: dict[str, Any], folder: Path, row: str, seed: int, percent: int | None
+) -> dict[str, Path]:
+    own_methods, where = settings.get("own_methods", {}), seed_folder(seed, percent)
     add_all(own_methods)
     files = {"train": folder / "train" / row / where / POLICY}
     if not files["train"].is_file():
@@ -94,7 +100,7 @@ def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = 
     sizes = settings.get("sweep", {}).get("percent", ())
     if (percent is None) == bool(sizes) or (sizes and percent not in sizes):
         wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"
-        raise BadInputError(f"{run}: percent: expected {wanted}, got {percent or 'none'}")
+        raise BadInputError(f"{folder}: percent: expected {wanted}, got {percent or 'none'}")
     base = grounded_as(row)
     for name in own_methods.keys() & {method.name, base}:
         check_unchanged(own_methods[name]["method"], folder, name=name)

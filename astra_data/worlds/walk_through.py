@@ -41,7 +41,10 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
     starts, goals, simulator = tried(_starts), tried(_goals), tried(_simulator, device)
     tried(_abstraction)
     tried(_robot)
-    if starts is not None and simulator is not None and tried(_reset, simulator, starts):
+    if starts is None or simulator is None:
+        return faults
+    starts = starts.to(simulator.state.device)
+    if tried(_reset, simulator, starts):
         landed = tried(_step, simulator, starts, device)
         if landed is not None and goals is not None:
             before, after, goals = (values.to(device) for values in (starts, landed, goals))
@@ -108,7 +111,6 @@ def _simulator(task: Task, device: str) -> AbstractSimulator:
 
 
 def _reset(task: Task, simulator: AbstractSimulator, starts: Tensor) -> bool:
-    starts = starts.to(simulator.state.device)
     with explained("make_simulator: reset_to(state)"):
         simulator.reset_to(starts.clone())
         shown = simulator.state
@@ -121,7 +123,7 @@ def _reset(task: Task, simulator: AbstractSimulator, starts: Tensor) -> bool:
 
 
 def _step(task: Task, simulator: AbstractSimulator, starts: Tensor, device: str) -> Tensor:
-    what, starts = "make_simulator: step(command)", starts.to(simulator.state.device)
+    what = "make_simulator: step(command)"
     drawn = generator(0, "actions").uniform(-1.0, 1.0, (_COUNT, len(task.limits)))
     command = task.limits.in_units(torch.from_numpy(drawn).float().to(starts.device))
 

@@ -100,22 +100,27 @@ def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(columns[ABSTRACT_SIMULATED_NEXT_STATE], expected)
 
 
+def glider_that_is_off(place: Path, error: float, later: str) -> str:
+    """Write a simulator that is reset with an error, and at each time after with that which `later` gives."""
+    (place / "off.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
+        "class Off(Glider):\n"
+        f"    error = {error}\n"
+        "    def reset_to(self, state, rows=None):\n"
+        "        super().reset_to(state + self.error, rows)\n"
+        f"        self.error = {later}\n"
+    )
+    return f"{place}/off.py:Off"
+
+
 @pytest.mark.parametrize("size", ["_BLOCK", "BATCH"])
 def test_the_largest_reset_error_of_all_blocks_is_recorded(
     size: str, collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "settling.py").write_text(
-        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
-        "class Settling(Glider):\n"
-        "    error = 0.08\n"
-        "    def reset_to(self, state, rows=None):\n"
-        "        super().reset_to(state + self.error, rows)\n"
-        "        self.error /= 2\n"
-    )
     # A block for each of the eight episodes, or all in one and a batch for each ten steps.
     monkeypatch.setattr(f"astra_data.stages.pair.{size}", {"_BLOCK": 1, "BATCH": 10}[size])
     config = PairConfig(reset_tolerance=0.1)
-    simulator = f"{tmp_path}/settling.py:Settling"
+    simulator = glider_that_is_off(tmp_path, 0.08, "self.error / 2")
     pair(simulator, config, dataset=collected, out=tmp_path / "out", progress=silent)
     assert Dataset.open(tmp_path / "out").description["reset_error"] == pytest.approx(0.08, abs=1e-5)
 
@@ -234,16 +239,8 @@ def test_the_step_that_is_told_is_that_of_the_dataset(
     collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A simulator that is reset rightly once, for the first episode, and never again."""
-    (tmp_path / "tiring.py").write_text(
-        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
-        "class Tiring(Glider):\n"
-        "    error = 0.0\n"
-        "    def reset_to(self, state, rows=None):\n"
-        "        super().reset_to(state + self.error, rows)\n"
-        "        self.error = 0.5\n"
-    )
     monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
-    simulator, out = f"{tmp_path}/tiring.py:Tiring", tmp_path / "out"
+    simulator, out = glider_that_is_off(tmp_path, 0.0, "0.5"), tmp_path / "out"
     with pytest.raises(BadInputError) as caught:
         pair(simulator, PairConfig(), dataset=collected, out=out, progress=silent)
     told = re.search(r"of step (\d+), shows ([xy]) = .* and not (\S+) \(", str(caught.value))
