@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from gpu import needs_cuda
 from quick_runs import fit_failures_quickly, run_here
 
 from astra_data.training.policy_file import PolicyFile
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+pytestmark = needs_cuda
 
 ROWS = (
     *("direct_transfer", "domain_randomization", "compass_uniform", "compass", "rma"),

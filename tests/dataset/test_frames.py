@@ -5,6 +5,7 @@ import pytest
 import torch
 from fake_dataset import COLUMNS, LENGTHS, concatenated
 from fake_frames import NAMES, assert_equal, everything
+from gpu import needs_cuda
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
@@ -54,7 +55,7 @@ def test_columns_are_mapped_where_their_share_of_the_memory_is_too_small(
     assert list(tmp_path.rglob("values.npy"))
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@needs_cuda
 @pytest.mark.parametrize("fits", [True, False])
 def test_batches_come_to_the_device(
     fake: Dataset, frames: Frames, monkeypatch: pytest.MonkeyPatch, fits: bool

@@ -3,6 +3,7 @@ from typing import Any
 
 import pytest
 import torch
+from gpu import needs_cuda
 from pydantic import ValidationError
 from torch import Tensor
 
@@ -158,7 +159,7 @@ def test_an_action_at_the_bound_can_be_learned_by_a_policy_that_squashes() -> No
     assert (mean_action(trained(Iql(policy, experience, settings, seed=0)).policy) > before + 0.3).all()
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+@needs_cuda
 @pytest.mark.parametrize("memory", [0, 8])
 def test_it_learns_on_a_gpu(memory: int) -> None:
     torch.manual_seed(1)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gpu import needs_cuda
 from on_meta import places
 from small_cart import TASK, Cart, Rail, Reach
 from torch import Tensor
@@ -32,7 +33,7 @@ def test_objectives_compute_where_states_are(name: str) -> None:
     assert places(task_named(name)) == {"meta"}
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+@needs_cuda
 @pytest.mark.parametrize("name", [*TASKS, *EXAMPLES])
 def test_nothing_is_wrong_with_them_on_a_gpu(name: str) -> None:
     assert check_task(task_named(name), "cuda") == []
