@@ -55,6 +55,12 @@ def test_what_does_not_fit_float32_is_rejected() -> None:
     assert (finite, values[1]) == ([False, True], 2.0)
 
 
+def test_counts_of_which_float32_skips_every_second_are_kept() -> None:
+    counts = [2**24 + number for number in range(21)]
+    values, _ = convert({}, counts)
+    assert np.abs(values - counts).max() == 1 and np.count_nonzero(np.diff(values)) == 10
+
+
 def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
     made = converter({"c": {"fields": ("f",)}}, time="t", split={"ends": ("e",)})
     fields = {"f": np.zeros(4), "t": np.array([0, NAN, 2, 3]), "e": np.array([0, 0, np.inf, 0])}
@@ -68,6 +74,8 @@ def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
         ({"dtype": "bool"}, [0, 1, 2], "columns.c: expected true and false, or 1 and 0"),
         ({"dtype": "int64"}, [1.0, 1.5], "columns.c: expected whole numbers"),
         ({"dtype": "int64"}, np.array([2**63], np.uint64), r"columns.c: expected whole numbers below 2\^63"),
+        ({}, [2**53 + 1], r"columns.c: integers beyond 2\^53 do not fit float32; set dtype = .int64"),
+        ({}, [-(2**53) - 1], r"columns.c: integers beyond 2\^53 do not fit float32; set dtype = .int64"),
         ({"take": (2,)}, [[1, 2]], r"columns.c: take \[2\]: f hold 2 values, counted from 0"),
         ({"scale": (1.0, 2.0, 3.0)}, [[1, 2]], "columns.c: scale has 3 numbers for 2 values"),
         ({"offset": (1.0, 2.0)}, [1], "columns.c: offset has 2 numbers for 1 values"),

@@ -29,6 +29,13 @@ def test_fields_are_numbers_flags_and_what_is_neither(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
+def test_days_tell_episodes_apart_unless_one_is_missing(tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    for third, numbers in (("2024-01-02", [1.0, 0.0, 1.0]), ("", [np.nan] * 3)):
+        log.write_text(f"x,run_id\n1,2024-01-02\n2,2024-01-01\n3,{third}\n")
+        np.testing.assert_array_equal(read_numbers(log, RUN)["run_id"], numbers)
+
+
 def test_a_log_of_texts_alone_is_refused(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("run_id,name\na,b\nc,\n")
     read_numbers(tmp_path / "log.csv", RUN)  # which tells episodes apart

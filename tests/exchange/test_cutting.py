@@ -172,6 +172,14 @@ def test_gaps_are_measured_between_the_rows_that_are_kept(block_rows: int) -> No
 
 
 @BLOCKS
+def test_a_gap_to_a_rejected_row_is_told_and_not_the_step_back_from_it(block_rows: int) -> None:
+    cutting = cutter(time="t", not_finite="drop", split={"gap_s": 1.0})
+    episodes = cut(cutting, block_rows, x=[0, 1, np.nan, 3, 4], t=[0.0, 0.1, 50.0, 0.3, 0.4])
+    assert rows(episodes) == [[0], [3]]
+    assert (cutting.tally.split_points, cutting.tally.back_rows) == ({"gap": 1}, 1)
+
+
+@BLOCKS
 def test_a_rate_is_that_of_the_rows_that_are_kept(block_rows: int) -> None:
     cutting = cutter(time="t", not_finite="drop")
     cut(cutting, block_rows, x=np.where(np.arange(60) % 2, np.nan, 1.0), t=np.arange(60) / 20)
@@ -331,6 +339,30 @@ def test_a_flag_that_is_not_known_ends_no_episode(block_rows: int) -> None:
     cutting = cutter(not_finite="drop", split={"ends": ("end",)})
     episodes = cut(cutting, block_rows, x=[0, 0, np.nan, 0, 0, 0], end=[0, 0, np.nan, 0, 0, 1])
     assert rows(episodes) == [[0, 1, 3, 4]]
+
+
+@pytest.mark.parametrize(("not_finite", "kept"), [("drop", [[0, 1, 2]]), ("split", [[0], [2]])])
+def test_a_row_that_is_cut_off_where_the_next_file_goes_on_is_a_rejected_one(
+    not_finite: str, kept: list[list[int]]
+) -> None:
+    cutting = cutter(not_finite=not_finite)
+    begun, rest = (
+        Block({"x": np.zeros(2), "a": first + np.arange(2)}, f"{first}.csv", torn=torn)
+        for first, torn in ((0, 1), (2, 0))
+    )
+    cuts = [*cutting.feed(begun, 0, is_apart=True), *cutting.feed(rest, 0, is_apart=False)]
+    assert rows([columns for columns, _ in [*cuts, *cutting.finish()]]) == kept
+    assert (cutting.tally.rows, cutting.tally.torn_rows, cutting.tally.rejected_rows) == (5, 1, 1)
+
+
+@BLOCKS
+def test_a_rejected_row_that_ends_its_episode_is_no_gap_and_changes_no_rate(block_rows: int) -> None:
+    cutting = cutter(time="t", not_finite="split", split={"gap_s": 0.15})
+    x = np.where(np.arange(60) % 3 == 2, np.nan, 0.0)
+    episodes = cut(cutting, block_rows, x=x, t=np.arange(60) / 10)
+    assert rows(episodes) == [[first] for first in range(0, 60, 3)]
+    assert cutting.tally.split_points == {"rejected": 19}
+    cutting.check_rate()
 
 
 def test_what_is_not_finite_is_not_clipped_into_range() -> None:
@@ -493,3 +525,13 @@ def test_a_success_without_an_end_is_kept_where_its_row_is_rejected(block_rows: 
     cutting = cutter(columns=columns | {SUCCESS: {"fields": ("won",)}}, not_finite="drop")
     (episode,) = cut(cutting, block_rows, x=[0, 1, float("nan")], won=[0, 0, 1])
     assert episode[SUCCESS].tolist() == [False, True]
+
+
+def test_times_of_a_formats_own_episodes_may_begin_again() -> None:
+    cutting = cutter(time="t")
+    for number in range(3):
+        times = np.arange(4) / 10 + 0.3 * (number == 2)  # the last begins when the one before ends
+        block = Block({"x": np.zeros(4), "a": np.zeros(4), "t": times}, f"log/{number}", starts=True)
+        list(cutting.feed(block, 0, is_apart=number == 0))
+    tally = cutting.tally
+    assert (tally.split_points, tally.back_rows, tally.still_rows) == ({"source": 2}, 0, 0)

@@ -110,6 +110,12 @@ def test_times_that_are_rounded_are_of_their_mean_rate(tmp_path: Path) -> None:
     assert logs.rate == 30 and logs.uneven == ""
 
 
+def test_a_row_that_is_written_twice_changes_no_rate(tmp_path: Path) -> None:
+    times = np.sort(np.append(np.round(np.arange(90) / 30, 3), 1.0))
+    logs = guess([write(tmp_path / "log.csv", {"t": times, "x": times, "cmd": times}, rows=91)])
+    assert logs.rate == 30 and logs.uneven == ""
+
+
 @pytest.mark.parametrize(("step", "measured", "rate"), [(0.4, "2.5", 3), (0.7, "1.429", 2), (3, "0.3333", 1)])
 def test_a_rate_that_no_import_takes_is_refused(
     tmp_path: Path, step: float, measured: str, rate: int
@@ -161,8 +167,9 @@ def test_a_flag_is_no_state_and_its_end_is_to_be_named(tmp_path: Path) -> None:
     assert fields[2].why == "0 or 1: name it success or failed if it is an end"
 
 
-def test_a_time_that_does_not_rise_is_left_out(tmp_path: Path) -> None:
-    logs = guess([write(tmp_path / "log.csv", {"stamp": RAMP // 4, "x": RAMP, "cmd": RAMP})])
+@pytest.mark.parametrize("stamp", [RAMP // 4, RAMP % 5])
+def test_a_time_that_does_not_rise_is_left_out(tmp_path: Path, stamp: object) -> None:
+    logs = guess([write(tmp_path / "log.csv", {"stamp": stamp, "x": RAMP, "cmd": RAMP})])
     assert (logs.fields[0].role, logs.fields[0].why) == ("left out", "a time that does not rise")
 
 

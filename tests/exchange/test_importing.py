@@ -44,9 +44,10 @@ def test_the_files_of_a_folder_or_archive_continue_one_another(tmp_path: Path) -
     state = rows()
     expected = np.stack([state["x"], state["y"]], axis=1)[:-1] * 0.001
     for recording in (folder, tmp_path / "logs.tar.gz"):
-        dataset, _ = imported(tmp_path / f"from{recording.suffix}", recording, ONE_LOG)
+        dataset, report = imported(tmp_path / f"from{recording.suffix}", recording, ONE_LOG)
         np.testing.assert_array_equal(dataset.columns([STATE])[STATE], expected.astype(np.float32))
         assert len(dataset) == 1
+        assert report.unused == ()  # all files are in it
     both, report = imported(tmp_path / "both", [folder, tmp_path / "logs.tar.gz"], ONE_LOG)
     assert len(both) == 2
     assert report.tally.split_points == {"file": 1}

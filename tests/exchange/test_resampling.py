@@ -172,3 +172,8 @@ def test_a_clock_that_is_a_little_off_is_not_told() -> None:
     """20.2 Hz: one message in a hundred is in no row."""
     resampler, _ = sampled(20, 49.5 * np.arange(400), 50.0 * np.arange(396))
     assert 3 <= resampler.skipped["/odom"] <= 5 and resampler.unevenness() == ()
+
+
+def test_a_step_as_long_as_the_gap_is_one_of_the_period() -> None:
+    times = {"/odom": np.array([0, 100, 200, 301], np.int64)}
+    assert usual_periods(times, 100) == {"/odom": 100.0}

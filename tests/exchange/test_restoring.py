@@ -82,3 +82,19 @@ def test_a_record_with_another_uid_is_told(source: Source, tmp_path: Path) -> No
 def test_an_export_may_be_imported_at_another_rate(source: Source, tmp_path: Path) -> None:
     import_dataset([source.path], out=tmp_path / "out", fps=7)
     assert Dataset.open(tmp_path / "out").info["fps"] == 7
+
+
+def test_a_record_of_more_rows_than_there_are_is_told(source: Source) -> None:
+    record = read_record(hdf5, source)
+    assert record is not None
+    longer = record.model_copy(update={"lengths": (*record.lengths[:-1], record.lengths[-1] + 1)})
+    with pytest.raises(CorruptDatasetError, match="incomplete: the number of rows differs"):
+        list(restored(hdf5, source, longer))
+
+
+def test_at_home_an_export_becomes_the_version_after_those_that_are_there(
+    source: Source, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    roots = [import_dataset([source.path]).root.name for _ in range(2)]
+    assert roots == ["data-1.0.1", "data-1.0.2"]

@@ -81,6 +81,16 @@ def test_blanks_around_cells_are_nothing(tmp_path: Path) -> None:
     np.testing.assert_array_equal(block.values["gap"], [2.5, np.nan])
 
 
+def test_a_line_is_counted_from_the_beginning_of_the_file(tmp_path: Path) -> None:
+    """Which is read in blocks of 1 MB."""
+    n, path = 120_000, tmp_path / "log.csv"
+    path.write_text("whole,float\n" + "1,0.5\n" * 60_000 + f"1,{'0' * 20}\n" * 60_000 + "1,perhaps\n")
+    columns = {name: {"fields": (name,)} for name in ("whole", "float")}
+    mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
+    with pytest.raises(BadInputError, match=rf"log\.csv line {n + 2}: field 'float': .*, got 'perhaps'"):
+        list(csv.read(Source(path, None, path), mapping))
+
+
 def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows())
     path.write_text(path.read_text().replace("True", "perhaps"))

@@ -85,6 +85,7 @@ def test_robomimic_needs_no_mapping(tmp_path: Path) -> None:
     assert dataset.lengths.tolist() == [4, 5, 6]
     assert dataset.info["fps"] == 20
     assert report.tally.split_points == {"source": 2}
+    assert dataset.metadata["source_row"] == [0, 0, 0]
     for episode, demo in zip(dataset.episodes(), ("demo_0", "demo_2", "demo_10"), strict=True):
         fields = demos[demo]
         state = np.column_stack([fields["obs/eef_pos"], fields["obs/gripper"]]).astype(np.float32)
@@ -94,6 +95,31 @@ def test_robomimic_needs_no_mapping(tmp_path: Path) -> None:
         np.testing.assert_array_equal(episode.columns[ACTION], fields["actions"].astype(np.float32))
         np.testing.assert_array_equal(episode.columns[TERMINATED], fields["dones"] == 1)
         assert episode.metadata["source"] == f"lift.hdf5/data/{demo}"
+
+
+def write_demo(path: Path, control_freq: float, **flags: list[int]) -> Path:
+    """Write a demonstration of robomimic with one row, and `flags` for it."""
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": control_freq}})
+        demo = {"obs/a": [0.0], "next_obs/a": [1.0], "actions": [0.0], "rewards": [1.0], **flags}
+        for field, values in demo.items():
+            data[f"demo_0/{field}"] = values
+    return path
+
+
+def test_a_demonstration_of_one_step_is_kept_where_truncation_is_recorded(tmp_path: Path) -> None:
+    whole = write_demo(tmp_path / "whole.hdf5", 20, dones=[1], truncated=[0])
+    dataset, _ = imported(tmp_path, whole, None, name="lift")
+    assert dataset.lengths.tolist() == [1]
+    with pytest.raises(BadInputError, match="no episodes"):
+        imported(tmp_path / "other", write_demo(tmp_path / "bare.hdf5", 20, dones=[1]), None, name="lift")
+
+
+def test_a_control_rate_that_is_no_whole_number_has_to_be_given(tmp_path: Path) -> None:
+    path = write_demo(tmp_path / "lift.hdf5", 12.5, dones=[1], truncated=[0])
+    with pytest.raises(BadInputError, match=r"lift\.hdf5: pass --fps, or --mapping"):
+        imported(tmp_path, path, None, name="lift")
 
 
 def test_d3rlpy_needs_no_mapping(tmp_path: Path) -> None:

@@ -105,6 +105,13 @@ def test_a_last_line_that_is_cut_off_is_counted(tmp_path: Path, n: int) -> None:
         assert [block.torn for block in blocks] == [0] * (len(blocks) - 1) + [torn]
 
 
+def test_a_last_line_with_an_end_is_not_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text('{"x": 1, "on": true}\n{"x": 1, "on": tr\n')
+    with pytest.raises(BadInputError, match=r"log\.jsonl line 2: expected an object of fields"):
+        list(json.read(Source(path, None, path), LISTS))
+
+
 def test_a_line_that_is_too_long_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(json, "LIMIT_BYTES", 100)
     with pytest.raises(BadInputError, match=r"log\.jsonl: expected lines of at most"):

@@ -4,7 +4,7 @@ import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.versions import Version
-from astra_data.exchange.sharing.address import Hub, Url, parse_place, parse_source
+from astra_data.exchange.sharing.address import Hub, Url, is_address, parse_place, parse_source
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,27 @@ def test_a_folder_is_a_place_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert parse_place("./My Läufe") == Url(f"file://{tmp_path}/My Läufe")
     assert parse_place("~/shared") == Url(f"file://{Path.home()}/shared")
     assert parse_source(f"{tmp_path}/it@data-1.2.0") == (Url(f"file://{tmp_path}/it"), Version(1, 2, 0))
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        ("me/it", True),
+        ("me/it@data-1.2.0", True),
+        ("s3://bucket/a/b/ant", True),
+        ("ant", False),
+        ("ant@data-1.2.0", False),
+        ("runs/cart/pair", False),
+        ("./it", False),
+        ("../me/it", False),
+        ("/it", False),
+    ],
+)
+def test_an_address_is_told_from_a_folder_and_a_name(data: str, expected: bool) -> None:
+    assert is_address(data) is expected
+
+
+def test_a_folder_that_is_there_is_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("me/it").mkdir(parents=True)
+    assert not is_address("me/it") and is_address("you/it")

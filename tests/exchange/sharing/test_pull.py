@@ -114,6 +114,16 @@ def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_pa
             pull(source(shared), out=out)
 
 
+def test_a_folder_of_which_no_file_is_of_the_dataset_holds_something_else(
+    shared: Path, tmp_path: Path
+) -> None:
+    copy = pull(source(shared), out=tmp_path / "out").root
+    for path in contents(copy):
+        (copy / path).write_bytes(b"{}")
+    with pytest.raises(BadInputError, match="exists already and holds something else"):
+        pull(source(shared), out=copy)
+
+
 def test_a_copy_that_was_altered_is_told(fake: Dataset, shared: Path, tmp_path: Path) -> None:
     copy = pull(source(shared), out=tmp_path / "out").root
     for path in (DATA, "meta/stats.json"):
