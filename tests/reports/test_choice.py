@@ -53,6 +53,17 @@ def test_an_interval_takes_judges_as_the_sampling_unit() -> None:
     assert "interval" not in choice(*A, judges=3).withheld
 
 
+def test_an_interval_that_a_single_policy_lacks_is_withheld() -> None:
+    candidates = [
+        Candidate(row="a", seed=seed, success=dict.fromkeys(range(judges), 0.5))
+        for seed, judges in ((0, 3), (1, 2))
+    ]
+    of = Judged(judge="nas", episodes=5, candidates=candidates)
+    found = choice_of(of, None, measured={}, replicates=100)
+    assert found is not None and [one.low is None for one in found.candidates] == [False, True]
+    assert found.withheld["interval"] == "fewer than 3 judges"
+
+
 def test_a_choice_is_worth_its_rank_correlation_and_its_regret() -> None:
     found = choice(*A, *B)
     # Within a the order is right, within b it is reversed; between rows nothing counts.

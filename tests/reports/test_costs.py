@@ -1,7 +1,7 @@
 import pytest
 
 from astra_data.reports.artefacts import Artefact, CurveFile, Metrics
-from astra_data.reports.costs import THROUGHPUT, Files, seconds, seed_cost, throughput
+from astra_data.reports.costs import THROUGHPUT, Files, seconds, seed_cost, throughput, with_first
 from astra_data.reports.schema import Cost
 
 
@@ -51,3 +51,12 @@ def test_rows_without_a_speed_for_every_seed_are_left_out(figure: str) -> None:
     assert found["evaluate"] == {"target_steps_per_second": {}}
     partly = throughput(files(ground={"astra": [metrics(**{figure: 5}), metrics()]}))
     assert partly["ground"][figure] == {}
+
+
+def test_a_training_that_goes_on_from_another_costs_both() -> None:
+    own = {"train": Cost(wall_seconds=10, cpu_seconds=20), "align": Cost(wall_seconds=1, cpu_seconds=2)}
+    first = curve(wall_seconds=3, cpu_seconds=5)
+    both = own | {"train": Cost(wall_seconds=13, cpu_seconds=25)}
+    assert with_first(own, first) == both
+    assert with_first(own, curve(wall_seconds=3))["train"] == Cost(wall_seconds=13, cpu_seconds=None)
+    assert with_first(own, None) == with_first(own, curve()) == own

@@ -29,6 +29,12 @@ def test_outcomes_add_up_and_those_out_of_time_are_the_rest(results: Results) ->
     assert len(row.cells) == len(loss_head(found))
 
 
+def test_no_episode_is_out_of_time_where_all_succeed_or_fail(results: Results) -> None:
+    found = changed(results, "astra", success=[0.9] * 3, failed=[0.1] * 3)  # 1 - 0.9 - 0.1 is below 0
+    row = losses(found)[1]
+    assert row.cells[4:6] == ["0.10 ± 0.00", "0.00 ± 0.00"] and row.outcomes["out of time"] == 0.0
+
+
 def test_a_row_without_a_simulator_loses_nothing_there(results: Results) -> None:
     follower = losses(results)[-1]
     assert (follower.role, follower.simulated) == ("ceiling", None)

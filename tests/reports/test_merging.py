@@ -172,3 +172,11 @@ def test_results_of_other_data_are_not_added(root: Path, other: str) -> None:
     edit_json(root / "pair/seed_1/meta/astra/dataset.json", content_hash=other)
     with pytest.raises(BadInputError, match=f"pair seed 1 with content hash1 and {other}"):
         assembled(root, published=published)
+
+
+def test_without_a_target_no_simulator_is_said_to_predict_it(root: Path) -> None:
+    published = assembled(root)
+    assert published.predictive_validity.keys() == {"raw", "grounded"}
+    shutil.rmtree(root)
+    elsewhere = published.model_copy(update={"tested_in": "simulators"})
+    assert assembled(root, published=elsewhere).predictive_validity == {}

@@ -50,6 +50,7 @@ def test_rows_that_are_not_finished_are_left_open() -> None:
         ],
         unfinished=[10, 150],
     )
+    assert found.methods() == ["nas", "iql", "astra"]  # as in the size that has most of them
     page = render_sizes(found, {})
     assert "Not finished yet: NAS and DT at 50 %; all rows at 10 %; all rows at 150 %. Produced by" in page
     assert "| astra | 0.38 ± 0.18 | 0.00 (1 seed) |" in page and "| nas | - | 0.00 ± 0.00 |" in page
