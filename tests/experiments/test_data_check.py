@@ -23,15 +23,16 @@ def write_logs(
     *,
     state_size: int = 2,
     held_out: Sequence[bool] = (False,) * 2,
+    **metadata: int,
 ) -> None:
-    """Write pushes of the small cart, whose bounds are -1 and 4."""
+    """Write pushes of the small cart, whose bounds are -1 and 4; `metadata` is of each."""
     columns = [Column(STATE, size=state_size), Column(NEXT_STATE, size=state_size), Column(ACTION, size=1)]
     states = np.zeros((9, state_size), np.float32)
     actions = np.linspace(least, largest, 9, dtype=np.float32)
     with writer(folder, columns=columns, fps=10) as logs:
         for uid, held in enumerate(held_out):
             columns_of_one = {STATE: states, NEXT_STATE: states, ACTION: actions}
-            logs.add(Episode(uid, columns_of_one, {"held_out": held}))
+            logs.add(Episode(uid, columns_of_one, {"held_out": held, **metadata}))
 
 
 @pytest.fixture
@@ -141,6 +142,13 @@ def test_the_smallest_size_of_a_sweep_has_to_leave_some(recipe: Path, percent: s
             check(recipe, root=recipe.parent / "runs")
     else:
         assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
+
+
+def test_copies_of_one_recording_are_one_in_a_size_of_a_sweep(recipe: Path) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False] * 4, source_episode=0)
+    recipe.write_text(recipe.read_text() + "[sweep]\npercent = [50, 100]\n")
+    with pytest.raises(BadInputError, match=r"50 % of fake@data-1\.0\.0: recorded episodes: 1, of which 1"):
+        check(recipe, root=recipe.parent / "runs")
 
 
 def test_recipes_that_collect_or_pull_have_no_such_line(recipe: Path) -> None:

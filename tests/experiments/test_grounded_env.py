@@ -188,8 +188,9 @@ def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
     assert ends == [[False, True], [False, True]]
     assert (steps(), steps(episode_steps=7), steps(max_episode_steps=5)) == (150, 7, 5)
     make: Callable[..., Any] = gymnasium.make_vec
-    vectors = [make(ID, num_envs=3, run=run, row="nas", **more) for more in ({}, {"max_episode_steps": 6})]
-    assert [env.max_episode_steps for env in vectors] == [150, 6]
+    limits: list[dict[str, int]] = [{}, {"max_episode_steps": 6}, {"max_episode_steps": 400}]
+    vectors = [make(ID, num_envs=3, run=run, row="nas", **more) for more in limits]
+    assert [env.max_episode_steps for env in vectors] == [150, 6, 150]
     assert all(isinstance(env, BatchedVectorEnv) for env in vectors)
 
 

@@ -79,6 +79,8 @@ def test_logs_of_an_arm_give_its_task(tmp_path: Path) -> None:
     assert places(task) == {"meta"}
     least, largest = task.limits["q1"]
     assert -np.radians(30) - 1e-3 <= least < 0 < largest <= np.radians(30) + 1e-3
+    split = tomllib.loads(Path("robots/arm/logs.toml").read_text())["split"]
+    assert split == {"field": "episode", "gap_s": 0.25}  # five steps
     command(f"import {log} --mapping robots/arm/logs.toml --out imported")
     data = Dataset.open("imported")
     assert (len(data), len(data.columns(["action"])["action"])) == (2, 78)
@@ -323,3 +325,5 @@ def test_logs_may_be_given_as_a_shell_writes_them_out(tmp_path: Path) -> None:
     assert shown.exit_code == 0
     assert "x[m]" in shown.stdout  # brackets are no markup
     assert "horizon=7" in Path("slide/slide.py").read_text()
+    recipe = tomllib.loads(Path("slide/slide.toml").read_text())
+    assert recipe["ground"]["window"] == recipe["align"]["window"] == 2  # a history has two steps or more

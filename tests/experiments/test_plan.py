@@ -1,5 +1,6 @@
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_stages import FakeConfig
@@ -121,6 +122,22 @@ def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_re
     assert items["collect/seed_7"].call.keywords["config"].episodes == 300  # type: ignore[attr-defined]
     options = "--method astra --seed 7 --percent 50"
     assert items["report"].call.keywords["command"].endswith(f"r.toml {options}")  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("part", "command"),
+    [
+        ({}, "run {}"),
+        ({"seeds": [7]}, "run {} --seed 7"),
+        ({"methods": ["astra"]}, "sweep {} --method astra"),  # which `run` does not take
+    ],
+)
+def test_the_command_that_made_a_part_is_one_that_takes_its_options(
+    tmp_path: Path, fake_recipe: type[Recipe], part: dict[str, list[Any]], command: str
+) -> None:
+    recipe, path = load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml"
+    *_, report = plan(recipe, path, tmp_path, Selection.of(recipe, **part))
+    assert report.call.keywords["command"] == f"astra-data {command.format(path)}"  # type: ignore[attr-defined]
 
 
 def test_a_new_stage_is_planned_by_what_its_function_takes(

@@ -184,6 +184,14 @@ def test_a_rate_of_turning_is_no_steering_angle(tmp_path: Path, name: str) -> No
     assert write_robot("robot", tmp_path / "robot", [turned]).simulator.startswith("a unicycle")
 
 
+def test_a_steering_rate_is_no_angle_even_where_it_would_fit(tmp_path: Path) -> None:
+    poses, commands = steer(0.26)
+    columns = ["x", "y", "yaw", "cmd_v", "cmd_steering_rad_s"]
+    assert Bicycle.of(guess([write(tmp_path / "log.csv", columns, poses, commands)])) is None
+    columns[-1] = "cmd_steering_rad"
+    assert Bicycle.of(guess([write(tmp_path / "log.csv", columns, poses, commands)])) is not None
+
+
 def test_a_car_that_never_drives_has_no_wheelbase(tmp_path: Path) -> None:
     poses, commands = steer(0.26)
     commands[:, 0] = 0.5 * (np.arange(len(commands)) == len(commands) - 1)  # in the last row alone

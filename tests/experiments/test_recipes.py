@@ -89,6 +89,7 @@ HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[col
         ("", "[plus]\nsupport_penalty = 0.1\n", "plus.support_penalty"),
         ("", "[plus]\ncommand_limit = 1.0\n", "plus.command_limit"),
         ("", "[evaluate]\nleg_scale = 1.25\n", "evaluate.leg_scale"),
+        ("", "[evaluate]\nleg_scale = 0.8\n", "evaluate.leg_scale"),
         ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),
     ],
 )

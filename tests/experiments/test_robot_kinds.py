@@ -252,3 +252,9 @@ def test_cosine_and_sine_of_a_heading_have_one_range(tmp_path: Path) -> None:
     assert (values["step"], values["apart"]) == ("command", "")  # no heading is stepped from where it was
     z, cosine, sine = (float(value) for value in values["range"].strip("()").split(","))
     assert z == 49 and cosine == sine == pytest.approx(2 * np.sin(0.2), rel=1e-3)
+
+
+def test_a_turn_rate_moves_the_heading_of_its_name_before_others(tmp_path: Path) -> None:
+    turned = np.cumsum(T % 3) / 10
+    kind = Direct.of(logs(tmp_path, theta=turned, yaw=2 + turned, cmd_vyaw=T % 3))
+    assert [field.short for field in kind.moved] == ["yaw"]

@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ from astra_data.core.config import validated
 from astra_data.experiments.execution import Item
 from astra_data.experiments.plan import plan, stage_of
 from astra_data.experiments.recipe import Recipe
-from astra_data.experiments.staleness import reads
+from astra_data.experiments.staleness import reads, stale_stages
 from astra_data.methods import METHODS
 
 ROWS = [*METHODS, "astra_plus", "direct_transfer_plus"]
@@ -48,3 +49,15 @@ def test_with_the_reference_all_evaluations_depend_on_its_grounding_and_no_other
 def test_a_row_of_an_unknown_method_may_have_been_grounded() -> None:
     assert reads("gone", "ground") and reads("gone_plus", "align")
     assert not reads("gone", "target")
+
+
+def test_a_row_depends_on_what_the_row_that_it_goes_on_from_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    for first, is_grounded in (("nas", True), ("direct_transfer", False)):
+        monkeypatch.setitem(METHODS, "further", replace(METHODS["direct_transfer"], initial=first))
+        assert reads("further", "ground") is is_grounded
+
+
+def test_other_data_outdate_what_is_made_of_them_and_no_collection() -> None:
+    stale = stale_stages({"data"})
+    assert {"label", "pair", "ground", "train", "align", "evaluate"} <= stale and "collect" not in stale
+    assert "collect" in stale_stages({"collect"}) and "label" not in stale_stages({"collect"})

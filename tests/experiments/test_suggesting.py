@@ -3,6 +3,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 from rail_run import write_recipe
@@ -16,6 +17,7 @@ from astra_data.dataset import Dataset
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.suggesting import _usual, suggest
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.reports import figures
 from astra_data.worlds.registry import TASKS
 
 FEW: dict[str, Any] = {"episodes": 3, "proposals": 20}
@@ -96,6 +98,20 @@ def test_from_logs_alone_it_says_what_to_do_on_the_robot(folder: Path) -> None:
     assert "bring it to each start" in page and "| episode | from | for | v |" in page
     config = json.loads((folder / "suggest/config.json").read_text())["suggest"]
     assert (config["max_steps"], config["start"]) == (40, "task")
+
+
+def test_a_path_is_drawn_as_far_as_its_episode_goes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+    draw = figures.information_map
+
+    def noted(maps: Any, starts: Any, paths: Any, maze: Any) -> Any:  # noqa: ANN401 - passed on
+        drawn.append(paths)
+        return draw(maps, starts, paths, maze)
+
+    monkeypatch.setattr(figures, "information_map", noted)
+    _, found, _ = suggest(folder, **FEW)
+    there = found.rollouts.reached[:, found.taken].T.numpy() > 0
+    np.testing.assert_array_equal(np.isfinite(drawn[0][..., 0]), there)
 
 
 def test_what_cannot_disagree_is_refused_and_nothing_is_written(folder: Path) -> None:

@@ -87,6 +87,17 @@ def test_the_best_predicted_are_tried_and_the_posterior_decides(folder: Path, tr
     assert (folder / "select/trials.json").is_file()
 
 
+def test_what_was_predicted_is_the_lower_quartile_over_the_judges(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = select(folder)
+    split = [one.model_copy(update={"success": {8: 0.0, 9: 1.0}}) for one in judged.candidates]
+    monkeypatch.setattr(module, "select", lambda *_, **__: judged.model_copy(update={"candidates": split}))
+    found = choose_by_trials(folder, 4, field=2)
+    # Of two successes in two trials, with a prediction of 0.25 that counts as four.
+    assert found.mean == pytest.approx((4 * 0.25 + 2) / (4 + 2))
+
+
 def test_candidates_of_a_round_meet_the_same_starts_and_goals(folder: Path, tries: Tries) -> None:
     choose_by_trials(folder, 20, field=4)
     seeds = [seed for *_, seed, _ in tries.made]
