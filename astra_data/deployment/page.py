@@ -17,11 +17,12 @@ policy = RobotPolicy(
     state={state_names},
     goal={goal_names},
 )
-run(policy, measure, send, goal, steps={minute}, stop={still})
+run(policy, measure, send, goal, steps={minute}, stop={stop})
 ```
 
 `measure()` returns the robot's state, `send(command)` gives it a command, and `stop` is the command that
-stops it, which is sent in the end, after an error and after Ctrl-C: all of these are yours.
+stops it, which is sent in the end, after an error and after Ctrl-C: all of these are yours. Zeros stop
+what is commanded by speeds, and move what is commanded by positions: there, None leaves the last command.
 `policy.start()` begins an episode and `policy.act(state, goal)` takes one step. Another rate, other
 values, and values that are not finite are refused with a `ValueError`. `pip install numpy onnxruntime`
 brings all that it takes; `python run_policy.py` tries it with zeros.
@@ -53,13 +54,15 @@ the files that it was made from and the versions of the packages; `manifest.json
 files here.
 """
 
+_POSITIONS = {"m", "cm", "mm", "rad", "deg", "°"}
+
 
 def page(about: Mapping[str, Any]) -> str:
     """Return the page, in Markdown, of a policy with the description `about`."""
     return _PAGE.format(
         **{key: about[key] for key in ("task", "row", "seed", "rate_hz")},
         minute=round(60 * about["rate_hz"]),
-        still=[0.0] * len(about["command"]["names"]),
+        stop=_stop(about["command"]),
         state_names=about["state"]["names"],
         goal_names=about["goal"]["names"],
         state=_table(about["state"]),
@@ -72,6 +75,12 @@ def page(about: Mapping[str, Any]) -> str:
         dataset=about["trained_on"]["dataset"],
         hash=about["trained_on"]["hash"],
     )
+
+
+def _stop(command: Mapping[str, Any]) -> list[float] | None:
+    """Return the command that stops the robot: None where the units of any tell a position."""
+    is_position = _POSITIONS.intersection(command.get("units", ()))
+    return None if is_position else [0.0] * len(command["names"])
 
 
 def _table(values: Mapping[str, Any]) -> str:

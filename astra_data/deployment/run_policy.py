@@ -40,15 +40,20 @@ class RobotPolicy:
         """Return the command (A,) for a state (S,) and a goal (G,), all in the units of policy.json."""
         feed = {"hidden": self.hidden}
         for column, given in (("state", state), ("goal", goal)):
-            values, names = np.asarray(given, np.float32), self.about[column]["names"]
-            if values.shape != (len(names),) or not np.isfinite(values).all():
-                raise ValueError(f"{column}: expected {len(names)} finite values {names}, got {given!r}")
-            feed[column] = values[None]
+            feed[column] = finite(column, given, self.about[column]["names"])[None]
         command, hidden = self.session.run(None, feed)
         if not np.isfinite(command).all():
             raise ValueError(f"the policy gives no command for the state {state!r} and the goal {goal!r}")
         self.hidden = hidden
         return command[0]
+
+
+def finite(called: str, given: Any, names: Sequence[str]) -> Any:  # noqa: ANN401 - anything like an array
+    """Return what was `given` as an array of float32, or raise a ValueError if it is not one value a name."""
+    values = np.asarray(given, np.float32)
+    if values.shape != (len(names),) or not np.isfinite(values).all():
+        raise ValueError(f"{called}: expected {len(names)} finite values {names}, got {given!r}")
+    return values
 
 
 def run(
@@ -57,13 +62,15 @@ def run(
     send: Callable[[Any], None],
     goal: Sequence[float],
     steps: int,
-    stop: Sequence[float],
+    stop: Sequence[float] | None,
 ) -> None:
     """Measure the state, send the command, and wait for the next control period, `steps` times.
 
-    The last command is `stop`, what stops the robot: also after an error, and after Ctrl-C. A period that
-    took too long is not made up for: the next command is due a period after the late one.
+    The last command is `stop`, what stops the robot: also after an error, and after Ctrl-C. With None no
+    other follows the policy's last, which holds a robot whose commands are positions. A period that took
+    too long is not made up for: the next command is due a period after the late one.
     """
+    last = None if stop is None else finite("stop", stop, policy.about["command"]["names"])
     policy.start()
     due = time.perf_counter()
     try:
@@ -73,7 +80,8 @@ def run(
             due = max(due + 1.0 / policy.about["rate_hz"], now)
             time.sleep(due - now)
     finally:
-        send(np.asarray(stop, np.float32))
+        if last is not None:
+            send(last)
 
 
 if __name__ == "__main__":

@@ -64,15 +64,18 @@ def view(
     Args:
         dataset: any.
         uids: of the episodes, by default all.
-        save: the recording, an `.rrd` file, in place of the viewer.
+        save: the recording, a file that ends in `.rrd` and is replaced, in place of the viewer.
         replays: of episodes, by their uids.
 
     Raises:
-        BadInputError: Rerun is not installed, its viewer does not open, or there is no such episode.
+        BadInputError: Rerun is not installed, its viewer does not open, there is no such episode, or `save`
+            is no `.rrd` file.
         CorruptDatasetError: a file cannot be read.
         DiskError: the recording cannot be written.
     """
     rerun = optional("rerun", "view")
+    if save is not None and save.suffix != ".rrd":
+        raise BadInputError(f"--save {save}: expected a file that ends in .rrd")
     known = {int(uid): index for index, uid in enumerate(dataset.uids)}
     check_uids(dataset, uids)
     chosen = sorted({known[uid] for uid in uids}) if uids else None

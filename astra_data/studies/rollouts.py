@@ -178,7 +178,8 @@ def _starts(sequences: Sequences, history: int, steps: int) -> tuple[Tensor, Ten
     if len(sequence) < 2:
         raise BadInputError(
             f"expected stretches of {history} + {steps} steps to fit to, the last of which count, found "
-            f"{len(sequence)}: take longer recordings"
+            f"{len(sequence)} in pieces of {int(sequences.lengths.max())} steps or fewer: give the recipe a "
+            "larger piece_s, or less history, or take longer recordings"
         )
     return sequence, step
 

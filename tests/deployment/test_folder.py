@@ -155,6 +155,9 @@ def test_its_page_tells_sizes_and_what_stops_the_robot() -> None:
     assert "goal=[], ) run(policy, measure, send, goal, steps=600, stop=[0.0, 0.0])" in text
     assert "## Goal None: all episodes have the same." in text
     assert "`state` (1, 3), `goal` (1, 0) and `hidden` (1, 5) in, `command` (1, 2) and" in text
+    for units, stop in ((["m/s", "rad/s"], "[0.0, 0.0]"), (["deg", "deg"], "None"), (["m/s", "rad"], "None")):
+        command = {"names": sizes["command"], "units": units}
+        assert f"steps=600, stop={stop})" in page(about | {"command": command})
 
 
 def test_a_description_names_encoder_limit_and_frames() -> None:

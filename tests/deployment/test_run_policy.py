@@ -122,6 +122,22 @@ def test_the_robot_is_stopped_whatever_happens(folder: Path, error: type[BaseExc
     assert len(sent) == 2 and sent[-1].tolist() == [0.25]
 
 
+def test_a_robot_that_holds_its_position_gets_no_other_command(folder: Path) -> None:
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    policy.about["rate_hz"] = 1000.0
+    sent: list[Any] = []
+    run(policy, lambda: [0.5, 1.0], sent.append, [1.0], steps=3, stop=None)
+    assert len(sent) == 3 and sent[-1].any()
+
+
+@pytest.mark.parametrize("stop", [[], [0.0, 0.0], [np.nan]])
+def test_what_cannot_stop_the_robot_is_refused_before_it_moves(folder: Path, stop: list[float]) -> None:
+    sent: list[Any] = []
+    with pytest.raises(ValueError, match=r"stop: expected 1 finite values \['v'\], got"):
+        run(RobotPolicy(**GIVEN, folder=folder), lambda: [0.5, 1.0], sent.append, [1.0], steps=3, stop=stop)
+    assert not sent
+
+
 def test_a_refused_command_is_not_remembered(folder: Path) -> None:
     policy = RobotPolicy(**GIVEN, folder=folder)
     policy.act([0.5, 1.0], [1.0])

@@ -127,6 +127,13 @@ def test_the_viewer_is_opened_without_a_file(tmp_path: Path, monkeypatch: pytest
     assert {"/episode_4/target", "/episode_7/target"} <= set(read(opened[0]))
 
 
+def test_a_recording_replaces_no_other_kind_of_file(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(BadInputError, match=r"notes\.txt: expected a file that ends in \.rrd"):
+        view(paired(tmp_path / "paired"), save=tmp_path / "notes.txt")
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
 def test_without_a_viewer_one_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import rerun  # noqa: PLC0415 - only to stand in for its viewer
 

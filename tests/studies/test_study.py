@@ -154,6 +154,13 @@ def test_recordings_without_walking_are_refused(tmp_path: Path) -> None:
         run_study(recipe(models=("ridge",)), [B], [still], tmp_path / "b", silent)
 
 
+def test_pieces_that_are_too_short_to_fit_to_are_told_with_their_steps(tmp_path: Path) -> None:
+    short = recording("c", rows=60)
+    told = r"of 4 \+ 6 steps to fit to, .* found 0 in pieces of 6 steps or fewer: .*piece_s"
+    with pytest.raises(BadInputError, match=told):
+        run_study(recipe(models=("gains",)), [A], [short], tmp_path, silent)
+
+
 def test_a_size_of_less_than_a_row_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected pieces of more than 0\.8 s without a split"):
         run_study(recipe(minutes=(1e-5,)), [A], [B], tmp_path, silent)

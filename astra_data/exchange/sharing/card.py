@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import RESERVED, Column
@@ -44,7 +45,7 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
 
     Args:
         dataset: any.
-        out: the Markdown file; it is replaced, and so is the figure, `<stem>-coverage.png`.
+        out: the Markdown file, which is not replaced by another; the figure, `<stem>-coverage.png`, is.
         notes: the part of the card that a person writes.
         source: where it is shared, as `pull` takes it; if None, the card shows how to open a folder.
 
@@ -52,6 +53,7 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
         the files written.
 
     Raises:
+        BadInputError: `out` is there already, with other contents.
         DiskError: `out` cannot be written.
         CorruptDatasetError: a value was altered: the card states the hash of all of them.
     """
@@ -59,6 +61,8 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
     positions = visited(dataset)
     figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
     text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)
+    if out.exists() and out.read_bytes() != text.encode():
+        raise BadInputError(f"{out} exists already and is not this card; delete it or choose another file.")
     write_file(out, text)
     if positions is None or figure is None:
         return [out]

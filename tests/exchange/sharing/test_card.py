@@ -8,7 +8,7 @@ from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake, writer
 from huggingface_hub import DatasetCard
 
 from astra_data.core.config import load_recipe
-from astra_data.core.errors import DiskError, RecipeError
+from astra_data.core.errors import BadInputError, DiskError, RecipeError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE, SUCCESS, Column, Episode
 from astra_data.exchange.sharing.card import _size_category, render_card, write_card
@@ -109,6 +109,16 @@ def test_the_figure_is_shown(fake: Dataset, tmp_path: Path) -> None:
     assert figure.read_bytes().startswith(b"\x89PNG")
     text = card.read_text()
     assert text.index(f"]({figure.name})") < text.index("## Loading") < text.index("## Contents")
+
+
+def test_what_a_person_wrote_is_not_replaced(fake: Dataset, tmp_path: Path) -> None:
+    files = write_card(fake, tmp_path / "it.md", NOTES)
+    assert write_card(fake, tmp_path / "it.md", NOTES) == files
+    with files[0].open("a") as card:
+        card.write("Robot 3 has a loose wheel.\n")
+    with pytest.raises(BadInputError, match=r"it\.md exists already and is not this card; delete it or"):
+        write_card(fake, tmp_path / "it.md", NOTES)
+    assert files[0].read_text().endswith("wheel.\n")
 
 
 def test_sums_are_folded_away(fake: Dataset) -> None:
