@@ -12,7 +12,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.field_names import HEADING, QUATERNION
 from astra_data.exchange.logs import Field, Floats, Logs
-from astra_data.experiments.kind_errors import errors
+from astra_data.experiments.kind_errors import JUDGED_STEPS, errors
 from astra_data.experiments.written_values import numbers, texts, typical
 
 _SPEED = re.compile(r"^(vel_|velocity_|v|d)(?=[a-z])")
@@ -91,8 +91,10 @@ class Direct:
         if not found:
             cure = "make yaw of the quaternion" if parts else "name it as its command, cmd_q1 and q1"
             raise BadInputError(f"found no state that a command could move: {cure}")
+        # Over one step, what lags behind where it is put looks like a rate.
+        steps = JUDGED_STEPS if any(len(values) > JUDGED_STEPS for values in logs.values(found)) else 1
         rates, targets = (
-            errors(cls(logs, found, (is_rate,) * len(found)), 1)[0] for is_rate in (True, False)
+            errors(cls(logs, found, (is_rate,) * len(found)), steps)[0] for is_rate in (True, False)
         )
         pairs = zip(found, logs.of("command"), strict=False)
         is_same = np.array([_is_same(state, command) for state, command in pairs])

@@ -200,6 +200,22 @@ def test_each_command_is_a_rate_or_a_target_by_itself(tmp_path: Path) -> None:
     assert (kind.values()["before"], kind.values()["after"]) == ("[0.0, 1.0]", "[0.1, 1.0]")
 
 
+@pytest.mark.parametrize("is_rate", [True, False])
+@pytest.mark.parametrize(("rows", "fast"), [(300, 0.3), (8, 0.9)])
+def test_an_actuator_with_a_lag_is_told_from_one_of_speeds(
+    tmp_path: Path, is_rate: bool, rows: int, fast: float
+) -> None:
+    walk = np.cumsum(np.random.default_rng(0).uniform(-0.1, 0.1, (rows, 2)), axis=0)
+    command = np.random.default_rng(1).uniform(-3, 3, (rows, 2)).repeat(3, axis=0)[:rows] if is_rate else walk
+    follows, q = np.zeros(2), [np.zeros(2)]
+    for given in command[:-1]:
+        follows = follows + fast * (given - follows)
+        q.append(q[-1] + follows / 30 if is_rate else follows)
+    time, (q0, q1), (cmd_q0, cmd_q1) = np.arange(rows) / 30, np.array(q).T, command.T
+    kind = Direct.of(logs(tmp_path, time=time, q0=q0, q1=q1, cmd_q0=cmd_q0, cmd_q1=cmd_q1))
+    assert kind.is_rate == (is_rate, is_rate)
+
+
 def test_something_has_to_move(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="found no state that a command could move"):
         Direct.of(logs(tmp_path, vel_a=T % 4, cmd_1=T % 5))
