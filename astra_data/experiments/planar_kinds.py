@@ -15,6 +15,7 @@ from astra_data.experiments.written_values import numbers, typical
 
 _TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|(?<!th)rot|steer).*")
 _STEERING = re.compile(r"(.+_)?steer(ing)?(_?(angle|ang))?")
+_SIDE = re.compile(r"left|right|(?<![a-z])[vw]?[lr](?![a-z])")
 _SPEED_AXIS = re.compile(r"(.+_)?(v|vel|velocity|linear)_?[xy]")
 
 
@@ -42,7 +43,8 @@ class Planar:
             ", ".join(field.short for field in fields)
             for fields in ((*self.position, *self.heading), self.logs.of("command"))
         )
-        return f"a {self.called}: {moved}, driven by {commands}"
+        doubt = f"; {self._doubt} (CHECK)" if self._doubt else ""
+        return f"a {self.called}: {moved}, driven by {commands}{doubt}"
 
     @property
     def names(self) -> tuple[str, str, str]:
@@ -53,16 +55,32 @@ class Planar:
     @property
     def meanings(self) -> list[str]:
         """What each command is: "turn" for a rate of turning, and for others names of speeds."""
+        turn = self._told_turn or self.logs.of("command")[1]
+        return ["turn" if field == turn else "speed" for field in self.logs.of("command")]
+
+    @property
+    def _told_turn(self) -> Field | None:
+        """The command of turning by its name, or as the only one in rad/s; None where nothing says so."""
         commands = self.logs.of("command")
-        turns = (field.is_turn_rate or _TURNS.fullmatch(field.short) is not None for field in commands)
-        turn = next((number for number, is_turn in enumerate(turns) if is_turn), 1)
-        return ["turn" if number == turn else "speed" for number in range(2)]
+        named = [field for field in commands if field.is_turn_rate or _TURNS.fullmatch(field.short)]
+        by_unit = [field for field in commands if field.unit == "rad/s"]
+        found = named or (by_unit if len(by_unit) == 1 else [])
+        return found[0] if found else None
+
+    @property
+    def _doubt(self) -> str:
+        """What was taken for what without a reason; nothing where there was one."""
+        if self._told_turn:
+            return ""
+        return f"took {self.logs.of('command')[1].short} for a turn rate: nothing says so"
 
     @classmethod
     def of(cls, logs: Logs) -> Self | None:
         """Return how it fits; None if it does not."""
         pose, commands = _pose(logs), logs.of("command")
-        return cls(logs, *pose) if pose and len(commands) == 2 and not _are_along_axes(commands) else None
+        if pose is None or len(commands) != 2 or _are_along_axes(commands) or _are_sides(*commands):
+            return None
+        return cls(logs, *pose)
 
     def states(self) -> list[Floats]:
         """Return x, y and the angle of the heading (T, 3) of each episode."""
@@ -114,6 +132,7 @@ class Planar:
             "robot": self.called.title().replace(" ", ""),
             "abstraction": abstraction,
             "commands": ", ".join(self.meanings),
+            "doubt": f"  # CHECK: {self._doubt}" if self._doubt else "",
             "along": f"\n        {along}" if along else "",
             "seen": "east, north" if is_in_world else seen,
             "seen_from": "from where the robot is" if is_in_world else "as the robot sees it",
@@ -268,6 +287,11 @@ def _are_along_axes(commands: Sequence[Field]) -> bool:
         if field.unit == "m/s" or (field.unit == "1" and _SPEED_AXIS.fullmatch(field.short))
     }
     return len(commands) == 2 and any(names == {f"{name[:-1]}x", f"{name[:-1]}y"} for name in names)
+
+
+def _are_sides(one: Field, other: Field) -> bool:
+    """Return whether they are of the left and the right, as of wheels, by names that are alike otherwise."""
+    return _SIDE.sub("", one.short) == _SIDE.sub("", other.short)
 
 
 def _unit_vector(pose: Floats) -> Floats:

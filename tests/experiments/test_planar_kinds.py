@@ -1,3 +1,4 @@
+import re
 import runpy
 import shutil
 from collections.abc import Sequence
@@ -136,6 +137,49 @@ def test_a_unicycle_has_a_speed_and_a_turn_rate(
     log = write(tmp_path / "log.csv", ["x", "y", "yaw", *names], poses, commands[:, :2])
     kind = Planar.of(guess([log]))
     assert (kind and kind.meanings) == meanings
+
+
+@pytest.mark.parametrize(
+    ("names", "meanings", "doubt"),
+    [
+        (("cmd_a", "cmd_b"), ["speed", "turn"], "took b for a turn rate: nothing says so"),
+        (("cmd_a_rad_s", "cmd_b_rad_s"), ["speed", "turn"], "took b for a turn rate: nothing says so"),
+        (("cmd_a_rad_s", "cmd_b_m_s"), ["turn", "speed"], ""),
+        (("cmd_a_m_s", "cmd_b_rad_s"), ["speed", "turn"], ""),
+        (("cmd_a_rad_s", "cmd_turn"), ["speed", "turn"], ""),
+        (("cmd_v", "cmd_w"), ["speed", "turn"], ""),
+    ],
+)
+def test_a_turn_rate_of_which_nothing_tells_is_told(
+    tmp_path: Path, names: Sequence[str], meanings: list[str], doubt: str
+) -> None:
+    poses, commands = drive()
+    log = write(tmp_path / "log.csv", ["x", "y", "yaw", *names], poses, commands[:, :2])
+    kind = Planar.of(guess([log]))
+    assert kind is not None and kind.meanings == meanings
+    shown = CliRunner().invoke(app, ["new", "cartlet", "--from", str(log), "--out", str(tmp_path / "out")])
+    told = f"; {doubt} (CHECK)\n" if doubt else "\n"
+    assert re.search(rf"simulator: a unicycle: x, y, yaw, driven by \w+, \w+{re.escape(told)}", shown.output)
+    step = f"    def step(self, command):{doubt and f'  # CHECK: {doubt}'}\n"
+    assert step in (tmp_path / "out/cartlet.py").read_text()
+    assert check_task(task_named(f"{tmp_path}/out/cartlet.py:TASK")) == []
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("cmd_left", "cmd_right"),
+        ("cmd_right_wheel_rad_s", "cmd_left_wheel_rad_s"),
+        ("u_l", "u_r"),
+        ("cmd_vl", "cmd_vr"),
+        ("cmd_left_rot_speed", "cmd_right_rot_speed"),
+    ],
+)
+def test_wheels_of_the_left_and_the_right_are_no_unicycle(tmp_path: Path, names: Sequence[str]) -> None:
+    poses, commands = drive()
+    log = write(tmp_path / "log.csv", ["x", "y", "theta", *names], poses, commands[:, :2])
+    assert Planar.of(guess([log])) is None and Bicycle.of(guess([log])) is None
+    assert isinstance(write_robot("wheels", tmp_path / "wheels", [log]), Direct)
 
 
 def steer(wheelbase_m: float, rows: int = 120) -> tuple[Floats, Floats]:
