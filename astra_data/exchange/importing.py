@@ -30,6 +30,7 @@ from astra_data.exchange.recording import (
     identities,
     is_archive,
     other_files,
+    refuse_dataset,
 )
 from astra_data.exchange.restoring import read_record, restored, write_restored
 from astra_data.exchange.tally import Tally
@@ -177,6 +178,7 @@ def _common_format(recordings: Sequence[Path]) -> str:
 
 
 def _format_of(recording: Path) -> str:
+    refuse_dataset(recording)
     if minari.is_dataset(recording):
         return "minari"
     names = [str(source) for source in find_sources(recording, [""])]

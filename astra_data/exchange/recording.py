@@ -1,6 +1,7 @@
 """Recordings in other formats: their files, and the blocks of rows that importers read from them."""
 
 import re
+import shlex
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,6 +14,8 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, in_short
 from astra_data.core.files import files_below
 from astra_data.dataset.columns import Array
+from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.plain import read_object
 
 BLOCK_ROWS = 2**13
 """Rows that an importer reads at once, if the format allows it."""
@@ -132,6 +135,20 @@ def other_files(recordings: Sequence[Path], suffixes: Sequence[str]) -> tuple[st
     inside = [source for path in recordings if path.is_dir() or is_archive(path) for source in _inside(path)]
     names = [name for name in map(str, inside) if not name.lower().endswith(beside)]
     return tuple(sorted((name for name in names if not _is_readme(name)), key=natural))
+
+
+def refuse_dataset(place: Path) -> None:
+    """Refuse a folder that is a dataset already, ours or one that LeRobot recorded.
+
+    Raises:
+        BadInputError: it is; says how to name it.
+    """
+    info = read_object(place / INFO_PATH)
+    if isinstance(info, dict) and "codebase_version" in info:
+        raise BadInputError(
+            f"{place} is a LeRobot dataset, no logs, and needs no import: name it as it is, as in "
+            f"`astra-data inspect {shlex.quote(str(place))}`, or as `data` in a recipe"
+        )
 
 
 def is_archive(path: Path) -> bool:

@@ -271,6 +271,13 @@ def test_what_is_of_no_use_is_told(tmp_path: Path, text: str, expected: str) -> 
         guess([tmp_path / "log.csv"])
 
 
+def test_a_dataset_is_no_logs(tmp_path: Path) -> None:
+    (tmp_path / "arm/meta").mkdir(parents=True)
+    (tmp_path / "arm/meta/info.json").write_text('{"codebase_version": "v3.0"}')
+    with pytest.raises(BadInputError, match=r"arm is a LeRobot dataset, .*inspect \S+/arm`, or as `data`"):
+        guess([tmp_path / "arm"])
+
+
 def test_files_have_to_be_there_and_alike(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected files that end in \.csv or \.tsv, found none"):
         guess([tmp_path])

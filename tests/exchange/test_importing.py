@@ -143,6 +143,25 @@ def test_a_format_that_does_not_exist_is_told(tmp_path: Path) -> None:
         imported(tmp_path, path, file_format="hdf")
 
 
+def test_a_dataset_needs_no_import(tmp_path: Path) -> None:
+    dataset, _ = imported(tmp_path / "my own", write_table(tmp_path / "a.csv", rows()))
+    told = f"is a LeRobot dataset, no logs, and needs no import: .*`astra-data inspect '{dataset.root}'`, or"
+    for mapping in (None, MAPPING):
+        with pytest.raises(BadInputError, match=told):
+            imported(tmp_path / "again", dataset.root, mapping)
+
+
+def test_the_tables_of_an_older_dataset_are_imported_where_their_format_is_given(tmp_path: Path) -> None:
+    table = write_table(tmp_path / "old/data/episode_0.parquet", rows())
+    (tmp_path / "old/meta").mkdir()
+    (tmp_path / "old/meta/info.json").write_text('{"codebase_version": "v2.1"}')
+    dataset, _ = imported(tmp_path, tmp_path / "old", MAPPING, file_format="parquet")
+    assert dataset.lengths.tolist() == list(STEPS)
+    (tmp_path / "old/meta/info.json").write_text("[]")  # no dataset
+    with pytest.raises(BadInputError, match="json has no standard fields"):
+        imported(tmp_path, table.parents[1], None)
+
+
 def test_tables_need_a_mapping(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="csv has no standard fields; pass --mapping"):
         imported(tmp_path, write_table(tmp_path / "a.csv", rows()), None, name="a", fps=10)

@@ -16,7 +16,7 @@ from pyarrow import csv
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Source, row_count
+from astra_data.exchange.recording import Block, Source, refuse_dataset, row_count
 
 SUFFIXES = (".csv", ".tsv")
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
@@ -47,11 +47,12 @@ def csv_files(place: Path) -> list[Path]:
     """Return the CSV files in a folder, or the one that `place` is.
 
     Raises:
-        BadInputError: there is none.
+        BadInputError: there is none, or it is a dataset.
     """
     inside = sorted(place.iterdir()) if place.is_dir() else [place]
     found = [path for path in inside if path.suffix.lower() in SUFFIXES]
     if not found:
+        refuse_dataset(place)
         raise BadInputError(
             f"{place}: expected files that end in {' or '.join(SUFFIXES)}, found none: `import` takes "
             "others, by a mapping"
