@@ -95,7 +95,7 @@ class DatasetWriter:
             faults.append(f"fps {fps!r}, expected a positive int")
         if compression not in layout.COMPRESSIONS:
             faults.append(f"compression {compression!r}, expected {' or '.join(layout.COMPRESSIONS)}")
-        if not is_text(task):
+        if not isinstance(task, str) or not is_text(task):
             faults.append(f"task {task!r}, expected text of valid characters")
         if faults:
             raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")

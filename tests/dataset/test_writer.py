@@ -5,12 +5,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import fake_dataset
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from fake_dataset import COLUMNS, fake_episode, fake_episodes, staged_writer, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, fake_episodes, staged_writer, write_fake, writer
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError
@@ -144,6 +145,10 @@ def test_arguments_are_checked_together(tmp_path: Path) -> None:
     )
     with pytest.raises(BadInputError, match=faults):
         writer(tmp_path / "set", columns=columns, fps=0, compression="gzip")
+    faults = "fps 0, expected a positive int; task None, expected text of"
+    task: Any = None
+    with pytest.raises(BadInputError, match=faults):
+        DatasetWriter(tmp_path / "set", COLUMNS, fps=0, task=task, description=DESCRIPTION)
     description = {"name": "a b", "versoin": "1", "parents": [{"name": "x"}], "config": {"x": float("inf")}}
     with pytest.raises(BadInputError) as caught:
         writer(tmp_path / "set", description=description)
