@@ -194,7 +194,8 @@ def _announce(
         parts.append(f"{single} of them in episodes of a single row")
     if lost := sum(episode.lost_success for episode in episodes):
         parts.append(
-            f"{lost} of these last rows are the only ones that succeeded, so {names.SUCCESS} is lost"
+            f"{lost} of these last rows are the only ones that succeeded, so {names.SUCCESS} is lost unless "
+            f"{names.DONE} or {names.TERMINATED} is set there"
         )
     if reward := sum(episode.lost_reward for episode in episodes):
         parts.append(f"with the last rows a reward of {reward:g} in sum is left out")

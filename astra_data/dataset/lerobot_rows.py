@@ -54,7 +54,7 @@ class Rows:
             elif name in (*ENDS, names.DONE):
                 sources.update(ENDS)
             elif name == names.SUCCESS:
-                sources.update((name, names.TERMINATED))
+                sources.update((name, names.TERMINATED, names.DONE))
             elif name == RECORDED_TASK:
                 sources.add(names.TASK_INDEX)
             elif name not in names.RESERVED:
@@ -102,7 +102,8 @@ class Rows:
         if not self.dropped or names.SUCCESS not in self.stored:
             return False
         successes = run.columns[names.SUCCESS] != 0
-        return bool(successes[-1] and not successes[:-1].any() and not self._is_terminated(run))
+        is_handed_on = self._ends_with(names.TERMINATED, run) or self._ends_with(names.DONE, run)
+        return bool(successes[-1] and not successes[:-1].any() and not is_handed_on)
 
     def lost_reward(self, run: Run) -> float:
         """Return the reward of the row that is left out."""
@@ -116,20 +117,26 @@ class Rows:
         terminated, truncated = (
             run.columns[name][:steps] != 0 if name in self.stored else np.zeros(steps, bool) for name in ENDS
         )
-        terminated[-1] |= self._is_terminated(run)
+        terminated[-1] |= self._ends_with(names.TERMINATED, run)
         truncated[-1] |= not terminated[-1]
         return terminated, truncated
 
     def _successes(self, run: Run, steps: int) -> Array:
-        """Return which steps succeeded, (T,); the last takes over what a terminated row left out says."""
+        """Return which steps succeeded, (T,).
+
+        The last takes over the success of a row left out that is done; of a terminated one, also its failure.
+        """
         stored = run.columns[names.SUCCESS] != 0
         success: Array = stored[:steps].copy()
-        if self._is_terminated(run):
+        if self._ends_with(names.TERMINATED, run):
             success[-1] = stored[-1]
+        elif self._ends_with(names.DONE, run):
+            success[-1] |= stored[-1]
         return success
 
-    def _is_terminated(self, run: Run) -> bool:
-        return names.TERMINATED in self.stored and bool(run.columns[names.TERMINATED][-1])
+    def _ends_with(self, flag: str, run: Run) -> bool:
+        """Whether the last row of an episode has this flag, (T,)."""
+        return flag in self.stored and bool(run.columns[flag][-1].all())
 
 
 @dataclass(frozen=True)

@@ -96,10 +96,12 @@ def test_next_states_are_those_of_the_following_rows(arm: Dataset) -> None:
         expected = values("arm", number)
         np.testing.assert_array_equal(episode.columns[STATE], expected[STATE][:-1])
         np.testing.assert_array_equal(episode.columns[NEXT_STATE], expected[STATE][1:])
-        for name in (ACTION, REWARD, SUCCESS):
+        for name in (ACTION, REWARD):
             np.testing.assert_array_equal(episode.columns[name], expected[name][:-1])
         np.testing.assert_array_equal(episode.columns["force"], expected["force"][:-1].astype(np.float32))
         last = np.arange(len(episode)) == len(episode) - 1
+        # The row that is left out is done: the step before takes over its success.
+        np.testing.assert_array_equal(episode.columns[SUCCESS], last & expected[SUCCESS][-1])
         assert not episode.columns[TERMINATED].any()
         np.testing.assert_array_equal(episode.columns[TRUNCATED], last)
         np.testing.assert_array_equal(episode.columns[DONE], last)
@@ -127,9 +129,21 @@ def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.Log
     assert line.endswith("left out, because they are not lists of numbers: observation.images.top")
     assert "\n" not in line
     assert caplog.records[0].levelno == logging.WARNING
-    assert "3 of these last rows are the only ones that succeeded, so next.success is lost" in line
+    assert "succeeded" not in line
     reward = sum(float(values("arm", number)[REWARD][-1]) for number in range(4))
     assert f"with the last rows a reward of {reward:g} in sum is left out" in line
+
+
+def test_a_success_that_no_step_takes_over_is_told_with_what_to_do(
+    recorded: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(recorded / "arm", tmp_path / "set")
+    alter_rows(tmp_path / "set" / DATA, DONE, dict.fromkeys(range(20), False))
+    arm = Dataset.open(tmp_path / "set")
+    [line] = caplog.messages
+    assert "3 of these last rows are the only ones that succeeded, so next.success is lost" in line
+    assert "is lost unless next.done or next.terminated is set there" in line
+    assert not arm.columns([SUCCESS])[SUCCESS].any()
 
 
 def test_lineage_names_what_was_read_by_its_hash(arm: Dataset, tmp_path: Path) -> None:

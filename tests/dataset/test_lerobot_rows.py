@@ -77,6 +77,12 @@ def test_a_terminated_row_that_is_left_out_hands_its_flags_to_the_step_before() 
     cut_off: dict[str, Array] = {names.TERMINATED: np.zeros(STEPS, bool), names.SUCCESS: last}
     assert values(names.SUCCESS, "bool", more=cut_off).tolist() == [False, False, False]
     assert values(names.SUCCESS, "bool", more={names.SUCCESS: last}).tolist() == [False, False, False]
+    done = {names.DONE: last, names.SUCCESS: last}
+    assert values(names.SUCCESS, "bool", more=done).tolist() == [False, False, True]
+    assert values(names.SUCCESS, "bool", more=cut_off | done).tolist() == [False, False, True]
+    assert values(names.TERMINATED, "bool", more=done).tolist() == [False, False, False]
+    earlier = {names.DONE: last, names.SUCCESS: failed[names.SUCCESS]}
+    assert values(names.SUCCESS, "bool", more=earlier).tolist() == [False, False, True]
     with_next = over | {names.NEXT_STATE: np.ones((STEPS, 2), np.float32)}
     assert values(names.SUCCESS, "bool", more=with_next).tolist() == [False, False, False, True]
 
@@ -93,6 +99,8 @@ def test_only_the_columns_that_are_needed_are_read() -> None:
     assert read("force") == {"force"}
     rows, _ = rows_and_run({names.TERMINATED: np.zeros(STEPS), names.SUCCESS: np.zeros(STEPS)})
     assert read(names.SUCCESS) == {names.SUCCESS, names.TERMINATED}
+    rows, _ = rows_and_run({names.DONE: np.zeros(STEPS), names.SUCCESS: np.zeros(STEPS)})
+    assert read(names.SUCCESS) == {names.SUCCESS, names.DONE}
     rows, _ = rows_and_run({names.TERMINATED: np.zeros(STEPS), names.TRUNCATED: np.zeros(STEPS)})
     assert read(names.TERMINATED) == read(names.DONE) == {names.TERMINATED, names.TRUNCATED}
 
@@ -106,11 +114,13 @@ def test_columns_of_ours_have_our_types() -> None:
     assert RECORDED_TASK in {column.name for column in our_columns(recorded, has_tasks=True)}
 
 
-def test_a_success_of_the_row_that_is_left_out_is_lost_unless_it_terminated() -> None:
+def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_over() -> None:
     last = np.arange(STEPS) == STEPS - 1
     for more, lost in (
         ({names.SUCCESS: last}, True),
         ({names.SUCCESS: last, names.TERMINATED: last}, False),
+        ({names.SUCCESS: last, names.DONE: last}, False),
+        ({names.SUCCESS: last, names.DONE: np.zeros(STEPS, bool)}, True),
         ({names.SUCCESS: np.ones(STEPS, bool)}, False),
         ({names.SUCCESS: last, names.NEXT_STATE: np.ones((STEPS, 2), np.float32)}, False),
         ({}, False),
