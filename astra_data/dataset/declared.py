@@ -51,6 +51,12 @@ def name_of(folder: Path) -> str:
     return name.lstrip("-._") or "repaired"
 
 
+def robot_of(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what info.json says of the robot, as the environment of a dataset of ours."""
+    robot = info.get("robot_type")
+    return {"robot_type": robot} if isinstance(robot, str) else {}
+
+
 def _labels(labels: object, size: int) -> list[str] | None:
     """Return a name per value, where `labels` has them: as a list, or a list within an object."""
     if isinstance(labels, dict) and len(labels) == 1:

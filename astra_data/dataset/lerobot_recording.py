@@ -18,10 +18,10 @@ from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
-from astra_data.dataset.declared import declared_columns, name_of
+from astra_data.dataset.declared import declared_columns, name_of, robot_of
 from astra_data.dataset.description import ContentHash, complete_description, permutation
 from astra_data.dataset.digests import Digests, digests_of
-from astra_data.dataset.lerobot_rows import ENDS, RecordedFiles, Rows, our_columns
+from astra_data.dataset.lerobot_rows import ENDS, RecordedFiles, Rows, lacking, our_columns
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.plain import (
     Run,
@@ -38,7 +38,7 @@ MOST_FAULTS = 8
 _log = logging.getLogger(__name__)
 
 
-class _Found(NamedTuple):
+class Found(NamedTuple):
     """An episode in the files."""
 
     uid: int
@@ -67,10 +67,7 @@ def open_recording(root: Path) -> Contents:
             "lerobot's convert_dataset_v21_to_v30"
         )
     stored, specs, fps = declared_columns(root, info)
-    sizes = {spec.name: spec.size for spec in specs}
-    missing = [name for name in (names.STATE, names.ACTION) if name not in sizes]
-    missing += [f"{name} of a single number" for name in (names.REWARD, *ENDS) if sizes.get(name, 1) > 1]
-    if missing:
+    if missing := lacking(specs):
         raise BadInputError(
             f"{root}, recorded by LeRobot, has no {' and no '.join(missing)}: expected lists of numbers "
             "for the state and the action, and one number for a reward or flag"
@@ -81,16 +78,15 @@ def open_recording(root: Path) -> Contents:
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
-    _announce(root, info, rows, episodes, [*sizes, *names.RESERVED])
+    _announce(root, info, rows, episodes, [*(spec.name for spec in specs), *names.RESERVED])
     uids = [episode.uid for episode in kept]
     lengths = np.array([episode.steps for episode in kept])
     first, last = episodes[0], episodes[-1]
-    robot = info.get("robot_type")
     description = {
         "name": name_of(root),
         "stage": "record",
         "config": {"codebase_version": version},
-        "environment": {"robot_type": robot} if isinstance(robot, str) else {},
+        "environment": robot_of(info),
     }
     order = {uid: index for index, uid in enumerate(uids)}
     stored_columns = layout.stored_columns(columns)
@@ -123,12 +119,12 @@ def open_recording(root: Path) -> Contents:
 
 def _survey(
     root: Path, rows: Rows, columns: list[Column], tasks: Mapping[int, str], info: Mapping[str, Any]
-) -> tuple[list[_Found], str, Digests]:
+) -> tuple[list[Found], str, Digests]:
     """Read every value once; return all episodes, and hash and digests of what becomes ours."""
     stored = list(rows.stored.values())
     specs = layout.stored_columns(columns)
     ends = [name for name in (*ENDS, names.EPISODE_INDEX) if name in rows.stored]
-    found: list[_Found] = []
+    found: list[Found] = []
     faults: list[str] = []
     parts: dict[str, list[NDArray[np.uint64]]] = {spec.name: [] for spec in specs}
     content, row, kept, steps = ContentHash(), 0, 0, 0
@@ -139,8 +135,7 @@ def _survey(
         if len(faults) >= MOST_FAULTS:
             break
         uid = int(run.columns.get(names.EPISODE_UID, run.columns[names.EPISODE_INDEX])[0])
-        lost = rows.lost_success(run), rows.lost_reward(run)
-        episode = _Found(uid, row, len(run) - rows.dropped, _facts(run, tasks), *lost)
+        episode = found_in(run, rows, tasks, row=row, uid=uid)
         found.append(episode)
         row += len(run)
         if not episode.steps:
@@ -168,6 +163,12 @@ def _survey(
     return found, content.hexdigest(), digests
 
 
+def found_in(run: Run, rows: Rows, tasks: Mapping[int, str], *, row: int, uid: int) -> Found:
+    """Return the episode of the rows `run`, which begins in the given row of the files."""
+    lost = rows.lost_success(run), rows.lost_reward(run)
+    return Found(uid, row, len(run) - rows.dropped, _facts(run, tasks), *lost)
+
+
 def _facts(run: Run, tasks: Mapping[int, str]) -> dict[str, Scalar]:
     """Return the metadata of an episode, of all its rows."""
     facts: dict[str, Scalar] = {}
@@ -178,19 +179,16 @@ def _facts(run: Run, tasks: Mapping[int, str]) -> dict[str, Scalar]:
     return facts
 
 
-def _announce(
-    root: Path, info: Mapping[str, Any], rows: Rows, episodes: Sequence[_Found], known: Collection[str]
-) -> None:
-    """Say in one line what is left out."""
-    parts = []
-    if rows.dropped:
-        total = episodes[-1].first_row + episodes[-1].steps + 1
-        parts.append(
-            f"next states are those of the following rows, which leaves out the last row of each episode, "
-            f"{len(episodes)} of {total} rows"
-        )
-    single = sum(not episode.steps for episode in episodes)
-    if single:
+def left_out(rows: Rows, episodes: Sequence[Found]) -> list[str]:
+    """Say what is left out with the last rows of the episodes."""
+    if not rows.dropped:
+        return []
+    total = sum(episode.steps + rows.dropped for episode in episodes)
+    parts = [
+        f"next states are those of the following rows, which leaves out the last row of each episode, "
+        f"{len(episodes)} of {total} rows"
+    ]
+    if single := sum(not episode.steps for episode in episodes):
         parts.append(f"{single} of them in episodes of a single row")
     if lost := sum(episode.lost_success for episode in episodes):
         parts.append(
@@ -199,6 +197,14 @@ def _announce(
         )
     if reward := sum(episode.lost_reward for episode in episodes):
         parts.append(f"with the last rows a reward of {reward:g} in sum is left out")
+    return parts
+
+
+def _announce(
+    root: Path, info: Mapping[str, Any], rows: Rows, episodes: Sequence[Found], known: Collection[str]
+) -> None:
+    """Say in one line what is left out."""
+    parts = left_out(rows, episodes)
     others = sorted(info["features"].keys() - set(known))
     if others:
         parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")

@@ -20,7 +20,7 @@ RECORDED_TASK = "recorded.task_index"
 """(T,) int64: LeRobot's task_index, where there are several tasks."""
 ENDS = (names.TERMINATED, names.TRUNCATED)
 _FLOATS = (names.STATE, names.NEXT_STATE, names.GOAL, names.ACTION, names.REWARD)
-_FLAGS = (*ENDS, names.DONE, names.SUCCESS)
+FLAGS = (*ENDS, names.DONE, names.SUCCESS)
 DERIVED_FLAGS = (
     Column(names.TERMINATED, "bool", meaning="the recording does not tell: never set"),
     Column(names.TRUNCATED, "bool", meaning="the recording of the episode ends"),
@@ -136,7 +136,7 @@ class Rows:
 
     def _ends_with(self, flag: str, run: Run) -> bool:
         """Whether the last row of an episode has this flag, (T,)."""
-        return flag in self.stored and bool(run.columns[flag][-1].all())
+        return flag in self.stored and bool(run.columns[flag][-1])
 
 
 @dataclass(frozen=True)
@@ -187,6 +187,15 @@ class RecordedFiles:
             yield {spec.name: self.rows.values(spec, run, *place) for spec in specs}
 
 
+def lacking(recorded: Iterable[Column]) -> list[str]:
+    """Say what columns of a recording lack without which its rows do not become ours."""
+    sizes = {column.name: column.size for column in recorded}
+    missing = [name for name in (names.STATE, names.ACTION) if name not in sizes]
+    return missing + [
+        f"{name} of a single number" for name in (names.REWARD, *FLAGS) if sizes.get(name, 1) > 1
+    ]
+
+
 def our_columns(recorded: Iterable[Column], *, has_tasks: bool) -> list[Column]:
     """Return the columns of the dataset, from those of the recording that are not LeRobot's own."""
     columns = {column.name: _typed(column) for column in recorded}
@@ -201,6 +210,6 @@ def next_state_of(state: Column) -> Column:
 
 
 def _typed(column: Column) -> Column:
-    if column.name in (*_FLOATS, *_FLAGS):
+    if column.name in (*_FLOATS, *FLAGS):
         return replace(column, dtype="float32" if column.name in _FLOATS else "bool")
     return column

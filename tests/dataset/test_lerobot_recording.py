@@ -203,6 +203,32 @@ def test_the_commands_take_it(recorded: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(columns["abstract.simulated_next_state"], expected, rtol=1e-6)
 
 
+def test_repaired_it_is_as_it_was_opened(arm: Dataset, recorded: Path, tmp_path: Path) -> None:
+    notes = repair(arm.root, out=tmp_path / "whole").notes
+    whole = Dataset.open(tmp_path / "whole")
+    assert (whole.content_hash, whole.schema, whole.task) == (arm.content_hash, arm.schema, arm.task)
+    assert (whole.uids.tolist(), whole.metadata) == (arm.uids.tolist(), arm.metadata)
+    assert whole.description["environment"] == {"robot_type": "so101"}
+    [note] = [note for note in notes if note.startswith("next states are those of the following rows")]
+    assert "the last row of each episode, 4 of 20 rows; 1 of them in episodes of a single row" in note
+    assert check(whole.root).faults == []
+
+
+def test_what_is_whole_of_it_is_paired_and_merged(recorded: Path, tmp_path: Path) -> None:
+    """A frame of its third episode is NaN."""
+    shutil.copytree(recorded / "arm", tmp_path / "broken")
+    alter_rows(tmp_path / "broken" / DATA, ACTION, {10: [float("nan"), 0.0]})
+    repair(tmp_path / "broken", out=tmp_path / "repaired")
+    (tmp_path / "glider.py").write_text(GLIDER)
+    pairs, simulator = tmp_path / "pairs", f"{tmp_path / 'glider.py'}:Glider"
+    command = ["pair", str(tmp_path / "repaired"), "--simulator", simulator, "--out", str(pairs)]
+    result = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert Dataset.open(pairs).lengths.tolist() == [5, 3]
+    parts = [Dataset.open(recorded / "arm"), Dataset.open(tmp_path / "repaired")]
+    assert Dataset.open(merge(parts, new_uids=True, out=tmp_path / "all")).lengths.tolist() == [5, 8, 3, 5, 3]
+
+
 def test_it_is_grounded(recorded: Path, tmp_path: Path) -> None:
     from small_run import GROUND  # noqa: PLC0415 - torch
 

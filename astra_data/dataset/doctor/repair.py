@@ -10,8 +10,8 @@ import numpy as np
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
-from astra_data.dataset.columns import Episode, Scalar
-from astra_data.dataset.declared import DTYPES, declared_columns, name_of
+from astra_data.dataset.columns import Array, Column, Episode, Scalar
+from astra_data.dataset.declared import DTYPES, declared_columns, name_of, robot_of
 from astra_data.dataset.digests import Digests, read_digests
 from astra_data.dataset.doctor.joining import Joined, join
 from astra_data.dataset.doctor.salvage import whole_runs
@@ -23,10 +23,13 @@ from astra_data.dataset.format import (
     SUBSETS_PATH,
     TASKS_PATH,
 )
+from astra_data.dataset.lerobot_recording import Found, found_in, left_out
+from astra_data.dataset.lerobot_rows import Rows, lacking, our_columns
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.opening import refuse_run
 from astra_data.dataset.plain import (
     PlainColumn,
+    Run,
     read_object,
     read_small_table,
     read_tasks,
@@ -68,7 +71,8 @@ def repair(
 
     Episodes with wrong values, or with other values than were written, are left out, and all that follow once
     it is unclear where episodes begin, or a file cannot be read. Data files without a footer, which a killed
-    writer leaves, are read page by page. Statistics and meta/episodes are rebuilt.
+    writer leaves, are read page by page. Statistics and meta/episodes are rebuilt. What LeRobot recorded
+    without next states becomes what `Dataset.open` makes of it.
 
     Args:
         folder: the damaged dataset; it is not changed.
@@ -98,8 +102,11 @@ def repair(
         raise BadInputError(
             f"{folder} has no column {names.EPISODE_UID}, by which it joins {first.reference}"
         )
-    result = Repaired(notes=_conversions(info, columns))
     tasks = read_tasks(folder)
+    rows = _recorded_rows(folder, columns, specs, fps)
+    if rows:
+        specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
+    result = Repaired(notes=_conversions(info, columns, specs))
     if isinstance(tasks, str):
         result.notes.append(f"{TASKS_PATH} {tasks}: the task is unknown")
         tasks = {}
@@ -108,7 +115,7 @@ def repair(
     altered = set(_altered_files(folder, old, result.notes))
     digests = _digests(folder, old, columns, result.notes) if first is None else {}
     metadata = _metadata(folder, altered, result.notes) if first is None else {}
-    description = _description(folder, sources, old)
+    description = _description(folder, info, sources, old)
     unknown = 0
     task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
     seed = _subset_seed(folder, altered) if first is None else first.subset_seed
@@ -118,11 +125,10 @@ def repair(
         joined = join(((uid, run.columns) for uid, run in whole([])), specs, sources)
         renamed = sum("merged_uid" in episode.metadata for episode in joined)
         result.notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
+    recorded: list[Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     with DatasetWriter(out, specs, fps=fps, task=task, description=description, subset_seed=seed) as writer:
         for number, (uid, run) in enumerate(whole(result.notes)):
-            with np.errstate(over="ignore"):  # what is too large for its type is refused below
-                values = {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
             known = joined[number] if joined else Joined(uid, {}, is_known=False)
             if first is None:
                 known = Joined(known.uid, metadata.get(uid, {}) | known.metadata, uid in metadata)
@@ -133,16 +139,25 @@ def repair(
                 )
                 continue
             facts = known.metadata
+            if rows:
+                found = found_in(run, rows, tasks, row=0, uid=uid)
+                recorded.append(found)
+                if not found.steps:
+                    continue
+                facts |= found.metadata
             if len(tasks) > 1:
                 facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
             try:
-                writer.add(Episode(known.uid, values, facts))
+                episode = Episode(known.uid, _values(specs, run, rows, uid), facts)
+                writer.add(episode)
             except BadInputError as error:
                 result.notes.append(f"left out the episode of uid {uid}: {error}")
                 continue
             unknown += not known.is_known
             result.episodes += 1
-            result.frames += len(run)
+            result.frames += len(episode)
+        if rows and recorded:
+            result.notes.append("; ".join(left_out(rows, recorded)))
         counted = info.get("total_episodes")
         if isinstance(counted, int) and counted > result.episodes:
             lost = counted - result.episodes
@@ -166,13 +181,33 @@ def repair(
     return result
 
 
-def _conversions(info: Mapping[str, Any], columns: Sequence[PlainColumn]) -> list[str]:
+def _recorded_rows(
+    folder: Path, columns: Sequence[PlainColumn], specs: Sequence[Column], fps: int
+) -> Rows | None:
+    """Return how rows become ours that LeRobot recorded without next states, None for other datasets."""
+    rows = Rows({column.name: column for column in columns}, fps)
+    is_ours = names.EPISODE_UID in rows.stored or (folder / "meta/astra").is_dir()
+    return None if is_ours or not rows.dropped or lacking(specs) else rows
+
+
+def _values(specs: Sequence[Column], run: Run, rows: Rows | None, uid: int) -> dict[str, Array]:
+    """Return the columns `specs` of an episode; the writer refuses what is too large for its type."""
+    if rows:
+        return {spec.name: rows.values(spec, run, 0, 0, uid) for spec in specs}
+    with np.errstate(over="ignore"):
+        return {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
+
+
+def _conversions(
+    info: Mapping[str, Any], columns: Sequence[PlainColumn], specs: Sequence[Column]
+) -> list[str]:
     notes = []
+    ours = {spec.name: spec.dtype for spec in specs}
     others = sorted(info["features"].keys() - {column.name for column in columns})
     if others:
         notes.append(f"left out, because they are not numeric: {', '.join(others)}")
     for column in columns:
-        kind = DTYPES[np.dtype(column.dtype).kind]
+        kind = ours.get(column.name, DTYPES[np.dtype(column.dtype).kind])
         if column.dtype != kind:
             notes.append(f"{column.name} was {column.dtype} and is now {kind}")
     return notes
@@ -223,13 +258,20 @@ def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[
     }
 
 
-def _description(folder: Path, sources: Sequence[Dataset], old: Mapping[str, Any]) -> dict[str, Any]:
+def _description(
+    folder: Path, info: Mapping[str, Any], sources: Sequence[Dataset], old: Mapping[str, Any]
+) -> dict[str, Any]:
     config = {"folder": folder.name}
     if sources:
         first, *others = sources
         return successor(first, "episodes", stage="repair", config=config, out=folder, parents=others)[0]
     if not old:
-        return {"name": name_of(folder), "stage": "repair", "config": config}
+        return {
+            "name": name_of(folder),
+            "stage": "repair",
+            "config": config,
+            "environment": robot_of(info),
+        }
     kept = {key: old[key] for key in ("name", "seeds", "environment", "simulator")}
     version = Version.parse(old["version"])
     parent = {"name": old["name"], "version": old["version"], "hash": old["content_hash"]}

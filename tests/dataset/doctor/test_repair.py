@@ -16,10 +16,11 @@ from fake_dataset import DESCRIPTION, LENGTHS, fake_episodes, write_fake
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset
-from astra_data.dataset.columns import DONE, REWARD, TERMINATED, TRUNCATED
+from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, METADATA_PATH, POLICY_PATH, SUBSETS_PATH
+from astra_data.dataset.lerobot_rows import RECORDED_TASK
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,16 @@ def assert_saved(root: Path, episodes: int) -> None:
     assert saved.uids.tolist() == list(range(episodes))
     for number, episode in enumerate(saved.episodes()):
         assert episode.metadata["task"] == killed_lerobot.task(number)
-        expected = killed_lerobot.values(number)
+        recorded = killed_lerobot.values(number)
+        last = np.arange(len(episode)) == len(episode) - 1
+        expected = {name: values[:-1] for name, values in recorded.items()} | {
+            NEXT_STATE: recorded[STATE][1:],
+            TERMINATED: np.zeros(len(episode), bool),
+            TRUNCATED: last,
+            DONE: last,
+            RECORDED_TASK: np.full(len(episode), number % 2),
+        }
+        assert len(episode) == killed_lerobot.length(number) - 1
         assert episode.columns.keys() == expected.keys()
         for name, values in expected.items():
             kept = values.astype(np.float32) if values.dtype == np.float64 else values
@@ -66,7 +76,7 @@ def test_every_saved_episode_of_a_killed_writer_is_recovered(
     repaired = repair(killed / case, out=tmp_path / "saved")
     assert (repaired.episodes, repaired.frames) == (
         episodes,
-        sum(map(killed_lerobot.length, range(episodes))),
+        sum(map(killed_lerobot.length, range(episodes))) - episodes,  # the last have no next state
     )
     assert "force was float64 and is now float32" in repaired.notes
     assert not [note for note in repaired.notes if "lost" in note]
