@@ -43,8 +43,8 @@ class Planar:
             ", ".join(field.short for field in fields)
             for fields in ((*self.position, *self.heading), self.logs.of("command"))
         )
-        doubt = f"; {self._doubt} (CHECK)" if self._doubt else ""
-        return f"a {self.called}: {moved}, driven by {commands}{doubt}"
+        guess = f"; {self._guess} (CHECK)" if self._guess else ""
+        return f"a {self.called}: {moved}, driven by {commands}{guess}"
 
     @property
     def names(self) -> tuple[str, str, str]:
@@ -55,11 +55,11 @@ class Planar:
     @property
     def meanings(self) -> list[str]:
         """What each command is: "turn" for a rate of turning, and for others names of speeds."""
-        turn = self._told_turn or self.logs.of("command")[1]
+        turn = self._known_turn or self.logs.of("command")[1]
         return ["turn" if field == turn else "speed" for field in self.logs.of("command")]
 
     @property
-    def _told_turn(self) -> Field | None:
+    def _known_turn(self) -> Field | None:
         """The command of turning by its name, or as the only one in rad/s; None where nothing says so."""
         commands = self.logs.of("command")
         named = [field for field in commands if field.is_turn_rate or _TURNS.fullmatch(field.short)]
@@ -68,9 +68,9 @@ class Planar:
         return found[0] if found else None
 
     @property
-    def _doubt(self) -> str:
+    def _guess(self) -> str:
         """What was taken for what without a reason; nothing where there was one."""
-        if self._told_turn:
+        if self._known_turn:
             return ""
         return f"took {self.logs.of('command')[1].short} for a turn rate: nothing says so"
 
@@ -132,7 +132,7 @@ class Planar:
             "robot": self.called.title().replace(" ", ""),
             "abstraction": abstraction,
             "commands": ", ".join(self.meanings),
-            "doubt": f"  # CHECK: {self._doubt}" if self._doubt else "",
+            "guess": f"  # CHECK: {self._guess}" if self._guess else "",
             "along": f"\n        {along}" if along else "",
             "seen": "east, north" if is_in_world else seen,
             "seen_from": "from where the robot is" if is_in_world else "as the robot sees it",
