@@ -195,8 +195,8 @@ def _among_neighbours(path: Path) -> Iterator[None]:
         sys.path.reverse()
         sys.path.remove(f"{folder}")  # the last, which is ours
         sys.path.reverse()
-        if f"{folder}" not in sys.path:
-            sys.path.append(f"{folder}")  # what is imported later, too
+    if f"{folder}" not in sys.path:
+        sys.path.append(f"{folder}")  # what is imported later, too, unless the file failed
 
 
 def _folder_of(module: ModuleType) -> Path | None:

@@ -91,6 +91,21 @@ def test_each_file_imports_those_beside_it(tmp_path: Path, monkeypatch: pytest.M
     assert sys.modules["own_facts"].VALUE == 1  # what was imported first stays so for all else
 
 
+def test_a_file_that_failed_hides_no_neighbours_of_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for folder, text in (("a", "VALUE = 1"), ("b", "1 / 0"), ("c", "from own_pose import HERE as VALUE")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text(text)
+    for folder in "ac":
+        (tmp_path / folder / "own_pose.py").write_text(f"HERE = {folder!r}")
+    assert own_object(f"{tmp_path}/a/mine.py:VALUE") == 1
+    with pytest.raises(BadInputError, match="ZeroDivisionError"):
+        own_object(f"{tmp_path}/b/mine.py:VALUE")
+    assert own_object(f"{tmp_path}/c/mine.py:VALUE") == "c"
+
+
 def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text("import sys\nfrom pathlib import Path\nTASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
