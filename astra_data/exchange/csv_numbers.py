@@ -77,8 +77,9 @@ def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:
 
 
 def plain_name(name: str) -> str:
-    """Return a field's name in small letters, digits and single underscores; ° is deg."""
-    return re.sub(r"[^a-z0-9]+", "_", name.lower().replace("°", " deg ")).strip("_")
+    """Return a field's name in small letters, digits and single underscores; ° is deg, and ² and ^2 are 2."""
+    spelled = name.lower().replace("°", " deg ").replace("²", "2").replace("^", "")
+    return re.sub(r"[^a-z0-9]+", "_", spelled).strip("_")
 
 
 def _no_number(values: Sequence[str]) -> tuple[int, str] | None:
