@@ -8,9 +8,10 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from astra_data.exchange.field_names import HEADING, LENGTH
+from astra_data.exchange.field_names import LENGTH
 from astra_data.exchange.logs import Field, Floats, Logs
 from astra_data.experiments.kind_errors import errors
+from astra_data.experiments.planar_heading import Heading
 from astra_data.experiments.written_values import numbers, typical
 
 _TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|(?<!th)rot|steer).*")
@@ -25,12 +26,12 @@ class Planar:
 
     Attributes:
         logs: what was recorded.
-        position: x and y. heading: an angle, or its cosine and sine.
+        position: x and y. heading: of any form.
     """
 
     logs: Logs
     position: tuple[Field, Field]
-    heading: tuple[Field, ...]
+    heading: Heading
 
     template = "planar.py"
     angles = (False, False, True)
@@ -41,7 +42,7 @@ class Planar:
         """What it is and what moves it, in a few words."""
         moved, commands = (
             ", ".join(field.short for field in fields)
-            for fields in ((*self.position, *self.heading), self.logs.of("command"))
+            for fields in ((*self.position, *self.heading.fields), self.logs.of("command"))
         )
         guess = f"; {self._guess} (CHECK)" if self._guess else ""
         return f"a {self.called}: {moved}, driven by {commands}{guess}"
@@ -49,8 +50,8 @@ class Planar:
     @property
     def names(self) -> tuple[str, str, str]:
         """What x, y and the angle are called in the logs."""
-        x, y, heading = (field.short for field in (*self.position, self.heading[0]))
-        return x, y, heading if len(self.heading) == 1 else heading.removesuffix("_x")
+        x, y = self.position
+        return x.short, y.short, self.heading.name
 
     @property
     def meanings(self) -> list[str]:
@@ -84,10 +85,8 @@ class Planar:
 
     def states(self) -> list[Floats]:
         """Return x, y and the angle of the heading (T, 3) of each episode."""
-        poses = self.logs.values((*self.position, *self.heading))
-        if len(self.heading) == 1:
-            return poses
-        return [np.column_stack([pose[:, :2], np.arctan2(pose[:, 3], pose[:, 2])]) for pose in poses]
+        poses = self.logs.values((*self.position, *self.heading.fields))
+        return [np.column_stack([pose[:, :2], self.heading.angle(pose[:, 2:])]) for pose in poses]
 
     def step(self, state: Floats, command: Floats) -> Floats:
         """Return where x, y and the angle (B, 3) land by commands (B, A)."""
@@ -110,16 +109,9 @@ class Planar:
     def values(self) -> dict[str, str]:
         """Return what its templates name."""
         order = {field.name: number for number, field in enumerate(self.logs.of("state"))}
-        indices = [order[field.name] for field in (*self.position, *self.heading)]
-        if len(self.heading) == 2:
-            abstraction = f"return state[..., {indices}]"
-        else:
-            x, y, yaw = (f"state[..., {index}]" for index in indices)
-            library = "np if isinstance(state, np.ndarray) else torch"
-            abstraction = (
-                f"of, yaw = {library}, {yaw}\n"
-                f"        return of.stack([{x}, {y}, of.cos(yaw), of.sin(yaw)], -1)"
-            )
+        position, heading = (
+            [order[field.name] for field in fields] for fields in (self.position, self.heading.fields)
+        )
         poses = self.states()
         starts = np.array([pose[0] for pose in poses])
         goal, close = typical([pose[:, :2] for pose in poses], self.logs.failed)
@@ -130,7 +122,7 @@ class Planar:
         return {
             "called": self.called,
             "robot": self.called.title().replace(" ", ""),
-            "abstraction": abstraction,
+            "abstraction": self.heading.abstraction(position, heading),
             "commands": ", ".join(self.meanings),
             "guess": f"  # CHECK: {self._guess}" if self._guess else "",
             "along": f"\n        {along}" if along else "",
@@ -258,19 +250,13 @@ class Holonomic(Planar):
         return f"east, north = forward * {cos} - left * {sin}, forward * {sin} + left * {cos}"
 
 
-def _pose(logs: Logs) -> tuple[tuple[Field, Field], tuple[Field, ...]] | None:
-    """Return the fields of a position that moves and of a heading; None if one is missing."""
+def _pose(logs: Logs) -> tuple[tuple[Field, Field], Heading] | None:
+    """Return the fields of a position that moves, and the heading; None if one is missing."""
     states = {field.short: field for field in logs.of("state")}
     for short, x in states.items():
         y = states.get(f"{short[:-1]}y")
-        if short[-1] != "x" or y is None or not LENGTH.fullmatch(short) or not _moves(logs, (x, y)):
-            continue
-        angles = [name for name in states if HEADING.fullmatch(name)]
-        pairs = [name[:-2] for name in states if HEADING.fullmatch(name[:-2]) and name.endswith("_x")]
-        names = [f"{pairs[0]}_x", f"{pairs[0]}_y"] if pairs else angles[:1]
-        return (
-            ((x, y), tuple(states[name] for name in names)) if names and set(names) <= set(states) else None
-        )
+        if short[-1] == "x" and y is not None and LENGTH.fullmatch(short) and _moves(logs, (x, y)):
+            return ((x, y), heading) if (heading := Heading.of(states)) else None
     return None
 
 

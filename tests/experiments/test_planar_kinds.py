@@ -65,6 +65,27 @@ def test_a_base_that_drives_sideways_is_stepped_as_it_was_driven(tmp_path: Path,
     import_dataset([log, tmp_path / "again.csv"], tmp_path / "mecanum/logs.toml", out=tmp_path / "data")
 
 
+@pytest.mark.parametrize("axes", ["xyzw", "zw", "wz"])
+def test_a_base_whose_heading_is_a_quaternion_is_stepped_as_it_was_driven(tmp_path: Path, axes: str) -> None:
+    poses, commands = drive()
+    half = poses[:, 2] / 2
+    tilt = 1e-5 * np.sin(np.arange(len(half)))  # of a floor that is nearly flat
+    part = {"x": tilt, "y": -tilt, "z": np.sin(half), "w": np.cos(half)}
+    names = ["cmd_vx", "cmd_vy", "cmd_wz", *(f"orientation.{axis}" for axis in axes), "x", "y"]
+    quaternion = np.column_stack([part[axis] for axis in axes])
+    log = write(tmp_path / "log.csv", names, commands, quaternion, poses[:, :2])
+    kind = write_robot("mecanum", tmp_path / "mecanum", [log])
+    assert isinstance(kind, Planar) and kind.names == ("x", "y", "yaw")
+    np.testing.assert_allclose(kind.step(poses[:-1], commands[:-1])[:, :2], poses[1:, :2], atol=1e-6)
+    task = task_named(f"{tmp_path}/mecanum/mecanum.py:TASK")
+    assert check_task(task) == []
+    states = np.column_stack([quaternion, poses[:, :2]])
+    pose = np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    np.testing.assert_allclose(task.abstraction(states), pose, atol=1e-6)
+    seen = task.abstraction(torch.from_numpy(states))
+    torch.testing.assert_close(seen, torch.from_numpy(pose), atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize(
     "names",
     [

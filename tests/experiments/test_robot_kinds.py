@@ -61,7 +61,7 @@ def test_the_second_command_turns_where_no_name_says_which(tmp_path: Path) -> No
 def test_a_unit_vector_goes_before_an_angle(tmp_path: Path) -> None:
     vector = {"heading_x": np.cos(T), "heading_y": np.sin(T)}
     kind = Planar.of(logs(tmp_path, x=T, y=T % 9, yaw=T % 3, **vector, cmd_v=T % 5, cmd_w=T % 2))
-    assert kind is not None and [field.short for field in kind.heading] == ["heading_x", "heading_y"]
+    assert kind is not None and [field.short for field in kind.heading.fields] == ["heading_x", "heading_y"]
 
 
 def test_starts_and_the_goal_are_those_of_the_episodes(tmp_path: Path) -> None:
