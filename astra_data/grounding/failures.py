@@ -16,6 +16,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
+from astra_data.learning.generators import seeded
 from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.paired_windows import RISK_STEPS, before_failures
 from astra_data.worlds.task import Task
@@ -168,8 +169,7 @@ def averages_before(
     task: Task, grounding: HistoryGrounding, failures: FailureModel, episodes: PairedEpisodes
 ) -> Tensor:
     """Return the averages that a failure model remembers before each step, (E, T, 15), as in replays."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
+    with seeded(0, episodes.windows.mask.device):
         after = failures.averages_of(replayed_inputs(task, grounding, failures, episodes))
     return functional.pad(after[:, :-1], (0, 0, 1, 0))
 

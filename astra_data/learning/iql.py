@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from astra_data.core.config import AtOnce, Config, Count, NotNegative, Number, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
+from astra_data.learning.generators import seed_generators
 from astra_data.learning.networks.history import mlp
 from astra_data.learning.networks.policy import Policy
 from astra_data.learning.recorded import Recorded
@@ -167,7 +168,7 @@ class Iql:
 
     def iterate(self) -> dict[str, float]:
         """Make one update and return its losses: "value" and "action_value", or the "policy"'s."""
-        _seed(derive(self.seed, f"update {self.updates}"), self._transitions.reward.device)
+        seed_generators(derive(self.seed, f"update {self.updates}"), self._transitions.reward.device)
         losses = (
             self._learn_values()
             if self.updates < self.config.critic_updates
@@ -250,13 +251,6 @@ class Iql:
         self._critic_optimizer.load_state_dict(state["critic_optimizer"])
         self._optimizer.load_state_dict(state["optimizer"])
         self.updates, self._weights = state["updates"], None
-
-
-def _seed(seed: int, device: torch.device) -> None:
-    """Seed torch's generators of the CPU and `device`; `torch.manual_seed` takes ten times as long."""
-    torch.default_generator.manual_seed(seed)
-    if device.type == "cuda":
-        torch.cuda.manual_seed(seed)
 
 
 def transitions(experience: Experience, config: IqlConfig) -> Transitions:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from astra_data.core.seeding import fresh_seed
 from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.learning.generators import seeded
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv, Step
 from astra_data.worlds.registry import task_named
@@ -72,8 +73,7 @@ class SeededSimulatorEnv:
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(self._rng.integers(2**62)))
+        with seeded(int(self._rng.integers(2**62)), torch.device("cpu")):
             return self.env.reset(mask)
 
     def step(self, action: Tensor) -> Step:

@@ -181,14 +181,16 @@ def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before() 
         torch.testing.assert_close(seen[episode, step], inputs[0], atol=1e-4, rtol=1e-4)
 
 
-def test_a_failure_model_remembers_what_a_replay_showed_it() -> None:
+def test_a_failure_model_remembers_what_a_replay_showed_it(monkeypatch: pytest.MonkeyPatch) -> None:
     episodes, used = hurried(3, 0), HistoryGrounding(grounding_model())
     windows = episodes.windows
     failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
     failures.set_move_scales(windows)
-    drawn = torch.random.get_rng_state()
+    drawn, seeds = torch.random.get_rng_state(), list[int]()
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds.append)
     averages = averages_before(TASK, used, failures, episodes)
     assert torch.equal(torch.random.get_rng_state(), drawn)
+    assert not seeds
     assert averages.shape == (3, 100, 15)
     assert not averages[:, 0].any()
     for episode, step, begun in ((1, 1, 0), (1, 60, 0), (0, 61, 20), (1, 99, 40)):

@@ -233,3 +233,11 @@ def test_a_grounded_simulator_shows_its_latents() -> None:
         np.testing.assert_allclose(np.linalg.norm(first[:, :16], axis=1), 1.0, rtol=1e-3)
         command = np.full((3, 2), 0.5, dtype=np.float32)
         first, expected = env.step(command)[0], raw.step(command)[0]
+
+
+def test_resets_leave_the_generators_of_other_devices_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds.append)
+    env = point_mazes(2, 10)
+    env.reset(seed=0)
+    assert not seeds
