@@ -68,7 +68,7 @@ class BallAgent(PlanarStates):
             maze: the walls.
             num_envs: B.
             timestep_s: control period.
-            radius_m: distance that the mass keeps from walls.
+            radius_m: distance that the mass keeps from walls, a multiple of the maze's `fine_m`.
             speed_m_s: top speed along each axis.
             reach_m: distance between the centres below which the mass touches the ball.
             knock_m_s: speed of a ball that the mass walks into.

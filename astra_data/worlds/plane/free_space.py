@@ -36,7 +36,7 @@ class FreeSpace:
 
     @classmethod
     def of_maze(cls, maze: Maze, *, radius_m: float, device: str = "cpu") -> "FreeSpace":
-        """Return the free space of a disc of `radius_m`, a multiple of the grid's cell."""
+        """Return the free space of a disc of `radius_m`, to the nearest cell of the grid."""
         reach = round(radius_m / maze.fine_m)
         square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
         blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)

@@ -5,11 +5,15 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.geometry import turned
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import VariableSimulator
 from astra_data.worlds.variation import Variation, VariedSimulator, noisy_command
+
+_CELLS_APART = 1e-6
+"""How far a radius may be from a whole number of cells, by rounding."""
 
 
 class PlanarStates:
@@ -41,10 +45,19 @@ class PlanarStates:
             maze: the walls.
             num_envs: B.
             timestep_s: control period.
-            radius_m: distance that the disc's centre keeps from walls.
+            radius_m: distance that the disc's centre keeps from walls, a multiple of the maze's `fine_m`.
             speed_m_s: top speed along each axis.
             device: torch device.
+
+        Raises:
+            BadInputError: the radius is no such multiple.
         """
+        cells = radius_m / maze.fine_m
+        if abs(cells - round(cells)) > _CELLS_APART:
+            raise BadInputError(
+                f"radius_m: expected a multiple of the maze's fine_m, {maze.fine_m} m, got {radius_m}: "
+                "take another radius, or a finer maze"
+            )
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
         self._maze, self._settles_in = maze, self.free
@@ -76,7 +89,10 @@ class PlanarStates:
             self.blocked = self.blocked.index_fill(0, rows, False)
 
     def keep_clear(self, distance_m: float) -> None:
-        """Let corrections end no closer to walls than `distance_m`; steps come as close as the disc can."""
+        """Let corrections end no closer to walls than `distance_m`, to the nearest cell of the fine grid.
+
+        Steps come as close as the disc can.
+        """
         widest = max(distance_m, self.parameters["radius_m"])
         device = str(self.state.device)
         self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=device)

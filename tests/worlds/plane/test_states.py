@@ -1,5 +1,9 @@
+from dataclasses import replace
+
+import pytest
 import torch
 
+from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.states import PlanarStates, VariedPlanar
 from astra_data.worlds.variation import BallVariation, PlanarVariation
@@ -39,6 +43,23 @@ def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
     assert torch.equal(handed_out, HERE)
     assert torch.equal(states.state[1], HERE[0] + 1.0)
     assert states.blocked.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(("fine_m", "radius_m"), [(0.25, 0.1), (0.1, 0.15), (0.1, 0.149)])
+def test_a_radius_between_the_cells_of_the_maze_is_refused(fine_m: float, radius_m: float) -> None:
+    expected = f"radius_m: expected a multiple of the maze's fine_m, {fine_m} m, got {radius_m}: take another"
+    with pytest.raises(BadInputError, match=expected):
+        PlanarStates(replace(U_MAZE, fine_m=fine_m), 1, timestep_s=0.1, radius_m=radius_m)
+
+
+@pytest.mark.parametrize(("fine_m", "radius_m"), [(0.1, 0.0), (0.1, 0.3), (0.05, 0.35), (0.25, 0.75)])
+def test_a_radius_of_whole_cells_is_kept(fine_m: float, radius_m: float) -> None:
+    class Planar(PlanarStates):
+        state_size = 4
+
+    free = Planar(replace(U_MAZE, fine_m=fine_m), 1, timestep_s=0.1, radius_m=radius_m).free
+    end, _ = free.slide(torch.tensor([[-4.0, 5.99 - radius_m]]), torch.tensor([[-4.0, 7.0]]))
+    assert float(end[0, 1]) == pytest.approx(6.0 - radius_m, abs=1e-3)
 
 
 def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() -> None:
