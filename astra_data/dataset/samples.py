@@ -159,7 +159,7 @@ class Batches:
 
 def take(values: Tensor, rows: Tensor) -> Tensor:
     """Return the rows `rows` (n,) of `values` (N, ...)."""
-    if values.is_cuda or not values.is_contiguous():
+    if values.device.type != "cpu" or not values.is_contiguous():
         return values.index_select(0, rows)
     # For many short rows numpy is faster; of an array that is not contiguous it would first copy all.
     return torch.from_numpy(values.numpy().take(rows.numpy(), axis=0))

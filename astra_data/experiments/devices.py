@@ -17,7 +17,7 @@ CUDA_JOBS = 2
 
 
 def check_device(device: str, cluster: str | None) -> None:
-    """Check that a device of torch is available, or may be on the cluster at an address.
+    """Check that the CPU or a CUDA device is available, or may be on the cluster at an address.
 
     Raises:
         BadInputError: it is not.
@@ -25,7 +25,9 @@ def check_device(device: str, cluster: str | None) -> None:
     try:
         wanted = torch.device(device)
     except RuntimeError:
-        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'") from None
+        wanted = None
+    if wanted is None or wanted.type not in {"cpu", "cuda"}:
+        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'")
     if cluster is not None:
         # Ray gives each task its own GPU, which is the only one that it sees.
         if wanted.index:

@@ -6,7 +6,7 @@ from torch.utils.data import DataLoader
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.frames import Frames, Padding
-from astra_data.dataset.samples import Order
+from astra_data.dataset.samples import Order, take
 
 
 def test_samples_come_one_by_one_too(frames: Frames) -> None:
@@ -120,3 +120,9 @@ def test_a_batch_that_there_is_not_is_refused(key: str, value: float, expected: 
 def test_an_order_without_batches_is_refused(count: int, size: int, drop_last: bool) -> None:
     with pytest.raises(BadInputError, match=f"batches of {size} out of {count} samples"):
         Order(count, size, drop_last=drop_last)
+
+
+def test_rows_are_taken_on_the_device_where_they_lie() -> None:
+    """Not only on CUDA; "meta" stands for another."""
+    taken = take(torch.empty(5, 3, device="meta"), torch.empty(2, dtype=torch.long, device="meta"))
+    assert taken.device.type == "meta" and taken.shape == (2, 3)

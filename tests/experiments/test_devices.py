@@ -8,6 +8,9 @@ from astra_data.core.errors import BadInputError
 from astra_data.experiments.devices import check_device, default_jobs, share_cores
 from astra_data.experiments.execution import Item
 
+OTHERS = ("mps", "meta", "xpu:0")
+"""Devices that torch knows, and trainings do not."""
+
 
 def threads(num_threads: int = 1) -> int:
     return num_threads
@@ -36,6 +39,8 @@ def test_items_that_step_physics_share_the_cores(monkeypatch: pytest.MonkeyPatch
     ("device", "cluster", "expected"),
     [
         ("gpu", None, "expected a device such as cpu, cuda or cuda:1, got 'gpu'"),
+        *((kind, None, f"expected a device such as cpu, cuda or cuda:1, got '{kind}'") for kind in OTHERS),
+        ("mps", "local", "expected a device such as cpu, cuda or cuda:1, got 'mps'"),
         ("cuda:7", None, "device 'cuda:7' is not available: torch finds 1 CUDA devices"),
         ("cuda:1", "local", "expected device cpu or cuda on a cluster, got 'cuda:1'"),
     ],
