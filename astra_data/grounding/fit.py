@@ -290,4 +290,4 @@ def _fit_scatter(model: GroundingModel, members: Sequence[GroundingModel], held_
         model.usual_disagreement.copy_(held_out.steps(model.disagreement(predictions)).mean())
     for member in members:
         apart = member.disagreement(torch.stack([own, corrected(member).mean(0)]))
-        member.usual_disagreement.mul_(held_out.steps(apart).mean())
+        member.usual_disagreement.copy_(held_out.steps(apart).mean())
