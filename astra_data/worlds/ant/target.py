@@ -87,7 +87,7 @@ class AntMazeEnv:
     @property
     def wall_contact(self) -> Tensor:
         """Which ants touched a wall in their last step, (B,) bool."""
-        return torch.from_numpy(self.physics.touching)
+        return torch.from_numpy(self.physics.touching.copy())
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of starts, goals and headings at `seed`."""

@@ -90,6 +90,13 @@ def test_walls_are_felt_and_the_floor_is_not() -> None:
     assert felt.tolist() == [True, True, False, False]
 
 
+def test_wall_contacts_handed_out_stay() -> None:
+    env = placed([[-4.0, 4.0]])
+    handed_out = env.wall_contact
+    env.physics.touching[:] = True
+    assert env.wall_contact.all() and not handed_out.any()
+
+
 def test_wall_contact_equals_a_search_through_all_contacts() -> None:
     env = placed([[x, 4.0] for x in (-5.5, -5.0, -4.5, -4.0)], leg_scale=1.25)
     model = ant_model(U_MAZE, leg_scale=1.25)
