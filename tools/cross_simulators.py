@@ -15,12 +15,12 @@ import typer
 from door import run_tool
 
 from astra_data.core.seeding import derive
-from astra_data.experiments.trained_policy import policy_files, settings_of
+from astra_data.experiments.trained_policy import settings_of, trained_policy
 from astra_data.grounding.files import load_grounding
 from astra_data.methods.follower import FOLLOWER, careful
 from astra_data.training.episode_record import Outcome
 from astra_data.training.own_world import Begin, in_simulator, own_world, started
-from astra_data.training.policy_file import PolicyFile, running
+from astra_data.training.policy_file import running
 from astra_data.worlds.registry import task_named
 
 
@@ -47,9 +47,9 @@ def outcomes(
 ) -> dict[tuple[str, str], Outcome]:
     """Return what came of each row's policy and of the follower in each row's simulator, by both names."""
     task = task_named(settings_of(run)["task"])
-    files = {row: policy_files(run, row, seed=seed, percent=percent) for row in rows}
-    trained = {row: PolicyFile.load(of["train"]) for row, of in files.items()}
-    groundings = {row: load_grounding(of["ground"]) for row, of in files.items()}
+    made = {row: trained_policy(run, row, seed=seed, percent=percent) for row in rows}
+    trained = {row: policy.file for row, policy in made.items()}
+    groundings = {row: load_grounding(policy.files["ground"]) for row, policy in made.items()}
     acting: dict[str, Begin] = {FOLLOWER.name: partial(careful, task)}
     for row in rows:
         policy = running(task, trained[row], groundings[row])

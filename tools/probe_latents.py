@@ -24,12 +24,11 @@ from torch import Tensor
 
 from astra_data.core.naming import seed_folder
 from astra_data.core.seeding import derive
-from astra_data.experiments.trained_policy import load_policy, policy_files, settings_of
+from astra_data.experiments.trained_policy import settings_of, trained_policy
 from astra_data.grounding.files import GROUNDING, load_grounding, load_history_model
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as
 from astra_data.training.own_world import in_simulator, own_world, started
-from astra_data.training.policy_file import PolicyFile
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import task_named
 
@@ -89,15 +88,15 @@ def _probes(run: Path, rows: list[str], seed: int, steps: int) -> None:
 
 def successes(run: Path, row: str, seed: int, where: Where, episodes: int) -> dict[str, float]:
     """Return the success of a row's policy by what its latents are altered to."""
-    deployed = load_policy(run, row, seed=seed)
+    made = trained_policy(run, row, seed=seed)
+    deployed = made.running()
     reached = {}
     for kind, alter in ALTERATIONS.items():
         altered = AlteredLatents.of(deployed, alter)
         if where is Where.TARGET:
             outcome = in_target(altered, episodes, derive(seed, "evaluation"))
         else:
-            files = policy_files(run, row, seed=seed)
-            trained, grounding = PolicyFile.load(files["train"]), load_grounding(files["ground"])
+            trained, grounding = made.file, load_grounding(made.files["ground"])
             if trained.simulation is None:
                 raise typer.BadParameter(f"{row} was not trained in a simulator")
             world = own_world(deployed.task, trained.simulation, grounding, episodes)

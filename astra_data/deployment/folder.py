@@ -16,8 +16,7 @@ from astra_data.dataset.columns import Column
 from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, TORCHSCRIPT, write_graphs
 from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.deployment.page import page
-from astra_data.experiments.trained_policy import load_policy, policy_files, task_of
-from astra_data.training.policy_file import PolicyFile
+from astra_data.experiments.trained_policy import trained_policy
 from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.own_code import file_of
 
@@ -42,10 +41,9 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
     """
     if out.exists():
         raise BadInputError(f"{out} exists already; delete it or choose another folder.")
-    deployed = load_policy(run, row, seed=seed, percent=percent)
-    made_from = policy_files(run, row, seed=seed, percent=percent)
-    digests = {stage: file_digest(path) for stage, path in made_from.items()}
-    trained = PolicyFile.load(made_from["train"])
+    trained = trained_policy(run, row, seed=seed, percent=percent)
+    deployed = trained.running()
+    digests = {stage: file_digest(path) for stage, path in trained.files.items()}
     with atomic_folder(out) as folder:
         written = write_graphs(deployed, folder)
         about = {
@@ -53,10 +51,10 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
             "row": row,
             "seed": seed,
             **({} if percent is None else {"percent": percent}),
-            "trained_on": {"dataset": trained.dataset, "hash": trained.content_hash},
+            "trained_on": {"dataset": trained.file.dataset, "hash": trained.file.content_hash},
             **describe(deployed, written.parts),
             "largest_difference": written.apart,
-            "made_from": digests | file_of(task_of(run)),
+            "made_from": digests | file_of(trained.settings["task"]),
             **origin(),
         }
         (folder / DESCRIPTION).write_text(json.dumps(about, indent=1))

@@ -53,7 +53,7 @@ def grounded(
         BadInputError: the row is not trained in a simulator, an artefact is not there, or an option does not
             fit the row or the task.
     """
-    env, _, training = _world(run, row, seed, percent, num_envs=1, **options)
+    env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=1, **options)
     return SingleEnv(SeededSimulatorEnv(env), training.simulated_steps)
 
 
@@ -71,7 +71,7 @@ def grounded_vector(
     Raises:
         BadInputError: as `grounded`.
     """
-    env, _, training = _world(run, row, seed, percent, num_envs=num_envs, **options)
+    env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=num_envs, **options)
     steps = training.simulated_steps
     return BatchedVectorEnv(SeededSimulatorEnv(env), min(steps, max_episode_steps or steps))
 
@@ -103,10 +103,10 @@ def evaluate_policy(
     Raises:
         BadInputError: as `grounded`, or the policy returns something else than actions.
     """
-    env, simulation, training = _world(run, row, seed, percent, num_envs=1)
+    settings = settings_of(run)
+    env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)
     own = OwnPolicy(policy, env.observation_size, env.action_size)
     episodes = training.episodes
-    settings = settings_of(run)
     rows = list(dict.fromkeys([*settings.get("methods", []), row]))
     tested = {"seeds": [seed]} | settings | {"methods": rows}
     evaluate = _planned(run, tested, "evaluate", row, seed, percent)
@@ -120,13 +120,14 @@ def evaluate_policy(
 
 def _world(
     run: str | Path,
+    settings: dict[str, Any],
     row: str,
     seed: int,
     percent: int | None,
     **options: Any,  # noqa: ANN401 - checked as a recipe's are
 ) -> tuple[SimulatorEnv, Simulation, Training]:
     """Return the environment that `train` builds for a row, and what it builds it from."""
-    learn = _method_of(settings_of(run), row).learn
+    learn = _method_of(settings, row).learn
     if not isinstance(learn, InSimulator):
         raise BadInputError(
             f"{row} is not trained in a simulator: expected a row that is, such as nas, or "
@@ -134,7 +135,7 @@ def _world(
         )
     if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
         raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
-    training = training_of(run, row, seed, percent, options)
+    training = _training(run, settings, row, seed, percent, options)
     return *learn.world(training), training
 
 
@@ -152,7 +153,18 @@ def training_of(
     Raises:
         BadInputError: the row trains nothing, an artefact is not there, or a change does not fit.
     """
-    settings, table = settings_of(run), "plus" if is_plus(row) else "train"
+    return _training(run, settings_of(run), row, seed, percent, changes)
+
+
+def _training(
+    run: str | Path,
+    settings: dict[str, Any],
+    row: str,
+    seed: int,
+    percent: int | None,
+    changes: Mapping[str, Any],
+) -> Training:
+    table = "plus" if is_plus(row) else "train"
     if _method_of(settings, row).learn is None:
         raise BadInputError(f"{row} trains nothing: expected a row that is trained")
     changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | dict(changes)}

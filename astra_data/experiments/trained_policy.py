@@ -1,5 +1,6 @@
 """Load a policy that a run has trained, ready to act."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,40 @@ from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.running_policy import RunningPolicy
 from astra_data.worlds.own_code import found_near
 from astra_data.worlds.registry import task_named
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A policy that a run has trained, and what goes with it.
+
+    Attributes:
+        settings: of the run's recipe, see `settings_of`. files: those that make up the policy, by the stage
+            that wrote them. file: what that of `train` holds.
+    """
+
+    settings: dict[str, Any]
+    files: dict[str, Path]
+    file: PolicyFile
+
+    def running(self) -> RunningPolicy:
+        """Return it ready to act, with its encoder if it has one."""
+        return running(
+            task_named(self.settings["task"]),
+            self.file,
+            grounding_at(self.files.get("ground")),
+            load_target_encoder(self.files["align"]) if "align" in self.files else None,
+        )
+
+
+def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> TrainedPolicy:
+    """Return the policy of a row of a run, with its files and the settings of its recipe.
+
+    Raises:
+        BadInputError: as `load_policy`.
+    """
+    settings = settings_of(run)
+    files = _files(settings, Path(run), row, seed, percent)
+    return TrainedPolicy(settings, files, PolicyFile.load(files["train"]))
 
 
 def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> RunningPolicy:
@@ -36,14 +71,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         >>> policy.start(1)
         >>> velocity = policy.command(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
     """
-    settings = settings_of(run)
-    files = _files(settings, Path(run), row, seed, percent)
-    return running(
-        task_named(settings["task"]),
-        PolicyFile.load(files["train"]),
-        grounding_at(files.get("ground")),
-        load_target_encoder(files["align"]) if "align" in files else None,
-    )
+    return trained_policy(run, row, seed=seed, percent=percent).running()
 
 
 def task_of(run: str | Path) -> str:
@@ -75,15 +103,6 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     for own in settings.get("own_methods", {}).values():
         own["method"] = found_near(own["method"], folder)
     return settings
-
-
-def policy_files(run: str | Path, row: str, *, seed: int, percent: int | None = None) -> dict[str, Path]:
-    """Return the files that make up the policy of a row, by the stage that wrote them.
-
-    Raises:
-        BadInputError: as `load_policy`.
-    """
-    return _files(settings_of(run), Path(run), row, seed, percent)
 
 
 def _files(

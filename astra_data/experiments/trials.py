@@ -13,7 +13,7 @@ from astra_data.core.manifest import read_manifest, write_manifest
 from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
 from astra_data.experiments.selecting import select
-from astra_data.experiments.trained_policy import load_policy, settings_of, task_of
+from astra_data.experiments.trained_policy import task_of, trained_policy
 from astra_data.reports.choice import SELECTED, Candidate, Judged
 from astra_data.reports.choice_page import select_page
 from astra_data.reports.halving import PSEUDO_TRIALS, halve, least_trials, widest_field
@@ -131,8 +131,8 @@ def _halve(
 
 def _try(folder: Path, row: str, seed: int, percent: int | None, trials: int, number: int) -> list[int]:
     """Return 1 or 0 for each episode of a policy in the target, deployed as `evaluate` does it."""
-    config = EvaluateConfig.model_validate(settings_of(folder).get("evaluate") or {})
-    policy = load_policy(folder, row, seed=seed, percent=percent)
+    trained = trained_policy(folder, row, seed=seed, percent=percent)
+    config, policy = EvaluateConfig.model_validate(trained.settings.get("evaluate") or {}), trained.running()
     if config.encoder == "source":
         policy = replace(policy, target_encoder=None)
     drawn = derive(number, "trials of a choice")

@@ -3,6 +3,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from astra_data.core.progress import silent
 from astra_data.deployment.folder import deploy, describe
 from astra_data.deployment.graph import load_torchscript
 from astra_data.deployment.page import page
+from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.experiments.trained_policy import load_policy
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.alignment import TargetEncoder
@@ -122,6 +124,13 @@ def test_what_is_no_policy_and_a_folder_that_exists_are_refused(run: Path, tmp_p
     with pytest.raises(BadInputError, match=r"exists already; delete it or choose another folder"):
         deploy(run, "nas", tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_record_of_a_run_is_read_once(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = Mock(wraps=recorded_settings)
+    monkeypatch.setattr("astra_data.experiments.trained_policy.recorded_settings", read)
+    deploy(run, "nas", tmp_path / "policy")
+    read.assert_called_once_with(run)
 
 
 def test_the_policy_is_that_of_the_seed_and_size_that_are_asked_for(tmp_path: Path) -> None:

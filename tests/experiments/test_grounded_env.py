@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
@@ -249,9 +250,13 @@ class OurPolicyAgain:
         return self.network.act(features).numpy()
 
 
-def test_a_rows_own_network_behind_the_protocol_has_the_rows_figures(run: Path, tmp_path: Path) -> None:
-    policy = OurPolicyAgain(run, "astra")
+def test_a_rows_own_network_behind_the_protocol_has_the_rows_figures(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, read = OurPolicyAgain(run, "astra"), Mock(wraps=settings_of)
+    monkeypatch.setattr(grounded_env, "settings_of", read)
     evaluate_policy(run, "astra", policy, out=tmp_path / "own")
+    read.assert_called_once_with(run)
     experiment = load_experiment(run.parents[1] / "cart.toml", run.parent)
     items = {item.key: item for item in plan(experiment.recipe, experiment.path, run)}
     items["evaluate/astra/seed_0"].call(out=tmp_path / "row", progress=silent)

@@ -3,6 +3,7 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from rail_run import ROOT, make_rail_run
@@ -14,8 +15,9 @@ from astra_data.core.lock import held
 from astra_data.core.manifest import read_manifest
 from astra_data.core.seeding import derive
 from astra_data.experiments import trials as module
+from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.experiments.selecting import select
-from astra_data.experiments.trained_policy import load_policy
+from astra_data.experiments.trained_policy import TrainedPolicy, trained_policy
 from astra_data.experiments.trials import choose_by_trials
 from astra_data.reports.halving import halve
 from astra_data.reports.trials import TrialsFile
@@ -98,8 +100,13 @@ def test_what_was_predicted_is_the_lower_quartile_over_the_judges(
     assert found.mean == pytest.approx((4 * 0.25 + 2) / (4 + 2))
 
 
-def test_candidates_of_a_round_meet_the_same_starts_and_goals(folder: Path, tries: Tries) -> None:
+def test_candidates_of_a_round_meet_the_same_starts_and_goals(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = Mock(wraps=recorded_settings)
+    monkeypatch.setattr("astra_data.experiments.trained_policy.recorded_settings", read)
     choose_by_trials(folder, 20, field=4)
+    assert read.call_count == 1 + 1 + len(tries.made)  # by it, by the choice, and for each that is tried
     seeds = [seed for *_, seed, _ in tries.made]
     assert [made[1] for made in tries.made] == [2] * 4 + [6] * 2
     assert len(set(seeds[:4])) == len(set(seeds[4:])) == 1 and seeds[0] != seeds[4]
@@ -198,15 +205,15 @@ def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:
 def test_trials_are_of_the_size_that_is_asked_for(
     folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    judged, made, loaded = select(folder), load_policy, list[int | None]()
+    judged, made, loaded = select(folder), trained_policy, list[int | None]()
     sized = [one.model_copy(update={"percent": size}) for size in (50, 100) for one in judged.candidates]
     both = judged.model_copy(update={"candidates": sized})
 
-    def noted(run: Path, row: str, *, seed: int, percent: int | None = None) -> RunningPolicy:
+    def noted(run: Path, row: str, *, seed: int, percent: int | None = None) -> TrainedPolicy:
         loaded.append(percent)
         return made(run, row, seed=seed)
 
-    monkeypatch.setattr(module, "load_policy", noted)
+    monkeypatch.setattr(module, "trained_policy", noted)
     monkeypatch.setattr(module, "select", lambda *_, **__: both)
     with pytest.raises(BadInputError, match=r"a size of the run \(50, 100\), got none"):
         choose_by_trials(folder, 20, field=4)
