@@ -58,6 +58,17 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
         CorruptDatasetError: a value was altered: the card states the hash of all of them.
     """
     dataset.require_whole()
+    return write_card_of_checked(dataset, out, notes, source=source)
+
+
+def write_card_of_checked(
+    dataset: Dataset, out: Path, notes: Notes, *, source: str | None = None
+) -> list[Path]:
+    """Write the card as `write_card` does, of a dataset of which `check` has just read every value.
+
+    Raises:
+        BadInputError, DiskError: as `write_card`.
+    """
     positions = visited(dataset)
     figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
     text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)

@@ -1,6 +1,7 @@
 import errno
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from fake_dataset import write_fake
@@ -23,6 +24,16 @@ def test_a_push_names_where_it_put_the_version_and_how_far_it_is(fake: Dataset, 
     assert (seen[0], seen[-1]) == (0.0, 1.0)
     files = contents(tmp_path / "shared/fake/data-1.0.0")
     assert files.keys() == contents(fake.root).keys() | {"README.md", "README-coverage.png", "SHA256SUMS"}
+
+
+def test_values_are_read_once_to_be_checked(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By `check`, which looks at more than `require_whole`."""
+    again = Mock()
+    monkeypatch.setattr(Dataset, "require_whole", again)
+    push(fake.root, f"file://{tmp_path}/shared")
+    again.assert_not_called()
 
 
 def test_a_second_push_sends_nothing(fake: Dataset, tmp_path: Path) -> None:
