@@ -3,10 +3,12 @@ import hashlib
 import os
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import fsspec
 import pytest
 
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import DiskError, SharingError
 from astra_data.exchange.sharing import fetch as module
 from astra_data.exchange.sharing import store
@@ -55,9 +57,12 @@ def test_only_what_is_missing_is_read(
     monkeypatch.setattr(store, "BLOCK_BYTES", block)
     (tmp_path / "here/data").mkdir(parents=True)
     (tmp_path / "here/data/file.part").write_bytes(CONTENT[:5000])
+    digested = Mock(wraps=file_digest)
+    monkeypatch.setattr(module, "file_digest", digested)
     fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
     assert (tmp_path / "here/data/file").read_bytes() == CONTENT
     assert appended == [5000]
+    digested.assert_called_once()
 
 
 @pytest.mark.parametrize("left", [b"x" * 5000, b"x" * 10**5])
