@@ -117,7 +117,7 @@ def train(
             num_threads=num_threads,
         )
         if base.in_simulator:
-            policy, curve = with_restarts(base.learn, training, grounding_at(grounding_file))
+            policy, curve = with_restarts(base.learn, training, grounding_file)
         else:
             policy, curve = base.learn(training)
         policy.save(folder / POLICY)

@@ -2,26 +2,28 @@
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from astra_data.core.progress import part
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import CLOCKS
-from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.files import grounding_at
 from astra_data.training.own_world import Reached, reached_in_own_world
 from astra_data.training.policy_file import POLICY, PolicyFile
 from astra_data.training.train import Learn, Training
 
 
 def with_restarts(
-    learn: Learn, training: Training, grounding: Grounding
+    learn: Learn, training: Training, grounding_file: Path | None
 ) -> tuple[PolicyFile, dict[str, Any]]:
     """Train until a policy masters its own simulator, `tries` times at most, each from another seed.
 
     Args:
         learn: trains once.
         training: what it is given.
-        grounding: that of the training, on the CPU, where policies are tested.
+        grounding_file: of its grounding, which is read again where that is not on the CPU: policies are
+            tested there.
 
     Returns:
         the policy that does, or else the one with the most success there; and its learning curve, with the
@@ -30,6 +32,7 @@ def with_restarts(
     config = training.config
     if config.tries == 1:
         return learn(training)
+    grounding = training.grounding if training.device == "cpu" else grounding_at(grounding_file)
     made: list[tuple[Reached, PolicyFile, dict[str, Any]]] = []
     seeds = [training.seed, *(derive(training.seed, f"try {number}") for number in range(1, config.tries))]
     for number, seed in enumerate(seeds):
@@ -49,14 +52,13 @@ def with_restarts(
     ]
     spent = {clock: sum(of_try[clock] for _, _, of_try in made) for clock in CLOCKS if clock in curve}
     for number in range(1, len(made)):
-        shutil.rmtree(_attempt(training, 0, number).folder)
+        shutil.rmtree(_folder(training, number))
     return policy, curve | spent | {"tries": tries}
 
 
 def _attempt(training: Training, seed: int, number: int) -> Training:
     """Return the training of a try; the first is the one that there would be without tries."""
-    tries = training.config.tries
-    folder = training.folder / f"try_{number}" if number else training.folder
+    tries, folder = training.config.tries, _folder(training, number)
     folder.mkdir(exist_ok=True)
     share = part(training.progress, number / tries, (number + 1) / tries)
 
@@ -64,6 +66,10 @@ def _attempt(training: Training, seed: int, number: int) -> Training:
         share(fraction, f"try {number + 1} of {tries}  {note}")
 
     return replace(training, seed=seed, folder=folder, progress=progress)
+
+
+def _folder(training: Training, number: int) -> Path:
+    return training.folder / f"try_{number}" if number else training.folder
 
 
 def _masters(reached: Reached, training: Training) -> bool:

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -67,7 +68,7 @@ def restarted(
         kept, curve = learner(given)
         return kept, curve | ({"wall_seconds": 2.0 * len(seeds), "cpu_seconds": len(seeds)} if clocks else {})
 
-    kept, curve = with_restarts(timed, training, NO_GROUNDING)
+    kept, curve = with_restarts(timed, training, None)
     assert isinstance(kept, PolicyFile) and isinstance(kept.policy, OwnPolicy)
     return kept.policy.acting.command, curve, seeds  # type: ignore[attr-defined]
 
@@ -122,6 +123,39 @@ def test_all_tries_cost_time(tmp_path: Path) -> None:
 def test_without_tries_nothing_is_tested(tmp_path: Path) -> None:
     command, curve, seeds = restarted(tmp_path, [-1.0])
     assert (command, seeds) == (-1.0, [7]) and "tries" not in curve
+
+
+@pytest.mark.parametrize(
+    ("device", "tries", "read"), [("cpu", 1, 0), ("cpu", 2, 0), ("cuda", 1, 0), ("cuda", 2, 1)]
+)
+def test_a_grounding_is_read_again_only_to_test_on_the_cpu_what_is_trained_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, tries: int, read: int
+) -> None:
+    grounding_at, given = Mock(), list[object]()
+    monkeypatch.setattr("astra_data.training.restarts.grounding_at", grounding_at)
+
+    def tested(task: Any, policy: Any, grounding: object, seed: int) -> Reached:  # noqa: ANN401
+        given.append(grounding)
+        return Reached(1.0, 1.0)
+
+    monkeypatch.setattr("astra_data.training.restarts.reached_in_own_world", tested)
+    kept: Any = Mock()
+    monkeypatch.setattr(PolicyFile, "load", Mock())
+    training: Any = Training(
+        task=TASK,
+        config=PpoTrainConfig(tries=tries),
+        settings=None,
+        episodes=Mock(),
+        grounding=NO_GROUNDING,
+        initial=None,
+        seed=7,
+        device=device,
+        folder=tmp_path,
+        progress=silent,
+    )
+    with_restarts(lambda _: (kept, {"points": []}), training, tmp_path / "grounding")
+    assert grounding_at.call_count == read
+    assert given == ([grounding_at.return_value if read else NO_GROUNDING] if tries > 1 else [])
 
 
 def test_what_is_to_last_has_no_time_to_spare() -> None:
