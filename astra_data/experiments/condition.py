@@ -13,7 +13,7 @@ from typing import Literal
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError
-from astra_data.core.manifest import read_manifest
+from astra_data.core.manifest import Manifest, read_manifest
 from astra_data.core.naming import stage_of_key
 from astra_data.dataset.lineage import Ancestor, lineage
 from astra_data.dataset.meta_files import read_description
@@ -57,11 +57,12 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
     key = item.key
     if not experiment.has(key):
         return Condition("missing")
-    if why := damage(key, experiment, verify=verify) or (verify and _unreadable(key, experiment)):
+    faults, manifest = _examined(key, experiment, verify=verify)
+    if why := faults or (verify and _unreadable(key, experiment)):
         return Condition("damaged", why)
-    if why := experiment.outdated(key) or _replaced(item, experiment):
+    if why := experiment.outdated(key) or _replaced(item, experiment, manifest):
         return Condition("stale", why)
-    return Condition("finished", _remark(key, experiment))
+    return Condition("finished", _remark(key, experiment, manifest))
 
 
 def damage(key: str, experiment: Experiment, *, verify: bool) -> str:
@@ -69,7 +70,14 @@ def damage(key: str, experiment: Experiment, *, verify: bool) -> str:
 
     Of datasets, what the metadata and the footers of the files show or, with `verify`, all values.
     """
+    faults, _ = _examined(key, experiment, verify=verify)
+    return faults
+
+
+def _examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Manifest | None]:
+    """Return what `damage` does, and the manifest of the artefact `key` if it has one."""
     folder, stage = experiment.place(key), _stage(key)
+    manifest = None
     try:
         if stage.makes_dataset:
             dataset = Dataset.open(folder)
@@ -80,8 +88,8 @@ def damage(key: str, experiment: Experiment, *, verify: bool) -> str:
             whole = stage.result is None or _has_bytes(folder / stage.result)
             faults = [] if whole else [f"{stage.result} is missing or empty"]
     except AstraDataError as error:
-        return str(error)
-    return "; ".join(faults)
+        return str(error), None
+    return "; ".join(faults), manifest
 
 
 def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, str]:
@@ -147,15 +155,15 @@ def _unreadable(key: str, experiment: Experiment) -> str:
     return ""
 
 
-def _replaced(item: Item, experiment: Experiment) -> str:
-    """Return which of the artefacts that `item` is made from it was not made from."""
+def _replaced(item: Item, experiment: Experiment, manifest: Manifest | None) -> str:
+    """Return which of the artefacts that `item` is made from it was not made from, by its manifest."""
     folder = experiment.place(item.key)
     if stage_of(item) == "label" and (data := _other_data(folder, experiment.recipe.data)):
         return f"made from another dataset than {data}"
     made_from: Collection[str]
     if _stage(item.key).makes_dataset:
         made_from = [parent["hash"] for parent in read_description(folder)["parents"]]
-    elif manifest := read_manifest(folder):
+    elif manifest:
         made_from = manifest.made_from.values()
         # A choice is among the policies that the recipe has now.
         absent = [key for key in item.inputs if item.key == "select" and key not in manifest.made_from]
@@ -197,13 +205,11 @@ def _digest(key: str, experiment: Experiment) -> str | None:
     return None
 
 
-def _remark(key: str, experiment: Experiment) -> str:
-    """Return what is unusual about a finished artefact."""
+def _remark(key: str, experiment: Experiment, manifest: Manifest | None) -> str:
+    """Return what is unusual about a finished artefact with this manifest."""
     if _stage(key).makes_dataset:
         return ""
-    folder = experiment.place(key)
-    manifest = read_manifest(folder)
     if manifest is None:
         return "no manifest (made by 0.1)"
-    foreign = manifest.foreign(folder)
+    foreign = manifest.foreign(experiment.place(key))
     return f"not of it: {', '.join(foreign)}" if foreign else ""

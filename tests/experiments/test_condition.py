@@ -5,16 +5,19 @@ import re
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
-from astra_data.core.manifest import MANIFEST
+from astra_data.core.manifest import MANIFEST, read_manifest
 from astra_data.core.progress import silent
-from astra_data.experiments.condition import LOADERS
+from astra_data.experiments.condition import LOADERS, condition
 from astra_data.experiments.execution import Item
+from astra_data.experiments.experiment import load_experiment
+from astra_data.experiments.plan import plan
 from astra_data.experiments.run import check, run, run_stage
 from astra_data.stages.registry import STAGES
 
@@ -55,6 +58,16 @@ def states(recipe: Path, *, verify: bool = False) -> dict[str, tuple[str, str]]:
 def made_again(folder: Path) -> list[str]:
     aside = folder / "set_aside"
     return sorted(path.relative_to(aside).as_posix() for path in aside.rglob("seed_0"))
+
+
+def test_a_manifest_is_read_once(recipe: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    experiment = load_experiment(recipe, recipe.parent)
+    (item,) = (one for one in plan(experiment.recipe, recipe, folder) if one.key == EVALUATE)
+    read = Mock(wraps=read_manifest)
+    monkeypatch.setattr("astra_data.experiments.condition.read_manifest", read)
+    assert condition(item, experiment).is_finished
+    read_folders = [call.args[0] for call in read.call_args_list]
+    assert read_folders.count(folder / EVALUATE) == 1
 
 
 def test_an_emptied_file_is_found_and_made_again(
