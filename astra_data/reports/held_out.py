@@ -18,6 +18,9 @@ from astra_data.reports.schema import GapMeans, judged_horizon, shared_horizons
 
 Floats = NDArray[np.float64]
 
+Measured = Mapping[int | None, Mapping[str, Mapping[str, Sequence[Foresight]]]]
+"""How failures are foreseen on each seed, by size (the largest last), grounding, and part of it."""
+
 PAGE = "gap.md"
 RELIABILITY = "gap_reliability.png"
 _SURE = 0.1
@@ -61,7 +64,8 @@ def write_held_out(
         return None
     every = [gap for sizes in found.values() for gap in sizes.values()]
     horizons = shared_horizons([gap.horizons for gap in every])
-    rates = failure_rates(root, groundings, seeds, max(percents, default=None))
+    foreseen = measured_foresight(root, groundings, seeds, percents)
+    rates = failure_rates(foreseen)
     if rates:
         from astra_data.reports.figures import png, reliability
 
@@ -74,7 +78,7 @@ def write_held_out(
         horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
         tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
         astray=astray(every[0]),
-        foresight=foresight_lines(root, groundings, seeds, percents),
+        foresight=foresight_lines(foreseen),
         reliability=RELIABILITY if rates else None,
         enough=[
             enough(method_title(method), name, sizes, horizons)
@@ -100,23 +104,35 @@ def astray(gap: GapMeans) -> list[str]:
     ]
 
 
-def foresight_lines(
+def measured_foresight(
     root: Path, groundings: Sequence[str], seeds: Sequence[int], percents: Sequence[int]
-) -> list[list[str]]:
+) -> Measured:
+    """Read how well groundings foresee failures, on the seeds where some were held out.
+
+    Raises:
+        BadInputError: a file of figures is malformed.
+    """
+    return {
+        percent: {method: _measured(root, method, seeds, percent) for method in groundings}
+        for percent in sorted(percents) or (None,)
+    }
+
+
+def foresight_lines(measured: Measured) -> list[list[str]]:
     """Return a line for each size, grounding and part of it that foresees failures, with means over seeds."""
     lines = []
-    for percent in sorted(percents) or (None,):
-        for method in groundings:
-            for part, found in _measured(root, method, seeds, percent).items():
+    for percent, of_methods in measured.items():
+        for method, parts in of_methods.items():
+            for part, found in parts.items():
                 title = f"{method_title(method)}: {part.replace('_', ' ')}"
-                lines.append([*([f"{percent} %"] if percents else []), title, *_foresight_cells(found)])
+                size = [] if percent is None else [f"{percent} %"]
+                lines.append([*size, title, *_foresight_cells(found)])
     return lines
 
 
 def _measured(
     root: Path, method: str, seeds: Sequence[int], percent: int | None
 ) -> dict[str, list[Foresight]]:
-    """Return how well each part of a grounding foresees failures, on the seeds where some were held out."""
     measured: dict[str, list[Foresight]] = {}
     for seed in seeds:
         file = root / "ground" / method / seed_folder(seed, percent) / METRICS
@@ -126,13 +142,15 @@ def _measured(
     return measured
 
 
-def failure_rates(
-    root: Path, groundings: Sequence[str], seeds: Sequence[int], percent: int | None
-) -> dict[str, dict[str, Floats]]:
-    """Return rates by part that foresees failures and grounding, over all seeds, as a figure takes them."""
+def failure_rates(measured: Measured) -> dict[str, dict[str, Floats]]:
+    """Return rates by part that foresees failures and grounding, as a figure takes them.
+
+    They are over all seeds, at the largest size.
+    """
     parts: dict[str, dict[str, Floats]] = {}
-    for method in groundings:
-        for part, found in _measured(root, method, seeds, percent).items():
+    largest = [*measured.values()][-1]
+    for method, of_parts in largest.items():
+        for part, found in of_parts.items():
             rows = np.array([row for one in found for row in one.reliability or ()])
             parts.setdefault(part.replace("_", " "), {})[method] = _pooled(rows.reshape(-1, 3))
     return parts

@@ -29,7 +29,7 @@ from astra_data.reports.files import (
     read_published,
     write_results,
 )
-from astra_data.reports.held_out import failure_rates, foresight_lines
+from astra_data.reports.held_out import failure_rates, foresight_lines, measured_foresight
 from astra_data.reports.html_page import HTML, render_html
 from astra_data.reports.page import render
 from astra_data.reports.runs import Reported, Runs
@@ -124,12 +124,12 @@ def report(
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
     groundings = dict.fromkeys(grounding for results in sizes.values() for grounding in results.gaps())
-    foreseen = (root, list(groundings), recipe.seeds)
-    rates = failure_rates(*foreseen, max(sized, default=None))
+    foreseen = measured_foresight(root, [*groundings], recipe.seeds, [*sized])
+    rates = failure_rates(foreseen)
     inlined = images | ({"reliability": png(reliability(rates))} if rates else {})
     with finished_folder(root / "report", replace=True) as folder:
         write_results(found, page, images, folder, "results")
-        write_file(folder / HTML, render_html(found, inlined, foresight_lines(*foreseen, [*sized])))
+        write_file(folder / HTML, render_html(found, inlined, foresight_lines(foreseen)))
         if isinstance(found, Results) and found.headline == SUCCESS:
             write_file(folder / "eval_info.json", json.dumps(eval_info(found), indent=1))
         write_manifest(folder, read)

@@ -1,6 +1,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.reports.artefacts import Metrics, read_json
 from astra_data.reports.figures import reliability
 from astra_data.reports.held_out import enough, write_held_out
 from astra_data.reports.schema import BandMeans, GapMeans
@@ -114,7 +116,9 @@ def write_foresight(root: Path, seed: int, auc: float, last: float | None = None
     file.write_text(json.dumps({"failures": {"failure_model": of, "topple_head": none}}))
 
 
-def test_how_well_failures_are_foreseen_is_told_where_it_was_measured(tmp_path: Path) -> None:
+def test_how_well_failures_are_foreseen_is_told_where_it_was_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for seed in (0, 1, 2):
         write(tmp_path, 100, seed, 0.1)
     given = ("r", tmp_path, ("nas",), (0, 1, 2, 3), (100,))
@@ -123,7 +127,10 @@ def test_how_well_failures_are_foreseen_is_told_where_it_was_measured(tmp_path: 
     assert not (tmp_path / "gap_reliability.png").exists() and ".png" not in page.read_text()
     write_foresight(tmp_path, 0, 0.8, last=0.65)
     write_foresight(tmp_path, 1, 0.9)  # with episodes too short for the last window
+    read = Mock(wraps=read_json)
+    monkeypatch.setattr("astra_data.reports.held_out.read_json", read)
     write_held_out(*given, timestep_s=0.05)
+    assert sum(call.args[0] is Metrics for call in read.call_args_list) == 2  # each seed's once
     lines = [
         line for line in page.read_text().splitlines() if "failure model" in line or "topple head" in line
     ]
