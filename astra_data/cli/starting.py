@@ -15,7 +15,9 @@ def new(
     logs: Annotated[
         list[Path] | None,
         typer.Option(
-            "--from", help="Its logs: CSV files, or folders of them.", show_default="those of a made-up cart"
+            "--from",
+            help="Its logs: CSV files, or folders of them; or a dataset.",
+            show_default="those of a made-up cart",
         ),
     ] = None,
     more: Annotated[

@@ -18,6 +18,10 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TERMINATED
+from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import locate
+from astra_data.exchange.dataset_logs import logs_of
 from astra_data.exchange.field_names import Role
 from astra_data.exchange.guessing import guess
 from astra_data.exchange.logs import Logs
@@ -42,10 +46,11 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
     Args:
         name: of the task: a-z, digits and _, and no module's.
         out: the folder to write.
-        logs: CSV files, or folders of them; by default those of a made-up cart, which are written too.
+        logs: CSV files, or folders of them; or one dataset. By default the logs are those of a made-up cart,
+            which are written too.
 
     Raises:
-        BadInputError: `name` is no name, `out` exists, or the logs are of no use: see `guess`.
+        BadInputError: `name` is no name, `out` exists, or the logs are of no use: see `guess` and `logs_of`.
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart")
@@ -55,21 +60,55 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
         places = [path.resolve() for path in logs]
         if not places:
             _drive(folder / "logs")
-        found = guess(places or [folder / "logs"])
+        data = _dataset(logs)
+        found = logs_of(data) if data else guess(places or [folder / "logs"])
         kind = Holonomic.of(found) or Bicycle.of(found) or Planar.of(found) or Direct.of(found)
         values = _common(name, found) | kind.values()
         values["simulator"] = kind.simulator
-        values["logs"] = shlex.join(map(str, places)) or "logs"
-        for template, written in {
+        values |= _of_dataset(data.root) if data else _of_mapping(name, places)
+        written_as = {
             kind.template: f"{name}.py",
             "recipe.toml": f"{name}.toml",
-            "logs.toml": "logs.toml",
             "test.py": f"test_{name}.py",
             "README.md": "README.md",
-        }.items():
+        }
+        for template, written in (written_as if data else written_as | {"logs.toml": "logs.toml"}).items():
             text = (files("astra_data.experiments") / f"robot_files/{template}.template").read_text()
             (folder / written).write_text(Template(text).substitute(values), encoding="utf-8")
     return kind
+
+
+def _dataset(logs: Sequence[Path]) -> Dataset | None:
+    """Return the dataset that `logs` name; None where they are files, or folders of them."""
+    if len(logs) != 1:
+        return None
+    try:
+        folder = locate(logs[0])
+    except BadInputError:
+        return None
+    return Dataset.open(folder) if (folder / INFO_PATH).is_file() else None
+
+
+def _of_dataset(root: Path) -> dict[str, str]:
+    """Return what recipe and page say where the data are a dataset."""
+    place = str(root.resolve())
+    return {"data": _toml(place), "dataset": shlex.quote(place)} | dict.fromkeys(
+        ("and_mapping", "versions", "import_line", "mapping_row"), ""
+    )
+
+
+def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
+    """Return what recipe and page say where the data are imported from `logs`, by a mapping."""
+    places = shlex.join(map(str, logs)) or "logs"
+    return {
+        "logs": places,
+        "data": _toml(f"{name}-logs@data-1.0.0"),
+        "dataset": f"{name}-logs",
+        "and_mapping": " and `logs.toml`",
+        "versions": "\nAfter a change of `logs.toml` give it a `version`, and the recipe's `data` the same.",
+        "import_line": f"astra-data import {places} --mapping logs.toml  # a dataset, {name}-logs\n",
+        "mapping_row": "| `logs.toml` | which fields of the logs become which columns, in which units |\n",
+    }
 
 
 def _is_installed(name: str) -> bool:
@@ -83,8 +122,10 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
     states, commands = logs.of("state"), logs.of("command")
     given = np.concatenate(logs.values(commands))
     lows, highs = given.min(axis=0), given.max(axis=0)
-    unit = 10.0 ** np.floor(np.log10(highs - lows)) / 1e3  # a thousandth or less of the range, outwards
+    span = np.where(highs > lows, highs - lows, 1.0)
+    unit = 10.0 ** np.floor(np.log10(span)) / 1e3  # a thousandth or less of the range, outwards
     lows, highs = np.floor(lows / unit) * unit, np.ceil(highs / unit) * unit
+    highs = np.where(highs > lows, highs, lows + unit)  # of a command that never changes
     bounds = {
         field.short: (significant(low), significant(high))
         for field, low, high in zip(commands, lows, highs, strict=True)

@@ -118,6 +118,7 @@ class Direct:
         starts = np.array([values[0] for values in recorded])
         episodes = [_shown(values, plain) for values in recorded]
         span = np.ptp(np.concatenate(episodes), axis=0)
+        span[span == 0] = 1.0  # of what never moves
         span[plain:] = np.tile(span[plain:].reshape(2, -1).max(axis=0), 2)  # the same of cosine and sine
         goal, close = typical([values / span for values in episodes], self.logs.failed)
         actions, moved = len(self.logs.of("command")), len(self.moved)

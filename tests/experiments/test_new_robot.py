@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fake_dataset import DESCRIPTION
 from on_meta import places
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
+from astra_data.dataset import DatasetWriter
+from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.experiments.new_robot import write_robot
 from astra_data.experiments.run import check, run
@@ -327,3 +330,39 @@ def test_logs_may_be_given_as_a_shell_writes_them_out(tmp_path: Path) -> None:
     assert "horizon=7" in Path("slide/slide.py").read_text()
     recipe = tomllib.loads(Path("slide/slide.toml").read_text())
     assert recipe["ground"]["window"] == recipe["align"]["window"] == 2  # a history has two steps or more
+
+
+@pytest.mark.parametrize("place", ["my_cart-logs", "my_cart-logs@data-1.0.0", "home/my_cart-logs/data-1.0.0"])
+def test_a_dataset_is_begun_with_as_it_is(tmp_path: Path, place: str) -> None:
+    command("new my_cart")
+    command("import my_cart/logs --mapping my_cart/logs.toml")
+    shown = CliRunner().invoke(app, ["new", "other", "--from", place])
+    assert shown.exit_code == 0, shown.output
+    assert "a unicycle: x, y, heading_x, heading_y, driven by v, w" in shown.stdout
+    assert not Path("other/logs.toml").exists()
+    page = Path("other/README.md").read_text()
+    assert "logs.toml" not in page and "astra-data import" not in page
+    data = tomllib.loads(Path("other/other.toml").read_text())["data"]
+    assert data == str(tmp_path / "home/my_cart-logs/data-1.0.0")
+    assert f"astra-data inspect {data} " in page
+    one, other = (task_named(f"{name}/{name}.py:TASK") for name in ("my_cart", "other"))
+    assert other.limits == one.limits and other.timestep_s == one.timestep_s == 0.1
+    assert other.state == one.state and other.action == one.action
+    assert check_task(other) == []
+    assert check(Path("other/other.toml"))["data"].state == "finished"
+
+
+def test_what_never_moves_is_a_part_of_the_task(tmp_path: Path) -> None:
+    names = ("shoulder.pos", "gripper.pos")
+    columns = (Column(STATE, size=2, names=names), Column(ACTION, size=2, names=names))
+    angles = np.column_stack([np.sin(np.arange(30) / 5), np.full(30, 0.5)]).astype(np.float32)
+    with DatasetWriter(Path("arm"), columns=columns, fps=10, task="hold", description=DESCRIPTION) as out:
+        for uid in range(2):
+            out.add(Episode(uid, {STATE: angles, ACTION: angles}))
+    write_robot("still", Path("still"), [Path("arm")])
+    task = task_named("still/still.py:TASK")
+    assert check_task(task) == []
+    least, largest = task.limits["gripper.pos"]
+    assert least <= 0.5 < largest
+    observed = task.objective.observe(torch.from_numpy(angles), torch.zeros(30, 0))
+    assert observed.isfinite().all()

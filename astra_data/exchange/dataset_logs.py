@@ -1,0 +1,46 @@
+"""A dataset as logs: what `new` begins with, where logs are imported already or were recorded by LeRobot."""
+
+import numpy as np
+
+from astra_data.dataset.columns import ACTION, STATE, SUCCESS, TERMINATED, TIMESTAMP, Column
+from astra_data.dataset.reader import Dataset
+from astra_data.exchange.field_names import Role
+from astra_data.exchange.logs import Field, Logs
+
+_FAILED = "failed"
+_ROLES: dict[str, Role] = {STATE: "state", ACTION: "command"}
+
+
+def logs_of(data: Dataset) -> Logs:
+    """Return the episodes of `data` as logs: its states and commands by their own names, and failures.
+
+    Raises:
+        BadInputError: it has no states or commands, or a value is not finite.
+        CorruptDatasetError: a file cannot be read, or values differ from their digests.
+    """
+    fields = [Field(TIMESTAMP, "time", "time", "s", 1.0, f"{data.info['fps']} rows a second")]
+    columns = data.specs([STATE, ACTION])
+    fields += [field for column in columns for field in _fields(column)]
+    ends = [name for name in (TERMINATED, SUCCESS) if name in data.features]
+    if TERMINATED in ends:
+        fields.append(Field(_FAILED, "failure", "failure", "1", 1.0, f"{TERMINATED}, and no success"))
+    episodes = []
+    for episode in data.episodes([STATE, ACTION, *ends]):
+        values = np.column_stack([episode.columns[column.name] for column in columns]).astype(float)
+        names = [field.name for field in fields if field.role in ("state", "command")]
+        found = dict(zip(names, values.T, strict=True))
+        found[TIMESTAMP] = np.arange(len(values)) / data.info["fps"]
+        if TERMINATED in ends:
+            failed = episode.columns[TERMINATED] & ~episode.columns.get(SUCCESS, np.zeros(len(values), bool))
+            found[_FAILED] = failed.astype(float)
+        episodes.append(found)
+    return Logs(tuple(fields), tuple(episodes), {})
+
+
+def _fields(column: Column) -> list[Field]:
+    """Return a field for each value of a column."""
+    names = column.names or tuple(f"{_ROLES[column.name][0]}{number}" for number in range(column.size))
+    return [
+        Field(f"{column.name} {name}", _ROLES[column.name], name, unit or "1", 1.0, "its column")
+        for name, unit in zip(names, column.units, strict=True)
+    ]

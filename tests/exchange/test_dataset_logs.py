@@ -1,0 +1,61 @@
+from pathlib import Path
+
+import numpy as np
+from fake_dataset import writer
+
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    OUTCOME_COLUMNS,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Column,
+    Episode,
+)
+from astra_data.exchange.dataset_logs import logs_of
+
+POSE = Column(STATE, size=2, names=("x", "Yaw.pos"), astra={"unit": ["m", ""]})
+SPEED = Column(ACTION, size=1)
+ENDS = ((False, False), (True, False), (True, True))
+"""Terminated and success at the end of each episode."""
+
+
+def recorded(root: Path, *columns: Column, fps: int = 20) -> Dataset:
+    names = {column.name for column in columns}
+    with writer(root, columns=columns, fps=fps) as out:
+        for uid, (terminated, success) in enumerate(ENDS):
+            steps = 4 + uid
+            last = np.arange(steps) == steps - 1
+            flags = {
+                TERMINATED: last & terminated,
+                SUCCESS: last & success,
+                DONE: last,
+                TRUNCATED: last & (not terminated),
+            }
+            values = {
+                column.name: flags.get(column.name, np.zeros(steps, column.dtype)) for column in columns
+            }
+            values |= {STATE: uid + np.arange(2 * steps, dtype=np.float32).reshape(steps, 2)}
+            values |= {ACTION: np.arange(steps, dtype=np.float32) - uid}
+            out.add(Episode(uid, {name: values[name] for name in names}))
+    return Dataset.open(root)
+
+
+def test_states_commands_and_failures_are_fields_of_logs(tmp_path: Path) -> None:
+    logs = logs_of(recorded(tmp_path / "data", POSE, SPEED, *OUTCOME_COLUMNS))
+    assert [(field.short, field.unit) for field in logs.of("state")] == [("x", "m"), ("Yaw.pos", "1")]
+    assert [(field.short, field.unit, field.scale) for field in logs.of("command")] == [("c0", "1", 1.0)]
+    assert [len(values) for values in logs.values(logs.of("state"))] == [4, 5, 6]
+    np.testing.assert_array_equal(logs.values(logs.of("state"))[1], 1 + np.arange(10).reshape(5, 2))
+    np.testing.assert_array_equal(logs.values(logs.of("command"))[2][:, 0], np.arange(6) - 2)
+    assert logs.failed == [False, True, False]
+    assert (logs.rate, logs.uneven, logs.left_out) == (20, "", {})
+
+
+def test_without_outcomes_nothing_fails(tmp_path: Path) -> None:
+    logs = logs_of(recorded(tmp_path / "data", POSE, SPEED, fps=7))
+    assert logs.failed == [False, False, False] and logs.rate == 7
+    assert not logs.of("failure")
