@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_cart import Last
+from small_cart import Last, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -60,7 +60,9 @@ def write(
 
 def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     logs = write(tmp_path / "logs", [drive(0.5, 10), drive(4.0, 10)])
-    labelled = Dataset.open(label(CART, data=logs, out=tmp_path / "labelled"))
+    notes = list[str]()
+    out = label(CART, data=logs, out=tmp_path / "labelled", progress=lambda _, note: notes.append(note))
+    labelled = Dataset.open(out)
     slow, fast = labelled.episodes()
     assert len(slow) == 10 and not slow.columns[SUCCESS].any() and not slow.columns[TERMINATED].any()
     np.testing.assert_allclose(slow.columns[REWARD], 0.05, atol=1e-6)
@@ -73,11 +75,13 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
         == fast.columns[TERMINATED].tolist()
         == [False] * (len(fast) - 1) + [True]
     )
+    assert not fast.columns[TRUNCATED].any()
     np.testing.assert_allclose(fast.columns[REWARD][-1], 10.4, atol=1e-5)
     assert labelled.metadata["success"] == [False, True] and labelled.metadata["failed"] == [False, False]
     assert labelled.metadata["return"] == pytest.approx([0.5, 10 + 0.4 * len(fast)], abs=1e-5)
     assert labelled.description["dropped_steps"] == 10 - len(fast)
     assert labelled.reference == "logs@data-2.0.0"
+    assert notes[-1] == f"1 successes, 0 failures in {10 + len(fast)} steps"
 
 
 def test_goals_that_are_drawn_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -170,6 +174,23 @@ def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
         assert told.columns[TRUNCATED].tolist() == [False] * 9 + [True]
 
 
+class ShortRail(Reach):
+    """The rail ends after 1 m."""
+
+    def missed(self, state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        return state[:, 0] > 1.0
+
+
+def test_who_can_no_longer_reach_the_goal_has_failed() -> None:
+    task = replace(task_named(CART), objective=ShortRail(horizon=40))
+    given = drive(4.0, 10) | {GOAL: np.full(10, 1.9, np.float32)}
+    labelled = labels(task, Episode(0, given, {}), 0)
+    # 0.4 m a step: the third leaves the rail.
+    assert labelled.columns[TERMINATED].tolist() == labelled.columns[DONE].tolist() == [False, False, True]
+    assert labelled.columns[REWARD].tolist() == pytest.approx([0.4, 0.4, 0.4 - 10.0])
+    assert labelled.metadata["failed"] and not labelled.metadata["success"]
+
+
 def test_outcomes_are_those_of_the_steps_that_are_kept() -> None:
     recorded: dict[str, float | str] = {"success": False, "failed": True, "return": -3.0, "driver": "Ada"}
     labelled = labels(task_named(CART), Episode(0, drive(4.0, 10), recorded), 0)
@@ -244,10 +265,10 @@ def test_a_dataset_of_another_rate_is_refused(tmp_path: Path) -> None:
     logs = Dataset.open(write(tmp_path / "logs", [drive(0.1, 3)]))
     task = task_named(CART)
     check_fits(logs, task)
-    with pytest.raises(
-        BadInputError, match=r"has 10 steps per second, expected the 5 of .*timestep_s is 0.2"
-    ):
-        check_fits(logs, replace(task, timestep_s=0.2))
+    for timestep_s, fps in ((0.2, 5), (0.05, 20)):
+        told = rf"has 10 steps per second, expected the {fps} of .*timestep_s is {timestep_s}"
+        with pytest.raises(BadInputError, match=told):
+            check_fits(logs, replace(task, timestep_s=timestep_s))
 
 
 @pytest.mark.parametrize(
@@ -280,9 +301,12 @@ def test_what_an_objective_returns_has_a_value_per_step(name: str, monkeypatch: 
         labels(task, episode, 0)
 
 
-def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(tmp_path: Path, home: Path) -> None:
+def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(
+    tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     labelled = label(CART, data=write(tmp_path / "logs", [drive(0.1, 3)]), out=tmp_path / "labelled")
-    link = label(CART, data=labelled, out=tmp_path / "run" / "seed_0")
+    monkeypatch.chdir(tmp_path)
+    link = label(CART, data="labelled", out=tmp_path / "run" / "seed_0")
     assert link.is_symlink() and Dataset.open(link).content_hash == Dataset.open(labelled).content_hash
     for taken in (link, labelled):
         with pytest.raises(BadInputError, match="exists already; delete it or choose another folder"):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_dataset import writer
 from toy_logs import write_logs
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -19,6 +20,7 @@ from astra_data.dataset.columns import (
     NEXT_STATE,
     STATE,
     Column,
+    Episode,
 )
 from astra_data.stages.pair import PairConfig, pair, pair_steps
 from astra_data.worlds.registry import TASKS
@@ -56,6 +58,7 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
     }
     steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
     assert steps == pytest.approx(after.lengths.sum())
+    assert after.description["simulated_pairs_per_second"] > after.description["pairs_per_second"]
     assert after.description["machine"] == before.description["machine"]
     assert after.order == before.order
     assert after.metadata == before.metadata
@@ -111,6 +114,20 @@ def glider_that_is_off(place: Path, error: float, later: str) -> str:
         f"        self.error = {later}\n"
     )
     return f"{place}/off.py:Off"
+
+
+def glider_that_gets_lost(place: Path) -> str:
+    """Write a simulator whose second step has no y in its fourth row."""
+    (place / "lost.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
+        "class Lost(Glider):\n"
+        "    steps = 0\n"
+        "    def step(self, action):\n"
+        "        self.steps += 1\n"
+        "        super().step(action)[3, 1] /= float(self.steps < 2)\n"
+        "        return self.state\n"
+    )
+    return f"{place}/lost.py:Lost"
 
 
 @pytest.mark.parametrize("size", ["_BLOCK", "BATCH"])
@@ -179,6 +196,18 @@ def rewritten(source: Dataset, out: Path, changed: dict[str, Column]) -> Path:
     return out
 
 
+def test_bounds_of_the_commands_are_recorded(tmp_path: Path) -> None:
+    """They say what the commands are multiples of to whoever learns from the pairs."""
+    columns = [Column(STATE, size=2), Column(NEXT_STATE, size=2), Column(ACTION, size=1)]
+    still = np.zeros((3, 2), np.float32)
+    with writer(tmp_path / "logs", columns=columns, fps=10) as logs:
+        logs.add(Episode(0, {STATE: still, NEXT_STATE: still, ACTION: still[:, 0]}, {}))
+    cart = f"{MINE.with_name('small_cart.py')}:TASK"
+    out = pair(cart, dataset=tmp_path / "logs", out=tmp_path / "out", progress=silent)
+    assert Dataset.open(out).description["simulator"]["commands"] == {"v": [-1.0, 4.0]}
+
+
+@pytest.mark.usefixtures("task")  # known, and in the maze of the task that the simulator is of
 def test_names_that_are_not_the_tasks_are_told(
     collected: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -238,7 +267,7 @@ def test_a_damaged_dataset_is_refused(task: str, collected: Path, tmp_path: Path
 def test_the_step_that_is_told_is_that_of_the_dataset(
     collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A simulator that is reset rightly once, for the first episode, and never again."""
+    """A simulator that is reset rightly once, for the first episode, and never again, or lost."""
     monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
     simulator, out = glider_that_is_off(tmp_path, 0.0, "0.5"), tmp_path / "out"
     with pytest.raises(BadInputError) as caught:
@@ -248,6 +277,9 @@ def test_the_step_that_is_told_is_that_of_the_dataset(
     source, step, entry = Dataset.open(collected), int(told[1]), "xy".index(told[2])
     assert source.lengths[0] <= step < source.lengths[:2].sum()
     assert float(told[3]) == pytest.approx(source.columns([STATE])[STATE][step, entry], rel=1e-5)
+    lost = f"stepped from φ(s) of step {source.lengths[0] + 3}, gives y = "
+    with pytest.raises(BadInputError, match=re.escape(lost)):
+        pair(glider_that_gets_lost(tmp_path), PairConfig(), dataset=collected, out=out, progress=silent)
 
 
 def test_a_heading_that_wraps_is_told(
