@@ -72,7 +72,12 @@ def copies(source: Dataset, dataset: Dataset) -> Iterator[tuple[Episode, Episode
 def test_as_many_episodes_as_there_are_get_no_copies(collected: Path, tmp_path: Path) -> None:
     source = Dataset.open(collected)
     config = AugmentConfig(episodes=len(source))
-    same = augment(None, config, dataset=collected, seed=0, out=tmp_path / "same", progress=silent)
+    told = list[tuple[float, str]]()
+    same = augment(
+        None, config, dataset=collected, out=tmp_path / "same", progress=lambda *note: told.append(note)
+    )
+    assert [done for done, _ in told] == pytest.approx(np.arange(1, 9) / 8)
+    assert told[-1][1] == "0 copies, no place for 0"
     dataset = Dataset.open(same)
     assert dataset.uids.tolist() == source.uids.tolist()
     assert dataset.description["copies"] == 0
@@ -85,7 +90,7 @@ def test_episodes_are_as_many_as_asked_and_none_is_lost(collected: Path, augment
     assert dataset.verify() == []
     assert dataset.description["version"] == "1.1.0"
     assert dataset.description["parents"] == [source.identity]
-    assert dataset.description["seeds"]["augment"] == 1
+    assert dataset.description["seeds"] == source.description["seeds"] | {"augment": 1}
     assert dataset.description["copies"] == CONFIG.episodes - len(source)
     assert dataset.features == source.features
     kept = {episode.uid: episode for episode in dataset.episodes()}
@@ -282,6 +287,28 @@ def test_originals_can_be_left_out(collected: Path, tmp_path: Path) -> None:
     assert sum(value is True for value in dataset.metadata["held_out"]) == 1
 
 
+def test_copies_may_turn_where_they_are_by_quarters(collected: Path, tmp_path: Path) -> None:
+    """Few turns fit there, so that more tries find more places."""
+    found = []
+    for tries in (1, 100):
+        config = AugmentConfig(copies=4, rotations="quarter", translations=False, min_steps=5, tries=tries)
+        out = augment(None, config, dataset=collected, out=tmp_path / f"{tries}", progress=silent)
+        made = list(copies(Dataset.open(collected), Dataset.open(out)))
+        found.append(len(made))
+        for copy, cut in made:
+            np.testing.assert_allclose(copy.columns[STATE][0, :2], cut.columns[STATE][0, :2], atol=1e-5)
+            assert float(copy.metadata["augmentation_rotation_rad"]) % (np.pi / 2) == pytest.approx(0.0)
+    assert 0 < found[0] < found[1]
+
+
+def test_copies_differ_from_what_they_are_of() -> None:
+    assert AugmentConfig(rotations="none").translations
+    with pytest.raises(ValueError, match="expected rotations or translations, got neither"):
+        AugmentConfig(rotations="none", translations=False)
+    with pytest.raises(ValueError, match="expected either copies or episodes, got both"):
+        AugmentConfig(copies=2, episodes=30)
+
+
 def test_mirror_images_are_no_longer_made() -> None:
     assert validated({"reflections": False}, AugmentConfig, "[augment]") == AugmentConfig()
     with pytest.raises(RecipeError, match=r"augment\]: reflections: expected false, for copies are not"):
@@ -322,6 +349,7 @@ def test_datasets_that_do_not_fit_are_refused(
         (mute, None, "give --task"),
         (mute, TASK, "observation.state: it has no roles"),
         (mute, "antmaze-umase", "did you mean 'antmaze-umaze'"),
+        (mute, "nao-kick", r"observation.state: expected \d+ values per step, got 29"),
     ):
         with pytest.raises(BadInputError, match=told):
             augment(task, CONFIG, dataset=dataset, seed=0, out=tmp_path / "out", progress=silent)

@@ -101,14 +101,17 @@ def test_what_it_earned_is_recorded(collected: Path) -> None:
 
 def test_batches_follow_each_other(task: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    collect(task, TINY.model_copy(update={"num_envs": 2}), seed=0, out=out, progress=silent)
+    config = TINY.model_copy(update={"num_envs": 2, "episodes": 5})
+    collect(task, config, seed=0, out=out, progress=silent)
     collect(task, TINY.model_copy(update={"episodes": 2}), seed=0, out=tmp_path / "two", progress=silent)
     batched, two = Dataset.open(out), Dataset.open(tmp_path / "two")
-    assert batched.uids.tolist() == [0, 1, 2]
-    first, second, third = batched.episodes()
+    assert batched.uids.tolist() == [0, 1, 2, 3, 4]
+    first, second, *others = batched.episodes()
     for one, other in zip((first, second), two.episodes(), strict=True):
         np.testing.assert_array_equal(one.columns[STATE], other.columns[STATE])
-    assert (third.columns[STATE][0] != first.columns[STATE][0]).any()
+    for name in (STATE, ACTION):  # starts and commands of each batch are its own
+        begun = {tuple(episode.columns[name][0].tolist()) for episode in (first, second, *others)}
+        assert len(begun) == 5
 
 
 def test_an_interrupted_recording_goes_on_to_the_same_bytes(
@@ -220,8 +223,9 @@ def test_only_as_many_episodes_are_kept_as_have_the_steps(
     assert kept.description["config"]["least_steps"] == steps
     assert "least_steps" not in whole.description["config"]
     exactly = some.model_copy(update={"least_steps": sum(lengths[:2])})
+    batches.clear()
     collect(task, exactly, seed=0, out=tmp_path / "exactly", progress=silent)
-    assert len(Dataset.open(tmp_path / "exactly")) == 2
+    assert len(Dataset.open(tmp_path / "exactly")) == 2 and batches == [range(2)]
 
 
 def test_an_episode_that_an_interruption_cut_off_counts_before_later_ones(
@@ -379,6 +383,12 @@ def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Pa
     with pytest.raises(BadInputError, match=r"takes 24 values, .* gives 8: expected a policy of"):
         collect(task, without_latent, seed=0, out=tmp_path / "out", progress=silent)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_steps_that_take_terabytes_are_refused() -> None:
+    assert CollectConfig(episodes=10**8, max_steps=100).episodes == 10**8
+    with pytest.raises(ValueError, match=r"episodes: 100000001 of .*, expected at most 10000000000 steps"):
+        CollectConfig(episodes=10**8 + 1, max_steps=100)
 
 
 def test_an_unknown_task_is_told(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from rail_run import make_rail_run
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
+from astra_data.core.progress import Progress, silent
 from astra_data.dataset.meta_files import read_description
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
@@ -36,8 +37,14 @@ def reported(root: Path, **changes: Any) -> Reported:  # noqa: ANN401
     return Reported(**usual | {"groundings": {}, "settings": settings} | changes)
 
 
-def judged(root: Path, recipe: Reported | None = None, **settings: Any) -> Judged:  # noqa: ANN401
-    select(recipe or reported(root), SelectConfig(**{"episodes": 5} | settings), root=root)
+def judged(
+    root: Path,
+    recipe: Reported | None = None,
+    progress: Progress = silent,
+    **settings: Any,  # noqa: ANN401
+) -> Judged:
+    config = SelectConfig(**{"episodes": 5} | settings)
+    select(recipe or reported(root), config, root=root, progress=progress)
     found = read_judged(root)
     assert found is not None
     return found
@@ -134,15 +141,17 @@ def test_policies_of_a_size_are_judged_by_groundings_of_that_size(
 ) -> None:
     more = "[sweep]\npercent = [100, 150]\n"
     root = make_rail_run(tmp_path, seeds="[0, 1]", methods='["nas"]', more=more)
-    loaded = []
+    loaded, told = [], list[tuple[float, str]]()
 
     def success(self: Judge, *_: object) -> float:
         loaded.append(self.scatter)
-        return 0.5
+        return len(loaded) / 10
 
     monkeypatch.setattr(Judge, "success", success)
     recipe = reported(root, methods=("nas",), seeds=(0, 1), percents=(100, 150))
-    found = judged(root, recipe)
+    found = judged(root, recipe, progress=lambda done, note: told.append((done, note)))
+    assert [done for done, _ in told] == pytest.approx([0.99 / 4, 0.99 / 2, 0.99 * 3 / 4, 0.99, 1.0])
+    assert told[-1][1] == "nas, seed 1: 0.40 in the lower quartile of its judges"  # of the largest size
     assert [(one.seed, one.percent, *one.success) for one in found.candidates] == [
         *((0, 100, 1), (1, 100, 0)),
         *((0, 150, 1), (1, 150, 0)),
@@ -171,6 +180,11 @@ def test_judges_without_a_failure_model_get_one_of_the_recipes_size_when_they_ar
     judged(root, failure_members=7, failure_steps=3)
     assert begun == [(7, 3)] * 3  # once for each of three judges of six policies
     assert (SelectConfig().failure_members, SelectConfig().failure_steps) == (5, 2)
+
+
+def test_who_learned_in_the_target_or_nowhere_is_not_judged(root: Path) -> None:
+    (bench,) = benches(reported(root, methods=("follower", "target", "full_obs", "nas")), "nas")
+    assert {one.row for one in bench.entries} == {"nas"}
 
 
 def test_judges_of_the_same_episodes_are_named(root: Path) -> None:
