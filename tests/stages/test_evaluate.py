@@ -30,6 +30,7 @@ from astra_data.training.policy_file import PolicyFile
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import TASKS
+from astra_data.worlds.score import RETURN
 
 CONFIG = EvaluateConfig(episodes=3)
 HORIZON = 25
@@ -81,6 +82,7 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     assert told["dataset_version"] == "antmaze-short-random-seed0@data-2.0.0"
     check_outcome(told["target"], paths["target.position"])
     check_outcome(told["simulated"], paths["simulated.position"])
+    assert json.loads((tmp_path / "astra/config.json").read_text()) == CONFIG.model_dump(mode="json")
     manifest = read_manifest(tmp_path / "astra")
     assert manifest and manifest.made_from == {
         name: file_digest(next(folder.glob("*.safetensors"))) for name, folder in inputs.items()
@@ -225,6 +227,29 @@ def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
         assert first[0][world] == second[0][world]
 
 
+def test_the_mean_of_the_first_score_is_told(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Navigation, "scores", (RETURN,))
+    notes, out = list[tuple[float, str]](), tmp_path / "out"
+    evaluate(task, "follower", CONFIG, out=out, progress=lambda *note: notes.append(note))
+    returns = json.loads((out / "evaluation.json").read_text())["target"]["return"]
+    assert notes[-1] == (1.0, f"return in the target {np.mean(returns):.1f}")
+    assert max(returns) > np.mean(returns) + 0.1
+
+
+def test_where_there_are_pictures_the_states_of_the_first_episode_are_kept(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(
+        TASKS, task, replace(TASKS[task], photograph=lambda states: np.zeros((1, 2, 2, 3), np.uint8))
+    )
+    told, paths = make(task, "follower", tmp_path / "out")
+    filmed, steps = paths["target.state"], int(told["target"]["steps"][0])
+    assert filmed.shape == (steps + 1, 29)
+    assert torch.equal(filmed[:, :2], paths["target.position"][0, : steps + 1])
+
+
 def test_an_episode_ends_with_its_success(
     task: str, trained: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -255,8 +280,9 @@ def test_a_student_is_tested_in_the_target_and_in_its_varied_simulator(
 def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="run the stage `train` first"):
         make(task, "astra", tmp_path / "out")
-    with pytest.raises(BadInputError, match="run the stage `ground` first"):
-        make(task, "astra", tmp_path / "out", {"policy": trained})
+    for method in ("astra", "nas"):
+        with pytest.raises(BadInputError, match="run the stage `ground` first"):
+            make(task, method, tmp_path / "out", {"policy": trained})
     with pytest.raises(BadInputError, match=r"policy.safetensors does not exist") as caught:
         make(task, "direct_transfer", tmp_path / "out", {"policy": tmp_path})
     assert "\n" not in str(caught.value)

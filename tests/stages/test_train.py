@@ -261,6 +261,8 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
     eased = TRAIN.model_copy(update={"ramp": 0.5, "ramp_while": 0.9})
     with pytest.raises(BadInputError, match="ramp_while: no episode of humanoid-walker2d succeeds before"):
         make("humanoid-walker2d", "direct_transfer", paired, None, tmp_path / "out", eased)
+    with pytest.raises(BadInputError, match="pair it again, with the simulator of this task"):
+        make("humanoid-walker2d", "direct_transfer", paired, None, tmp_path / "out")
     with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
         make(task, "astra", paired, tmp_path, tmp_path / "out")
     assert "\n" not in str(caught.value)
