@@ -17,8 +17,9 @@ from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.residual import ResidualModel, ResidualShape
-from astra_data.training.build_env import EnvConfig, env_parts, training_env
+from astra_data.training.build_env import EnvConfig, env_parts, recorded_steps, training_env
 from astra_data.training.ramp import Ramp
+from astra_data.training.simulator_env import policy_observation
 from astra_data.worlds.plane.free_space import FreeSpace
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
@@ -73,6 +74,27 @@ def test_without_switches_it_is_the_plain_simulator(
         drawn = torch.get_rng_state()
         world.step(torch.zeros(4, 2))
         assert torch.equal(torch.get_rng_state(), drawn)
+
+
+@torch.no_grad()
+def test_recorded_steps_show_what_was_known_before_each(
+    episodes: PairedEpisodes, grounding: HistoryGrounding
+) -> None:
+    windows, model = episodes.windows, grounding.model
+    for used in (NO_GROUNDING, grounding):
+        recorded = recorded_steps(TASK, episodes, used)
+        hidden, previous = torch.zeros(2, 8), torch.zeros(2, 2)
+        for step in range(6):
+            state, goal, latent = windows.state[:, step], windows.goal[:, step], None
+            if used is grounding:
+                hidden = model.encoder.step(model.encoder_input(state, goal, previous), hidden)
+                latent = model.encoder.latent(hidden)
+            seen = policy_observation(TASK.objective, state, goal, latent)
+            torch.testing.assert_close(recorded.observation[:, step], seen)
+            assert torch.equal(recorded.previous_action[:, step], previous)
+            previous = windows.action[:, step]
+            assert torch.equal(recorded.action[:, step], previous)
+        assert recorded.lengths.tolist() == [400, 300]
 
 
 def test_failures_are_foreseen_where_rewards_or_ends_depend_on_them() -> None:

@@ -2,11 +2,12 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 from small_cart import TASK, Last
 
 from astra_data.core.progress import silent
-from astra_data.dataset.columns import DONE, SUCCESS, TERMINATED, TRUNCATED, Episode
+from astra_data.dataset.columns import ACTION, DONE, SUCCESS, TERMINATED, TRUNCATED, Episode
 from astra_data.training.recording import _step, record
 
 
@@ -19,6 +20,7 @@ def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
     assert record(task, env, behavior, range(2), writer, max_steps=4, seed=0, progress=silent) == 8
     for episode in recorded:
         assert episode.columns[SUCCESS].tolist() == [False, False, False, True]
+        assert episode.columns[ACTION].tolist() == pytest.approx([0.0] * 4, abs=1e-6)  # in m/s
         assert (episode.metadata["success"], episode.metadata["failed"]) == (True, False)
     assert len(recorded) == 2
 
