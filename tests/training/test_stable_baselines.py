@@ -2,6 +2,7 @@
 
 import gymnasium
 import numpy as np
+import pytest
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecMonitor
 
@@ -31,6 +32,15 @@ def test_rows_are_those_of_the_vector_environment() -> None:
             lengths.append(ages[row])
             ages[row] = 0
     assert len(lengths) >= 3
+
+
+def test_who_ends_in_the_last_moment_is_not_timed_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = gymnasium.make_vec("astra_data/PointMazeUMaze-v0", num_envs=3)
+    rows, zeros = StableBaselinesEnv(env), np.zeros((3, 8), np.float32)
+    ended, late = np.array([True, True, False]), np.array([True, False, True])
+    monkeypatch.setattr(env, "step", lambda _: (zeros, zeros[:, 0], ended, late, {"final_obs": zeros}))
+    _, _, done, infos = rows.step(np.zeros((3, 2), np.float32))
+    assert done.all() and [info["TimeLimit.truncated"] for info in infos] == [False, False, True]
 
 
 def test_the_seed_that_is_set_is_that_of_the_next_reset() -> None:

@@ -153,7 +153,7 @@ def test_how_long_episodes_last_is_the_mean_over_all_of_them(monkeypatch: pytest
         def step(self, action: Tensor, active: Tensor) -> Any:  # noqa: ANN401
             self.steps += 1
             self.actives = [*getattr(self, "actives", []), active.tolist()]
-            ends = torch.tensor([self.steps >= 2, self.steps >= 4, False])
+            ends = torch.tensor([self.steps == 2, self.steps == 4, False])  # in this step alone
             return type("Step", (), {"terminated": ends})()
 
     class Deployed:
