@@ -133,6 +133,19 @@ def test_the_record_of_a_run_is_read_once(run: Path, tmp_path: Path, monkeypatch
     read.assert_called_once_with(run)
 
 
+def test_of_a_policy_that_cannot_be_written_nothing_is_left(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: RunningPolicy, folder: Path) -> None:
+        (folder / "policy.onnx").touch()
+        raise BadInputError("code that cannot be traced")
+
+    monkeypatch.setattr("astra_data.deployment.folder.write_graphs", fail)
+    with pytest.raises(BadInputError, match="cannot be traced"):
+        deploy(run, "nas", tmp_path / "policy")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_policy_is_that_of_the_seed_and_size_that_are_asked_for(tmp_path: Path) -> None:
     run, code = tmp_path / "rail", Path(__file__).parents[1] / "small_cart.py"
     torch.manual_seed(0)
@@ -153,6 +166,7 @@ def test_the_policy_is_that_of_the_seed_and_size_that_are_asked_for(tmp_path: Pa
     hidden = torch.zeros(1, about["hidden"]["size"])
     command, _ = load_torchscript(folder / "policy.torchscript")(state, goal, hidden)
     torch.testing.assert_close(command, here.command(state, goal), atol=1e-5, rtol=0)
+    assert about["command_limit"] is None  # of velocities in a maze alone
 
 
 def test_its_page_tells_sizes_and_what_stops_the_robot() -> None:
