@@ -71,6 +71,7 @@ def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
             ["collect", "humanoid-walker2d", "--clearance-m", "0.5", "--start", "task"],
             r"expected a task in a maze",
         ),
+        (["collect", "antmaze-umaze", "--plan", "none.json"], r"none.json cannot be read as a plan: No such"),
         (["collect", "antmaze-umase"], r"did you mean 'antmaze-umaze'"),
         (["pair", "recipe.toml", "--simulator", "antmaze-umaze"], r"in \[pair\]: leave out --simulator"),
         (["pair", "walks", "--jobs", "2", "--simulator", "antmaze-umaze"], r"neither --seed nor --jobs"),
@@ -97,10 +98,16 @@ def test_datasets_at_home_are_listed(home: Path) -> None:
 
 
 def test_stopping_a_recording_says_how_to_go_on(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    add = StagedWriter.add
+
     def stop(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
+        add(writer, episode, position)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(StagedWriter, "add", stop)
     stopped = call("collect", "antmaze-umaze", *SMALL)
     assert stopped.exit_code == 130
     assert stopped.output.splitlines()[-1] == "stopped: run the same command with --resume to continue"
+    monkeypatch.setattr(StagedWriter, "add", add)
+    assert "resume it" in str(call("collect", "antmaze-umaze", *SMALL).exception)
+    assert call("collect", "antmaze-umaze", *SMALL, "--resume").exit_code == 0

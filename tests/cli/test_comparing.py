@@ -25,6 +25,7 @@ def test_lineage_and_differences_are_shown(tmp_path: Path) -> None:
         "1 episodes only in fake@data-1.0.0: 13",
     ]
     assert "stage: 'collect', then 'delete'" in told
+    assert run("diff", str(made), str(first.root))[2] == "1 episodes only in fake@data-1.0.0: 13"
 
 
 def test_values_are_told_from_metadata(tmp_path: Path) -> None:

@@ -6,13 +6,14 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.edit import subset
 from astra_data.dataset.versions import open_dataset, versions_at_home
 
 
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path))
-    write_fake(tmp_path / "fake/data-1.0.0")
+    write_fake(tmp_path / "fake/data-1.0.0", subset_seed=3)
     return "fake@data-1.0.0"
 
 
@@ -32,6 +33,21 @@ def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> No
     )
     assert open_dataset(tmp_path / "here").verify() == []
     assert len(versions_at_home("fake")) == 5
+
+
+def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str, tmp_path: Path) -> None:
+    def uids(*arguments: str) -> list[int]:
+        out = tmp_path / "-".join(arguments)
+        run(*arguments[:1], fake, *arguments[1:], "--out", str(out))
+        return [int(uid) for uid in open_dataset(out).uids]
+
+    # Returns are half the uids; lengths are 7, 1, 12, 30 and 5.
+    assert uids("filter", "--min-return", "2", "--max-return", "3") == [4, 6]
+    assert uids("filter", "--min-length", "5", "--max-length", "12") == [13, 2**53 + 1, 0]
+    stored = subset(open_dataset(fake), episodes=3, out=tmp_path / "stored")
+    taken = uids("subset", "--episodes", "3")
+    assert taken == open_dataset(stored).uids.tolist()
+    assert taken != uids("subset", "--episodes", "3", "--seed", "0")
 
 
 def test_a_refused_edit_writes_nothing(fake: str) -> None:

@@ -6,7 +6,7 @@ from shared_files import contents
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, SharingError
 from astra_data.dataset import Dataset
 
 
@@ -34,6 +34,8 @@ def test_a_version_goes_to_a_folder_and_back(fake: Dataset, tmp_path: Path) -> N
     assert call("pull", f"{place}/fake", "--out", str(out)) == f"fake@data-1.0.0: {out}\n"
     with pytest.raises(BadInputError, match=r"no version data-2\.0\.0"):
         call("pull", f"{place}/fake", "--version", "2.0.0")
+    with pytest.raises(SharingError, match=r"bytes, of which at most 10 are taken"):
+        call("pull", f"{place}/fake", "--out", str(tmp_path / "large"), "--max-bytes", "10")
 
 
 def test_a_card_is_written_with_its_notes(fake: Dataset, tmp_path: Path) -> None:

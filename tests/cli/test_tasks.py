@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, Column, Episode
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.worlds import own_code, registry
@@ -81,9 +81,14 @@ def test_a_log_is_labelled_by_a_task_in_a_file(tmp_path: Path) -> None:
         writer.add(
             Episode(0, {STATE: state[:-1], ACTION: np.ones(5, np.float32), NEXT_STATE: state[1:].copy()})
         )
-    command = ["label", f"{tmp_path}/logs", "--task", f"{CART}:LOGS_ALONE", "--out", f"{tmp_path}/labelled"]
-    result = CliRunner().invoke(app, command)
-    assert result.exit_code == 0, result.output
-    assert f"finished: {tmp_path}/labelled" in result.output.replace("\n", "")
-    reward = Dataset.open(tmp_path / "labelled").columns([REWARD])[REWARD]
-    np.testing.assert_allclose(reward, 0.1, atol=1e-6)
+    goals = []
+    for name, more in (("labelled", list[str]()), ("again", ["--seed", "0"]), ("other", ["--seed", "1"])):
+        out = f"{tmp_path}/{name}"
+        command = ["label", f"{tmp_path}/logs", "--task", f"{CART}:LOGS_ALONE", "--out", out, *more]
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 0, result.output
+        assert f"finished: {out}" in result.output.replace("\n", "")
+        labelled = Dataset.open(out).columns([REWARD, GOAL])
+        np.testing.assert_allclose(labelled[REWARD], 0.1, atol=1e-6)
+        goals.append(float(labelled[GOAL][0]))
+    assert goals[0] == goals[1] != goals[2]

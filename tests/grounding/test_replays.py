@@ -99,6 +99,17 @@ def test_gaps_are_mean_distances_from_the_recording() -> None:
     torch.testing.assert_close(gaps[..., names.index("position_m")], off * along.mean(), atol=1e-4, rtol=0)
 
 
+def test_errors_to_either_side_add_up() -> None:
+    """Commands go back and forth, so that the plain simulator is too fast in either direction."""
+    start = torch.tensor([[*TASK.maze.cell_centre(1, 1), 0.0, 0.0]]).float()
+    action = torch.tensor([[0.5, 0.0], [-0.5, 0.0]]).repeat(2, 1)[None]
+    moved = 0.8 * TASK.timestep_s * action.cumsum(1)
+    target = torch.cat([start[:, None, :2] + moved, 0.8 * action], dim=-1)
+    recorded = ReplayWindows(start, start[:, :2], action, target)
+    (gap,) = trajectory_gaps(TASK, recorded, PlanarVariation().ranges()[:, 0][None], seed=0)
+    assert float(gap[0, list(TASK.quantities).index("velocity_m_s")]) == pytest.approx(0.2 * 0.5, abs=1e-4)
+
+
 def test_all_parameters_are_replayed_with_the_same_noise() -> None:
     start = torch.tensor([*TASK.maze.cell_centre(1, 1), 0.0, 0.0]).float().expand(3, 4)
     action = torch.zeros(3, 5, 2)
