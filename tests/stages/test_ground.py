@@ -115,9 +115,12 @@ def test_where_there_is_nothing_to_explain_r2_is_unknown(grounded: Path, paired:
     assert known is not None and known < 1.0
 
 
-def test_the_gap_is_measured_on_held_out_episodes(grounded: Path, paired: Path) -> None:
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_gap_is_measured_on_held_out_episodes(seed: int, task: str, paired: Path, tmp_path: Path) -> None:
     """One step after a reset, the raw simulator is where pairing saw it land."""
-    _, held_out = PairedEpisodes.load(paired).split(GROUND.held_out_share, 0)
+    grounded = tmp_path / "grounded"
+    ground(task, "nas", GROUND.model_copy(update={"updates": 2}), dataset=paired, seed=seed, out=grounded)
+    _, held_out = PairedEpisodes.load(paired).split(GROUND.held_out_share, seed)
     missed = (held_out.windows.simulated_next - held_out.windows.next_state).numpy()
     starts = [
         (row, step) for row, length in enumerate(held_out.lengths.tolist()) for step in range(0, length, 25)

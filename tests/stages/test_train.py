@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ from astra_data.learning.rma import RmaConfig
 from astra_data.methods import METHODS
 from astra_data.stages.train import train
 from astra_data.training.policy_file import PolicyFile
-from astra_data.training.train import PpoTrainConfig, SacTrainConfig
+from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
 from astra_data.worlds.registry import TASKS
 
 SWITCHES = {"topple": True, "residual_noise": 1.0, "support_penalty": 0.1, "data_start_share": 0.5}
@@ -263,6 +264,9 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
         make("humanoid-walker2d", "direct_transfer", paired, None, tmp_path / "out", eased)
     with pytest.raises(BadInputError, match="pair it again, with the simulator of this task"):
         make("humanoid-walker2d", "direct_transfer", paired, None, tmp_path / "out")
+    predicted = TRAIN.model_copy(update={"reward": "predicted"})
+    with pytest.raises(BadInputError, match="'direct_transfer' learns no reward: expected reward abstract"):
+        make(task, "direct_transfer", paired, None, tmp_path / "out", predicted)
     with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
         make(task, "astra", paired, tmp_path, tmp_path / "out")
     assert "\n" not in str(caught.value)
@@ -310,10 +314,17 @@ def test_trainings_without_a_simulator_are_made_once(
 ) -> None:
     """Whatever they learned, there is no simulator of theirs to test it in."""
     policy = PolicyFile(ActorCritic(ActorCriticShape(6, 2)), None, "toy@data-1.0.0", "abc")
-    learned = replace(METHODS["behavior_cloning"], learn=lambda training: (policy, {"points": []}))
-    monkeypatch.setitem(METHODS, "behavior_cloning", learned)
-    make(task, "behavior_cloning", paired, None, tmp_path / "cloned", TRAIN.model_copy(update={"tries": 2}))
-    assert "tries" not in json.loads((tmp_path / "cloned/curve.json").read_text())
+    given = list[Training]()
+
+    def learn(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        given.append(training)
+        return policy, {"points": []}
+
+    monkeypatch.setitem(METHODS, "behavior_cloning", replace(METHODS["behavior_cloning"], learn=learn))
+    config, out = TRAIN.model_copy(update={"tries": 2}), tmp_path / "cloned"
+    train(task, "behavior_cloning", config, dataset=paired, seed=4, out=out, num_threads=3)
+    assert "tries" not in json.loads((out / "curve.json").read_text())
+    assert [(one.seed, one.num_threads) for one in given] == [(4, 3)]
 
 
 def test_a_policy_of_short_commands_is_no_start_of_fine_tuning(
