@@ -38,6 +38,7 @@ from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizesResults
 from astra_data.stages import report as stage
 from astra_data.stages.report import report
+from astra_data.worlds.registry import TASKS
 from astra_data.worlds.score import RETURN, SURVIVED_STEPS
 
 
@@ -445,3 +446,10 @@ def test_how_failures_are_foreseen_is_drawn_of_the_largest_size(tasks: None, tmp
     make(tmp_path, recipe=FakeRecipe("sizes", methods=("astra",), percents=(50, 100)))
     page = read_page((tmp_path / "report/results.html").read_text())
     assert len(page.attributes("img")) == 1 + len(images(tmp_path / "report"))
+
+
+def test_pictures_are_taken_in_seconds() -> None:
+    camera = stage._camera(TASKS["humanoid-walker2d"])
+    assert camera is not None and camera.timestep_s == 0.015
+    assert camera.longest_s == pytest.approx(15.0)  # 1000 steps
+    assert stage._camera(TASKS["antmaze-umaze"]) is None
