@@ -37,6 +37,11 @@ def seed_folder(seed: int, percent: int | None = None) -> str:
     return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"
 
 
+def artefact_key(stage: str, row: str, seed: int, percent: int | None = None) -> str:
+    """Return the key of an artefact, its place in the folder of a run; `row` is empty for a dataset."""
+    return "/".join(filter(None, (stage, row, seed_folder(seed, percent))))
+
+
 def stage_of_key(key: str) -> str:
     """Return the stage of an artefact's key, as "train" of "train/astra/seed_0"."""
     return key.partition("/")[0]

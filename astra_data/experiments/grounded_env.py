@@ -10,7 +10,7 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import is_plus, seed_folder
+from astra_data.core.naming import artefact_key, is_plus
 from astra_data.core.progress import Progress, silent
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.plan import plan
@@ -197,7 +197,7 @@ def _planned(
     recipe = validated(settings | {"select": None}, Recipe, f"{run}")
     only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
     items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
-    call = items.get(f"{stage}/{row}/{seed_folder(seed, percent)}")
+    call = items.get(artefact_key(stage, row, seed, percent))
     if not isinstance(call, partial):
         raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
     return call

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import base_method, reference_of, seed_folder, stage_of_key
+from astra_data.core.naming import artefact_key, base_method, reference_of, stage_of_key
 from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
@@ -171,7 +171,7 @@ class _Plan:
     def _item(self, stage: Stage, seed: int, percent: int | None, name: str = "") -> Item:
         """Return the artefact that a stage makes of a dataset, for a method or row if `name` is one."""
         recipe, method = self.recipe, method_named(name) if name else None
-        key = "/".join(filter(None, (stage.name, name, seed_folder(seed, percent))))
+        key = artefact_key(stage.name, name, seed, percent)
         parameters = inspect.signature(stage.run).parameters
         artefacts = self._artefacts(stage, seed, percent, name)
         keys = {parameter: artefacts[parameter] for parameter in parameters if parameter in ARTEFACTS}
@@ -214,14 +214,14 @@ class _Plan:
         datasets = [read for read in map(STAGES.get, stage.reads) if read and read.makes_dataset]
         last = next((read for read in reversed(datasets) if self._has(read)), None)
         size = percent if last and last.each == "size" else None
-        artefacts = {"dataset": f"{last.name}/{seed_folder(seed, size)}" if last else None}
+        artefacts = {"dataset": artefact_key(last.name, "", seed, size) if last else None}
         if not name:
             return artefacts
         base = base_method(name)
         method, reference = method_named(base), reference_of(self.recipe.methods) or base
 
         def made(by: str, of: str | None) -> str | None:
-            return f"{by}/{of}/{seed_folder(seed, percent)}" if of else None
+            return artefact_key(by, of, seed, percent) if of else None
 
         return artefacts | {
             "policy": made("train", name if method.trains else None),

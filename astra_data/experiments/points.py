@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import seed_folder
+from astra_data.core.naming import artefact_key
 from astra_data.experiments.recipe import Recipe
 
 
@@ -20,7 +20,7 @@ class RunPoint:
     @property
     def key(self) -> str:
         """Key of its evaluation, the last artefact to be made for it."""
-        return f"evaluate/{self.method}/{seed_folder(self.seed, self.percent)}"
+        return artefact_key("evaluate", self.method, self.seed, self.percent)
 
 
 @dataclass(frozen=True)

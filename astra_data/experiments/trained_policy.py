@@ -6,7 +6,7 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import RECORD, seed_folder
+from astra_data.core.naming import RECORD, artefact_key
 from astra_data.experiments.own_files import check_unchanged
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.recipe_file import recorded_settings
@@ -108,9 +108,9 @@ def settings_of(run: str | Path) -> dict[str, Any]:
 def _files(
     settings: dict[str, Any], folder: Path, row: str, seed: int, percent: int | None
 ) -> dict[str, Path]:
-    own_methods, where = settings.get("own_methods", {}), seed_folder(seed, percent)
+    own_methods = settings.get("own_methods", {})
     add_all(own_methods)
-    files = {"train": folder / "train" / row / where / POLICY}
+    files = {"train": folder / artefact_key("train", row, seed, percent) / POLICY}
     if not files["train"].is_file():
         _check_asked(settings, row, seed)
     method = method_named(row)
@@ -124,9 +124,9 @@ def _files(
     for name in own_methods.keys() & {method.name, base}:
         check_unchanged(own_methods[name]["method"], folder, name=name)
     if method.grounds:
-        files["ground"] = folder / "ground" / base / where / GROUNDING
+        files["ground"] = folder / artefact_key("ground", base, seed, percent) / GROUNDING
     if method.aligns:
-        files["align"] = folder / "align" / base / where / TARGET_ENCODER
+        files["align"] = folder / artefact_key("align", base, seed, percent) / TARGET_ENCODER
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
     return files

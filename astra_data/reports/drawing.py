@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import seed_folder
+from astra_data.core.naming import artefact_key
 from astra_data.dataset.inspection import visited
 from astra_data.dataset.reader import Dataset
 from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
@@ -115,7 +115,7 @@ def _with_trajectories(root: Path, results: Results, rows: Sequence[str]) -> dic
     """Return row → folder of its first seed with trajectories; empty if any row has none."""
     found = {}
     for row in rows:
-        folders = (root / "evaluate" / row / seed_folder(seed) for seed in results.methods[row].seeds)
+        folders = (root / artefact_key("evaluate", row, seed) for seed in results.methods[row].seeds)
         folder = next((folder for folder in folders if (folder / TRAJECTORIES).exists()), None)
         if folder is None:
             return {}
@@ -233,7 +233,7 @@ def _scored(row: MethodResults, score: Score) -> Scored:
 def _subsets(found: SizesResults, root: Path) -> list[Path]:
     """Return the datasets of all sizes of the first seed that has all of them; empty without one."""
     for seed in found.sizes[0].results.seeds:
-        folders = [root / "subset" / seed_folder(seed, size.percent) for size in found.sizes]
+        folders = [root / artefact_key("subset", "", seed, size.percent) for size in found.sizes]
         if all(folder.is_dir() for folder in folders):
             return folders
     return []

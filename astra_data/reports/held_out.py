@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.durable import write_file
-from astra_data.core.naming import seed_folder
+from astra_data.core.naming import artefact_key
 from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
 from astra_data.reports.artefacts import GAP, METRICS, Foresight, Gap, Metrics, read_json
@@ -55,7 +55,7 @@ def write_held_out(
     for method in groundings:
         for percent in sorted(percents) or (None,):
             files = {
-                seed: root / "ground" / method / seed_folder(seed, percent) / GAP for seed in sorted(seeds)
+                seed: root / artefact_key("ground", method, seed, percent) / GAP for seed in sorted(seeds)
             }
             gaps = {seed: read_json(Gap, file) for seed, file in files.items() if file.is_file()}
             if gaps:
@@ -135,7 +135,7 @@ def _measured(
 ) -> dict[str, list[Foresight]]:
     measured: dict[str, list[Foresight]] = {}
     for seed in seeds:
-        file = root / "ground" / method / seed_folder(seed, percent) / METRICS
+        file = root / artefact_key("ground", method, seed, percent) / METRICS
         for part, one in read_json(Metrics, file).failures.items() if file.is_file() else ():
             if one.auc:
                 measured.setdefault(part, []).append(one)

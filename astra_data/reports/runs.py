@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.naming import base_method, seed_folder
+from astra_data.core.naming import artefact_key, base_method
 from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
 
 SHARED_BY_ROWS = ("ground", "align")
@@ -71,7 +71,7 @@ class Runs:
 
     def path(self, stage: str, method: str, seed: int, name: str) -> Path:
         """Return the path of a stage's file for one row and seed."""
-        return self.root / stage / self.owner(stage, method) / seed_folder(seed, self.percent) / name
+        return self.root / artefact_key(stage, self.owner(stage, method), seed, self.percent) / name
 
     @cached_property
     def _seeds(self) -> dict[str, tuple[int, ...]]:
@@ -115,7 +115,7 @@ class Runs:
         """Read the metadata of the datasets that a stage wrote, by seed."""
         percent = self.percent if stage == "subset" else None
         paths = {
-            seed: self.root / stage / seed_folder(seed, percent) / "meta" / "astra" / "dataset.json"
+            seed: self.root / artefact_key(stage, "", seed, percent) / "meta" / "astra" / "dataset.json"
             for seed in self.seeds
         }
         return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}

@@ -13,7 +13,7 @@ from astra_data.core.config import Config, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.manifest import write_manifest
-from astra_data.core.naming import seed_folder
+from astra_data.core.naming import artefact_key
 from astra_data.core.progress import Progress, silent
 from astra_data.methods import method_named
 from astra_data.reports.artefacts import EVALUATION
@@ -181,7 +181,7 @@ def _of_one(
 def _read(recipe: Reported, root: Path) -> dict[str, str]:
     """Return the digest of each evaluation that is finished, and of a choice, by its folder in `root`."""
     folders = [
-        f"evaluate/{row}/{seed_folder(seed, percent)}"
+        artefact_key("evaluate", row, seed, percent)
         for row in recipe.methods
         for percent in recipe.percents or (None,)
         for seed in recipe.seeds

@@ -16,7 +16,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
-from astra_data.core.naming import reference_of, seed_folder
+from astra_data.core.naming import artefact_key, reference_of
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -198,19 +198,21 @@ def select(
 
 def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -> Bench:
     dataset = "pair" if percent is None else "subset"
-    where = {seed: seed_folder(seed, percent) for seed in recipe.seeds}
     entries = [
         Entry(
             row,
             seed,
             percent,
-            f"train/{row}/{where[seed]}",
-            f"ground/{grounded_as(row)}/{where[seed]}" if method_named(row).grounds else None,
+            artefact_key("train", row, seed, percent),
+            artefact_key("ground", grounded_as(row), seed, percent) if method_named(row).grounds else None,
         )
         for row in rows
         for seed in recipe.seeds
     ]
-    judges = {seed: (f"ground/{judge}/{of}", f"{dataset}/{of}") for seed, of in where.items()}
+    judges = {
+        seed: (artefact_key("ground", judge, seed, percent), artefact_key(dataset, "", seed, percent))
+        for seed in recipe.seeds
+    }
     return Bench(percent, tuple(entries), judges)
 
 

@@ -1,4 +1,4 @@
-from astra_data.core.naming import base_method, is_plus, reference_of, seed_folder, stage_of_key
+from astra_data.core.naming import artefact_key, base_method, is_plus, reference_of, seed_folder, stage_of_key
 
 
 def test_a_row_is_a_method_or_its_plus() -> None:
@@ -14,6 +14,11 @@ def test_rows_are_tested_in_nas_if_it_is_among_them() -> None:
 def test_folders_of_seeds_lie_in_those_of_sizes() -> None:
     assert seed_folder(3) == "seed_3"
     assert seed_folder(3, 5) == "percent_005/seed_3"
+
+
+def test_a_key_is_the_place_in_a_run() -> None:
+    assert artefact_key("train", "astra", 3, 5) == "train/astra/percent_005/seed_3"
+    assert artefact_key("pair", "", 0) == "pair/seed_0"
 
 
 def test_a_key_begins_with_its_stage() -> None:
