@@ -76,13 +76,14 @@ def list_(
     from rich.table import Table
 
     from astra_data.core.errors import AstraDataError, CorruptDatasetError
+    from astra_data.dataset.description import full_name
     from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
 
     faults: list[str] = []
     table = Table("dataset", "stage", "episodes", "steps", "content", title=str(home()))
     for name in names_at_home():
         for version in versions_at_home(name):
-            reference = f"{name}@data-{version}"
+            reference = full_name({"name": name, "version": version})
             try:
                 found = open_dataset(reference)
             except AstraDataError as error:

@@ -39,6 +39,7 @@ def select(
     from astra_data.experiments.display import shown
     from astra_data.experiments.selecting import select as rank
     from astra_data.experiments.trials import choose_by_trials
+    from astra_data.reports.choice import FOLDER
 
     given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
     if trials is None and (field is not None or percent is not None):
@@ -49,7 +50,7 @@ def select(
         assert made.chosen is not None
         best, seed = made.chosen
         typer.echo(f"chosen by {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}")
-        typer.echo(f"written: {run / 'select' / 'select.md'}")
+        typer.echo(f"written: {run / FOLDER / 'select.md'}")
         return
     with shown("select") as progress:
         judged = rank(run, progress=progress, **given)
@@ -58,4 +59,4 @@ def select(
         reached = f"{first.lower:.2f} in the lower quartile of its judges"
         size = f" at {percent} %" if percent else ""
         typer.echo(f"chosen{size}: {first.row}, seed {first.seed}: {reached}")
-    typer.echo(f"written: {run / 'select' / 'select.md'}")
+    typer.echo(f"written: {run / FOLDER / 'select.md'}")

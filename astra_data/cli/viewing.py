@@ -35,12 +35,13 @@ def view(
 ) -> None:
     """Show paths, commands and rewards of a dataset in Rerun; of a run, also its simulators."""
     from astra_data.core.errors import BadInputError
+    from astra_data.core.naming import RECORD
     from astra_data.dataset.format import INFO_PATH
     from astra_data.dataset.versions import open_dataset
     from astra_data.reports.rerun_view import view as show
 
     folder = Path(source)
-    if (folder / "recipe.json").is_file():
+    if (folder / RECORD).is_file():
         from astra_data.experiments.run_view import view_run
 
         if lacking := view_run(folder, uids or (), seed=seed, save=save):
@@ -49,7 +50,7 @@ def view(
         if folder.is_dir() and not (folder / INFO_PATH).is_file():
             raise BadInputError(
                 f"{source}: expected a dataset, which holds {INFO_PATH}, or the folder of a run, which holds "
-                "recipe.json; got neither: name the folder that import, collect or run wrote"
+                f"{RECORD}; got neither: name the folder that import, collect or run wrote"
             )
         if seed is not None:
             raise BadInputError(f"{source} is a dataset: --seed is for the folder of a run")

@@ -27,6 +27,11 @@ _DEFAULTS: dict[str, Any] = {
 }
 
 
+def full_name(description: Mapping[str, Any]) -> str:
+    """Return "name" and "version" as one, such as "antmaze-long-random-seed0@data-1.0.0"."""
+    return f"{description['name']}@data-{description['version']}"
+
+
 def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     """Return the contents of meta/astra/dataset.json, without the content hash.
 

@@ -32,11 +32,12 @@ TASKS_PATH = "meta/tasks.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
-DATASET_PATH = "meta/astra/dataset.json"
-METADATA_PATH = "meta/astra/episodes.parquet"
-SUBSETS_PATH = "meta/astra/subsets.json"
-DIGESTS_PATH = "meta/astra/digests.parquet"
-POLICY_PATH = "meta/astra/policy.safetensors"
+OUR_FOLDER = "meta/astra"
+DATASET_PATH = f"{OUR_FOLDER}/dataset.json"
+METADATA_PATH = f"{OUR_FOLDER}/episodes.parquet"
+SUBSETS_PATH = f"{OUR_FOLDER}/subsets.json"
+DIGESTS_PATH = f"{OUR_FOLDER}/digests.parquet"
+POLICY_PATH = f"{OUR_FOLDER}/policy.safetensors"
 METADATA_KEYS = ("episode_uid", "length")
 """First columns of `METADATA_PATH`; the others are the episodes' own metadata."""
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.naming import RECORD
 from astra_data.core.wording import shortened
+from astra_data.dataset.description import full_name
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
@@ -78,7 +79,7 @@ def _ancestor(
     beside: Path,
     descendants: tuple[Mapping[str, str], ...],
 ) -> Ancestor:
-    reference = f"{identity['name']}@data-{identity['version']}"
+    reference = full_name(identity)
     if identity in descendants:
         raise CorruptDatasetError(
             f"{reference} is among its own ancestors: a {DATASET_PATH} was altered; restore it from a copy."

@@ -13,8 +13,9 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset.column_statistics import ranges
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, Ints, read_contents
+from astra_data.dataset.description import full_name
 from astra_data.dataset.digests import Digests, altered_columns, digests_of, read_digests
-from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.format import INFO_PATH, OUR_FOLDER
 from astra_data.dataset.lerobot_recording import open_recording
 from astra_data.dataset.libraries import to_huggingface, to_lerobot
 from astra_data.dataset.opening import explained, refuse_others
@@ -51,7 +52,7 @@ class Dataset(Contents):
         root = Path(root)
         refuse_others(root)
         with explained(root):
-            is_ours = (root / "meta/astra").is_dir() or not (root / INFO_PATH).is_file()
+            is_ours = (root / OUR_FOLDER).is_dir() or not (root / INFO_PATH).is_file()
             return cls(**vars(read_contents(root) if is_ours else open_recording(root)))
 
     @property
@@ -67,7 +68,7 @@ class Dataset(Contents):
     @property
     def reference(self) -> str:
         """Name and version, such as "antmaze-long-random-seed0@data-1.0.0"."""
-        return f"{self.description['name']}@data-{self.description['version']}"
+        return full_name(self.description)
 
     @property
     def content_hash(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
-from astra_data.dataset.description import ContentHash
+from astra_data.dataset.description import ContentHash, full_name
 from astra_data.dataset.versions import Version, home_of, versions_at_home
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.export_record import ExportRecord
@@ -65,7 +65,7 @@ def restored(module: ModuleType, source: Source, record: ExportRecord) -> Iterat
     if wrong or number < len(record.lengths):
         raise CorruptDatasetError(
             f"{source} was altered or is incomplete: {', '.join(wrong) or 'the number of rows'} differs from "
-            f"what was exported of {record.name}@data-{record.version}; export it again, or restore a copy"
+            f"what was exported of {full_name(record.identity)}; export it again, or restore a copy"
         )
 
 
@@ -118,7 +118,7 @@ def write_restored(
             frames += len(episode)
         if options.get("fps", record.fps) == record.fps and writer.content_hash != record.content_hash:
             raise CorruptDatasetError(
-                f"the record of {record.name}@data-{record.version} was altered: with its uids, lengths and "
+                f"the record of {full_name(record.identity)} was altered: with its uids, lengths and "
                 "names, the values are not those that were exported; export it again, or restore a copy"
             )
         writer.made = {"wall_seconds": time.perf_counter() - began}

@@ -14,10 +14,10 @@ from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.run import set_aside
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.methods import grounded_as
-from astra_data.reports.choice import Judged, read_judged
+from astra_data.reports.choice import FOLDER, Judged, read_judged
 from astra_data.reports.runs import Reported
 from astra_data.reports.trials import TRIALS
-from astra_data.stages.select import FOLDER, SelectConfig, benches, digests, judge_in
+from astra_data.stages.select import SelectConfig, benches, digests, judge_in
 from astra_data.stages.select import select as judge_all
 
 _log = logging.getLogger(__name__)

@@ -11,6 +11,7 @@ from astra_data.reports.artefacts import Artefact, read_json
 from astra_data.reports.schema import Calibration, Choice, Ranked
 from astra_data.reports.statistics import Correlation, mean_interval, mean_rank_correlation
 
+FOLDER = "select"
 SELECTED = "select.json"
 LEAST = 3
 """Judges of a policy whose predicted success has an interval; seeds of a row whose ranks are compared."""
@@ -81,7 +82,7 @@ def read_judged(root: Path) -> Judged | None:
     Raises:
         BadInputError: it is malformed.
     """
-    path = root / "select" / SELECTED
+    path = root / FOLDER / SELECTED
     return read_json(Judged, path) if path.is_file() else None
 
 

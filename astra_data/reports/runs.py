@@ -9,6 +9,7 @@ from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import artefact_key, base_method
+from astra_data.dataset.format import DATASET_PATH
 from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
 
 SHARED_BY_ROWS = ("ground", "align")
@@ -115,8 +116,7 @@ class Runs:
         """Read the metadata of the datasets that a stage wrote, by seed."""
         percent = self.percent if stage == "subset" else None
         paths = {
-            seed: self.root / artefact_key(stage, "", seed, percent) / "meta" / "astra" / "dataset.json"
-            for seed in self.seeds
+            seed: self.root / artefact_key(stage, "", seed, percent) / DATASET_PATH for seed in self.seeds
         }
         return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}
 

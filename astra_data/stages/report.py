@@ -18,7 +18,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.methods import method_named
 from astra_data.reports.artefacts import EVALUATION
 from astra_data.reports.assembly import assemble
-from astra_data.reports.choice import SELECTED
+from astra_data.reports.choice import FOLDER, SELECTED
 from astra_data.reports.command_replay import can_replay, replay_commands
 from astra_data.reports.eval_info import eval_info
 from astra_data.reports.files import (
@@ -186,9 +186,7 @@ def _read(recipe: Reported, root: Path) -> dict[str, str]:
         for percent in recipe.percents or (None,)
         for seed in recipe.seeds
     ]
-    files = {folder: root / folder / EVALUATION for folder in folders} | {
-        "select": root / "select" / SELECTED
-    }
+    files = {folder: root / folder / EVALUATION for folder in folders} | {FOLDER: root / FOLDER / SELECTED}
     return {folder: file_digest(file) for folder, file in files.items() if file.exists()}
 
 

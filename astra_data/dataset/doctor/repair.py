@@ -19,6 +19,7 @@ from astra_data.dataset.format import (
     DATASET_PATH,
     INFO_PATH,
     METADATA_PATH,
+    OUR_FOLDER,
     POLICY_PATH,
     SUBSETS_PATH,
     TASKS_PATH,
@@ -186,7 +187,7 @@ def _recorded_rows(
 ) -> Rows | None:
     """Return how rows become ours that LeRobot recorded without next states, None for other datasets."""
     rows = Rows({column.name: column for column in columns}, fps)
-    is_ours = names.EPISODE_UID in rows.stored or (folder / "meta/astra").is_dir()
+    is_ours = names.EPISODE_UID in rows.stored or (folder / OUR_FOLDER).is_dir()
     return None if is_ours or not rows.dropped or lacking(specs) else rows
 
 
@@ -243,7 +244,7 @@ def _digests(
 
 def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[int, dict[str, Scalar]]:
     """Return the episodes' metadata by uid, empty where there is none to rely on."""
-    if METADATA_PATH in altered or not (folder / "meta/astra").is_dir():
+    if METADATA_PATH in altered or not (folder / OUR_FOLDER).is_dir():
         return {}
     table = read_small_table(folder / METADATA_PATH)
     if isinstance(table, str):

@@ -13,6 +13,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import RESERVED, Column
+from astra_data.dataset.description import full_name
 from astra_data.dataset.inspection import visited
 from astra_data.exchange.sharing.loading import loading
 from astra_data.exchange.sharing.notes import Notes
@@ -183,9 +184,7 @@ def _units(column: Column) -> str:
 
 
 def _provenance(description: dict[str, Any]) -> str:
-    parents = [
-        f"{parent['name']}@data-{parent['version']} (`{parent['hash']}`)" for parent in description["parents"]
-    ]
+    parents = [f"{full_name(parent)} (`{parent['hash']}`)" for parent in description["parents"]]
     packages = [f"{name} {version}" for name, version in description["packages"].items()]
     rows = [
         ("version", description["version"]),
