@@ -81,6 +81,7 @@ class FakeMethod:
     ) -> None:
         self.grounds, self.aligns, self.trains = grounds, aligns, trains
         self.in_simulator = trains and initial is None and not steps_target
+        self.trains_without_target = trains and not steps_target
         self.steps_target, self.table, self.configures = steps_target, table, "train"
         self.grounded_as, self.initial = grounded_as, initial
 

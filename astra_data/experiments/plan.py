@@ -204,7 +204,7 @@ class _Plan:
 
     def _recorded(self, method: Method | None, seed: int, percent: int | None, name: str) -> Path | None:
         """Return the dataset that the policy of a row was trained on; None if it is none."""
-        if method is None or not method.trains or method.steps_target:
+        if method is None or not method.trains_without_target:
             return None
         made = self._artefacts(STAGES["train"], seed, percent, name)["dataset"]
         return self.folder / made if made else None

@@ -186,8 +186,7 @@ class Recipe(Config):
             raise ValueError(f"select.judge: {error}") from None
         if len(self.seeds) < 2:
             raise ValueError("select: expected two seeds or more, got 1: judges are of other seeds")
-        methods = [method_named(row) for row in self.methods]
-        if not any(method.trains and not method.steps_target for method in methods):
+        if not any(method_named(row).trains_without_target for row in self.methods):
             raise ValueError("select: expected a row with policies of abstract states, got none")
         return self
 

@@ -102,6 +102,11 @@ class Method:
         """Whether its policy is trained in the target itself."""
         return self.trains and self.learns_from == "target"
 
+    @property
+    def trains_without_target(self) -> bool:
+        """Whether its policy is trained without the target, on the abstract states of a dataset."""
+        return self.trains and self.learns_from != "target"
+
     def accepts(self, reward: RewardSource | None) -> bool:
         """Return whether it can be trained with `reward`: "predicted" needs a grounding that predicts it."""
         return reward != "predicted" or self.predicts_reward or not self.in_simulator

@@ -122,7 +122,7 @@ def judge_in(recipe: Reported, config: SelectConfig) -> str:
 
 def benches(recipe: Reported, judge: str) -> list[Bench]:
     """Return who is judged by whom, at each size; policies that do not act on abstract states are not."""
-    able = [row for row in recipe.methods if method_named(row).trains and not method_named(row).steps_target]
+    able = [row for row in recipe.methods if method_named(row).trains_without_target]
     return [_bench(recipe, able, judge, percent) for percent in recipe.percents or (None,)]
 
 
