@@ -36,7 +36,6 @@ class FakeRecipe(Reported):
     task: str = "antmaze-u"
     methods: tuple[str, ...] = ROWS
     seeds: tuple[int, ...] = SEEDS
-    groundings: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     percents: tuple[int, ...] = ()
 

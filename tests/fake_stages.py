@@ -25,7 +25,6 @@ class Reported:
     task: str
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
-    groundings: Mapping[str, str]
     settings: Mapping[str, Any]
     percents: tuple[int, ...]
 

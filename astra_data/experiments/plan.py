@@ -62,7 +62,6 @@ def plan(
         task=recipe.task,
         methods=selection.methods,
         seeds=selection.seeds,
-        groundings={row: grounded_as(row) for row in selection.methods},
         settings=recipe.settings,
         percents=selection.percents,
     )

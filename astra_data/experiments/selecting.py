@@ -13,7 +13,6 @@ from astra_data.core.progress import Progress, silent
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.run import set_aside
 from astra_data.experiments.trained_policy import settings_of
-from astra_data.methods import grounded_as
 from astra_data.reports.choice import FOLDER, Judged, read_judged
 from astra_data.reports.runs import Reported
 from astra_data.reports.trials import TRIALS
@@ -52,13 +51,11 @@ def select(
     given = {"judge": judge, "episodes": episodes}
     asked = asked | {key: value for key, value in given.items() if value is not None}
     config = validated(asked, SelectConfig, f"{folder}: select")
-    methods = tuple(rows) or tuple(settings["methods"])
     recipe = Reported(
         name=folder.name,
         task=settings["task"],
-        methods=methods,
+        methods=tuple(rows) or tuple(settings["methods"]),
         seeds=tuple(settings["seeds"]),
-        groundings={row: grounded_as(row) for row in methods},
         settings=settings,
         percents=tuple(settings.get("sweep", {}).get("percent", ())),
     )

@@ -77,6 +77,7 @@ def sweep(
             Ray or trackio is not installed, or another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
+    stages = stages_until(until)
     experiment = load_experiment(recipe_path, root)
     part = Selection.of(experiment.recipe, methods, seeds, percents)
     log = _tracked(trackio, experiment.folder.name) if trackio else None
@@ -84,11 +85,7 @@ def sweep(
     points = part.points()
     if unpublished:
         points, items = _left(points, items, experiment.published())
-    wanted = [
-        item
-        for item in items
-        if experiment.maker(stage_of(item)) is experiment and stage_of(item) in stages_until(until)
-    ]
+    wanted = [item for item in items if stage_of(item) in stages - experiment.borrowed]
     show = partial(_shown, PointTable(experiment, points), log)
     make(experiment, wanted, jobs=jobs, device=device, cluster=cluster, show=show)
     if any(stage_of(item) == "ground" for item in wanted):

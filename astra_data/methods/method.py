@@ -104,7 +104,7 @@ class Method:
 
     @property
     def trains_without_target(self) -> bool:
-        """Whether its policy is trained without the target, on the abstract states of a dataset."""
+        """Whether its policy is trained without the target, and so acts on abstract states."""
         return self.trains and self.learns_from != "target"
 
     def accepts(self, reward: RewardSource | None) -> bool:

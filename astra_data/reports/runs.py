@@ -10,6 +10,7 @@ from pydantic import JsonValue
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import artefact_key, base_method
 from astra_data.dataset.format import DATASET_PATH
+from astra_data.methods import grounded_as
 from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
 
 SHARED_BY_ROWS = ("ground", "align")
@@ -23,7 +24,6 @@ class Reported:
     Attributes:
         name: of the recipe's file, without its ending. task: name of a task.
         methods: rows, in the order of the table. seeds: those to report, as far as they are finished.
-        groundings: row → the method whose grounding and alignment it uses.
         settings: all settings of the recipe.
         percents: dataset sizes in percent that every row is repeated on; empty if only on the whole.
     """
@@ -32,9 +32,13 @@ class Reported:
     task: str
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
-    groundings: Mapping[str, str]
     settings: Mapping[str, JsonValue]
     percents: tuple[int, ...] = ()
+
+    @property
+    def groundings(self) -> Mapping[str, str]:
+        """Row → the method whose grounding and alignment it uses."""
+        return {row: grounded_as(row) for row in self.methods}
 
 
 @dataclass(frozen=True)

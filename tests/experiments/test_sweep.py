@@ -104,6 +104,11 @@ def test_networks_compute_on_the_device_that_is_asked_for(
     assert ("train", "cuda:0") in told and ("collect", "cpu") in told
 
 
+def test_a_stage_that_is_none_is_told_before_anything_is_opened(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="unknown stage 'grund'"):
+        sweep(tmp_path / "absent.toml", root=tmp_path, until="grund")
+
+
 def test_points_outlive_what_they_were_made_of(recipe: Path, tmp_path: Path) -> None:
     folder = sweep(recipe, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
     rmtree(folder / "train")

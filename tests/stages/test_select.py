@@ -34,7 +34,7 @@ def root(made: Path, tmp_path: Path) -> Path:
 def reported(root: Path, **changes: Any) -> Reported:  # noqa: ANN401
     settings = json.loads((root / "recipe.json").read_text()) | changes.pop("settings", {})
     usual = {"name": "rail", "task": settings["task"], "methods": ROWS, "seeds": SEEDS}
-    return Reported(**usual | {"groundings": {}, "settings": settings} | changes)
+    return Reported(**usual | {"settings": settings} | changes)
 
 
 def judged(
