@@ -43,7 +43,7 @@ def maps_of(task: Task, suggestion: Suggestion) -> dict[str, dict[str, Any]]:
         taught, _ = np.histogramdd(shown, bins=edges, weights=worth)
         mean = np.where(steps > 0, taught / np.maximum(steps, 1e-9), np.nan)
         found[name] = {
-            "axes": labels(column)[:2],
+            "axes": with_units(column)[:2],
             "edges": [each.tolist() for each in edges],
             "information": _without_nan(mean.tolist()),
             "steps": steps.tolist(),
@@ -68,7 +68,7 @@ def _of_commands(task: Task) -> Column:
     return Column(task.action.name, size=len(task.limits), names=tuple(task.limits), astra=task.action.astra)
 
 
-def labels(column: Column) -> list[str]:
+def with_units(column: Column) -> list[str]:
     """Return the names of a column's entries with their units, where these are known."""
     named = zip(column.labels, column.units, strict=True)
     return [name if unit in ("1", "") else f"{name} ({unit})" for name, unit in named]
@@ -90,7 +90,7 @@ def suggestion_page(
     expected = rollouts.expected.sum(0).numpy()
     lengths = (rollouts.reached.sum(0) * task.timestep_s).numpy()
     number = len(str(len(episodes)))
-    states, commands = labels(task.abstract_state), labels(_of_commands(task))
+    states, commands = with_units(task.abstract_state), with_units(_of_commands(task))
     return (
         fill(
             "suggest.md.jinja",

@@ -100,7 +100,7 @@ def label(
     steps = successes = failures = at_goal = 0
     with DatasetWriter.like(source, out, description, more=more) as writer:
         for number, episode in enumerate(source.episodes(), start=1):
-            labelled = labels(world, episode, seed)
+            labelled = with_outcomes(world, episode, seed)
             writer.add(labelled)
             steps += len(labelled)
             successes += bool(labelled.metadata["success"])
@@ -135,7 +135,7 @@ def _drawn_goals(source: Dataset, task: Task) -> str:
     )
 
 
-def labels(task: Task, episode: Episode, seed: int) -> Episode:
+def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     """Return the episode with goals and outcomes, up to its first success.
 
     What it has of them is kept.

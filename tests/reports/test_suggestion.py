@@ -6,7 +6,7 @@ import torch
 from small_cart import LOGS_ALONE, TASK
 
 from astra_data.grounding.committee import Rollouts
-from astra_data.reports.suggestion import CELLS, labels, maps_of, suggestion_page
+from astra_data.reports.suggestion import CELLS, maps_of, suggestion_page, with_units
 from astra_data.training.plan import RecordingPlan, names_of
 from astra_data.training.proposals import Proposals, Suggestion, planned
 from astra_data.worlds.registry import TASKS
@@ -46,7 +46,7 @@ def test_a_cell_has_the_mean_of_the_steps_that_are_reached(suggestion: Suggestio
 
 
 def test_units_are_named_where_they_are_known() -> None:
-    assert labels(TASKS["antmaze-umaze"].abstract_state) == ["x (m)", "y (m)", "vx (m/s)", "vy (m/s)"]
+    assert with_units(TASKS["antmaze-umaze"].abstract_state) == ["x (m)", "y (m)", "vx (m/s)", "vy (m/s)"]
 
 
 def test_the_page_says_where_to_start_what_to_hold_and_how_to_record_it(suggestion: Suggestion) -> None:

@@ -27,7 +27,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.sharing.push import push
-from astra_data.stages.label import check_fits, label, labels, remarks
+from astra_data.stages.label import check_fits, label, remarks, with_outcomes
 from astra_data.worlds.registry import task_named
 
 CART = f"{Path(__file__).parents[1] / 'small_cart.py'}:LOGS_ALONE"
@@ -161,14 +161,18 @@ def test_who_falls_while_it_lasts_is_at_no_goal(
 def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
     task = replace(task_named(CART), objective=Last(horizon=10))
     short, long = (Episode(0, drive(0.01, steps), {}) for steps in (9, 10))
-    assert not labels(task, short, 0).columns[SUCCESS].any()
-    lasted = labels(task, long, 0)
+    assert not with_outcomes(task, short, 0).columns[SUCCESS].any()
+    lasted = with_outcomes(task, long, 0)
     assert lasted.columns[SUCCESS].tolist() == [False] * 9 + [True]
     assert lasted.metadata["success"] and lasted.columns[TRUNCATED].tolist() == [False] * 9 + [True]
-    fell = labels(task, Episode(0, dict(long.columns) | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0)
+    fell = with_outcomes(
+        task, Episode(0, dict(long.columns) | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0
+    )
     assert not fell.columns[SUCCESS].any() and fell.metadata["failed"]
     for over in ({}, {TERMINATED: lasted.columns[TRUNCATED]}):
-        told = labels(task, Episode(0, dict(long.columns) | over | {SUCCESS: lasted.columns[SUCCESS]}, {}), 0)
+        told = with_outcomes(
+            task, Episode(0, dict(long.columns) | over | {SUCCESS: lasted.columns[SUCCESS]}, {}), 0
+        )
         assert told.metadata["success"] and not told.metadata["failed"]
         assert not told.columns[TERMINATED].any()
         assert told.columns[TRUNCATED].tolist() == [False] * 9 + [True]
@@ -193,7 +197,7 @@ def test_who_can_no_longer_reach_the_goal_has_failed() -> None:
 
 def test_outcomes_are_those_of_the_steps_that_are_kept() -> None:
     recorded: dict[str, float | str] = {"success": False, "failed": True, "return": -3.0, "driver": "Ada"}
-    labelled = labels(task_named(CART), Episode(0, drive(4.0, 10), recorded), 0)
+    labelled = with_outcomes(task_named(CART), Episode(0, drive(4.0, 10), recorded), 0)
     reward = float(labelled.columns[REWARD].sum(dtype=np.float64))
     outcome = {"success": True, "failed": False, "return": reward}
     assert len(labelled) < 10 and dict(labelled.metadata) == {"driver": "Ada"} | outcome
@@ -290,7 +294,7 @@ def test_an_objective_that_fails_is_told_in_one_line(
 
     monkeypatch.setattr(type(task.objective), name, fail)
     with pytest.raises(BadInputError, match=rf"{re.escape(call)} fails with ZeroDivisionError: division by"):
-        labels(task, episode, 0)
+        with_outcomes(task, episode, 0)
 
 
 @pytest.mark.parametrize("name", ["reward", "reached", "missed"])
@@ -298,7 +302,7 @@ def test_what_an_objective_returns_has_a_value_per_step(name: str, monkeypatch: 
     task, episode = task_named(CART), Episode(0, drive(0.1, 3), {})
     monkeypatch.setattr(type(task.objective), name, lambda *_given: torch.zeros(3, 1))
     with pytest.raises(BadInputError, match=rf"objective.{name}\(.*\): expected shape \(3,\), got \(3, 1\)"):
-        labels(task, episode, 0)
+        with_outcomes(task, episode, 0)
 
 
 def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(
