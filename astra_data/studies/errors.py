@@ -54,8 +54,8 @@ class Starts:
         order = order[torch.linspace(0, len(order) - 1, min(len(order), MOST_STARTS)).long()]
         sequence, step = sequence[order], step[order]
         stretch = sequences.stretches(sequence, step, history, max(horizons))
-        counts = stretch.counts.long().cumprod(1)
-        reached = tuple(horizon for horizon in horizons if counts[:, horizon - 1].any())
+        all_count = stretch.all_count
+        reached = tuple(horizon for horizon in horizons if all_count[:, horizon - 1].any())
         return cls(stretch, sequences.piece[sequence].numpy(), reached)
 
     @torch.no_grad()
@@ -64,8 +64,7 @@ class Starts:
         stretch, chosen = self.stretch, [horizon - 1 for horizon in self.horizons]
         predicted, true = predict(model, stretch)[:, chosen], stretch.body.chained(stretch.motion)[:, chosen]
         errors = stretch.body.wrong(predicted, true, stretch.heading).square()
-        all_count = stretch.counts.long().cumprod(1)[:, chosen].bool()
-        return errors.masked_fill(~all_count[..., None], torch.nan)
+        return errors.masked_fill(~stretch.all_count[:, chosen, None], torch.nan)
 
 
 def summary(

@@ -202,7 +202,7 @@ def _descend[M: (WindowModel, HistoryModel)](
         stretch = sequences.stretches(sequence[chosen], step[chosen], history, config.steps)
         stretch = stretch.mirrored(torch.rand(config.batch) < 0.5)
         # Errors after a jump within a stretch are undefined.
-        judged = stretch.counts.long().cumprod(1)[..., None].bool().expand_as(stretch.motion)
+        judged = stretch.all_count[..., None].expand_as(stretch.motion)
         error = (rollout(model, _noisy(stretch, config.noise)) - chained(stretch.motion)) / spread
         missed = error[judged].square().mean()
         descent.update(missed + own_loss(stretch))

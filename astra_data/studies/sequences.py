@@ -55,6 +55,11 @@ class Stretch:
         """Return B."""
         return len(self.heading)
 
+    @property
+    def all_count(self) -> Tensor:
+        """Whether each future step counts and all before it do, (B, F)."""
+        return self.counts.long().cumprod(1).bool()
+
     def mirrored(self, which: Tensor | None = None) -> "Stretch":
         """Mirror left and right in the stretches in `which` (B,) bool, by default all; joints stay."""
         if not self.body.mirror:

@@ -226,7 +226,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
         }
         for minutes, models in sorted(squared.items())
     ]
-    all_count = starts.stretch.counts.long().cumprod(1)[:, [horizon - 1 for horizon in starts.horizons]]
+    all_count = starts.stretch.all_count[:, [horizon - 1 for horizon in starts.horizons]]
     return {
         "name": case.name,
         "title": case.title,
