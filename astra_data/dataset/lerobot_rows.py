@@ -19,8 +19,8 @@ Ints = NDArray[np.int64]
 RECORDED_TASK = "recorded.task_index"
 """(T,) int64: LeRobot's task_index, where there are several tasks."""
 ENDS = (names.TERMINATED, names.TRUNCATED)
-_FLOATS = (names.STATE, names.NEXT_STATE, names.GOAL, names.ACTION, names.REWARD)
-FLAGS = (*ENDS, names.DONE, names.SUCCESS)
+FLOATS = (names.STATE, names.NEXT_STATE, names.GOAL, names.ACTION, names.REWARD)
+_OUTCOME_FLAGS = (*ENDS, names.DONE, names.SUCCESS)
 DERIVED_FLAGS = (
     Column(names.TERMINATED, "bool", meaning="the recording does not tell: never set"),
     Column(names.TRUNCATED, "bool", meaning="the recording of the episode ends"),
@@ -192,7 +192,7 @@ def lacking(recorded: Iterable[Column]) -> list[str]:
     sizes = {column.name: column.size for column in recorded}
     missing = [name for name in (names.STATE, names.ACTION) if name not in sizes]
     return missing + [
-        f"{name} of a single number" for name in (names.REWARD, *FLAGS) if sizes.get(name, 1) > 1
+        f"{name} of a single number" for name in (names.REWARD, *_OUTCOME_FLAGS) if sizes.get(name, 1) > 1
     ]
 
 
@@ -210,6 +210,6 @@ def next_state_of(state: Column) -> Column:
 
 
 def _typed(column: Column) -> Column:
-    if column.name in (*_FLOATS, *FLAGS):
-        return replace(column, dtype="float32" if column.name in _FLOATS else "bool")
+    if column.name in (*FLOATS, *_OUTCOME_FLAGS):
+        return replace(column, dtype="float32" if column.name in FLOATS else "bool")
     return column

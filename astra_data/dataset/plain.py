@@ -26,7 +26,7 @@ _NUMBERS = (
     *("bool", "float16", "float32", "float64"),
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
 )
-_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
+_END_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
 
 
 @dataclass(frozen=True)
@@ -265,14 +265,14 @@ def flag_faults(run: Run, number: int) -> Iterator[str]:
     """Yield a sentence for each flag of episode `number` that ends it early or contradicts another."""
     flags = {
         name: values != 0
-        for name in _FLAGS
+        for name in _END_FLAGS
         if (values := run.columns.get(name)) is not None and values.ndim == 1
     }
     for name, values in flags.items():
         if values[:-1].any():
             found = f"{name} is True in episode {number} frame {values.argmax()}"
             yield f"{found}, before the last frame {len(run) - 1}"
-    if len(flags) == len(_FLAGS):
+    if len(flags) == len(_END_FLAGS):
         expected = flags[names.TERMINATED] | flags[names.TRUNCATED]
         wrong = flags[names.DONE] != expected
         if wrong.any():

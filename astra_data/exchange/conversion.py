@@ -10,7 +10,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_column
 from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, TERMINATED, Array, Column
 from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
-from astra_data.exchange.mapping import FLAGS, ColumnMapping, ImportMapping
+from astra_data.exchange.mapping import MAPPED_FLAGS, ColumnMapping, ImportMapping
 from astra_data.exchange.recording import Block
 
 Mask = NDArray[np.bool_]
@@ -75,7 +75,7 @@ class Converter:
         faults = []
         if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
             faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
-        for name in (REWARD, *FLAGS):
+        for name in (REWARD, *MAPPED_FLAGS):
             if sizes.get(name, 1) > 1:
                 faults.append(f"{name}: {sizes[name]} values, expected 1")
         jump = self._mapping.split.jump
@@ -96,7 +96,7 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
         if len(words) not in (0, 1, size):
             raise BadInputError(f"{key} has {len(words)} words for {size} values")
     astra = {key: list(words) * (size if len(words) == 1 else 1) for key, words in lists.items() if words}
-    dtype = spec.dtype or ("bool" if name in FLAGS else "float32")
+    dtype = spec.dtype or ("bool" if name in MAPPED_FLAGS else "float32")
     # Fields of one value each name what they hold; `size` tells that none holds more.
     names = spec.names or (spec.fields if len(spec.fields) == size > 1 and not spec.take else None)
     return Column(name, dtype, size, names, spec.meaning, astra or None)

@@ -10,18 +10,14 @@ from pydantic import AfterValidator, Field, model_validator
 from astra_data.core.config import Config, Count, Positive, load_tables, validated
 from astra_data.core.errors import RecipeError
 from astra_data.dataset.columns import (
-    ACTION,
     DONE,
-    GOAL,
-    NEXT_STATE,
     RESERVED,
-    REWARD,
     ROLES,
-    STATE,
     SUCCESS,
     TERMINATED,
     TRUNCATED,
 )
+from astra_data.dataset.lerobot_rows import FLOATS
 
 Index = Annotated[int, Field(ge=0)]
 
@@ -33,8 +29,7 @@ def _other_than_zero(factor: float) -> float:
 
 
 Factor = Annotated[float, AfterValidator(_other_than_zero)]
-FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
-FLOATS = (STATE, NEXT_STATE, GOAL, ACTION, REWARD)
+MAPPED_FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
 _OF_RECIPES = {"methods", "based_on", "models"}
 """Keys that recipes of `run` and `gap` have, and no mapping."""
 
@@ -157,13 +152,13 @@ class ImportMapping(Config):
     def _check(self) -> Self:
         faults = []
         for name, column in self.columns.items():
-            expected = "bool" if name in FLAGS else "float32" if name in FLOATS else column.dtype
+            expected = "bool" if name in MAPPED_FLAGS else "float32" if name in FLOATS else column.dtype
             if column.dtype not in (None, expected):
                 faults.append(f"column {name} has dtype {column.dtype}, expected {expected}")
             if name in (*RESERVED, DONE):
                 faults.append(f"column {name} is filled in, leave it out")
-            slip = get_close_matches(name, {*FLAGS, *FLOATS} - self.columns.keys(), n=1, cutoff=0.9)
-            if slip and name not in (*FLAGS, *FLOATS):
+            slip = get_close_matches(name, {*MAPPED_FLAGS, *FLOATS} - self.columns.keys(), n=1, cutoff=0.9)
+            if slip and name not in (*MAPPED_FLAGS, *FLOATS):
                 faults.append(f"column {name}: did you mean '{slip[0]}'?")
             if not name or "/" in name:
                 faults.append(f"column '{name}': expected a name without '/'")
