@@ -154,7 +154,7 @@ class HistoryFit:
         weights, count = self.weights(config, failures=not foresees), 1 + config.members
         first, *others = (_fitted(fitting, weights, number, count) for number in range(count))
         (model, metrics), members = first, tuple(other for other, _ in others)
-        _fit_scatter(model, members, fitting.held_out)
+        _measure_corrections(model, members, fitting.held_out)
         if members:
             metrics["members"] = [figures["epochs"][-1] for _, figures in others]
             for clock in CLOCKS:
@@ -272,8 +272,10 @@ def _optimise(
 
 
 @torch.no_grad()
-def _fit_scatter(model: GroundingModel, members: Sequence[GroundingModel], held_out: PairedEpisodes) -> None:
-    """Fit the scatter of the target around the correction, and how far corrections are usually apart.
+def _measure_corrections(
+    model: GroundingModel, members: Sequence[GroundingModel], held_out: PairedEpisodes
+) -> None:
+    """Measure the scatter of the target around the correction, and how far corrections are usually apart.
 
     That is between the heads of the `model`, or between it and each of its `members`.
     """
