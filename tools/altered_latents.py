@@ -9,8 +9,8 @@ from torch import Tensor
 from astra_data.learning.networks.history import LatentEncoder
 from astra_data.training import target_episodes
 from astra_data.training.episode_record import Outcome
-from astra_data.training.own_world import Act, started
 from astra_data.training.running_policy import RunningPolicy
+from astra_data.training.simulator_episodes import Act, started
 
 Alteration = Callable[[Tensor], Tensor]
 """Latents (B, Z) to those that the policy is shown."""

@@ -26,8 +26,8 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.methods.follower import careful
 from astra_data.reports.formatting import table
-from astra_data.training.own_world import in_simulator
 from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.simulator_episodes import in_simulator
 from astra_data.worlds.plane.ball import asks_to_kick
 from astra_data.worlds.plane.geometry import wrapped
 from astra_data.worlds.registry import task_named

@@ -19,8 +19,9 @@ from astra_data.experiments.trained_policy import settings_of, trained_policy
 from astra_data.grounding.files import load_grounding
 from astra_data.methods.follower import FOLLOWER, careful
 from astra_data.training.episode_record import Outcome
-from astra_data.training.own_world import Begin, in_simulator, own_world, started
+from astra_data.training.own_world import own_world
 from astra_data.training.policy_file import running
+from astra_data.training.simulator_episodes import Begin, in_simulator, started
 from astra_data.worlds.registry import task_named
 
 

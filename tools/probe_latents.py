@@ -28,7 +28,8 @@ from astra_data.experiments.trained_policy import settings_of, trained_policy
 from astra_data.grounding.files import GROUNDING, load_grounding, load_history_model
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as
-from astra_data.training.own_world import in_simulator, own_world, started
+from astra_data.training.own_world import own_world
+from astra_data.training.simulator_episodes import in_simulator, started
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.registry import task_named
 

@@ -19,7 +19,7 @@ from astra_data.reports.choice_page import select_page
 from astra_data.reports.halving import PSEUDO_TRIALS, halve, least_trials, widest_field
 from astra_data.reports.trials import TRIALS, TrialRound, TrialsFile, Tried, read_trials
 from astra_data.stages.evaluate import EvaluateConfig
-from astra_data.training.own_world import started
+from astra_data.training.simulator_episodes import started
 from astra_data.training.target_episodes import in_target
 from astra_data.worlds.registry import task_named
 

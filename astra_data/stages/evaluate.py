@@ -38,11 +38,12 @@ from astra_data.methods import method_named
 from astra_data.methods.follower import careful
 from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES
 from astra_data.training.own_policy import OwnPolicy
-from astra_data.training.own_world import Act, Begin, in_simulator, own_world, started
+from astra_data.training.own_world import own_world
 from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.running_policy import EncoderKind
 from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.simulator_episodes import Act, Begin, in_simulator, started
 from astra_data.training.target_episodes import in_target
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task

@@ -10,9 +10,9 @@ from astra_data.grounding.failures import fit_failures, tells_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
-from astra_data.training.own_world import in_simulator, started
 from astra_data.training.running_policy import RunningPolicy
 from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.training.simulator_episodes import in_simulator, started
 from astra_data.worlds.task import Task
 
 

@@ -9,8 +9,8 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.training.episode_record import EpisodeRecord, Outcome
-from astra_data.training.own_world import Begin
 from astra_data.training.recorded_range import RecordedRange
+from astra_data.training.simulator_episodes import Begin
 from astra_data.worlds.task import Task
 
 

@@ -6,8 +6,8 @@ from small_cart import TASK, Cart, Last
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.training.own_world import Act
 from astra_data.training.recorded_range import RecordedRange
+from astra_data.training.simulator_episodes import Act
 from astra_data.training.target_episodes import in_target
 
 
