@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from astra_data.dataset.columns import Column
 from astra_data.reports.formatting import fill
-from astra_data.training.plan import PlannedEpisode
 from astra_data.training.proposals import Suggestion
+from astra_data.training.recording_plan import PlannedEpisode
 from astra_data.worlds.task import Task
 
 Floats = NDArray[np.float64]

@@ -29,9 +29,9 @@ from astra_data.training.behaviors import (
     WallWatch,
     held_steps,
 )
-from astra_data.training.plan import PlannedCommands, RecordingPlan
 from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.recording import record
+from astra_data.training.recording_plan import PlannedCommands, RecordingPlan
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 

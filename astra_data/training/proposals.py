@@ -21,7 +21,7 @@ from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.committee import Committee, Rollouts
 from astra_data.training.behaviors import HoldTimes, RandomCommands, held_steps
-from astra_data.training.plan import PlannedEpisode, RecordingPlan, names_of
+from astra_data.training.recording_plan import PlannedEpisode, RecordingPlan, names_of
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.task import Task
 

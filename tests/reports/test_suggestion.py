@@ -7,8 +7,8 @@ from small_cart import LOGS_ALONE, TASK
 
 from astra_data.grounding.committee import Rollouts
 from astra_data.reports.suggestion import CELLS, maps_of, suggestion_page, with_units
-from astra_data.training.plan import RecordingPlan, names_of
 from astra_data.training.proposals import Proposals, Suggestion, planned
+from astra_data.training.recording_plan import RecordingPlan, names_of
 from astra_data.worlds.registry import TASKS
 
 

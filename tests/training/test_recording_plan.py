@@ -7,7 +7,7 @@ import torch
 from small_cart import TASK
 
 from astra_data.core.errors import BadInputError
-from astra_data.training.plan import PlannedCommands, RecordingPlan
+from astra_data.training.recording_plan import PlannedCommands, RecordingPlan
 
 GOOD: dict[str, Any] = {
     "task": "rail-cart",
