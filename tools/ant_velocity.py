@@ -33,7 +33,6 @@ class AntVelocityConfig:
     num_envs: int = 64
     num_threads: int | None = None
     """Physics threads, by default one per core."""
-    integrator: str = "RK4"
     torque_scale: float = 0.7
     """Largest torque as a share of the motors' limit."""
     upright_reward: float = 0.5
@@ -56,7 +55,7 @@ class AntVelocityEnv:
     def __init__(self, config: AntVelocityConfig, *, seed: int) -> None:
         self.config = config
         self.num_envs = config.num_envs
-        model = ant_model(integrator=config.integrator)
+        model = ant_model()
         self.physics = BatchedPhysics(
             model, config.num_envs, substeps=CONTROL_SUBSTEPS, num_threads=config.num_threads
         )

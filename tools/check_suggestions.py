@@ -49,7 +49,7 @@ class Setting:
 
     Attributes:
         task: its name. collect: of the first episodes; more are like them.
-        more: episodes suggested. fresh: episodes to measure on, of each behaviour.
+        more: episodes suggested. fresh: episodes to measure on, of each behavior.
         ground: of the members; the groundings that are compared have none.
         quantity: what is measured of the gap report.
     """
@@ -145,7 +145,7 @@ def foreseen(setting: Setting, folder: Path, seed: int, fresh: str) -> float:
 
 
 def measured(setting: Setting, folder: Path, seed: int) -> dict[str, Any]:
-    """Make all of a seed; return steps, falls, and errors by fresh behaviour, arm and horizon."""
+    """Make all of a seed; return steps, falls, and errors by fresh behavior, arm and horizon."""
     home = folder / seed_folder(seed)
     result = home / "result.json"
     if result.is_file():

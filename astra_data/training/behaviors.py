@@ -1,4 +1,4 @@
-"""Behaviours: controllers that act in the target while data is collected."""
+"""Behaviors: controllers that act in the target while data is collected."""
 
 from typing import Annotated, Protocol
 

@@ -422,7 +422,7 @@ def test_planned_episodes_start_and_go_as_the_plan_says(task: str, tmp_path: Pat
     assert dataset.description["config"]["plan_sha256"] == digest
 
 
-def test_a_plan_and_its_behaviour_come_together() -> None:
+def test_a_plan_and_its_behavior_come_together() -> None:
     for given in (
         {"behavior": "planned"},
         {"plan": "plan.json"},

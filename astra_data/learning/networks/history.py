@@ -7,6 +7,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+_LONGEST_M = 16.0
+"""Longest wavelength of position features."""
+
 
 def mlp(
     sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False
@@ -24,12 +27,12 @@ def mlp(
 class PositionFeatures(nn.Module):
     """Sines and cosines of planar positions, so that a smooth network can place sharp walls.
 
-    Maps (..., 2) in m to (..., 4 * octaves): wavelengths from `longest_m` down by halves.
+    Maps (..., 2) in m to (..., 4 * octaves): wavelengths from `_LONGEST_M` down by halves.
     """
 
-    def __init__(self, octaves: int, longest_m: float = 16.0) -> None:
+    def __init__(self, octaves: int) -> None:
         super().__init__()
-        wavelengths = longest_m * 0.5 ** torch.arange(octaves)
+        wavelengths = _LONGEST_M * 0.5 ** torch.arange(octaves)
         self.register_buffer("frequencies", 2 * torch.pi / wavelengths)
         self.frequencies: Tensor
         self.size = 4 * octaves

@@ -5,7 +5,7 @@ from typing import get_args
 
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE, Column
 from astra_data.worlds.ant.abstraction import ant_beyond_point_mass, ant_to_point_mass
-from astra_data.worlds.ant.body import TIMESTEP_S, WALL_REACH_M
+from astra_data.worlds.ant.body import INTEGRATOR, TIMESTEP_S, WALL_REACH_M
 from astra_data.worlds.ant.target import AntMazeEnv
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.worlds.plane.navigation import Navigation, RewardKind
@@ -69,7 +69,7 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
         quantities={"position_m": (0, 1), "velocity_m_s": (2, 3)},
         timestep_s=TIMESTEP_S,
         simulator_id="point_mass",
-        facts={"integrator": "RK4", "leg_scale": 1.0},
+        facts={"integrator": INTEGRATOR, "leg_scale": 1.0},
         varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),
         plane=Plane(wall_reach_m=WALL_REACH_M),
     )

@@ -111,7 +111,9 @@ class BatchedNao:
             BadInputError: `ball` is given for robots without balls.
         """
         if ball is not None and not self.has_ball:
-            raise BadInputError("These robots have no balls to place; build BatchedNao with ball=True.")
+            raise BadInputError(
+                "ball: expected none for robots without one, got positions: build BatchedNao with ball=True"
+            )
         put_rows(self.traits, rows, Traits.draw(self.spread, len(rows), rng))
         standing = Gait.standing(len(rows), self._limits)
         put_rows(self.gait, rows, standing)
@@ -141,9 +143,9 @@ class BatchedNao:
         """
         if command.shape != (self.num_robots, 3) or not np.isfinite(command).all():
             raise BadInputError(
-                f"Expected finite commands of shape ({self.num_robots}, 3); got {command.shape}"
-                f"{'' if np.isfinite(command).all() else ' with values that are not finite'}. "
-                "Give every robot forward m/s, sideways m/s, turn rad/s."
+                f"command: expected finite values of shape ({self.num_robots}, 3), got {command.shape}"
+                f"{'' if np.isfinite(command).all() else ' with some that are not finite'}: "
+                "give every robot forward m/s, sideways m/s, turn rad/s"
             )
         rows = np.flatnonzero(~self.fallen if active is None else active & ~self.fallen)
         targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))

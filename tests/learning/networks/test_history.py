@@ -40,7 +40,7 @@ def test_latents_have_zero_mean_and_unit_variance(encoder: HistoryEncoder) -> No
 
 
 def test_position_features_have_halving_wavelengths() -> None:
-    features = PositionFeatures(3, longest_m=16.0)
+    features = PositionFeatures(3)
     values = features(torch.tensor([[1.5, -2.0]]))[0].tolist()
     phases = [2 * math.pi * place / wavelength for place in (1.5, -2.0) for wavelength in (16, 8, 4)]
     assert len(values) == features.size == 12

@@ -164,7 +164,9 @@ def test_a_ball_dead_ahead_is_kicked_too() -> None:
 
 def test_bad_input_is_told() -> None:
     nao = BatchedNao(2, seed=0, num_threads=1)
-    with pytest.raises(BadInputError, match=r"shape \(2, 3\); got \(3, 3\)"):
+    with pytest.raises(
+        BadInputError, match=r"^command: expected finite values of shape \(2, 3\), got \(3, 3\): give"
+    ):
         nao.step(np.zeros((3, 3)))
     with pytest.raises(BadInputError, match="finite"):
         nao.step(np.full((2, 3), np.nan))
