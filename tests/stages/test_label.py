@@ -188,7 +188,7 @@ class ShortRail(Reach):
 def test_who_can_no_longer_reach_the_goal_has_failed() -> None:
     task = replace(task_named(CART), objective=ShortRail(horizon=40))
     given = drive(4.0, 10) | {GOAL: np.full(10, 1.9, np.float32)}
-    labelled = labels(task, Episode(0, given, {}), 0)
+    labelled = with_outcomes(task, Episode(0, given, {}), 0)
     # 0.4 m a step: the third leaves the rail.
     assert labelled.columns[TERMINATED].tolist() == labelled.columns[DONE].tolist() == [False, False, True]
     assert labelled.columns[REWARD].tolist() == pytest.approx([0.4, 0.4, 0.4 - 10.0])
