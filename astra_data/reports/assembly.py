@@ -34,6 +34,7 @@ from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.runs import Runs
 from astra_data.reports.schema import (
     BandMeans,
+    Choice,
     DatasetOrigin,
     GapMeans,
     Learning,
@@ -64,7 +65,7 @@ def assemble(
     """Read the artefacts under `root` of every row, for the seeds in `asked` that it has finished.
 
     `percent` selects the dataset size, if there are several. Results in `published` are merged in, unless
-    there are newer ones under `root`.
+    there are newer ones under `root`, which for a choice is one among all policies of the outcome.
 
     Raises:
         MissingStageError: no row has an evaluation and nothing is published; or a row lacks other artefacts
@@ -85,11 +86,24 @@ def assemble(
     printed = {row: value for row, value in (paper_success or {}).items() if row in merged.methods}
     choice = published.choice if published else None
     if judged:
-        measured = _measured(merged)
-        choice = choice_of(
-            judged, percent, measured=measured, rows=methods, seeds=asked, replicates=replicates
+        found = choice_of(
+            judged,
+            percent,
+            measured=_measured(merged),
+            rows=methods,
+            seeds=asked,
+            replicates=replicates,
         )
+        if not published or (found and _is_among_all(found, merged)):
+            choice = found
     return merged.model_copy(update={"paper_success": printed, "choice": choice})
+
+
+def _is_among_all(choice: Choice, results: Results) -> bool:
+    """Return whether each policy of `results` that could be a candidate was one."""
+    asked = {(one.row, one.seed) for one in choice.candidates}
+    able = {row: found for row, found in results.methods.items() if method_named(row).trains_without_target}
+    return all((row, seed) in asked for row, found in able.items() for seed in found.seeds)
 
 
 def _measured(results: Results) -> dict[tuple[str, int], float]:

@@ -19,9 +19,18 @@ def assembled(
     methods: tuple[str, ...] = ROWS,
     seeds: tuple[int, ...] = SEEDS,
     scores: tuple[Score, ...] = (SUCCESS,),
+    published: Results | None = None,
 ) -> Results:
     return assemble(
-        "antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=10, scores=scores
+        "antmaze_u",
+        "antmaze-u",
+        methods,
+        seeds,
+        root=root,
+        command="",
+        replicates=10,
+        scores=scores,
+        published=published,
     )
 
 
@@ -202,6 +211,21 @@ def test_a_choice_is_of_the_seeds_that_are_asked_for_and_measured_in_the_target_
         found = assembled(root, rows)
         assert found.tested_in == "simulators" and found.choice is not None
         assert not any(one.target for one in found.choice.candidates)
+
+
+def test_a_choice_among_some_of_the_published_policies_is_left_out(root: Path) -> None:
+    rows = ("astra", "astra_plus")
+    published = assembled(root, rows)
+    write_choice(root)
+    whole = assembled(root, rows, published=published).choice
+    assert whole is not None and len(whole.candidates) == 6
+    candidates = json.loads((root / "select/select.json").read_text())["candidates"]
+    for some in (candidates[:3], candidates[:5]):  # a row, and all but a seed
+        edit_json(root / "select/select.json", candidates=some)
+        assert assembled(root, rows, published=published).choice is None
+        chosen = published.model_copy(update={"choice": whole})
+        assert assembled(root, rows, published=chosen).choice == whole
+        assert assembled(root, rows).choice is not None
 
 
 def test_a_row_that_was_in_no_simulator_has_no_success_there(root: Path) -> None:
