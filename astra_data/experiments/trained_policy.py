@@ -53,7 +53,9 @@ def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | N
 
 
 def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> RunningPolicy:
-    """Load the policy of a row, with its encoder if it has one; call `start` before the first `command`.
+    """Load the policy of a row, with the encoder that its run tests it with, if it has one.
+
+    Call `start` before the first `command`.
 
     Args:
         run: the folder of a run, such as "runs/quickstart".
@@ -125,7 +127,7 @@ def _files(
         check_unchanged(own_methods[name]["method"], folder, name=name)
     if method.grounds:
         files["ground"] = folder / artefact_key("ground", base, seed, percent) / GROUNDING
-    if method.aligns:
+    if method.aligns and (settings.get("evaluate") or {}).get("encoder") != "source":
         files["align"] = folder / artefact_key("align", base, seed, percent) / TARGET_ENCODER
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")

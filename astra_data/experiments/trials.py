@@ -1,7 +1,6 @@
 """End a choice by trials in the target: successive halving, from the prediction of `select` on."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shutil import copy2
@@ -132,8 +131,6 @@ def _try(folder: Path, row: str, seed: int, percent: int | None, trials: int, nu
     """Return 1 or 0 for each episode of a policy in the target, deployed as `evaluate` does it."""
     trained = trained_policy(folder, row, seed=seed, percent=percent)
     config, policy = EvaluateConfig.model_validate(trained.settings.get("evaluate") or {}), trained.running()
-    if config.encoder == "source":
-        policy = replace(policy, target_encoder=None)
     drawn = derive(number, "trials of a choice")
     begin = partial(started, policy, policy.act)
     found = in_target(policy.task, begin, trials, drawn, leg_scale=config.leg_scale)

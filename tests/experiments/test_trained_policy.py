@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.experiments.trained_policy import load_policy, settings_of, task_of
+from astra_data.experiments.trained_policy import load_policy, settings_of, task_of, trained_policy
 from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.stages.align import align
 from astra_data.stages.collect import collect
@@ -35,6 +36,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             train(TASK, row, TRAIN, dataset=pairs, grounding=grounding, out=out)
     (folder / "recipe.json").write_text(json.dumps({"task": "antmaze-umaze"}))
     return folder
+
+
+def test_the_encoder_is_that_of_the_tests(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    settings = {"task": "antmaze-umaze", "evaluate": {"encoder": "source"}}
+    (folder / "recipe.json").write_text(json.dumps(settings))
+    shutil.rmtree(folder / "align")  # which it does not need
+    trained = trained_policy(folder, "astra_plus")
+    assert sorted(trained.files) == ["ground", "train"]
+    policy = trained.running()
+    assert policy.source_encoder is not None and policy.target_encoder is None
 
 
 @pytest.mark.parametrize("row", ["astra_plus", "astra_task_reward"])
