@@ -49,6 +49,9 @@ class Resampler:
             mapping: says which fields of which topics become which columns.
             origin: the file's name, for messages.
             moments: topic to the times of all its messages, in their order, in ns.
+
+        Raises:
+            BadInputError: a topic begins when another has ended, as where their clocks differ.
         """
         self._origin = origin
         self.topics: dict[str, list[str]] = {}
@@ -65,6 +68,7 @@ class Resampler:
         self._expiring = {field.partition(":")[0] for field in expiring}
         self._gap_ns = round((mapping.split.gap_s or 0) * 1e9)
         self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
+        self._refuse_apart()
         self._periods = usual_periods(self._moments, self._gap_ns)
         self._fps = mapping.fps
         self._values: dict[str, Array] = {}
@@ -99,7 +103,7 @@ class Resampler:
         Raises:
             BadInputError: these are more than `MOST_HELD_ROWS`.
         """
-        if self._is_pause(time):
+        if self._start is not None and self._is_pause(time):
             yield from self._sampled(self._end(max(self._heard())))
             self._start = None
         yield from self._sampled(time)
@@ -110,7 +114,8 @@ class Resampler:
         Raises:
             BadInputError: as `rows_before`.
         """
-        yield from self._sampled(self._end(time))
+        if self._start is not None:
+            yield from self._sampled(self._end(time))
 
     def unevenness(self) -> tuple[str, ...]:
         """Tell each topic that many rows repeat, or of which many messages are in no row."""
@@ -162,6 +167,18 @@ class Resampler:
             return time + 1
         next_state = max(self.times[topic] + round(self._periods[topic]) for topic in self._states)
         return min(next_state, time + round(self._spacing_ns))
+
+    def _refuse_apart(self) -> None:
+        if not self.topics.keys() <= self._moments.keys():
+            return
+        last = max(self.topics, key=lambda topic: self._moments[topic][0])
+        first = min(self._expiring, key=lambda topic: self._moments[topic][-1])
+        apart_ns = self._moments[last][0] - self._moments[first][-1]
+        if apart_ns > self._gap_ns:
+            raise BadInputError(
+                f"{self._origin}: {last} begins {apart_ns / 1e9:.4g} s after the last message of {first}, and "
+                "no row can have both: their clocks differ, or one of them was not recorded until the end"
+            )
 
     def _refuse_gap(self, time: int) -> None:
         if self._start is None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE, Array
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.resampling import Resampler, usual_periods
@@ -107,6 +108,24 @@ def test_a_state_that_falls_silent_is_held_for_as_long_as_it_may_be() -> None:
     """The last state is at 500 ms; the row of 900 ms is 400 ms after it, as long as the longest gap."""
     resampler, rows = sampled(20, 50.0 * np.arange(11), 50.0 * np.arange(60))
     assert len(rows) == 19 and resampler.silences == {"/odom": 1}
+
+
+@pytest.mark.parametrize("early_ms", [0.0, 1200.0])
+def test_a_pause_before_all_topics_are_there_ends_nothing(early_ms: float) -> None:
+    """A command alone, long before the states and the commands of a drive."""
+    odom, commands = 2000 + 50.0 * np.arange(20), 2000 + 50.0 * np.arange(20)
+    resampler, rows = sampled(20, odom, np.insert(commands, 0, early_ms))
+    assert rows == [(k, k + 1) for k in range(20)]
+    assert not resampler.silences
+
+
+@pytest.mark.parametrize("late_ms", [2000.0, 7_200_000.0])
+def test_clocks_that_never_meet_are_refused_in_a_line(late_ms: float) -> None:
+    odom = 50.0 * np.arange(20)
+    told = rf"log: /cmd begins {late_ms / 1000 - 0.95:.4g} s after the last message of /odom, .* clocks differ"
+    with pytest.raises(BadInputError, match=told):
+        sampled(20, odom, late_ms + odom)
+    assert sampled(20, odom, 1350 + odom)[1]  # 0.4 s, as long as a state may be held
 
 
 def test_a_latched_topic_may_be_repeated() -> None:
