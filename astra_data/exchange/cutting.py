@@ -80,7 +80,8 @@ class Cutter:
         """
         columns, finite = self._converter.convert(block)
         self.tally.rows += len(block)
-        self.tally.notes += block.notes
+        for note in block.notes:
+            self.tally.topics.setdefault(note.removeprefix(f"{block.origin}: "), []).append(block.origin)
         if is_apart or not self._spent or self._spent[-1][0] != block.origin:
             self._spent.append((block.origin, np.zeros(3)))
         rejected = ~finite

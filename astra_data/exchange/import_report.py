@@ -45,9 +45,10 @@ class ImportReport:
             )
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
         rate = f"rate: {tally.clock}\n" if tally.clock else ""
-        notes = "".join(f"{note}\n" for note in tally.notes[:_SHOWN])
-        if len(tally.notes) > _SHOWN:
-            notes += f"and {len(tally.notes) - _SHOWN} more lines on rates\n"
+        lines = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
+        notes = "".join(f"{line}\n" for line in lines[:_SHOWN])
+        if len(lines) > _SHOWN:
+            notes += f"and {len(lines) - _SHOWN} more lines on rates\n"
         still = (
             f"time stands still in {tally.still_rows} rows, first in {tally.still_first}: expected one row "
             "at a time; they are of several robots, or written twice\n"

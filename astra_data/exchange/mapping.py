@@ -66,6 +66,9 @@ class ColumnMapping(Config):
     """By default bool for flags and float32 for all else."""
     latched: bool = False
     """MCAP: sent once or on change, so that the last value holds without limit."""
+    gap_s: Positive | None = None
+    """MCAP: the longest time for which the last value of this column's topics is held, by default that of
+    `split`."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -74,6 +77,8 @@ class ColumnMapping(Config):
             raise ValueError(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
         if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise ValueError(f"names has {', '.join(doubled)} more than once")
+        if self.latched and self.gap_s is not None:
+            raise ValueError("latched holds without limit, and gap_s is a limit: leave one out")
         if self.clip is not None and self.clip[0] >= self.clip[1]:
             raise ValueError(f"clip {list(self.clip)}, expected the lower bound first")
         return self
@@ -170,7 +175,13 @@ class ImportMapping(Config):
         return self
 
     def refuse_timeless(self, file_format: str, origin: str) -> None:
-        """Raise RecipeError where keys of the mapping `origin` say what `time` means, but there is none."""
+        """Raise RecipeError where keys of the mapping `origin` say what `time` means, but there is none.
+
+        `gap_s` of a column is for MCAP alone.
+        """
+        of_columns = [f'columns."{name}".gap_s' for name, column in self.columns.items() if column.gap_s]
+        if of_columns and file_format != "mcap":
+            raise RecipeError(f"{origin}: {', '.join(of_columns)}: only MCAP has it, take split.gap_s")
         given = {"split.gap_s": self.split.gap_s is not None, "time_scale": self.time_scale != 1.0}
         if self.time is None and file_format != "mcap" and any(given.values()):
             keys = " and ".join(key for key, is_given in given.items() if is_given)

@@ -1,9 +1,9 @@
 """Rows at fps of the messages of asynchronous topics.
 
 From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
-topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s` ends the
-episode, and the next begins when all have sent a message again; where all are silent for as long, it ends
-with the last message.
+topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s`, or the
+`gap_s` of its column, ends the episode, and the next begins when all have sent a message again; where all are
+silent for as long, it ends with the last message.
 
 Where a state comes as often as rows, or a whole number of times as often, rows are taken midway between its
 messages and those of the commands: jitter changes no row, and a state meets the command that is in force for
@@ -11,7 +11,7 @@ most of its step.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -21,12 +21,11 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.clock import GAP
 from astra_data.dataset.columns import STATE, Array
 from astra_data.exchange.cutting import RATE_TOLERANCE
+from astra_data.exchange.evenness import DUE, MISSED, MOST_UNEVEN, dropouts, uneven_steps
 from astra_data.exchange.mapping import ImportMapping
 
 MOST_HELD_ROWS = 10**6
 """Most rows in which the same values may be held: five hours at 50 Hz."""
-MOST_UNEVEN = 0.05
-"""Largest share of rows that repeat a message of a topic, or of messages in no row, that is not told."""
 _AVERAGED = 20
 """Messages of a topic over which jitter is averaged; over many more, a rate that is a little off counts."""
 
@@ -60,16 +59,20 @@ class Resampler:
         self.repeated: Counter[str] = Counter()
         self.skipped: Counter[str] = Counter()
         self._messages: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()
         self._rows = 0
         self._fresh: set[str] = set()
         for field in mapping.all_fields:
-            self.topics.setdefault(field.partition(":")[0], []).append(field)
-        expiring = {f for column in mapping.columns.values() if not column.latched for f in column.fields}
-        self._expiring = {field.partition(":")[0] for field in expiring}
-        self._gap_ns = round((mapping.split.gap_s or 0) * 1e9)
+            self.topics.setdefault(topic_of(field), []).append(field)
+        self._gap_ns: dict[str, int] = {}
+        for column in mapping.columns.values():
+            gap_ns = round((column.gap_s or mapping.split.gap_s or 0) * 1e9)
+            for topic in () if column.latched else topics_of(column.fields):
+                self._gap_ns[topic] = min(gap_ns, self._gap_ns.get(topic, gap_ns))
+        self._expiring = set(self._gap_ns)
         self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
         self._refuse_apart()
-        self._periods = usual_periods(self._moments, self._gap_ns)
+        self._periods = usual_periods(self._moments, round((mapping.split.gap_s or 0) * 1e9))
         self._fps = mapping.fps
         self._values: dict[str, Array] = {}
         self._start: int | None = None
@@ -77,13 +80,18 @@ class Resampler:
         often = {
             topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()
         }
-        of_state = mapping.columns[STATE].fields if STATE in mapping.columns else ()
-        states = self._expiring & {field.partition(":")[0] for field in of_state}
+        states = self._expiring & topics_of(mapping.columns[STATE].fields if STATE in mapping.columns else ())
         self._states = [topic for topic in states if often.get(topic)]
         most = max((often[topic] for topic in self._states), default=0)
         self._in_step = [topic for topic in self._expiring if 0 < often.get(topic, 0) <= most]
         self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
         self._delay_ns = 0
+        self._observed: dict[str, str] = {}
+        for name, column in mapping.columns.items():
+            if name.startswith("observation"):
+                self._observed |= dict.fromkeys(column.fields, name)
+        observed = topics_of(self._observed) & self._expiring & self._periods.keys()
+        self._silent_ns: dict[str, dict[int, int]] = {topic: {} for topic in observed}
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
         """Update the values of `topic` with a message at `time` ns."""
@@ -104,7 +112,7 @@ class Resampler:
             BadInputError: these are more than `MOST_HELD_ROWS`.
         """
         if self._start is not None and self._is_pause(time):
-            yield from self._sampled(self._end(max(self._heard())))
+            yield from self._sampled(self._end(max(self.times[topic] for topic in self._expiring)))
             self._start = None
         yield from self._sampled(time)
 
@@ -118,15 +126,30 @@ class Resampler:
             yield from self._sampled(self._end(time))
 
     def unevenness(self) -> tuple[str, ...]:
-        """Tell each topic that many rows repeat, or of which many messages are in no row."""
-        return tuple(
-            f"{self._origin}: {topic} comes {1e9 / self._periods[topic]:.4g} times a second, "
-            f"fps is {self._fps}: {self.repeated[topic]} of {self._rows} rows repeat its message before, "
-            f"{self.skipped[topic]} of {self._messages[topic]} messages are in no row"
-            for topic in sorted(self._expiring & self._periods.keys())
-            if self.repeated[topic] > MOST_UNEVEN * self._rows
-            or self.skipped[topic] > MOST_UNEVEN * self._messages[topic]
-        )
+        """Tell each topic that many rows repeat, or of which many messages are in no row.
+
+        Of a topic that is only observed, messages may be in no row, as where fps is lower than its rate; its
+        steps are told where they are uneven, and its dropouts.
+        """
+        notes = []
+        for topic in sorted(self._expiring & self._periods.keys()):
+            rate = 1e9 / self._periods[topic]
+            may_skip = self._observed.keys() >= set(self.topics[topic])
+            if topic in self._silent_ns and (odd := uneven_steps(topic, rate, self._fps)):
+                notes.append(odd)
+            elif self.repeated[topic] > MOST_UNEVEN * self._rows or (
+                self.skipped[topic] > MOST_UNEVEN * self._messages[topic] and not may_skip
+            ):
+                notes.append(
+                    f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {self.repeated[topic]} of "
+                    f"{self._rows} rows repeat its message before, {self.skipped[topic]} of "
+                    f"{self._messages[topic]} messages are in no row"
+                )
+            if silences := self._silent_ns.get(topic):
+                column = next(self._observed[f] for f in self.topics[topic] if f in self._observed)
+                ns = list(silences.values())
+                notes.append(dropouts(topic, column, rate, self._fps, ns, self._dropped[topic]))
+        return tuple(f"{self._origin}: {note}" for note in notes)
 
     def _sampled(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
         self._refuse_gap(time)
@@ -140,10 +163,24 @@ class Resampler:
                 return
             if self._row:
                 self._rows += 1
-                self.repeated.update(self.topics.keys() - self._fresh)
+                repeated = self.topics.keys() - self._fresh
+                self.repeated.update(repeated)
+                for topic in repeated & self._silent_ns.keys():
+                    self._note_silence(topic, moment - self._delay_ns)
             self._fresh.clear()
             yield self._row == 0, dict(self._values)
             self._row += 1
+
+    def _note_silence(self, topic: str, time: int) -> None:
+        """Count a row at `time` that repeats a message of `topic`, if the next ones are missing."""
+        since, period = self.times[topic], self._periods[topic]
+        moments = self._moments[topic]
+        later = moments[np.searchsorted(moments, since, side="right") :]
+        until = later[0] if len(later) else max(each[-1] for each in self._moments.values())
+        silence = min(int(until) - since, self._gap_ns[topic])
+        if silence > MISSED * period and time - since > DUE * period:
+            self._silent_ns[topic][since] = silence
+            self._dropped[topic] += 1
 
     def _midway(self, time: int) -> int:
         """Return how long after `time` the widest gap between the messages that are in step is half over."""
@@ -172,19 +209,19 @@ class Resampler:
         if not self.topics.keys() <= self._moments.keys():
             return
         last = max(self.topics, key=lambda topic: self._moments[topic][0])
-        first = min(self._expiring, key=lambda topic: self._moments[topic][-1])
+        first = min(self._expiring, key=lambda topic: int(self._moments[topic][-1]) + self._gap_ns[topic])
         apart_ns = self._moments[last][0] - self._moments[first][-1]
-        if apart_ns > self._gap_ns:
+        if apart_ns > self._gap_ns[first]:
             raise BadInputError(
-                f"{self._origin}: {last} begins {apart_ns / 1e9:.4g} s after the last message of {first}, and "
-                "no row can have both: their clocks differ, or one of them was not recorded until the end"
+                f"{self._origin}: {last} begins {apart_ns / 1e9:.4g} s after the last message of {first}, "
+                "and no row can have both: their clocks differ, or one of them was not recorded until the end"
             )
 
     def _refuse_gap(self, time: int) -> None:
         if self._start is None:
             return
         moment = self._start + self._row * 10**9 // self._fps
-        end = min(time, *(self.times[topic] + self._gap_ns for topic in self._expiring))
+        end = min(time, *(self.times[topic] + self._gap_ns[topic] for topic in self._expiring))
         if (rows := (end - moment) * self._fps // 10**9) > MOST_HELD_ROWS:
             raise BadInputError(
                 f"{self._origin}: nothing new comes between {moment} and {time} ns, which would be {rows} "
@@ -192,18 +229,15 @@ class Resampler:
             )
 
     def _is_pause(self, time: int) -> bool:
-        """Return whether all topics that are not latched were silent for too long before `time`."""
-        return bool(heard := self._heard()) and time - max(heard) > self._gap_ns
-
-    def _heard(self) -> list[int]:
-        return [self.times[topic] for topic in self._expiring & self.times.keys()]
+        """Return whether all topics that are not latched are silent too long at `time`; all were heard."""
+        return len(self._silent(time)) == len(self._expiring)
 
     def _is_complete(self, time: int) -> bool:
         return self.times.keys() == self.topics.keys() and not self._silent(time)
 
     def _silent(self, time: int) -> list[str]:
         """Return the topics that may not be silent for so long as they were before `time`; all were heard."""
-        return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns]
+        return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns[topic]]
 
 
 def usual_periods(moments: Mapping[str, NDArray[np.int64]], gap_ns: int) -> dict[str, float]:
@@ -220,6 +254,16 @@ def usual_periods(moments: Mapping[str, NDArray[np.int64]], gap_ns: int) -> dict
             usual = steps[steps <= GAP * np.median(steps)]
             periods[topic] = float((usual if 2 * usual.sum() >= steps.sum() else steps).mean())
     return periods
+
+
+def topic_of(field: str) -> str:
+    """Return the topic of a field."""
+    return field.partition(":")[0]
+
+
+def topics_of(fields: Iterable[str]) -> set[str]:
+    """Return the topics of fields."""
+    return set(map(topic_of, fields))
 
 
 def _messages_per_row(ratio: float) -> int:

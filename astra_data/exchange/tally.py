@@ -31,7 +31,8 @@ class Tally:
         rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
         endings: how the episodes end.
         clock: the recorded rate, gaps and jitter, where the mapping names the times.
-        notes: what is strange about the rates of files and topics, in a line each.
+        notes: what is strange about the rates of files, in a line each.
+        topics: what is strange about topics, in a line each, with the files that it is true of.
     """
 
     rows: int = 0
@@ -53,6 +54,7 @@ class Tally:
     endings: Endings = field(default_factory=Endings)
     clock: str = ""
     notes: list[str] = field(default_factory=list)
+    topics: dict[str, list[str]] = field(default_factory=dict)
 
     def count_torn(self, rows: int, place: str) -> None:
         """Count `rows` that are cut off, at the `place` of the first, where there are any."""

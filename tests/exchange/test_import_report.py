@@ -60,3 +60,16 @@ def test_strange_rates_are_told_in_lines_of_their_own_and_shortly() -> None:
     assert "\n".join(["", *notes[:8], "rejected"]) in told
     told = str(ImportReport(Path("out"), 2, 7, Tally(notes=notes), 0.25))
     assert "\n".join(["", *notes[:8], "and 2 more lines on rates", "rejected"]) in told
+
+
+def test_what_is_strange_about_topics_of_several_files_is_told_once() -> None:
+    tally = Tally(topics={"/odom is late": ["0.mcap"], "/odom is slow": [f"{k}.mcap" for k in range(9)]})
+    tally.notes += ["0.csv: 40 Hz, 20 Hz declared"]
+    lines = [
+        "",
+        "0.mcap: /odom is late",
+        "0.mcap, 1.mcap and 7 more: /odom is slow",
+        *tally.notes,
+        "rejected",
+    ]
+    assert "\n".join(lines) in str(ImportReport(Path("out"), 2, 7, tally, 0.25))

@@ -6,6 +6,7 @@ from recordings import MAPPING
 
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import RecipeError
+from astra_data.dataset.columns import STATE
 from astra_data.exchange.mapping import ColumnMapping, ImportMapping, Jump, Split, read_mapping
 
 
@@ -84,3 +85,16 @@ def test_a_recipe_in_place_of_a_mapping_is_told(recipe: str, command: str) -> No
         f"{path} is a recipe: `astra-data {command.format(path=path)}`; expected a mapping, which "
         "`astra-data new` writes"
     )
+
+
+def test_a_gap_of_a_column_is_for_mcap_and_for_what_may_go_stale() -> None:
+    state: dict[str, object] = {"fields": ("/odom:x",), "gap_s": 0.1}
+    given: dict[str, object] = {"name": "log", "task": "drive", "fps": 10, "columns": {STATE: state}}
+    mapping = ImportMapping.model_validate(given)
+    mapping.refuse_timeless("mcap", "mapping.toml")
+    with pytest.raises(
+        RecipeError, match=r'mapping.toml: columns."observation.state".gap_s: only MCAP has it'
+    ):
+        mapping.refuse_timeless("csv", "mapping.toml")
+    with pytest.raises(ValueError, match="latched holds without limit, and gap_s is a limit"):
+        ImportMapping.model_validate(given | {"columns": {STATE: state | {"latched": True}}})

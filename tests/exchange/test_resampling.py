@@ -12,7 +12,7 @@ MS = 10**6
 
 
 def sampled(
-    fps: int, odom: Array, commands: Array, *, latched: bool = False
+    fps: int, odom: Array, commands: Array, *, latched: bool = False, state_gap_s: float | None = None
 ) -> tuple[Resampler, list[tuple[int, int]]]:
     """Return, for each row, which message of each topic it holds; times are in ms."""
     command = {"fields": ("/cmd:k",), "latched": latched}
@@ -21,7 +21,7 @@ def sampled(
             "name": "log",
             "task": "drive",
             "fps": fps,
-            "columns": {STATE: {"fields": ("/odom:k",)}, ACTION: command},
+            "columns": {STATE: {"fields": ("/odom:k",), "gap_s": state_gap_s}, ACTION: command},
             "split": {"gap_s": 0.4},
         }
     )
@@ -122,7 +122,9 @@ def test_a_pause_before_all_topics_are_there_ends_nothing(early_ms: float) -> No
 @pytest.mark.parametrize("late_ms", [2000.0, 7_200_000.0])
 def test_clocks_that_never_meet_are_refused_in_a_line(late_ms: float) -> None:
     odom = 50.0 * np.arange(20)
-    told = rf"log: /cmd begins {late_ms / 1000 - 0.95:.4g} s after the last message of /odom, .* clocks differ"
+    told = (
+        rf"log: /cmd begins {late_ms / 1000 - 0.95:.4g} s after the last message of /odom, .* clocks differ"
+    )
     with pytest.raises(BadInputError, match=told):
         sampled(20, odom, late_ms + odom)
     assert sampled(20, odom, 1350 + odom)[1]  # 0.4 s, as long as a state may be held
@@ -180,11 +182,75 @@ def test_a_topic_that_rows_repeat_is_told_with_its_rate_and_counts() -> None:
 
 
 def test_a_topic_of_which_messages_are_skipped_is_told_with_its_rate_and_counts() -> None:
-    resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100))
+    resampler, _ = sampled(20, 50.0 * np.arange(100), 10.0 * np.arange(496))
     assert resampler.unevenness() == (
-        "log: /odom comes 100 times a second, fps is 20: 0 of 99 rows repeat its message before, "
+        "log: /cmd comes 100 times a second, fps is 20: 0 of 99 rows repeat its message before, "
         "396 of 495 messages are in no row",
     )
+
+
+def test_a_state_that_is_taken_less_often_than_it_comes_is_not_told_where_the_steps_are_even() -> None:
+    resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100))
+    assert resampler.skipped["/odom"] == 396 and resampler.unevenness() == ()
+
+
+def test_uneven_steps_of_a_state_are_told_instead_of_the_messages_in_no_row() -> None:
+    resampler, rows = sampled(20, 100 / 3 * np.arange(300), 50.0 * np.arange(200))
+    steps = np.diff([k for k, _ in rows])
+    assert set(steps) == {1, 2} and abs(steps.mean() - 1.5) < 0.01
+    assert resampler.unevenness() == (
+        "log: /odom comes 30 times a second, of which 20 fps is no whole fraction: steps of 33 and 67 ms "
+        "alternate; take 10, 15 or 30",
+    )
+
+
+def with_dropouts() -> tuple[Array, Array]:
+    """Return the times of states at 50 Hz, with three holes of up to 0.36 s, and of commands at 10 Hz."""
+    odom = 20.0 * np.arange(1000)
+    holes = ((odom > at) & (odom < at + 340) for at in (4000, 9010, 15030))
+    return odom[~np.any(list(holes), axis=0)], 100.0 * np.arange(200)
+
+
+def test_dropouts_of_a_state_are_told_with_the_gap_that_ends_episodes_there() -> None:
+    odom, commands = with_dropouts()
+    resampler, rows = sampled(10, odom, commands)
+    states = [k for k, _ in rows]
+    repeats = int((np.diff(states) == 0).sum())
+    assert repeats >= 6
+    told = (
+        f"log: /odom is silent for up to 0.36 s in 3 places, where {repeats} rows repeat its message before: "
+    )
+    assert resampler.unevenness() == (
+        told + 'gap_s = 0.08 in [columns."observation.state"] ends episodes there',
+    )
+    cut, rows = sampled(10, odom, commands, state_gap_s=0.08)
+    assert cut.silences == {"/odom": 3} and cut.unevenness() == ()
+    assert len({k for k, _ in rows}) == len(rows) > 180
+
+
+@pytest.mark.parametrize("period_ms", [20.0, 50.0, 100.0])
+def test_a_message_that_is_lost_is_no_dropout(period_ms: float) -> None:
+    odom = np.delete(period_ms * np.arange(round(20_000 / period_ms)), [100, 150])
+    resampler, _ = sampled(10, odom, 100.0 * np.arange(200))
+    assert resampler.unevenness() == ()
+
+
+def test_a_state_that_stops_before_the_log_ends_is_told() -> None:
+    """The states end at 1 s, and the command goes on."""
+    resampler, rows = sampled(20, 50.0 * np.arange(21), 50.0 * np.arange(60))
+    [*_, told] = resampler.unevenness()
+    held = [k for k, _ in rows].count(20) - 1
+    assert f"/odom is silent for up to 0.4 s once, where {held} rows repeat" in told
+
+
+@pytest.mark.parametrize("gap_s", [0.13, 0.31])
+def test_the_gap_of_a_column_is_that_of_its_topics_alone(gap_s: float) -> None:
+    """Each row after a state that is the last holds it for so long, while commands may be held for longer."""
+    odom = 50.0 * np.arange(41)
+    _, rows = sampled(20, odom, 300.0 * np.arange(20), state_gap_s=gap_s)
+    held = [k for k, _ in rows].count(40) - 1
+    assert held == gap_s * 1000 // 50
+    assert [k for k, _ in rows][: len(odom)] == list(range(41))
 
 
 def test_a_clock_that_is_a_little_off_is_not_told() -> None:

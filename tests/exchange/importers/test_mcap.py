@@ -203,3 +203,31 @@ def test_a_rate_that_is_not_that_of_a_topic_is_told_in_the_report(tmp_path: Path
             f"\nlog.mcap: {topic} comes 5 times a second, fps is 10: 50 of 100 rows repeat its message before"
         )
         assert told in str(report)
+
+
+def test_a_rate_that_does_not_divide_is_told_once_for_all_files(tmp_path: Path) -> None:
+    """Poses at 15 Hz."""
+    messages = [*(pose(k / 15, k) for k in range(45)), *(command(k / 10, k) for k in range(30))]
+    messages.sort(key=lambda message: message[1])
+    paths = [write_json(tmp_path / f"{k}.mcap", messages) for k in range(3)]
+    _, report = imported(tmp_path, paths, MAPPING)
+    assert (
+        "\n0.mcap, 1.mcap and 1 more: /pose comes 15 times a second, of which 10 fps is no whole fraction: "
+        "steps of 67 and 133 ms alternate; take 3, 5 or 15\nrejected"
+    ) in str(report)
+
+
+def test_a_gap_of_a_column_ends_episodes_where_a_state_drops_out(tmp_path: Path) -> None:
+    """Poses at 20 Hz without those of 0.3 s; commands may be held for longer."""
+    messages = [
+        *(pose(k / 20, k) for k in range(60) if not 20 < k < 26),
+        *(command(k / 4, k) for k in range(12)),
+    ]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    dataset, report = imported(tmp_path, path, MAPPING)
+    assert len(dataset) == 1
+    assert "/pose is silent for up to 0.3 s once, where 2 rows repeat its message before" in str(report)
+    state = '[columns."observation.state"]\n'
+    dataset, report = imported(tmp_path / "cut", path, MAPPING.replace(state, f"{state}gap_s = 0.1\n"))
+    assert len(dataset) == 2 and "silent" not in str(report)
+    assert (np.diff(np.concatenate([e.columns[STATE][:, 0] for e in dataset.episodes()])) > 0).all()
