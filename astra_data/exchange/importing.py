@@ -31,6 +31,7 @@ from astra_data.exchange.recording import (
     is_archive,
     other_files,
     refuse_dataset,
+    told_apart,
 )
 from astra_data.exchange.restoring import read_record, restored, write_restored
 from astra_data.exchange.tally import Tally
@@ -96,7 +97,7 @@ def import_dataset(
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
     if settings:
         settings.refuse_timeless(chosen, str(mapping))
-    sources = bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes)
+    sources = told_apart(bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes))
     strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
     if strange:
         raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")

@@ -39,12 +39,14 @@ class Source:
         member: its entry in the archive, None for a file of its own.
         recording: the file, folder or archive given by the user; its files follow one another.
         most_bytes: most bytes of values that are taken from it.
+        name: what it is called, by default its path within its recording.
     """
 
     path: Path
     member: tarfile.TarInfo | None
     recording: Path
     most_bytes: int = SMALL_BYTES
+    name: str = ""
 
     def refuse_beyond(self, size: int) -> None:
         """Refuse to take values of `size` bytes, if these are too many.
@@ -60,6 +62,8 @@ class Source:
 
     def __str__(self) -> str:
         """Name the file within its recording, for messages and for the episodes' metadata."""
+        if self.name:
+            return self.name
         if self.member is not None:
             return f"{self.path.name}/{self.member.name}"
         return _named(self.path, self.recording)
@@ -240,12 +244,20 @@ def bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
     return [replace(source, most_bytes=max_bytes) for source in sources]
 
 
+def told_apart(sources: Sequence[Source]) -> list[Source]:
+    """Name sources that are called alike by more of their paths."""
+    within = ["" if source.member is None else source.member.name for source in sources]
+    names = _longer(
+        [str(source) for source in sources], [s.path / w for s, w in zip(sources, within, strict=True)]
+    )
+    return [replace(source, name=name) for source, name in zip(sources, names, strict=True)]
+
+
 def identities(sources: Sequence[Source]) -> list[dict[str, str]]:
     """Return name and sha256 of every file of the recordings."""
-    return [
-        {"name": _named(file, recording), "sha256": file_digest(file)}
-        for file, recording in _files_of(sources).items()
-    ]
+    files = _files_of(sources)
+    names = _longer([_named(file, recording) for file, recording in files.items()], list(files))
+    return [{"name": name, "sha256": file_digest(file)} for name, file in zip(names, files, strict=True)]
 
 
 def _files_of(sources: Sequence[Source]) -> dict[Path, Path]:
@@ -260,3 +272,16 @@ def _named(path: Path, recording: Path) -> str:
     """Name a file by its path within a recording that is a folder."""
     within = path.relative_to(recording) if path.is_relative_to(recording) else Path()
     return within.as_posix() if within.parts else path.name
+
+
+def _longer(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
+    """Return `names`, the ends of `paths`; those of several paths are longer ends, by which these differ."""
+    places = [path.absolute() for path in paths]
+    of_name: dict[str, set[Path]] = {}
+    for name, place in zip(names, places, strict=True):
+        of_name.setdefault(name, set()).add(place)
+    longer = [
+        "/".join(place.parts[-len(PurePosixPath(name).parts) - 1 :]) if len(of_name[name]) > 1 else name
+        for name, place in zip(names, places, strict=True)
+    ]
+    return longer if longer == list(names) else _longer(longer, paths)

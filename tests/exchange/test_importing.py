@@ -53,6 +53,14 @@ def test_the_files_of_a_folder_or_archive_continue_one_another(tmp_path: Path) -
     assert report.tally.split_points == {"file": 1}
 
 
+def test_sources_of_one_name_are_told_apart_in_the_metadata(tmp_path: Path) -> None:
+    paths = [write_table(tmp_path / folder / "log.csv", rows()) for folder in ("a", "b")]
+    dataset, _ = imported(tmp_path, [*paths, *parts(tmp_path / "logs")[:1]], PER_FILE)
+    names = ["a/log.csv", "b/log.csv", "part_8.csv"]
+    assert list(dict.fromkeys(dataset.metadata["source"])) == names
+    assert [one["name"] for one in dataset.description["config"]["recordings"]] == names
+
+
 def test_a_first_file_without_rows_changes_nothing(tmp_path: Path) -> None:
     folder = parts(tmp_path / "logs")[0].parent
     write_table(folder / "part_0.csv", {name: values[:0] for name, values in rows().items()})
