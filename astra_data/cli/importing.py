@@ -39,6 +39,13 @@ MaxBytes = Annotated[
         show_default="100 times their size, or 256 MB",
     ),
 ]
+SkipBad = Annotated[
+    bool,
+    typer.Option(
+        "--skip-bad",
+        help="Leave out files that cannot be imported, and tell them at the end; each file is read twice.",
+    ),
+]
 
 
 def import_(
@@ -50,6 +57,7 @@ def import_(
     fps: Fps = None,
     task: Task = None,
     max_bytes: MaxBytes = None,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON, PyTorch) to a dataset."""
     from astra_data.exchange.importing import import_dataset
@@ -63,5 +71,6 @@ def import_(
         fps=fps,
         task=task,
         max_bytes=max_bytes,
+        skip_bad=skip_bad,
     )
     typer.echo(f"finished: {report}")

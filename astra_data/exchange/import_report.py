@@ -24,6 +24,7 @@ class ImportReport:
         wall_seconds: duration of the import.
         unused: the files of which no episode was made.
         unread: the files of folders and archives that have other endings than the format's.
+        left_out: what is wrong with each file that was left out.
     """
 
     root: Path
@@ -33,6 +34,7 @@ class ImportReport:
     wall_seconds: float
     unused: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Summarise it in a few lines."""
@@ -58,6 +60,9 @@ class ImportReport:
         unused = f"files without an episode: {first_few(self.unused, _SHOWN)}\n" if self.unused else ""
         if self.unread:
             unused += f"files of other endings, not read: {first_few(self.unread, _SHOWN)}\n"
+        if self.left_out:
+            faults = "".join(f"  {fault}\n" for fault in self.left_out)
+            unused += f"files that cannot be imported, left out: {len(self.left_out)}\n{faults}"
         return (
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"

@@ -3,7 +3,6 @@
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -11,29 +10,27 @@ from types import ModuleType
 from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
-from astra_data.core.errors import AstraDataError, BadInputError, in_short
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
 from astra_data.dataset.versions import home_of
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.exchange.cutting import Cut, Cutter
+from astra_data.exchange.cutting import Cutter
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.import_report import ImportReport, losses
 from astra_data.exchange.importers import csv, hdf5, json, mcap, minari, npz, parquet, torch
 from astra_data.exchange.mapping import ImportMapping, read_mapping
+from astra_data.exchange.reading import episodes, explained, importable, refuse_rejected
 from astra_data.exchange.recording import (
-    VALUE_BYTES,
-    Block,
     Source,
     bounded,
     find_sources,
-    identities,
     is_archive,
     other_files,
     refuse_dataset,
-    told_apart,
 )
 from astra_data.exchange.restoring import read_record, restored, write_restored
+from astra_data.exchange.source_names import identities, named_apart
 from astra_data.exchange.tally import Tally
 
 FORMATS: Mapping[str, ModuleType] = {
@@ -60,6 +57,7 @@ def import_dataset(
     fps: int | None = None,
     task: str | None = None,
     max_bytes: int | None = None,
+    skip_bad: bool = False,
 ) -> ImportReport:
     """Turn recordings into one dataset; at most a block of rows and an episode are in memory at once.
 
@@ -76,6 +74,8 @@ def import_dataset(
         task: what the episodes do.
         max_bytes: the most bytes of values that are taken from the recordings, eight a value; by default 100
             times the size of the files, or 256 MiB if that is more.
+        skip_bad: leave out files that cannot be imported, which the report and the dataset's description
+            tell; with a mapping only. Each file is then read twice.
 
     Raises:
         BadInputError: a recording is malformed, unpacks to too much or does not fit the mapping; nothing is
@@ -97,28 +97,29 @@ def import_dataset(
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
     if settings:
         settings.refuse_timeless(chosen, str(mapping))
-    sources = told_apart(bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes))
+    sources = named_apart(bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes))
     strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
     if strange:
         raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
+    sources, left_out = _without_bad(sources, chosen, settings) if skip_bad else (sources, ())
     records = {source: record for source in sources if (record := _record(source, chosen))}
     for source, record in records.items():
-        episodes = _restored(source, chosen, record)
+        recorded = _restored(source, chosen, record)
         if settings is None:
             if len(sources) > 1:
                 raise BadInputError(
                     f"{source} is an export of astra-data: import each on its own, then merge"
                 )
-            root, frames = write_restored(record, episodes, options, identities(sources), out)
+            root, frames = write_restored(record, recorded, options, identities(sources), out)
             seconds = time.perf_counter() - began
             return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
-        deque(episodes, maxlen=0)  # verifies the sums
+        deque(recorded, maxlen=0)  # verifies the sums
     settings = settings or _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
-    cuts = _in_memory(_episodes(sources, chosen, settings, cutter))
+    cuts = episodes(sources, FORMATS[chosen], settings, cutter)
     first = next(cuts, None)
     if first is None:
-        _refuse_rejected(cutter.tally, settings)
+        refuse_rejected(cutter.tally, settings)
         why = _why_none(cutter.tally, settings)
         raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes, {why} ({losses(cutter.tally)})")
     description = {
@@ -141,25 +142,35 @@ def import_dataset(
             writer.add(Episode(count - 1, columns, metadata))
             origins.add(str(metadata["source"]))
             frames += len(columns[TRUNCATED])
-        _refuse_rejected(cutter.tally, settings)
+        refuse_rejected(cutter.tally, settings)
         cutter.check_rate()
         seconds = time.perf_counter() - began
         writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
+        writer.made |= {"left_out": left_out} if left_out else {}
     names = [str(source) for source in sources]
     # Where episodes are parts of files, their origins are no files' names.
     are_files = settings.split.files and origins <= set(names)
     unused = tuple(name for name in names if are_files and name not in origins)
     unread = () if chosen == "minari" else other_files(recordings, _suffixes(FORMATS[chosen]))
-    return ImportReport(root, count, frames, cutter.tally, time.perf_counter() - began, unused, unread)
+    seconds = time.perf_counter() - began
+    return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, left_out)
+
+
+def _without_bad(
+    sources: Sequence[Source], file_format: str, mapping: ImportMapping | None
+) -> tuple[list[Source], tuple[str, ...]]:
+    if mapping is None:
+        raise BadInputError("--skip-bad needs a --mapping, which tells what is missing")
+    return importable(sources, FORMATS[file_format], mapping)
 
 
 def _record(source: Source, file_format: str) -> ExportRecord | None:
-    with _explained(source, file_format):
+    with explained(source, FORMATS[file_format]):
         return read_record(FORMATS[file_format], source)
 
 
 def _restored(source: Source, file_format: str, record: ExportRecord) -> Iterator[Episode]:
-    with _explained(source, file_format):
+    with explained(source, FORMATS[file_format]):
         yield from restored(FORMATS[file_format], source, record)
 
 
@@ -218,66 +229,12 @@ def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> I
         raise BadInputError(
             f"{source}: {file_format} has no standard fields; pass --mapping FILE.toml{written}"
         )
-    with _explained(source, file_format):
+    with explained(source, module):
         keys = module.layout(source) | options
     missing = [f"--{key}" for key in ("name", "fps") if key not in keys]
     if missing:
         raise BadInputError(f"{source}: pass {' and '.join(missing)}, or --mapping FILE.toml")
     return validated({"task": keys["name"]} | keys, ImportMapping, str(source))
-
-
-def _episodes(
-    sources: Sequence[Source], file_format: str, mapping: ImportMapping, cutter: Cutter
-) -> Iterator[Cut]:
-    recording = None
-    size = 0
-    for source in sources:
-        is_apart = mapping.split.files or source.recording != recording
-        origin, row = "", 0
-        for block in _blocks(source, file_format, mapping):
-            size += VALUE_BYTES * sum(values.size for values in block.values.values())
-            source.refuse_beyond(size)
-            recording = source.recording
-            row = row if block.origin == origin else 0
-            yield from cutter.feed(block, row, is_apart=is_apart)
-            is_apart, origin, row = False, block.origin, row + len(block)
-    yield from cutter.finish()
-
-
-def _in_memory(episodes: Iterator[Cut]) -> Iterator[Cut]:
-    try:
-        yield from episodes
-    except MemoryError as error:
-        raise BadInputError(
-            f"an episode does not fit into memory ({in_short(error)}): cut it by [split] in the mapping"
-        ) from error
-
-
-def _blocks(source: Source, file_format: str, mapping: ImportMapping) -> Iterator[Block]:
-    with _explained(source, file_format):
-        yield from FORMATS[file_format].read(source, mapping)
-
-
-@contextmanager
-def _explained(source: Source, file_format: str) -> Iterator[None]:
-    """Turn any exception of the library that reads a file into one clear message."""
-    try:
-        yield
-    except AstraDataError:
-        raise
-    except Exception as error:
-        message = in_short(error) or type(error).__name__
-        raise BadInputError(f"{source} cannot be read as {file_format}: {message}") from error
-
-
-def _refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
-    not_finite = tally.rejected_rows - tally.torn_rows
-    if not_finite and mapping.not_finite == "refuse":
-        raise BadInputError(
-            f"{not_finite} of {tally.rows} rows have values that are not finite, the first is "
-            f'{tally.rejected_first}; set not_finite in the mapping to leave them out: "split" ends '
-            'the episode there, "drop" goes on with the next row as if one step had passed'
-        )
 
 
 def _why_none(tally: Tally, settings: ImportMapping) -> str:

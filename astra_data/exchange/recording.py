@@ -10,7 +10,6 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import IO
 
 from astra_data.core.config import did_you_mean
-from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, in_short
 from astra_data.core.files import files_below
 from astra_data.dataset.columns import Array
@@ -66,7 +65,7 @@ class Source:
             return self.name
         if self.member is not None:
             return f"{self.path.name}/{self.member.name}"
-        return _named(self.path, self.recording)
+        return named(self.path, self.recording)
 
     @contextmanager
     def open(self) -> Iterator[IO[bytes]]:
@@ -239,28 +238,12 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
 def bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
     """Let the sources be taken up to `max_bytes`, by default in proportion to the sizes of their files."""
     if max_bytes is None:
-        size = sum(file.stat().st_size for file in _files_of(sources))
+        size = sum(file.stat().st_size for file in files_of(sources))
         max_bytes = max(SMALL_BYTES, MOST_UNPACKED * size)
     return [replace(source, most_bytes=max_bytes) for source in sources]
 
 
-def told_apart(sources: Sequence[Source]) -> list[Source]:
-    """Name sources that are called alike by more of their paths."""
-    within = ["" if source.member is None else source.member.name for source in sources]
-    names = _longer(
-        [str(source) for source in sources], [s.path / w for s, w in zip(sources, within, strict=True)]
-    )
-    return [replace(source, name=name) for source, name in zip(sources, names, strict=True)]
-
-
-def identities(sources: Sequence[Source]) -> list[dict[str, str]]:
-    """Return name and sha256 of every file of the recordings."""
-    files = _files_of(sources)
-    names = _longer([_named(file, recording) for file, recording in files.items()], list(files))
-    return [{"name": name, "sha256": file_digest(file)} for name, file in zip(names, files, strict=True)]
-
-
-def _files_of(sources: Sequence[Source]) -> dict[Path, Path]:
+def files_of(sources: Sequence[Source]) -> dict[Path, Path]:
     """Return the files, each with the recording that it is of."""
     files: dict[Path, Path] = {}
     for path, recording in dict.fromkeys((source.path, source.recording) for source in sources):
@@ -268,20 +251,7 @@ def _files_of(sources: Sequence[Source]) -> dict[Path, Path]:
     return files
 
 
-def _named(path: Path, recording: Path) -> str:
+def named(path: Path, recording: Path) -> str:
     """Name a file by its path within a recording that is a folder."""
     within = path.relative_to(recording) if path.is_relative_to(recording) else Path()
     return within.as_posix() if within.parts else path.name
-
-
-def _longer(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
-    """Return `names`, the ends of `paths`; those of several paths are longer ends, by which these differ."""
-    places = [path.absolute() for path in paths]
-    of_name: dict[str, set[Path]] = {}
-    for name, place in zip(names, places, strict=True):
-        of_name.setdefault(name, set()).add(place)
-    longer = [
-        "/".join(place.parts[-len(PurePosixPath(name).parts) - 1 :]) if len(of_name[name]) > 1 else name
-        for name, place in zip(names, places, strict=True)
-    ]
-    return longer if longer == list(names) else _longer(longer, paths)

@@ -43,3 +43,14 @@ def test_a_known_layout_needs_no_mapping_but_a_name_and_a_rate(tmp_path: Path) -
     result = CliRunner().invoke(cli.app, [*arguments, "--name", "set", "--fps", "20"])
     assert result.output.startswith(f"finished: {tmp_path / 'out'}: 1 episodes, 5 frames from 6 rows in ")
     assert Dataset.open(tmp_path / "out").task == "set"
+
+
+def test_bad_files_are_left_out_by_an_option(tmp_path: Path) -> None:
+    good = write_table(tmp_path / "good.csv", rows())
+    bad = write_table(tmp_path / "bad.csv", {"x": rows()["x"]})
+    (tmp_path / "mapping.toml").write_text(MAPPING)
+    arguments = ["import", str(good), str(bad), "--mapping", str(tmp_path / "mapping.toml"), "--out"]
+    refused = CliRunner().invoke(cli.app, [*arguments, str(tmp_path / "refused")])
+    assert isinstance(refused.exception, BadInputError) and "bad.csv: no fields" in str(refused.exception)
+    result = CliRunner().invoke(cli.app, [*arguments, str(tmp_path / "out"), "--skip-bad"])
+    assert result.exit_code == 0 and "left out: 1\n  bad.csv: no fields" in result.output

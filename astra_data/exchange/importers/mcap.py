@@ -47,6 +47,35 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         yield replace(_block(source, rows, starts), notes=resampler.unevenness())
 
 
+def check(source: Source, mapping: ImportMapping) -> None:
+    """Read the first message of each topic alone.
+
+    Raises:
+        BadInputError: topics or parts of these messages are missing.
+    """
+    _check_mapping(mapping, str(source))
+    topics: dict[str, list[str]] = {}
+    for field in mapping.all_fields:
+        topics.setdefault(field.partition(":")[0], []).append(field)
+    with source.open() as stream:
+        reader = optional("mcap.reader", "mcap").make_reader(stream, decoder_factories=_decoders())
+        _check_topics(reader.get_summary(), list(topics), str(source))
+        for topic, fields in topics.items():
+            first = next(reader.iter_decoded_messages(topics=[topic]), None)
+            if first is None:
+                raise BadInputError(f"{source}: no messages on {topic}")
+            _, _, message, content = first
+            _values(content, topic, fields, f"{source} at {message.log_time} ns")
+
+
+def _decoders() -> list[Any]:
+    return [
+        _Json(),
+        optional("mcap_protobuf.decoder", "mcap").DecoderFactory(),
+        optional("mcap_ros2.decoder", "mcap").DecoderFactory(),
+    ]
+
+
 def _moments(source: Source, mapping: ImportMapping) -> dict[str, "array[int]"]:
     """Return the log times of the messages of each topic, in ns."""
     topics = list(dict.fromkeys(field.partition(":")[0] for field in mapping.all_fields))
@@ -61,15 +90,10 @@ def _moments(source: Source, mapping: ImportMapping) -> dict[str, "array[int]"]:
 
 def _rows(source: Source, resampler: Resampler) -> Iterator[tuple[bool, dict[str, Array]]]:
     reading = optional("mcap.reader", "mcap")
-    factories = [
-        _Json(),
-        optional("mcap_protobuf.decoder", "mcap").DecoderFactory(),
-        optional("mcap_ros2.decoder", "mcap").DecoderFactory(),
-    ]
     time = 0
     sizes: dict[str, tuple[int, ...]] = {}
     with source.open() as stream:
-        reader = reading.make_reader(stream, validate_crcs=True, decoder_factories=factories)
+        reader = reading.make_reader(stream, validate_crcs=True, decoder_factories=_decoders())
         for _, channel, message, content in reader.iter_decoded_messages(topics=list(resampler.topics)):
             time = message.log_time
             values = _values(

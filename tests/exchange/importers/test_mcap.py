@@ -11,7 +11,10 @@ from recordings import imported
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE
+from astra_data.exchange.importers.mcap import check
 from astra_data.exchange.importing import import_dataset
+from astra_data.exchange.mapping import read_mapping
+from astra_data.exchange.recording import Source
 
 
 @pytest.mark.parametrize("write", [write_json, write_protobuf, write_ros2])
@@ -231,3 +234,41 @@ def test_a_gap_of_a_column_ends_episodes_where_a_state_drops_out(tmp_path: Path)
     dataset, report = imported(tmp_path / "cut", path, MAPPING.replace(state, f"{state}gap_s = 0.1\n"))
     assert len(dataset) == 2 and "silent" not in str(report)
     assert (np.diff(np.concatenate([e.columns[STATE][:, 0] for e in dataset.episodes()])) > 0).all()
+
+
+def test_all_bags_that_lack_something_are_told_at_once(tmp_path: Path) -> None:
+    """As far as their first messages tell."""
+    lacking = {
+        "1": [m for m in log() if m[0] == "/pose"],
+        "2": [m for m in log() if m[0] == "/pose"],
+        "4": [(topic, t, {"position": {}} if topic == "/pose" else m) for topic, t, m in log()],
+    }
+    bags = [write_json(tmp_path / f"{name}.mcap", lacking.get(name, log())) for name in "10234"]
+    bags[3].write_bytes(bags[3].read_bytes()[:8])
+    with pytest.raises(BadInputError) as caught:
+        imported(tmp_path, bags, MAPPING)
+    first, *others = str(caught.value).splitlines()
+    assert first == "1.mcap, 2.mcap: no topic '/command'; known: /pose"
+    assert [line[:6] for line in others] == ["3.mcap", "4.mcap"]
+    assert "'/pose:position.x' is neither a number nor a list of numbers" in others[1]
+
+
+def test_a_check_reads_the_first_messages_alone(tmp_path: Path) -> None:
+    mapping = tmp_path / "mapping.toml"
+    mapping.write_text(MAPPING)
+    messages = [*log(), ("/pose", 9.0, {"position": {}})]
+    path = write_json(tmp_path / "log.mcap", messages)
+    check(Source(path, None, path), read_mapping(mapping))
+    with pytest.raises(BadInputError, match=r"at 9000000000 ns: '/pose:position\.x' is neither"):
+        import_dataset([path], mapping, out=tmp_path / "out")
+    write_json(path, messages[-1:] + messages[:1])
+    with pytest.raises(BadInputError, match="no topic '/command'"):
+        check(Source(path, None, path), read_mapping(mapping))
+
+
+def test_bags_without_a_topic_are_left_out_where_that_is_asked_for(tmp_path: Path) -> None:
+    paths = [write_json(tmp_path / f"{name}.mcap", log()) for name in "012"]
+    write_json(paths[1], [m for m in log() if m[0] == "/pose"])
+    dataset, report = imported(tmp_path, paths, MAPPING, skip_bad=True)
+    assert set(dataset.metadata["source"]) == {"0.mcap", "2.mcap"}
+    assert report.left_out == ("1.mcap: no topic '/command'; known: /pose",)

@@ -1,0 +1,132 @@
+"""Recordings, read block by block and cut into episodes; every file that cannot be read is told at once."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+
+from astra_data.core.errors import AstraDataError, BadInputError, in_short
+from astra_data.core.wording import first_few
+from astra_data.exchange.cutting import Cut, Cutter
+from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.recording import VALUE_BYTES, Block, Source
+from astra_data.exchange.tally import Tally
+
+_NAMED = 50
+"""Files with one and the same fault that are named."""
+
+
+def episodes(
+    sources: Sequence[Source], module: ModuleType, mapping: ImportMapping, cutter: Cutter
+) -> Iterator[Cut]:
+    """Yield the episodes of `sources`, as the format's `module` reads them.
+
+    Raises:
+        BadInputError: a file cannot be read, or an episode does not fit into memory. The files after it that
+            cannot either, as far as their beginnings tell, are listed with it.
+    """
+    recording = None
+    size = 0
+    try:
+        for number, source in enumerate(sources):
+            is_apart = mapping.split.files or source.recording != recording
+            origin, row = "", 0
+            for block in _blocks_or_faults(sources[number:], module, mapping):
+                size += VALUE_BYTES * sum(values.size for values in block.values.values())
+                source.refuse_beyond(size)
+                recording = source.recording
+                row = row if block.origin == origin else 0
+                yield from cutter.feed(block, row, is_apart=is_apart)
+                is_apart, origin, row = False, block.origin, row + len(block)
+        yield from cutter.finish()
+    except MemoryError as error:
+        raise BadInputError(
+            f"an episode does not fit into memory ({in_short(error)}): cut it by [split] in the mapping"
+        ) from error
+
+
+def importable(
+    sources: Sequence[Source], module: ModuleType, mapping: ImportMapping
+) -> tuple[list[Source], tuple[str, ...]]:
+    """Return the sources that can be imported each by itself, and what is wrong with the others.
+
+    Each is read to its end.
+
+    Raises:
+        BadInputError: there are no such sources.
+    """
+    good, faults = [], {}
+    for source in sources:
+        cutter = Cutter(mapping)
+        try:
+            deque(episodes([source], module, mapping, cutter), maxlen=0)
+            refuse_rejected(cutter.tally, mapping)
+            good.append(source)
+        except BadInputError as error:
+            faults[source] = str(error)
+    if not good:
+        raise BadInputError("\n".join(_by_fault(faults)))
+    return good, tuple(faults.values())
+
+
+@contextmanager
+def explained(source: Source, module: ModuleType) -> Iterator[None]:
+    """Turn any exception of the library that reads a file into one clear message."""
+    try:
+        yield
+    except AstraDataError:
+        raise
+    except Exception as error:
+        file_format = module.__name__.rpartition(".")[2]
+        message = in_short(error) or type(error).__name__
+        raise BadInputError(f"{source} cannot be read as {file_format}: {message}") from error
+
+
+def refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
+    """Raise BadInputError where rows have values that are not finite, which `mapping` refuses."""
+    not_finite = tally.rejected_rows - tally.torn_rows
+    if not_finite and mapping.not_finite == "refuse":
+        raise BadInputError(
+            f"{not_finite} of {tally.rows} rows have values that are not finite, the first is "
+            f'{tally.rejected_first}; set not_finite in the mapping to leave them out: "split" ends '
+            'the episode there, "drop" goes on with the next row as if one step had passed'
+        )
+
+
+def _blocks_or_faults(
+    sources: Sequence[Source], module: ModuleType, mapping: ImportMapping
+) -> Iterator[Block]:
+    """Yield the blocks of the first of `sources`; if it cannot be read, tell which others cannot, too."""
+    try:
+        yield from _blocks(sources[0], module, mapping)
+    except BadInputError as error:
+        faults = {sources[0]: str(error)}
+        for source in sources[1:]:
+            try:
+                _check(source, module, mapping)
+            except BadInputError as other:
+                faults[source] = str(other)
+        raise BadInputError("\n".join(_by_fault(faults))) from error
+
+
+def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Iterator[Block]:
+    with explained(source, module):
+        yield from module.read(source, mapping)
+
+
+def _check(source: Source, module: ModuleType, mapping: ImportMapping) -> None:
+    """Raise BadInputError where the beginning of `source` tells that it cannot be read."""
+    if not hasattr(module, "check"):
+        next(_blocks(source, module, mapping), None)
+        return
+    with explained(source, module):
+        module.check(source, mapping)
+
+
+def _by_fault(faults: dict[Source, str]) -> list[str]:
+    """Return a line for each fault, with the names of the files that have it."""
+    names: dict[str, list[str]] = {}
+    for source, fault in faults.items():
+        begins = str(source) if fault.startswith(str(source)) else ""
+        names.setdefault(fault.removeprefix(begins), []).append(begins)
+    return [f"{first_few([name for name in of if name], _NAMED)}{fault}" for fault, of in names.items()]
