@@ -1,7 +1,7 @@
 """Import recordings in other formats as datasets."""
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import chain
@@ -101,6 +101,8 @@ def import_dataset(
     strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
     if strange:
         raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
+    if settings and chosen == "mcap" and not settings.split.files:
+        _refuse_parts(sources)
     sources, left_out = _without_bad(sources, chosen, settings) if skip_bad else (sources, ())
     records = {source: record for source in sources if (record := _record(source, chosen))}
     for source, record in records.items():
@@ -154,6 +156,17 @@ def import_dataset(
     unread = () if chosen == "minari" else other_files(recordings, _suffixes(FORMATS[chosen]))
     seconds = time.perf_counter() - began
     return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, left_out)
+
+
+def _refuse_parts(sources: Sequence[Source]) -> None:
+    """Refuse to let the files of a folder continue one another where each is resampled by itself."""
+    for recording, files in Counter(source.recording for source in sources).items():
+        if files > 1:
+            raise BadInputError(
+                f"{recording}: split.files = false cannot join its {files} MCAP files, each of which is "
+                "resampled by itself: make one of them, by `ros2 bag convert` or `mcap merge`, or leave the "
+                "key out, and an episode ends with each"
+            )
 
 
 def _without_bad(

@@ -100,7 +100,7 @@ class Split(Config):
     """Conditions that begin a new episode, in addition to the episodes that a format itself has."""
 
     files: bool = True
-    """Each file; if false, the files of a folder or archive continue one another."""
+    """Each file; if false, the files of a folder or archive continue one another (not those of MCAP)."""
     field: str | None = None
     """A field of the source whose value changes."""
     ends: tuple[str, ...] = ()

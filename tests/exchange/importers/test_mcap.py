@@ -272,3 +272,20 @@ def test_bags_without_a_topic_are_left_out_where_that_is_asked_for(tmp_path: Pat
     dataset, report = imported(tmp_path, paths, MAPPING, skip_bad=True)
     assert set(dataset.metadata["source"]) == {"0.mcap", "2.mcap"}
     assert report.left_out == ("1.mcap: no topic '/command'; known: /pose",)
+
+
+def test_the_parts_of_a_split_bag_are_not_joined_without_a_word(tmp_path: Path) -> None:
+    messages = log()
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for number, part in enumerate((messages[:40], messages[40:])):
+        write_json(folder / f"bag_{number}.mcap", part)
+    joined = f"{MAPPING}files = false\n"
+    with pytest.raises(
+        BadInputError, match=r"bag: split.files = false cannot join its 2 MCAP files, .*ros2 bag conv"
+    ):
+        imported(tmp_path, folder, joined)
+    _, report = imported(tmp_path, folder, MAPPING)
+    assert report.tally.split_points == {"file": 1, "source": 1}
+    for number in range(2):  # a file is all of its recording
+        imported(tmp_path / str(number), folder / f"bag_{number}.mcap", joined)
