@@ -235,6 +235,14 @@ def test_a_message_that_is_lost_is_no_dropout(period_ms: float) -> None:
     assert resampler.unevenness() == ()
 
 
+def test_rows_that_repeat_a_state_before_the_next_one_is_due_are_of_no_dropout() -> None:
+    """Each of the states is in two rows, one in eight: six of these are a dropout's."""
+    odom = np.delete(50.0 * np.arange(100), [41, 42, 43])
+    resampler, rows = sampled(40, odom, 25.0 * np.arange(200))
+    assert [k for k, _ in rows].count(40) == 8
+    assert "/odom is silent for up to 0.2 s once, where 6 rows repeat" in resampler.unevenness()[1]
+
+
 def test_a_state_that_stops_before_the_log_ends_is_told() -> None:
     """The states end at 1 s, and the command goes on."""
     resampler, rows = sampled(20, 50.0 * np.arange(21), 50.0 * np.arange(60))
