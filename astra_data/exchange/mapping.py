@@ -43,7 +43,7 @@ class ColumnMapping(Config):
     """
 
     fields: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Fields of the source; of MCAP, "/topic:path.in.message"."""
+    """Fields of the source; of MCAP, "/topic:path.in.message", and "/topic:list[name]" of named values."""
     take: tuple[Index, ...] = ()
     """Which of their values, from 0; by default all."""
     scale: tuple[Factor, ...] = ()

@@ -8,7 +8,7 @@ import json
 import logging
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.message_fields import MessageField
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
 from astra_data.exchange.resampling import Resampler
 
@@ -37,7 +38,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     starts = False
     rows: list[dict[str, Array]] = []
     resampler = Resampler(mapping, str(source), _moments(source, mapping))
-    for begins, row in _rows(source, resampler):
+    for begins, row in _rows(source, resampler, _fields(mapping)):
         if rows and (begins or len(rows) == BLOCK_ROWS):
             yield _block(source, rows, starts)
             starts, rows = False, []
@@ -54,9 +55,7 @@ def check(source: Source, mapping: ImportMapping) -> None:
         BadInputError: topics or parts of these messages are missing.
     """
     _check_mapping(mapping, str(source))
-    topics: dict[str, list[str]] = {}
-    for field in mapping.all_fields:
-        topics.setdefault(field.partition(":")[0], []).append(field)
+    topics = _fields(mapping)
     with source.open() as stream:
         reader = optional("mcap.reader", "mcap").make_reader(stream, decoder_factories=_decoders())
         _check_topics(reader.get_summary(), list(topics), str(source))
@@ -65,7 +64,7 @@ def check(source: Source, mapping: ImportMapping) -> None:
             if first is None:
                 raise BadInputError(f"{source}: no messages on {topic}")
             _, _, message, content = first
-            _values(content, topic, fields, f"{source} at {message.log_time} ns")
+            _values(content, fields, f"{source} at {message.log_time} ns")
 
 
 def _decoders() -> list[Any]:
@@ -88,7 +87,9 @@ def _moments(source: Source, mapping: ImportMapping) -> dict[str, "array[int]"]:
     return times
 
 
-def _rows(source: Source, resampler: Resampler) -> Iterator[tuple[bool, dict[str, Array]]]:
+def _rows(
+    source: Source, resampler: Resampler, fields: dict[str, list[MessageField]]
+) -> Iterator[tuple[bool, dict[str, Array]]]:
     reading = optional("mcap.reader", "mcap")
     time = 0
     sizes: dict[str, tuple[int, ...]] = {}
@@ -96,9 +97,7 @@ def _rows(source: Source, resampler: Resampler) -> Iterator[tuple[bool, dict[str
         reader = reading.make_reader(stream, validate_crcs=True, decoder_factories=_decoders())
         for _, channel, message, content in reader.iter_decoded_messages(topics=list(resampler.topics)):
             time = message.log_time
-            values = _values(
-                content, channel.topic, resampler.topics[channel.topic], f"{source} at {time} ns"
-            )
+            values = _values(content, fields[channel.topic], f"{source} at {time} ns")
             changed = [field for field, v in values.items() if sizes.setdefault(field, v.shape) != v.shape]
             if changed:
                 raise BadInputError(f"{source} at {time} ns: {', '.join(changed)} changes in size")
@@ -147,29 +146,25 @@ def _check_topics(summary: Any, topics: list[str], origin: str) -> None:  # noqa
         raise BadInputError(f"{origin}: {'; '.join(missing)}")
 
 
-def _values(content: Any, topic: str, fields: list[str], origin: str) -> dict[str, Array]:  # noqa: ANN401 - any message
+def _values(content: Any, fields: Sequence[MessageField], origin: str) -> dict[str, Array]:  # noqa: ANN401 - any message
     values, faults = {}, []
-    for field in fields:
-        part = content
-        for key in field.removeprefix(f"{topic}:").split("."):
-            part = _part(part, key)
-        is_list = hasattr(part, "__len__") and not isinstance(part, str | Mapping)
-        value = np.array(list(part) if is_list else part)
-        if value.dtype.kind not in "biufU":
-            faults.append(f"'{field}' is neither a number nor a list of numbers")
-        values[field] = value
+    for each in fields:
+        try:
+            values[each.name] = each.value(content)
+        except BadInputError as error:
+            faults.append(str(error))
     if faults:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
     return values
 
 
-def _part(value: Any, key: str) -> Any:  # noqa: ANN401 - any message
-    """Return part `key` of a message, None where there is none."""
-    if isinstance(value, Mapping):
-        return value.get(key)
-    if key.isdecimal():
-        return value[int(key)] if hasattr(value, "__len__") and int(key) < len(value) else None
-    return getattr(value, key, None)
+def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
+    """Return the fields of each topic."""
+    fields: dict[str, list[MessageField]] = {}
+    for name in mapping.all_fields:
+        of_message = MessageField(name)
+        fields.setdefault(of_message.topic, []).append(of_message)
+    return fields
 
 
 class _Json:
