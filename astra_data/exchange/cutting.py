@@ -86,8 +86,8 @@ class Cutter:
             self._spent.append((block.origin, np.zeros(3)))
         rejected = ~finite
         if rejected.any():
-            first = row + int(np.argmax(rejected))
-            self.tally.rejected_first = self.tally.rejected_first or row_name(block.origin, first)
+            first = int(np.argmax(rejected))
+            self.tally.rejected_first = self.tally.rejected_first or block.place(first, row + first)
             self.tally.rejected_rows += int(rejected.sum())
         self.tally.count_torn(block.torn, row_name(block.origin, row + len(block)))
         counters = self._count(block, row, columns, rejected, is_apart=is_apart)
@@ -230,7 +230,8 @@ class Cutter:
                 now[key] = series[1:]
             else:
                 masks["end"] |= (np.nan_to_num(series[:-1]) != 0).any(axis=1)
-        masks["file"][0], masks["source"][0] = is_apart, block.starts
+        masks["file"][0], masks["source"][0] = is_apart, block.starts and not block.is_back
+        masks["back"][0] |= block.is_back
         self._before = {key: values[-1:] for key, values in now.items()}
         if self._mapping.not_finite == "split":
             masks["rejected"] = rejected

@@ -210,9 +210,8 @@ def _format_of(recording: Path) -> str:
     for name, module in FORMATS.items():
         if any(file.lower().endswith(_suffixes(module)) for file in names):
             return name
-    raise BadInputError(
-        f"{recording}: its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"
-    )
+    unknown = f"its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"
+    raise BadInputError(f"{recording}: {mcap.advice(names) or unknown}")
 
 
 def _suffixes(module: ModuleType) -> tuple[str, ...]:

@@ -108,7 +108,7 @@ class Split(Config):
     next.truncated."""
     gap_s: Positive | None = None
     """A step in `time` that is longer; of MCAP, the longest time for which a topic's last value is held. Time
-    that goes back within a file begins a new episode in any case."""
+    that goes back within a file begins a new episode in any case; of MCAP, if a topic goes back by more."""
     jump: Jump | None = None
     """A jump between rows."""
 

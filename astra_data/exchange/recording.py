@@ -1,13 +1,14 @@
 """Recordings in other formats: their files, and the blocks of rows that importers read from them."""
 
+import io
 import re
 import shlex
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
-from typing import IO
+from typing import IO, Any
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError, in_short
@@ -81,6 +82,25 @@ class Source:
                 yield content
 
 
+class Part(io.RawIOBase):
+    """The first `size` bytes of a stream, from where it is."""
+
+    def __init__(self, stream: IO[bytes], size: int) -> None:
+        """Read from `stream`."""
+        self._stream, self._left = stream, size
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 - what Python's own streams fill
+        """Fill `buffer`, and return with how many bytes."""
+        read = self._stream.read(min(len(buffer), self._left))
+        buffer[: len(read)] = read
+        self._left -= len(read)
+        return len(read)
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Consecutive rows.
@@ -91,6 +111,8 @@ class Block:
         starts: whether an episode of the format itself begins with the first row.
         torn: how many rows after the last one are cut off at the end of the file, 0 or 1.
         notes: what the import's report tells of them, in a line each.
+        is_back: whether that episode begins since time goes back.
+        places: where the values of some rows were recorded, if the number of the row does not tell.
     """
 
     values: Mapping[str, Array]
@@ -98,10 +120,16 @@ class Block:
     starts: bool = False
     torn: int = 0
     notes: tuple[str, ...] = ()
+    is_back: bool = False
+    places: Mapping[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return n."""
         return len(next(iter(self.values.values())))
+
+    def place(self, row: int, number: int) -> str:
+        """Name a row of the block that has a `number` in its part of the file."""
+        return self.places.get(row) or row_name(self.origin, number)
 
 
 def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:

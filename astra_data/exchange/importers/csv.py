@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +16,7 @@ from pyarrow import csv
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Source, refuse_dataset, row_count
+from astra_data.exchange.recording import Block, Part, Source, refuse_dataset, row_count
 
 SUFFIXES = (".csv", ".tsv")
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
@@ -119,27 +119,9 @@ def _without_end(source: Source, size: int) -> Iterator[IO[bytes]]:
         if size:
             end = stream.seek(0, os.SEEK_END)
             stream.seek(0)
-            yield io.BufferedReader(_Part(stream, end - size))
+            yield io.BufferedReader(Part(stream, end - size))
         else:
             yield stream
-
-
-class _Part(io.RawIOBase):
-    """The first `size` bytes of a stream."""
-
-    def __init__(self, stream: IO[bytes], size: int) -> None:
-        self._stream, self._left = stream, size
-
-    def readable(self) -> bool:
-        """Return True."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 - what Python's own streams fill
-        """Fill `buffer`, and return with how many bytes."""
-        read = self._stream.read(min(len(buffer), self._left))
-        buffer[: len(read)] = read
-        self._left -= len(read)
-        return len(read)
 
 
 def _is_cut_in_header(source: Source) -> bool:

@@ -4,21 +4,18 @@ Times are the messages' log times. Files are read message by message, twice: how
 when rows are taken (`exchange/resampling.py`).
 """
 
-import json
 import logging
-from array import array
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.optional import optional
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.mcap_file import McapFile
+from astra_data.exchange.mcap_timeline import Timeline
 from astra_data.exchange.message_fields import MessageField
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
 from astra_data.exchange.resampling import Resampler
@@ -28,24 +25,54 @@ SUFFIXES = (".mcap",)
 _log = logging.getLogger(__name__)
 
 
+@dataclass
+class _Rows:
+    """Rows of one block, the topics' times in each, and how the block begins."""
+
+    values: list[dict[str, Array]] = field(default_factory=list)
+    times: list[dict[str, int]] = field(default_factory=list)
+    starts: bool = False
+    is_back: bool = False
+
+
+def advice(names: Sequence[str]) -> str:
+    """Say how to make MCAP of the files `names`, where another tool does; else nothing."""
+    for name in names:
+        if name.lower().endswith((".db3", ".db3.zstd")):
+            return (
+                "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, storage_id: mcap, "
+                "all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and import NEW"
+            )
+        if name.lower().endswith((".mcap.zstd", ".mcap.zst")):
+            return f"{name} is compressed as a whole: run `zstd -d {name}`, and import the .mcap"
+    return ""
+
+
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield rows at the rate `mapping.fps`.
 
     Raises:
         BadInputError: topics or parts of messages are missing; lists all of them.
     """
+    if hint := advice([str(source)]):
+        raise BadInputError(f"{source}: {hint}")
     _check_mapping(mapping, str(source))
-    starts = False
-    rows: list[dict[str, Array]] = []
-    resampler = Resampler(mapping, str(source), _moments(source, mapping))
-    for begins, row in _rows(source, resampler, _fields(mapping)):
-        if rows and (begins or len(rows) == BLOCK_ROWS):
-            yield _block(source, rows, starts)
-            starts, rows = False, []
-        starts |= begins
-        rows.append(row)
-    if rows:
-        yield replace(_block(source, rows, starts), notes=resampler.unevenness())
+    fields = _fields(mapping)
+    file = McapFile(source, fields.keys())
+    gaps_s = [mapping.split.gap_s or 0, *(column.gap_s or 0 for column in mapping.columns.values())]
+    timeline = Timeline(file, gaps_s[0], max(gaps_s))
+    resampler = Resampler(mapping, str(source), timeline.moments)
+    rows = _Rows()
+    for begins, is_back, row, times in _rows(source, resampler, timeline, fields):
+        if rows.values and (begins or len(rows.values) == BLOCK_ROWS):
+            yield _block(source, rows)
+            rows = _Rows()
+        rows.starts |= begins
+        rows.is_back |= is_back
+        rows.values.append(row)
+        rows.times.append(times)
+    if rows.values:
+        yield replace(_block(source, rows), torn=int(file.is_cut), notes=resampler.unevenness())
 
 
 def check(source: Source, mapping: ImportMapping) -> None:
@@ -55,55 +82,52 @@ def check(source: Source, mapping: ImportMapping) -> None:
         BadInputError: topics or parts of these messages are missing.
     """
     _check_mapping(mapping, str(source))
-    topics = _fields(mapping)
-    with source.open() as stream:
-        reader = optional("mcap.reader", "mcap").make_reader(stream, decoder_factories=_decoders())
-        _check_topics(reader.get_summary(), list(topics), str(source))
-        for topic, fields in topics.items():
-            first = next(reader.iter_decoded_messages(topics=[topic]), None)
-            if first is None:
-                raise BadInputError(f"{source}: no messages on {topic}")
-            _, _, message, content = first
-            _values(content, fields, f"{source} at {message.log_time} ns")
+    fields = _fields(mapping)
+    file = McapFile(source, fields.keys())
+    first: dict[str, Any] = {}
+    for topic, message in file.messages(checked=False):
+        first.setdefault(topic, message)
+        if len(first) == len(fields):
+            break
+    file.check_topics()
+    for topic in fields:
+        if topic not in first:
+            raise BadInputError(f"{source}: no messages on {topic}")
+        content = file.decoder(first[topic].channel_id)(first[topic].data)
+        _values(content, fields[topic], f"{source} at {first[topic].log_time} ns")
 
 
-def _decoders() -> list[Any]:
-    return [
-        _Json(),
-        optional("mcap_protobuf.decoder", "mcap").DecoderFactory(),
-        optional("mcap_ros2.decoder", "mcap").DecoderFactory(),
-    ]
-
-
-def _moments(source: Source, mapping: ImportMapping) -> dict[str, "array[int]"]:
-    """Return the log times of the messages of each topic, in ns."""
-    topics = list(dict.fromkeys(field.partition(":")[0] for field in mapping.all_fields))
-    times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
-    with source.open() as stream:
-        reader = optional("mcap.reader", "mcap").make_reader(stream)
-        _check_topics(reader.get_summary(), topics, str(source))
-        for _, channel, message in reader.iter_messages(topics=topics):
-            times[channel.topic].append(message.log_time)
-    return times
+def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
+    """Return the fields of each topic."""
+    fields: dict[str, list[MessageField]] = {}
+    for name in mapping.all_fields:
+        of_message = MessageField(name)
+        fields.setdefault(of_message.topic, []).append(of_message)
+    return fields
 
 
 def _rows(
-    source: Source, resampler: Resampler, fields: dict[str, list[MessageField]]
-) -> Iterator[tuple[bool, dict[str, Array]]]:
-    reading = optional("mcap.reader", "mcap")
+    source: Source, resampler: Resampler, timeline: Timeline, fields: Mapping[str, list[MessageField]]
+) -> Iterator[tuple[bool, bool, dict[str, Array], dict[str, int]]]:
+    """Yield whether a row begins an episode, and since time goes back, its values and the topics' times."""
     time = 0
+    is_back = False
+    log_times: dict[str, int] = {}
     sizes: dict[str, tuple[int, ...]] = {}
-    with source.open() as stream:
-        reader = reading.make_reader(stream, validate_crcs=True, decoder_factories=_decoders())
-        for _, channel, message, content in reader.iter_decoded_messages(topics=list(resampler.topics)):
-            time = message.log_time
-            values = _values(content, fields[channel.topic], f"{source} at {time} ns")
-            changed = [field for field, v in values.items() if sizes.setdefault(field, v.shape) != v.shape]
-            if changed:
-                raise BadInputError(f"{source} at {time} ns: {', '.join(changed)} changes in size")
-            yield from resampler.rows_before(time)
-            resampler.receive(channel.topic, time, values)
-    yield from resampler.last_rows(time)
+    for topic, time, log_time, content, begins_back in timeline.messages():
+        values = _values(content, fields[topic], f"{source} at {log_time} ns")
+        changed = [name for name, v in values.items() if sizes.setdefault(name, v.shape) != v.shape]
+        if changed:
+            raise BadInputError(f"{source} at {log_time} ns: {', '.join(changed)} changes in size")
+        for begins, row in resampler.rows_before(time):
+            yield begins, begins and is_back, row, dict(log_times)
+            is_back &= not begins
+        is_back |= begins_back
+        log_times[topic] = log_time
+        resampler.receive(topic, time, values)
+    for begins, row in resampler.last_rows(time):
+        yield begins, begins and is_back, row, dict(log_times)
+        is_back &= not begins
     silent = sorted(resampler.topics.keys() - resampler.times.keys())
     if silent:
         raise BadInputError(f"{source}: no messages on {', '.join(silent)}")
@@ -117,15 +141,22 @@ def _rows(
         )
 
 
-def _block(source: Source, rows: list[dict[str, Array]], starts: bool) -> Block:
-    return Block({field: np.stack([row[field] for row in rows]) for field in rows[0]}, str(source), starts)
+def _block(source: Source, rows: _Rows) -> Block:
+    values = {name: np.stack([row[name] for row in rows.values]) for name in rows.values[0]}
+    places = {
+        row: f"{source}, {name} at {rows.times[row][name.partition(':')[0]]} ns"
+        for name, column in reversed(values.items())
+        if column.dtype.kind == "f"
+        for row in np.flatnonzero(~np.isfinite(column.reshape(len(column), -1)).all(axis=1)).tolist()
+    }
+    return Block(values, str(source), rows.starts, is_back=rows.is_back, places=places)
 
 
 def _check_mapping(mapping: ImportMapping, origin: str) -> None:
     faults = [
-        f"field '{field}', expected '/topic:path.in.message'"
-        for field in mapping.all_fields
-        if not all(field.partition(":"))
+        f"field '{name}', expected '/topic:path.in.message'"
+        for name in mapping.all_fields
+        if not all(name.partition(":"))
     ]
     if mapping.split.gap_s is None:
         faults.append("split.gap_s is missing: the longest time for which a topic's last value is held")
@@ -137,16 +168,7 @@ def _check_mapping(mapping: ImportMapping, origin: str) -> None:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
 
 
-def _check_topics(summary: Any, topics: list[str], origin: str) -> None:  # noqa: ANN401 - of mcap
-    known = {channel.topic for channel in summary.channels.values()} if summary else set(topics)
-    missing = [
-        f"no topic '{topic}'{did_you_mean(topic, sorted(known))}" for topic in topics if topic not in known
-    ]
-    if missing:
-        raise BadInputError(f"{origin}: {'; '.join(missing)}")
-
-
-def _values(content: Any, fields: Sequence[MessageField], origin: str) -> dict[str, Array]:  # noqa: ANN401 - any message
+def _values(content: Any, fields: Sequence[MessageField], origin: str) -> Mapping[str, Array]:  # noqa: ANN401 - any message
     values, faults = {}, []
     for each in fields:
         try:
@@ -156,20 +178,3 @@ def _values(content: Any, fields: Sequence[MessageField], origin: str) -> dict[s
     if faults:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
     return values
-
-
-def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
-    """Return the fields of each topic."""
-    fields: dict[str, list[MessageField]] = {}
-    for name in mapping.all_fields:
-        of_message = MessageField(name)
-        fields.setdefault(of_message.topic, []).append(of_message)
-    return fields
-
-
-class _Json:
-    """Decodes JSON messages, with or without a schema."""
-
-    def decoder_for(self, message_encoding: str, schema: object) -> Callable[[bytes], object] | None:
-        """Return the decoder, None for other encodings."""
-        return json.loads if message_encoding == "json" else None

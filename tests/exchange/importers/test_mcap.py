@@ -1,9 +1,11 @@
+import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from mcap_recordings import MAPPING, command, log, ns, pose, write_json, write_protobuf, write_ros2
 from mcap_ros2.writer import Writer
 from recordings import imported
@@ -220,6 +222,66 @@ def drive(begin: float, end: float) -> list[tuple[str, float, dict[str, Any]]]:
     ]
 
 
+def test_where_a_clock_is_set_back_an_episode_begins_and_is_counted(tmp_path: Path) -> None:
+    """Before, both stretches were one, with their rows in turn."""
+    back = [(topic, time - 2, content) for topic, time, content in drive(3, 6)]
+    dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", drive(0, 3) + back), MAPPING)
+    assert report.tally.split_points == {"back": 1}
+    values = dataset.columns([STATE, ACTION])
+    assert dataset.lengths.tolist() == [29, 29]
+    assert values[ACTION].tolist() == values[STATE][:, 0].tolist() == [*range(29), *range(30, 59)]
+
+
+def test_a_gap_after_a_clock_was_set_back_is_a_gap(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "log.mcap", [*drive(10, 12), *drive(5, 7), *drive(8, 10)])
+    _, report = imported(tmp_path, path, MAPPING)
+    assert report.tally.split_points == {"back": 1, "source": 1}
+
+
+def test_a_latched_topic_is_held_where_a_clock_is_set_back(tmp_path: Path) -> None:
+    latched = MAPPING.replace('fields = ["/command:turn"]', 'fields = ["/command:turn"]\nlatched = true')
+    poses = [pose(k / 10, k) for k in (*range(100, 120), *range(20))]
+    path = write_json(tmp_path / "log.mcap", [command(10.0, 7.0), *poses])
+    dataset, report = imported(tmp_path, path, latched)
+    assert report.tally.split_points == {"back": 1} and dataset.lengths.tolist() == [19, 19]
+    assert dataset.columns([ACTION])[ACTION].tolist() == [7.0] * 38
+
+
+def test_a_bag_that_is_cut_off_is_read_up_to_there_and_counted(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "0.mcap", tmp_path / "1.mcap"
+    for path in (whole, cut):
+        with path.open("wb") as file:
+            writer = McapWriter(file, chunk_size=400)
+            writer.start()
+            channels = {
+                topic: writer.register_channel(topic, "json", schema_id=0) for topic in ("/pose", "/command")
+            }
+            for topic, time, content in drive(0, 3):
+                writer.add_message(channels[topic], ns(time), json.dumps(content).encode(), ns(time))
+            writer.finish()  # type: ignore[no-untyped-call]
+    written = cut.read_bytes()
+    cut.write_bytes(written[: len(written) // 3])
+    dataset, report = imported(tmp_path, [whole, cut], MAPPING)
+    first, second = dataset.episodes()
+    assert len(first) == 29 and 5 < len(second) < 20
+    np.testing.assert_array_equal(second.columns[STATE], first.columns[STATE][: len(second)])
+    assert report.tally.torn_rows == report.tally.rejected_rows == 1
+    told = (
+        f"rejected rows: 1; cut off at the end of their files: 1, the first is 1.mcap row {len(second) + 1}"
+    )
+    assert told in str(report)
+    cut.write_bytes(written[:-1])
+    assert import_dataset([cut], tmp_path / "mapping.toml", out=tmp_path / "all").tally.torn_rows == 0
+
+
+def test_a_value_that_is_not_finite_is_named_by_its_topic_and_time(tmp_path: Path) -> None:
+    messages = drive(0, 3)
+    messages[24] = pose(1.2, float("nan"))
+    path = write_json(tmp_path / "log.mcap", messages)
+    with pytest.raises(BadInputError, match=r"the first is log\.mcap, /pose:position\.x at 1200000000 ns;"):
+        imported(tmp_path, path, MAPPING)
+
+
 def test_stamps_are_a_column_that_inspect_reads(tmp_path: Path) -> None:
     """They are too large for float32, and for floats of 64 bits if they are to be exact."""
     stamp_ns = [1_764_000_000_000_000_000 + ns(k / 10) for k in range(60)]
@@ -248,6 +310,24 @@ def test_joints_that_change_places_are_refused_and_found_by_name(tmp_path: Path)
         imported(tmp_path, path, MAPPING)
     dataset, _ = imported(tmp_path, path, MAPPING.replace("/pose:joints", "/pose:joints[left]"))
     assert dataset.columns([STATE])[STATE].tolist() == [[k, k] for k in range(19)]
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("bag/bag_0.db3", r"ros2 bag convert -i BAG"),
+        ("bag.mcap.zstd", r"bag\.mcap\.zstd is compressed as a whole: run `zstd -d bag\.mcap\.zstd`"),
+    ],
+)
+def test_bags_that_another_tool_makes_readable_are_told(tmp_path: Path, name: str, told: str) -> None:
+    path = tmp_path / "given" / name
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"SQLite")
+    for options in ({}, {"file_format": "mcap"}):
+        with pytest.raises(BadInputError, match=told):
+            imported(tmp_path, path, MAPPING, **options)
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path, path.parent, MAPPING)
 
 
 def test_a_rate_that_does_not_divide_is_told_once_for_all_files(tmp_path: Path) -> None:

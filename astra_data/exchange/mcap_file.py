@@ -1,0 +1,177 @@
+"""MCAP files: the messages of some topics as they stand in the file, as far as it goes.
+
+A file without an end, as of a recorder that was killed, is read up to its last whole record.
+"""
+
+import json
+import struct
+from collections.abc import Callable, Collection, Iterator
+from io import SEEK_END, BufferedReader
+from typing import IO, Any
+
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.exchange.recording import Part, Source
+
+MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")
+"""Of a record: its kind and its length."""
+_BLOCK_BYTES = 2**16
+
+
+class McapFile:
+    """The messages of some topics of an MCAP file, in its order.
+
+    Attributes:
+        is_cut: whether messages may be missing at its end; known once it was read.
+    """
+
+    def __init__(self, source: Source, topics: Collection[str]) -> None:
+        """Look at both ends of the file, and read its index if it has one.
+
+        Raises:
+            BadInputError: the file is empty, or lacks topics by its index.
+        """
+        self.is_cut = False
+        self._source = source
+        self._wanted = topics
+        self._channels: dict[int, Any] = {}
+        self._schemas: dict[int, Any] = {}
+        self._chunks: list[Any] | None = None
+        self._whole_bytes: int | None = None
+        self._open()
+
+    def messages(self, *, checked: bool) -> Iterator[tuple[str, Any]]:
+        """Yield each message with its topic, in the order of the file; `checked` by its sums, or not."""
+        records = optional("mcap.records", "mcap")
+        wanted = {number: channel.topic for number, channel in self._channels.items()}
+        for record in self._records(checked=checked):
+            if isinstance(record, records.Message):
+                if record.channel_id not in wanted:
+                    raise BadInputError(f"{self._source}: no channel {record.channel_id}, which has messages")
+                topic = wanted[record.channel_id]
+                if topic in self._wanted:
+                    yield topic, record
+            elif isinstance(record, records.Channel):
+                self._channels[record.id] = record
+                wanted[record.id] = record.topic
+            elif isinstance(record, records.Schema):
+                self._schemas[record.id] = record
+
+    def check_topics(self) -> None:
+        """Refuse a file that lacks wanted topics, once its index or its messages were read.
+
+        Raises:
+            BadInputError: it does; lists all of them.
+        """
+        known = sorted({channel.topic for channel in self._channels.values()})
+        if self.is_cut and not known:
+            raise BadInputError(f"{self._source} is cut off before its first message ends: leave it out")
+        missing = [
+            f"no topic '{topic}'{did_you_mean(topic, known)}" for topic in self._wanted if topic not in known
+        ]
+        if missing:
+            raise BadInputError(f"{self._source}: {'; '.join(missing)}")
+
+    def decoder(self, number: int) -> Callable[[bytes], Any]:
+        """Return the decoder of the messages of channel `number`.
+
+        Raises:
+            BadInputError: they have an encoding that cannot be read, or a package is missing.
+        """
+        packages = "mcap_protobuf", "mcap_ros2"
+        factories = [optional(f"{package}.decoder", "mcap").DecoderFactory() for package in packages]
+        channel = self._channels[number]
+        if channel.message_encoding == "json":
+            return json.loads
+        schema = self._schemas.get(channel.schema_id)
+        for factory in factories:
+            decoder: Callable[[bytes], Any] | None = factory.decoder_for(channel.message_encoding, schema)
+            if decoder is not None:
+                return decoder
+        encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} schema"
+        raise BadInputError(
+            f"{self._source}: messages of {channel.topic} are {encoding}, expected json, protobuf, or cdr "
+            "with ros2msg schema"
+        )
+
+    def _open(self) -> None:
+        with self._source.open() as stream:
+            size, content = stream.seek(0, SEEK_END), _content_bytes(stream)
+            if not content:
+                raise BadInputError(f"{self._source} is empty: nothing was recorded, leave it out")
+            stream.seek(max(size - len(MAGIC), 0))
+            if size < 2 * len(MAGIC) or stream.read() != MAGIC:
+                self._whole_bytes, self.is_cut = _whole_bytes(stream, content), True
+                return
+            stream.seek(0)
+            summary = optional("mcap.reader", "mcap").make_reader(stream).get_summary()
+        if summary is None:
+            return
+        self._channels, self._schemas = dict(summary.channels), dict(summary.schemas)
+        used = set().union(*(index.message_index_offsets for index in summary.chunk_indexes))
+        described = {channel.schema_id for channel in summary.channels.values()} - {0}
+        # A summary may leave out what the data say.
+        if summary.chunk_indexes and used <= summary.channels.keys() and described <= summary.schemas.keys():
+            indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+            self._chunks = [index for index in indexes if self._may_hold(index.message_index_offsets)]
+            self.check_topics()
+
+    def _may_hold(self, channels: Collection[int]) -> bool:
+        """Return whether a chunk with messages of `channels` may have wanted ones; some list no channels."""
+        return not channels or any(self._channels[number].topic in self._wanted for number in channels)
+
+    def _records(self, *, checked: bool) -> Iterator[Any]:
+        """Yield the records of the data, those of chunks unpacked, and `checked` by their sums."""
+        reading, records = optional("mcap.stream_reader", "mcap"), optional("mcap.records", "mcap")
+        with self._source.open() as stream:
+            if self._chunks is not None:
+                for index in self._chunks:
+                    stream.seek(index.chunk_start_offset + _HEAD.size)
+                    chunk = records.Chunk.read(reading.ReadDataStream(stream))
+                    yield from reading.breakup_chunk(chunk, validate_crc=checked)
+                return
+            whole: IO[bytes] = stream
+            if self._whole_bytes is not None:
+                whole = BufferedReader(Part(stream, self._whole_bytes))
+            try:
+                for record in reading.StreamReader(whole, emit_chunks=True, validate_crcs=checked).records:
+                    if isinstance(record, records.Chunk):
+                        yield from reading.breakup_chunk(record, validate_crc=checked)
+                    elif isinstance(record, records.DataEnd):
+                        self.is_cut = False
+                        return
+                    else:
+                        yield record
+            except optional("mcap.exceptions", "mcap").EndOfFile:
+                if self._whole_bytes is None:
+                    raise
+
+
+def _content_bytes(stream: IO[bytes]) -> int:
+    """Return the size of a file without the zeros at its end, which a full or failing disk leaves."""
+    end = stream.seek(0, SEEK_END)
+    while end:
+        begin = max(0, end - _BLOCK_BYTES)
+        stream.seek(begin)
+        if content := stream.read(end - begin).rstrip(b"\0"):
+            return begin + len(content)
+        end = begin
+    return 0
+
+
+def _whole_bytes(stream: IO[bytes], content: int) -> int:
+    """Return up to where the records of a file with `content` bytes before zeros are whole."""
+    size = stream.seek(0, SEEK_END)
+    end = len(MAGIC) if size >= len(MAGIC) else 0
+    while True:
+        stream.seek(end)
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            return end
+        after = end + _HEAD.size + _HEAD.unpack(head)[1]
+        # Without zeros at the end, a record may well end in some of its own.
+        if after > content and after != size:
+            return end
+        end = after

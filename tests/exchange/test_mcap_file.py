@@ -1,0 +1,204 @@
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.mcap_file import McapFile
+from astra_data.exchange.recording import Source
+
+CHUNK = 2000
+LENGTH = 300
+
+
+def write(path: Path, *, is_finished: bool = True, **options: Any) -> Path:  # noqa: ANN401
+    """Write messages of one topic, and some of another, whose contents end in zeros."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=CHUNK, **options)
+        writer.start()
+        used = writer.register_channel("/used", "json", schema_id=0)
+        other = writer.register_channel("/other", "json", schema_id=0)
+        for number in range(LENGTH):
+            channel = other if number % 5 == 0 or 100 < number < 200 else used
+            writer.add_message(channel, number, b"%03d" % number + bytes(20), number)
+        if is_finished:
+            writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def numbers(path: Path, *, checked: bool = True) -> tuple[list[int], bool]:
+    """Return which messages are read, and whether the file is cut off."""
+    file = McapFile(Source(path, None, path), ["/used"])
+    read = [message.log_time for _, message in file.messages(checked=checked)]
+    file.check_topics()
+    return read, file.is_cut
+
+
+WANTED = [number for number in range(LENGTH) if number % 5 and not 100 < number < 200]
+FORMS: dict[str, dict[str, Any]] = {
+    "usual": {},
+    "lz4": {"compression": CompressionType.LZ4},
+    "without chunks": {"use_chunking": False},
+    "without indexes of messages": {"index_types": IndexType.CHUNK},
+    "without an index": {"index_types": IndexType.NONE},
+    "without channels in the summary": {"repeat_channels": False, "repeat_schemas": False},
+    "without a summary": {
+        "index_types": IndexType.NONE,
+        "repeat_channels": False,
+        "repeat_schemas": False,
+        "use_statistics": False,
+        "use_summary_offsets": False,
+    },
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_is_read(tmp_path: Path, form: str) -> None:
+    assert numbers(write(tmp_path / "log.mcap", **FORMS[form])) == (WANTED, False)
+
+
+def test_chunks_without_wanted_messages_are_not_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap", compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    for number in (150, 250):
+        place = content.index(b"%03d" % number + bytes(20))
+        content[place] ^= 1
+        path.write_bytes(content)
+        if number == 150:
+            assert numbers(path) == (WANTED, False)
+    with pytest.raises(ValueError, match="crc validation failed in Chunk"):
+        numbers(path)
+    assert numbers(path, checked=False) == (WANTED, False)
+
+
+@pytest.mark.parametrize("form", ["usual", "without chunks"])
+@pytest.mark.parametrize("zeros", [0, 1, 8, 9, 1000, 200_000])
+def test_a_file_that_is_cut_off_is_read_up_to_there(tmp_path: Path, form: str, zeros: int) -> None:
+    whole = write(tmp_path / "whole.mcap", **FORMS[form]).read_bytes()
+    path = tmp_path / "log.mcap"
+    lengths = set()
+    for cut in range(200, len(whole) - 1, 97):
+        path.write_bytes(whole[:cut] + bytes(zeros))
+        try:
+            read, is_cut = numbers(path)
+        except BadInputError as error:
+            assert re.search("no topic '/used'|is cut off before its first message ends", str(error))
+            read, is_cut = [], True
+        assert read == WANTED[: len(read)]
+        assert is_cut or read == WANTED
+        lengths.add(len(read))
+    assert len(lengths) > 5 and max(lengths) == len(WANTED)
+
+
+def test_no_message_before_a_cut_is_lost(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole.mcap", use_chunking=False).read_bytes()
+    path = tmp_path / "log.mcap"
+    end = whole.index(b"%03d" % WANTED[99]) + 23
+    path.write_bytes(whole[:end])
+    assert numbers(path) == (WANTED[:100], True)
+    path.write_bytes(whole[: end - 1])
+    assert numbers(path) == (WANTED[:99], True)
+
+
+def test_a_recorder_that_was_killed_leaves_whole_chunks(tmp_path: Path) -> None:
+    read, is_cut = numbers(write(tmp_path / "log.mcap", is_finished=False))
+    assert is_cut and 0 < len(read) < len(WANTED) and read == WANTED[: len(read)]
+
+
+def test_what_follows_the_end_changes_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap")
+    path.write_bytes(path.read_bytes() + bytes(4096))
+    assert numbers(path) == (WANTED, False)
+
+
+def test_damage_before_a_cut_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap", compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"050" + bytes(20))] ^= 1
+    path.write_bytes(content[: 3 * len(content) // 4])
+    with pytest.raises(ValueError, match="crc validation failed in Chunk"):
+        numbers(path)
+
+
+def test_damage_without_chunks_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap", use_chunking=False, enable_data_crcs=True)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"051" + bytes(20))] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="crc validation failed in DataEnd"):
+        numbers(path)
+
+
+def test_an_end_within_a_message_is_damage(tmp_path: Path) -> None:
+    """It takes the place of the last bytes of a message, after which nothing comes."""
+    path = write(tmp_path / "log.mcap", use_chunking=False, **FORMS["without a summary"])
+    whole = path.read_bytes()
+    end = whole[-37:]
+    path.write_bytes(whole[: whole.index(b"099" + bytes(20)) + 23 - len(end)] + end)
+    with pytest.raises(EndOfFile):
+        numbers(path)
+
+
+@pytest.mark.parametrize("content", [b"", bytes(100)])
+def test_an_empty_file_is_told(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(content)
+    with pytest.raises(BadInputError, match=r"^log\.mcap is empty: nothing was recorded, leave it out$"):
+        numbers(path)
+
+
+def test_a_file_that_was_only_begun_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap")
+    for size in (3, 8, 20):
+        path.write_bytes(write(tmp_path / "whole.mcap").read_bytes()[:size])
+        with pytest.raises(BadInputError, match=r"^log\.mcap is cut off before its first message ends"):
+            numbers(path)
+
+
+def test_topics_without_messages_are_known(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.register_channel("/used", "json", schema_id=0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and not summary.chunk_indexes
+    assert numbers(path) == ([], False)
+
+
+def test_schemas_may_stand_in_the_data_alone(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=200, repeat_schemas=False)
+        writer.start()
+        other = writer.register_channel("/other", "json", schema_id=0)
+        schema = writer.register_schema("demo/Turn", "ros2msg", b"float64 turn")
+        used = writer.register_channel("/used", "cdr", schema)
+        writer.add_message(other, 0, bytes(200), 0)
+        writer.add_message(used, 0, bytes([0, 1, 0, 0]) + struct.pack("<d", 0.5), 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    read = McapFile(Source(path, None, path), ["/used"])
+    [(_, message)] = read.messages(checked=True)
+    assert read.decoder(message.channel_id)(message.data).turn == 0.5
+
+
+def test_an_encoding_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Twist", "ros1msg", b"float64 x")
+        used = writer.register_channel("/used", "ros1", schema)
+        writer.add_message(used, 0, bytes(8), 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    file_of = McapFile(Source(path, None, path), ["/used"])
+    [(_, message)] = file_of.messages(checked=True)
+    with pytest.raises(BadInputError, match="messages of /used are ros1 with ros1msg schema, expected json"):
+        file_of.decoder(message.channel_id)
