@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.clock import GAP
-from astra_data.dataset.columns import STATE, Array
+from astra_data.dataset.columns import ACTION, REWARD, STATE, Array
 from astra_data.exchange.cutting import RATE_TOLERANCE
 from astra_data.exchange.evenness import DUE, MISSED, MOST_UNEVEN, dropouts, uneven_steps
-from astra_data.exchange.mapping import ImportMapping
+from astra_data.exchange.mapping import MAPPED_FLAGS, ImportMapping
 
 MOST_HELD_ROWS = 10**6
 """Most rows in which the same values may be held: five hours at 50 Hz."""
@@ -92,6 +92,7 @@ class Resampler:
                 self._observed |= dict.fromkeys(column.fields, name)
         observed = topics_of(self._observed) & self._expiring & self._periods.keys()
         self._silent_ns: dict[str, dict[int, int]] = {topic: {} for topic in observed}
+        self._lossy = _lossy_topics(mapping)
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
         """Update the values of `topic` with a message at `time` ns."""
@@ -128,17 +129,16 @@ class Resampler:
     def unevenness(self) -> tuple[str, ...]:
         """Tell each topic that many rows repeat, or of which many messages are in no row.
 
-        Of a topic that is only observed, messages may be in no row, as where fps is lower than its rate; its
-        steps are told where they are uneven, and its dropouts.
+        Of a topic without commands, flags and outcomes, messages may be in no row, as where fps is lower than
+        its rate; where it is observed, uneven steps are told, and dropouts.
         """
         notes = []
         for topic in sorted(self._expiring & self._periods.keys()):
             rate = 1e9 / self._periods[topic]
-            may_skip = self._observed.keys() >= set(self.topics[topic])
             if topic in self._silent_ns and (odd := uneven_steps(topic, rate, self._fps)):
                 notes.append(odd)
             elif self.repeated[topic] > MOST_UNEVEN * self._rows or (
-                self.skipped[topic] > MOST_UNEVEN * self._messages[topic] and not may_skip
+                topic in self._lossy and self.skipped[topic] > MOST_UNEVEN * self._messages[topic]
             ):
                 notes.append(
                     f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {self.repeated[topic]} of "
@@ -264,6 +264,16 @@ def topic_of(field: str) -> str:
 def topics_of(fields: Iterable[str]) -> set[str]:
     """Return the topics of fields."""
     return set(map(topic_of, fields))
+
+
+def _lossy_topics(mapping: ImportMapping) -> set[str]:
+    """Return the topics of which each message counts: of commands, flags, outcomes and ends of episodes."""
+    fields = [*mapping.split.ends, *([mapping.split.field] if mapping.split.field else [])]
+    for name, column in mapping.columns.items():
+        is_flag = column.dtype == "bool" or name in (*MAPPED_FLAGS, REWARD)
+        if is_flag or name.startswith(ACTION):
+            fields += column.fields
+    return topics_of(fields)
 
 
 def _messages_per_row(ratio: float) -> int:

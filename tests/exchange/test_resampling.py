@@ -12,17 +12,28 @@ MS = 10**6
 
 
 def sampled(
-    fps: int, odom: Array, commands: Array, *, latched: bool = False, state_gap_s: float | None = None
+    fps: int,
+    odom: Array,
+    commands: Array,
+    *,
+    latched: bool = False,
+    state_gap_s: float | None = None,
+    more: dict[str, dict[str, object]] | None = None,
 ) -> tuple[Resampler, list[tuple[int, int]]]:
-    """Return, for each row, which message of each topic it holds; times are in ms."""
+    """Return, for each row, which message of each topic it holds; times are in ms.
+
+    `more` are further columns or, as `split`, keys of that table.
+    """
+    columns = dict(more or {})
+    split: dict[str, object] = {"gap_s": 0.4} | columns.pop("split", {})
     command = {"fields": ("/cmd:k",), "latched": latched}
     mapping = ImportMapping.model_validate(
         {
             "name": "log",
             "task": "drive",
             "fps": fps,
-            "columns": {STATE: {"fields": ("/odom:k",), "gap_s": state_gap_s}, ACTION: command},
-            "split": {"gap_s": 0.4},
+            "columns": {STATE: {"fields": ("/odom:k",), "gap_s": state_gap_s}, ACTION: command, **columns},
+            "split": split,
         }
     )
     times = {"/odom": odom, "/cmd": commands}
@@ -192,6 +203,44 @@ def test_a_topic_of_which_messages_are_skipped_is_told_with_its_rate_and_counts(
 def test_a_state_that_is_taken_less_often_than_it_comes_is_not_told_where_the_steps_are_even() -> None:
     resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100))
     assert resampler.skipped["/odom"] == 396 and resampler.unevenness() == ()
+
+
+@pytest.mark.parametrize(
+    ("more", "counts"),
+    [
+        ({"stamp": {"fields": ("/odom:stamp",), "dtype": "int64"}}, False),
+        ({"wheels": {"fields": ("/odom:velocity",)}}, False),
+        ({"next.observation.state": {"fields": ("/odom:next",)}}, False),
+        ({"action.gripper": {"fields": ("/odom:gripper",)}}, True),
+        ({"next.success": {"fields": ("/odom:arrived",)}}, True),
+        ({"next.reward": {"fields": ("/odom:reward",)}}, True),
+        ({"bumper": {"fields": ("/odom:bumper",), "dtype": "bool"}}, True),
+        ({"split": {"field": "/odom:trial"}}, True),
+        ({"split": {"ends": ("/odom:end",)}}, True),
+    ],
+)
+def test_messages_in_no_row_are_told_where_commands_flags_outcomes_or_ends_are_lost(
+    more: dict[str, dict[str, object]], counts: bool
+) -> None:
+    """A state at 100 Hz whose messages hold something else, too."""
+    resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100), more=more)
+    told = (
+        "log: /odom comes 100 times a second, fps is 20: 0 of 99 rows repeat its message before, "
+        "396 of 495 messages are in no row",
+    )
+    assert resampler.unevenness() == (told if counts else ())
+
+
+def test_joints_of_a_column_of_their_own_may_be_in_no_row_and_are_told_where_rows_repeat_them() -> None:
+    """Not observed, and no command."""
+    more: dict[str, dict[str, object]] = {
+        ACTION: {"fields": ("/odom:k",)},
+        "wheels": {"fields": ("/cmd:k",)},
+    }
+    resampler, _ = sampled(20, 50.0 * np.arange(100), 10.0 * np.arange(496), more=more)
+    assert resampler.skipped["/cmd"] == 396 and resampler.unevenness() == ()
+    [told] = sampled(20, 50.0 * np.arange(100), 100.0 * np.arange(50), more=more)[0].unevenness()
+    assert "/cmd comes 10 times a second" in told
 
 
 def test_uneven_steps_of_a_state_are_told_instead_of_the_messages_in_no_row() -> None:
