@@ -67,6 +67,33 @@ def dropouts(topic: str, column: str, rate: float, fps: int, silences_ns: list[i
     )
 
 
+def ended(topic: str, times: int, gap_s: float, column: str, commanded: str | None) -> str:
+    """Tell that `topic` ended episodes, and what to do where that is not right.
+
+    Args:
+        topic: the topic.
+        times: how often it was silent for too long, and others were not.
+        gap_s: the longest silence that is no end.
+        column: the column whose own `gap_s` that is; "" if it is that of `split`.
+        commanded: the column of commands that the topic gives values to, if any.
+    """
+    key = f'gap_s in [columns."{column}"]' if column else "split.gap_s"
+    often = "once" if times == 1 else f"{times} times"
+    told = (
+        f"{topic} is silent for over {gap_s:g} s ({key}) {often} while others are not, and episodes end there"
+    )
+    # A column with a gap of its own cannot be latched.
+    if commanded:
+        latched = "" if column else f'latched = true in [columns."{commanded}"], or '
+        return (
+            f"{told}, as is right where the robot stops by itself without commands; where it goes on with "
+            f"the last one, set {latched}a longer gap_s"
+        )
+    if column:
+        return f"{told}; where values may be held for longer, set a longer one"
+    return f"{told}: set latched = true where it is sent on change, or a longer gap_s"
+
+
 def _share_odd(messages_per_row: float) -> float:
     """Return the share of the rows that have one message more, or less, than most."""
     return abs(messages_per_row - round(messages_per_row))

@@ -12,6 +12,7 @@ from astra_data.core.errors import RecipeError
 from astra_data.dataset.columns import (
     DONE,
     RESERVED,
+    REWARD,
     ROLES,
     SUCCESS,
     TERMINATED,
@@ -192,6 +193,14 @@ class ImportMapping(Config):
         """The fields with numbers that the mapping needs, each once."""
         more = [*self.split.ends, *([self.time] if self.time else [])]
         return list(dict.fromkeys([field for c in self.columns.values() for field in c.fields] + more))
+
+    @property
+    def flag_fields(self) -> list[str]:
+        """The fields of flags, outcomes and ends of episodes."""
+        fields = [*self.split.ends, *([self.split.field] if self.split.field else [])]
+        for name, column in self.columns.items():
+            fields += column.fields if column.dtype == "bool" or name in (*MAPPED_FLAGS, REWARD) else ()
+        return fields
 
     @property
     def all_fields(self) -> list[str]:

@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.clock import GAP
-from astra_data.dataset.columns import ACTION, REWARD, STATE, Array
+from astra_data.dataset.columns import ACTION, STATE, Array
 from astra_data.exchange.cutting import RATE_TOLERANCE
-from astra_data.exchange.evenness import DUE, MISSED, MOST_UNEVEN, dropouts, uneven_steps
-from astra_data.exchange.mapping import MAPPED_FLAGS, ImportMapping
+from astra_data.exchange.evenness import DUE, MISSED, MOST_UNEVEN, dropouts, ended, uneven_steps
+from astra_data.exchange.mapping import ImportMapping
 
 MOST_HELD_ROWS = 10**6
 """Most rows in which the same values may be held: five hours at 50 Hz."""
@@ -65,10 +65,16 @@ class Resampler:
         for field in mapping.all_fields:
             self.topics.setdefault(topic_of(field), []).append(field)
         self._gap_ns: dict[str, int] = {}
-        for column in mapping.columns.values():
+        self._own_gap: dict[str, str] = {}
+        self._has_own_gap: set[str] = set()
+        for name, column in mapping.columns.items():
             gap_ns = round((column.gap_s or mapping.split.gap_s or 0) * 1e9)
             for topic in () if column.latched else topics_of(column.fields):
-                self._gap_ns[topic] = min(gap_ns, self._gap_ns.get(topic, gap_ns))
+                if gap_ns < self._gap_ns.get(topic, gap_ns + 1):
+                    self._gap_ns[topic] = gap_ns
+                    self._own_gap[topic] = name if column.gap_s else ""
+                if column.gap_s:
+                    self._has_own_gap.add(topic)
         self._expiring = set(self._gap_ns)
         self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
         self._refuse_apart()
@@ -92,7 +98,9 @@ class Resampler:
                 self._observed |= dict.fromkeys(column.fields, name)
         observed = topics_of(self._observed) & self._expiring & self._periods.keys()
         self._silent_ns: dict[str, dict[int, int]] = {topic: {} for topic in observed}
-        self._lossy = _lossy_topics(mapping)
+        commands = [name for name in mapping.columns if name.startswith(ACTION)]
+        self._commands = {topic: n for n in commands for topic in topics_of(mapping.columns[n].fields)}
+        self._lossy = self._commands.keys() | topics_of(mapping.flag_fields)
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
         """Update the values of `topic` with a message at `time` ns."""
@@ -126,11 +134,19 @@ class Resampler:
         if self._start is not None:
             yield from self._sampled(self._end(time))
 
+    def endings(self) -> tuple[str, ...]:
+        """Tell each topic that ended episodes, and what to do where it should not."""
+        return tuple(
+            f"{self._origin}: "
+            + ended(topic, times, self._gap_ns[topic] / 1e9, self._own_gap[topic], self._commands.get(topic))
+            for topic, times in self.silences.items()
+        )
+
     def unevenness(self) -> tuple[str, ...]:
         """Tell each topic that many rows repeat, or of which many messages are in no row.
 
         Of a topic without commands, flags and outcomes, messages may be in no row, as where fps is lower than
-        its rate; where it is observed, uneven steps are told, and dropouts.
+        its rate; where it is observed, uneven steps are told, and dropouts, unless a column has its own gap.
         """
         notes = []
         for topic in sorted(self._expiring & self._periods.keys()):
@@ -145,7 +161,7 @@ class Resampler:
                     f"{self._rows} rows repeat its message before, {self.skipped[topic]} of "
                     f"{self._messages[topic]} messages are in no row"
                 )
-            if silences := self._silent_ns.get(topic):
+            if topic not in self._has_own_gap and (silences := self._silent_ns.get(topic)):
                 column = next(self._observed[f] for f in self.topics[topic] if f in self._observed)
                 ns = list(silences.values())
                 notes.append(dropouts(topic, column, rate, self._fps, ns, self._dropped[topic]))
@@ -264,16 +280,6 @@ def topic_of(field: str) -> str:
 def topics_of(fields: Iterable[str]) -> set[str]:
     """Return the topics of fields."""
     return set(map(topic_of, fields))
-
-
-def _lossy_topics(mapping: ImportMapping) -> set[str]:
-    """Return the topics of which each message counts: of commands, flags, outcomes and ends of episodes."""
-    fields = [*mapping.split.ends, *([mapping.split.field] if mapping.split.field else [])]
-    for name, column in mapping.columns.items():
-        is_flag = column.dtype == "bool" or name in (*MAPPED_FLAGS, REWARD)
-        if is_flag or name.startswith(ACTION):
-            fields += column.fields
-    return topics_of(fields)
 
 
 def _messages_per_row(ratio: float) -> int:

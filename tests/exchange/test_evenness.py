@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from astra_data.exchange.evenness import dropouts, uneven_steps
+from astra_data.exchange.evenness import dropouts, ended, uneven_steps
 
 
 def odd_share(rate: float, fps: int) -> float:
@@ -71,3 +71,21 @@ def test_a_dropout_is_told_with_its_column() -> None:
         "/imu is silent for up to 0.25 s in 2 places, where a row repeats its message before"
     )
     assert 'gap_s = 0.09 in [columns."observation.imu"]' in told
+
+
+@pytest.mark.parametrize("column", ["", "action", "observation.state"])
+@pytest.mark.parametrize("commanded", [None, "action"])
+def test_a_silence_that_ends_episodes_is_told_with_its_key_and_what_it_may_mean(
+    column: str, commanded: str | None
+) -> None:
+    """A column with a gap of its own cannot be latched; a base's watchdog stops it without commands."""
+    told = ended("/cmd_vel", 2, 0.5, column, commanded)
+    key = f'gap_s in [columns."{column}"]' if column else "split.gap_s"
+    assert told.startswith(f"/cmd_vel is silent for over 0.5 s ({key}) 2 times while others are not, and ")
+    assert ("is right where the robot stops by itself" in told) is (commanded is not None)
+    assert ("latched = true" in told) is (not column)
+    assert "set a longer" in told or "or a longer gap_s" in told
+
+
+def test_silences_once_are_not_counted() -> None:
+    assert "(split.gap_s) once while" in ended("/odom", 1, 0.5, "", None)

@@ -277,6 +277,30 @@ def test_dropouts_of_a_state_are_told_with_the_gap_that_ends_episodes_there() ->
     assert len({k for k, _ in rows}) == len(rows) > 180
 
 
+def test_silences_that_the_gap_of_the_column_accepts_are_not_told() -> None:
+    """Of 0.36 s, where the column holds values for 0.38; what is longer ends episodes and is told as that."""
+    odom, commands = with_dropouts()
+    accepted, rows = sampled(10, odom, commands, state_gap_s=0.38)
+    assert len({k for k, _ in rows}) < len(rows)
+    assert accepted.unevenness() == accepted.endings() == ()
+    stamp: dict[str, dict[str, object]] = {"stamp": {"fields": ("/odom:stamp",)}}
+    assert sampled(10, odom, commands, state_gap_s=0.38, more=stamp)[0].unevenness() == ()
+    [told] = sampled(10, odom, commands, state_gap_s=0.08)[0].endings()
+    assert told.startswith(
+        'log: /odom is silent for over 0.08 s (gap_s in [columns."observation.state"]) 3 times'
+    )
+    assert "latched" not in told
+
+
+@pytest.mark.parametrize("gap_s", [None, 0.3, 0.6])
+def test_the_shortest_gap_of_the_columns_of_a_topic_is_the_one_that_is_named(gap_s: float | None) -> None:
+    odom = np.concatenate([50.0 * np.arange(20), 2000 + 50.0 * np.arange(20)])
+    more: dict[str, dict[str, object]] = {"pose": {"fields": ("/odom:pose",), "gap_s": gap_s}}
+    [told] = sampled(20, odom, 50.0 * np.arange(60), more=more)[0].endings()
+    key = '0.3 s (gap_s in [columns."pose"])' if gap_s == 0.3 else "0.4 s (split.gap_s)"
+    assert told.startswith(f"log: /odom is silent for over {key} once")
+
+
 @pytest.mark.parametrize("period_ms", [20.0, 50.0, 100.0])
 def test_a_message_that_is_lost_is_no_dropout(period_ms: float) -> None:
     odom = np.delete(period_ms * np.arange(round(20_000 / period_ms)), [100, 150])

@@ -131,14 +131,8 @@ def _rows(
     silent = sorted(resampler.topics.keys() - resampler.times.keys())
     if silent:
         raise BadInputError(f"{source}: no messages on {', '.join(silent)}")
-    for topic, times in resampler.silences.items():
-        _log.warning(
-            "%s: %s is silent for over split.gap_s %d times while others are not, and episodes end there: "
-            "set latched = true where it is sent on change, or a longer gap_s",
-            source,
-            topic,
-            times,
-        )
+    for told in resampler.endings():
+        _log.warning("%s", told)
 
 
 def _block(source: Source, rows: _Rows) -> Block:

@@ -187,8 +187,26 @@ def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
     path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
     imported(tmp_path, path, MAPPING)
     [warning] = caplog.messages
-    assert "log.mcap: /command is silent for over split.gap_s 3 times while others are not" in warning
+    assert (
+        "log.mcap: /command is silent for over 0.35 s (split.gap_s) 3 times while others are not" in warning
+    )
     assert "latched = true" in warning
+    assert "as is right where the robot stops by itself" in warning
+
+
+def test_a_topic_that_is_silent_for_longer_than_its_column_allows_is_named_with_that_key(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages = [pose(k / 10, k) for k in range(40) if k not in (10, 11)] + [
+        command(k / 10, 1.0) for k in range(40)
+    ]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    imported(tmp_path, path, MAPPING.replace("[columns.action]", "gap_s = 0.15\n[columns.action]"))
+    [warning] = caplog.messages
+    told = (
+        '/pose is silent for over 0.15 s (gap_s in [columns."observation.state"]) once while others are not'
+    )
+    assert told in warning and "latched" not in warning and "split.gap_s" not in warning
 
 
 def test_messages_that_come_a_little_late_make_even_steps(tmp_path: Path) -> None:
