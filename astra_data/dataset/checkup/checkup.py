@@ -75,7 +75,8 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     for episode in dataset.episodes(names or list(columns)):
         for part in parts:
             part.add(episode)
-    findings = [finding for clock in clocks for finding in clock.findings(called)]
+    mcap = _is_of_mcap(dataset)
+    findings = [finding for clock in clocks for finding in clock.findings(called, mcap=mcap)]
     findings += angles.findings() if angles else []
     findings += jumps.findings(dataset, called) if jumps else []
     findings += continuity.findings() + duplicates.findings(called)
@@ -87,3 +88,12 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     summary += [f"rate: {rate}" for rate in rates]
     findings.sort(key=lambda finding: finding.severity != "warning")
     return Checkup(dataset.reference, tuple(summary), tuple(findings))
+
+
+def _is_of_mcap(dataset: Dataset) -> bool | None:
+    """Return whether all episodes were imported from MCAP, by their files' names; None if it is not known."""
+    if dataset.description.get("config", {}).get("format") == "mcap":
+        return True
+    sources = [source for source in dataset.metadata.get("source", ()) if isinstance(source, str)]
+    kinds = {source.lower().endswith(".mcap") for source in sources}
+    return kinds.pop() if len(kinds) == 1 and len(sources) == len(dataset) else None

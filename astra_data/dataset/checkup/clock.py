@@ -11,6 +11,8 @@ from astra_data.dataset.columns import RESERVED, Column, Episode
 
 GAP = 1.5
 """A step that takes more than so many periods is a gap."""
+HELD = 0.75
+"""Periods for which an MCAP topic may be held, as is proposed: rows that lack a message hold one longer."""
 WRONG_RATE = 0.05
 """Relative difference between the declared and the recorded rate above which the declared one is wrong."""
 JITTERY = 0.2
@@ -35,8 +37,8 @@ def is_clock(column: Column) -> bool:
 class Clock:
     """The times that are called `name`, in `scale` s, of a recording of `fps` declared steps per second."""
 
-    def __init__(self, name: str, fps: int, scale: float = 1.0) -> None:
-        self._name, self._fps, self._scale = name, fps, scale
+    def __init__(self, name: str, fps: int, scale: float = 1.0, *, whole: bool = False) -> None:
+        self._name, self._fps, self._scale, self._whole = name, fps, scale, whole
         self._bins: NDArray[np.int64] = np.zeros(FINE * MOST_PERIODS + 1, np.int64)
         self._longest_s: list[float] = []
         self._standing: list[int] = []
@@ -47,7 +49,7 @@ class Clock:
     def of(cls, column: Column, fps: int) -> Self:
         """Return a clock of the times in `column` (T,), in its unit, by default s."""
         unit = column.units[0] or column.name.lower().rpartition("_")[2]
-        return cls(column.name, fps, _SECONDS.get(unit, 1.0))
+        return cls(column.name, fps, _SECONDS.get(unit, 1.0), whole=column.dtype == "int64")
 
     def add(self, episode: Episode) -> None:
         """Count the steps between the times of the next episode."""
@@ -95,14 +97,19 @@ class Clock:
         jitter = f"jitter {100 * self.jitter:.1f} % of a period"
         return f"{self._fps} Hz declared, {rate}; gaps within episodes: {self.gaps}{missing}, {jitter}"
 
-    def findings(self, called: str) -> list[Finding]:
-        """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""
+    def findings(self, called: str, *, mcap: bool | None = None) -> list[Finding]:
+        """Tell a wrong rate, gaps, jitter, and where time stands still or goes back.
+
+        Args:
+            called: how commands are to call the dataset.
+            mcap: whether it was imported from MCAP; None if that is not known.
+        """
         found = []
         period_s = self.period_s
         if self._standing:
-            remedy = "store it as seconds since the start (`offset`) or as int64, or leave the episodes out"
             what = f"{self._name} stands still or goes back between steps"
-            advice = f"{remedy}: {deletion(called, self._standing)}"
+            remedy = self._standing_remedy(mcap)
+            advice = f"{remedy}, or leave the episodes out: {deletion(called, self._standing)}"
             found.append(Finding("warning", what, advice, tuple(self._standing)))
         if not self._has_rate:
             return found
@@ -120,12 +127,7 @@ class Clock:
         if self.gaps:
             longest = np.array(self._longest_s)
             uids = np.array(self._uids)[longest * self._fps * FINE >= self._first_gap() - 0.5]
-            keys = f"`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the mapping"
-            split = f"begin new episodes there ({keys})"
-            # Many gaps are a recording of another rate, of which splits would leave crumbs.
-            advice = (
-                split if self.gaps < MANY_GAPS * self._bins.sum() else f"resample the recording, or {split}"
-            )
+            advice = self._gap_remedy(mcap)
             what = f"steps of over {GAP:g} periods: {self.gaps}, the longest {longest.max():.3g} s"
             found.append(Finding("warning", what, f"{advice} and import again", tuple(uids.tolist())))
         if self.jitter > JITTERY:
@@ -134,6 +136,24 @@ class Clock:
             advice = f"resample the recording to {self._fps} Hz and import again"
             found.append(Finding("note", what, advice))
         return found
+
+    def _standing_remedy(self, mcap: bool | None) -> str:
+        if not self._whole:
+            return "store it as seconds since the start (`offset`) or as int64"
+        if mcap:
+            own = f'[columns."{self._name}"]'
+            return f"rows repeat a message: lower `fps`, or set `gap_s` in {own} where the topic drops out"
+        return "look for rows that the log has twice, or a clock that was set back"
+
+    def _gap_remedy(self, mcap: bool | None) -> str:
+        split = f"`time`, and `gap_s = {GAP * self.period_s:.3g}` in [split], of the mapping"
+        own = f'`gap_s = {HELD * self.period_s:.3g}` in [columns."{self._name}"]'
+        keys = f"{own} of the mapping" if mcap else split if mcap is False else f"{split}; for MCAP, {own}"
+        remedy = f"begin new episodes there ({keys})"
+        # Many gaps are a recording of another rate, of which splits would leave crumbs.
+        if self.gaps < MANY_GAPS * self._bins.sum():
+            return remedy
+        return f"{'take an `fps` that divides its rate' if mcap else 'resample the recording'}, or {remedy}"
 
     @property
     def _has_rate(self) -> bool:

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_logs import Columns, toy_columns, write_logs
+from toy_logs import CLOCK, COLUMNS, FPS, Columns, toy_columns, write_logs
 
+from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.checkup.checkup import Checkup, check_up
 from astra_data.dataset.checkup.finding import Finding
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Episode
 
 
 def test_good_logs_have_no_findings(tmp_path: Path) -> None:
@@ -153,3 +154,32 @@ def test_warnings_come_first_and_findings_are_recorded(tmp_path: Path) -> None:
     assert record["findings"][0]["episodes"] == [11, 12]
     assert "logs@data-1.0.0 --episode 11" in record["findings"][0]["advice"]
     assert set(record["findings"][1]) == set(Finding.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(
+    ("sources", "format_", "is_mcap"),
+    [
+        (["a.mcap", "b.MCAP"], None, True),
+        (["a.csv", "b.csv"], None, False),
+        (["a.csv", "b.mcap"], None, None),
+        (["a.mcap"], None, None),
+        ([], None, None),
+        (["a", "b"], "mcap", True),
+    ],
+)
+def test_whether_a_dataset_is_of_mcap_is_seen_by_its_files(
+    tmp_path: Path, sources: list[str], format_: str | None, is_mcap: bool | None
+) -> None:
+    """Also where it is a part of one; two episodes, of which some tell no file."""
+    description = {"name": "logs", "stage": "import", "config": {"format": format_} if format_ else {}}
+    with DatasetWriter(
+        tmp_path / "logs", [*COLUMNS, CLOCK], fps=FPS, task="drive", description=description
+    ) as writer:
+        for uid in range(2):
+            columns = toy_columns(uid)
+            missed(3, columns)
+            writer.add(Episode(uid, columns, {"source": sources[uid]} if uid < len(sources) else {}))
+    findings = check_up(Dataset.open(tmp_path / "logs"), "walks").findings
+    (advice,) = [finding.advice for finding in findings if "steps of over" in finding.what]
+    assert ("`time`" in advice) is (is_mcap is not True)
+    assert ("[columns." in advice) is (is_mcap is not False)

@@ -83,6 +83,28 @@ def test_gaps_are_counted_where_the_declared_rate_is_wrong_too() -> None:
     assert "gap_s = 0.15" in gaps.advice
 
 
+@pytest.mark.parametrize(
+    ("mcap", "keys"),
+    [
+        (True, '`gap_s = 0.075` in [columns."time"] of the mapping'),
+        (False, "`time`, and `gap_s = 0.15` in [split], of the mapping"),
+        (
+            None,
+            "`time`, and `gap_s = 0.15` in [split], of the mapping; for MCAP, "
+            '`gap_s = 0.075` in [columns."time"]',
+        ),
+    ],
+)
+def test_the_keys_that_split_at_gaps_are_those_of_the_format(mcap: bool | None, keys: str) -> None:
+    """Mappings of MCAP take no `time`."""
+    few, many = clock([*REGULAR * 3, 0.3]), clock(REGULAR * 2 + [0.3] * 3)
+    (finding,) = few.findings("walks", mcap=mcap)
+    assert finding.advice == f"begin new episodes there ({keys}) and import again"
+    (finding,) = many.findings("walks", mcap=mcap)
+    first = "take an `fps` that divides its rate" if mcap else "resample the recording"
+    assert finding.advice == f"{first}, or begin new episodes there ({keys}) and import again"
+
+
 @pytest.mark.parametrize(("off_s", "found"), [(0.019, False), (0.022, True)])
 def test_steps_that_are_off_by_a_fifth_of_a_period_are_jitter(off_s: float, found: bool) -> None:
     # Every tenth step is late and the next early: a fifth of all steps.
@@ -112,7 +134,13 @@ def test_time_that_never_goes_on_has_no_rate() -> None:
     timed = clock([0.0] * 20)
     assert str(timed) == "10 Hz declared; time does not go on in most steps"
     (finding,) = timed.findings("walks")
+    assert "set back" in finding.advice and "int64" not in finding.advice
+    floats = Clock.of(SECONDS, 10)
+    floats.add(Episode(0, {"time": np.zeros(20, np.float32)}))
+    (finding,) = floats.findings("walks")
     assert "int64" in finding.advice
+    (finding,) = timed.findings("walks", mcap=True)
+    assert "rows repeat a message" in finding.advice and "int64" not in finding.advice
 
 
 def test_seconds_since_1970_in_float32_have_no_rate() -> None:

@@ -429,3 +429,26 @@ def test_the_parts_of_a_split_bag_are_not_joined_without_a_word(tmp_path: Path) 
     assert report.tally.split_points == {"file": 1, "source": 1}
     for number in range(2):  # a file is all of its recording
         imported(tmp_path / str(number), folder / f"bag_{number}.mcap", joined)
+
+
+@pytest.mark.parametrize("lost", [{20}, {20, 21, 22}])
+def test_the_gap_that_a_checkup_proposes_splits_there(tmp_path: Path, lost: set[int]) -> None:
+    """Poses and their stamps are lost; mappings of MCAP take no `time`."""
+    messages = [("/pose", t, m | {"stamp": ns(t)}) for k in range(200) for _, t, m in [pose(1 + k / 10, k)]]
+    messages = [message for k, message in enumerate(messages) if k not in lost]
+    messages += [command(0.95 + k / 10, 1.0) for k in range(200)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    stamp = '[columns.stamp]\nfields = ["/pose:stamp"]\ndtype = "int64"\nunit = ["ns"]\n'
+    mapping = MAPPING.replace("gap_s = 0.35", "gap_s = 0.9").replace("[split]", f"{stamp}[split]")
+    dataset, _ = imported(tmp_path / "whole", path, mapping)
+    assert len(dataset) == 1
+    (advice,) = [f.advice for f in check_up(dataset).findings if "steps of over" in f.what]
+    assert (
+        advice
+        == 'begin new episodes there (`gap_s = 0.075` in [columns."stamp"] of the mapping) and import again'
+    )
+    dataset, _ = imported(
+        tmp_path / "cut", path, mapping.replace("[columns.stamp]\n", "[columns.stamp]\ngap_s = 0.075\n")
+    )
+    assert len(dataset) == 2
+    assert not [f for f in check_up(dataset).findings if "stamp" in f.what or "steps of over" in f.what]
