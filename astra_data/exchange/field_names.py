@@ -75,7 +75,6 @@ TURN_RATE = re.compile(
     r"(v|d|vel_|velocity_)(heading|yaw|theta|psi|th|rot|ang)|"
     r"(heading|yaw|theta|psi|turn(ing)?|rot(ation)?)_?(rate|vel|velocity|speed|dot))"
 )
-ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
 LENGTH = re.compile(
     r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
 )

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.checkup.angles import LARGEST
+from astra_data.dataset.checkup.angles import ANGLE, LARGEST
 from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers
 from astra_data.exchange.cutting import RATE_TOLERANCE
 from astra_data.exchange.field_names import (
-    ANGLE,
     COMMAND,
     COMMANDED,
     ENDINGS,

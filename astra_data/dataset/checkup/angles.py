@@ -1,6 +1,7 @@
 """Angles that are too large for their unit: degrees that were taken for radians."""
 
 import math
+import re
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +10,18 @@ from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.finding import Finding, channels
 from astra_data.dataset.columns import Column, Episode
 
+ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
+"""Names of angles."""
+TURNS = {"rad": 2 * math.pi, "deg": 360.0}
+"""What a full turn is in each unit."""
 LARGEST = 4 * math.pi
 """Few robots turn further than twice around."""
+
+
+def is_angle(name: str) -> bool:
+    """Return whether `name` is one of an angle, as "base.theta" or "Yaw.pos"."""
+    short = re.sub(r"[^a-z0-9]+", "_", name.lower())
+    return ANGLE.fullmatch(re.sub(r"_(pos|position|rad|deg)$", "", short)) is not None
 
 
 class Angles:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.numbers import as_rows
+from astra_data.dataset.checkup.angles import TURNS, is_angle
 from astra_data.dataset.checkup.finding import Finding, channels, deletion, labels
 from astra_data.dataset.columns import NEXT_STATE, STATE, Array, Column, Episode
 from astra_data.dataset.reader import Dataset
@@ -27,7 +28,10 @@ RARE = 0.001
 SAMPLES = 2**18
 """Steps from which the median and the share are estimated; of a dataset with no more, exactly."""
 
-_TURN = {"rad": 2 * np.pi, "deg": 360.0}
+WHOLE = 0.01
+"""Share of a turn by which the step of an angle that wraps may be off ..."""
+USUAL = 3
+"""... or so many median steps, if that is more."""
 
 Floats = NDArray[np.float64]
 
@@ -92,18 +96,23 @@ class Jumps:
         suspects = np.flatnonzero((np.array(self._largest) > limits).any(axis=1)).tolist()
         names = [name for name in (STATE, NEXT_STATE) if name in dataset.features]
         sizes: dict[int, list[float]] = {}
+        wraps: dict[str, dict[int, set[int]]] = {}
         uids, count = [], 0
         for episode in dataset.episodes(names, suspects) if suspects else ():
             steps = self.steps(episode.columns)
             jumped: set[int] = set()
             for index in np.flatnonzero(steps.max(axis=0, initial=0.0) > limits).tolist():
                 for at in jumps(steps[:, index], limits[index]):
+                    if unit := self._wraps(index, float(steps[at, index]), float(limits[index]) / LARGE):
+                        wraps.setdefault(unit, {}).setdefault(index, set()).add(episode.uid)
+                        continue
                     sizes.setdefault(index, []).append(float(steps[at, index]))
                     jumped.add(at)
             count += len(jumped)
             uids += [episode.uid] if jumped else []
+        wrapped = [self._wrapping(unit, found) for unit, found in wraps.items()]
         if not uids:
-            return []
+            return wrapped
         where = channels(self._column, sorted(sizes))
         worst = max(sizes, key=lambda index: max(sizes[index]) / limits[index])
         # Where large steps are many, a split at the smallest jump would leave no episodes.
@@ -117,13 +126,27 @@ class Jumps:
             f'begin new episodes there ([split.jump] in the mapping: column = "{STATE}", values = [{worst}], '
             f"above = {above:.2g}) and import again, or {deletion(called, uids)}"
         )
-        return [Finding("warning", what, advice, tuple(uids))]
+        return [*wrapped, Finding("warning", what, advice, tuple(uids))]
+
+    def _wraps(self, index: int, step: float, median: float) -> str:
+        """Return the unit in which `step` is a full turn of what is called an angle; "" if it is none."""
+        if self._turns[index] or not is_angle(labels(self._column)[index]):
+            return ""
+        for unit, turn in TURNS.items():
+            if abs(step - turn) <= max(WHOLE * turn, USUAL * median):
+                return unit
+        return ""
+
+    def _wrapping(self, unit: str, found: Mapping[int, set[int]]) -> Finding:
+        what = f"{channels(self._column, sorted(found))} jumps by a full turn, like an angle that wraps"
+        advice = f'store its cosine and sine in its place, or say that it is an angle by unit = "{unit}"'
+        return Finding("warning", what, advice, tuple(sorted(set().union(*found.values()))))
 
 
 def full_turns(column: Column) -> Floats:
     """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
     turns = [
-        _TURN.get(unit, 2 * np.pi if role == "heading" else 0.0)
+        TURNS.get(unit, 2 * np.pi if role == "heading" else 0.0)
         for unit, role in zip(column.units, _role_of_each(column), strict=True)
     ]
     return np.array(turns)

@@ -1,6 +1,7 @@
 import numpy as np
+import pytest
 
-from astra_data.dataset.checkup.angles import Angles
+from astra_data.dataset.checkup.angles import Angles, is_angle
 from astra_data.dataset.checkup.finding import Finding
 from astra_data.dataset.columns import STATE, Column, Episode
 
@@ -29,3 +30,20 @@ def test_two_turns_and_other_units_are_nothing_odd() -> None:
     plain = Angles(Column(STATE, size=2))
     plain.add(Episode(0, {STATE: np.full((3, 2), 180.0, np.float32)}))
     assert plain.findings() == []
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        ("theta", True),
+        ("Base.Yaw", True),
+        ("heading_deg", True),
+        ("joint1.pos", True),
+        ("y", False),
+        ("theta.vel", False),
+        ("yaw_rate", False),
+        ("cos_yaw_dot", False),
+    ],
+)
+def test_angles_are_known_by_their_names(name: str, known: bool) -> None:
+    assert is_angle(name) is known

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from toy_logs import Columns, write_logs
 
+from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.checkup import jumps as module
+from astra_data.dataset.checkup.checkup import check_up
 from astra_data.dataset.checkup.jumps import Jumps, jumps
-from astra_data.dataset.columns import NEXT_STATE, STATE, Array, Column, Episode
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array, Column, Episode
 
 
 def steps(*large: float, usual: float = 0.1) -> Array:
@@ -144,3 +146,46 @@ def test_jumps_are_found_in_the_episodes_that_have_them(tmp_path: Path) -> None:
     assert finding.episodes == (3, 8)
     assert finding.what.startswith("3 single-step jumps in y of observation.state; the farthest is 1.98 in y")
     assert 'column = "observation.state", values = [1], above = 0.6' in finding.advice
+
+
+def turning(root: Path, name: str, turn: float, unit: str = "") -> Dataset:
+    """Write three robots that turn around once and a half; the second is carried away, too."""
+    astra = {"unit": ["", unit]} if unit else None
+    columns = [Column(STATE, size=2, names=("x", name), astra=astra), Column(ACTION)]
+    with DatasetWriter(
+        root, columns, fps=10, task="turn", description={"name": "turns", "stage": "import"}
+    ) as writer:
+        for uid in range(3):
+            rng = np.random.default_rng(uid)
+            angle = turn * (0.1 * uid + 1.5 * np.linspace(0, 1, 300)) % turn
+            x = np.cumsum(rng.uniform(0.05, 0.1, 300)) + 5.0 * ((np.arange(300) > 50) & (uid == 1))
+            state = np.column_stack([x, angle]).astype(np.float32)
+            writer.add(Episode(uid, {STATE: state, ACTION: rng.normal(size=300).astype(np.float32)}))
+    return Dataset.open(root)
+
+
+@pytest.mark.parametrize(
+    ("name", "turn", "unit"), [("theta", 2 * np.pi, "rad"), ("base.yaw.pos", 360.0, "deg")]
+)
+def test_an_angle_without_a_unit_that_wraps_is_told_as_one(
+    tmp_path: Path, name: str, turn: float, unit: str
+) -> None:
+    """Nothing is to be deleted; what jumps is told as before."""
+    dataset = turning(tmp_path / "turns", name, turn)
+    found = [f for f in check_up(dataset, "turns").findings if "jump" in f.what]
+    wraps, jump = found
+    assert wraps.what == f"{name} of observation.state jumps by a full turn, like an angle that wraps"
+    assert wraps.episodes == (0, 1, 2) and wraps.severity == "warning"
+    assert "cosine and sine" in wraps.advice and f'unit = "{unit}"' in wraps.advice
+    assert "delete" not in wraps.advice and "split" not in wraps.advice
+    assert jump.what.startswith("1 single-step jump in x of observation.state") and jump.episodes == (1,)
+    dataset = turning(tmp_path / "told", name, turn, unit)
+    assert ["single-step" in f.what for f in check_up(dataset).findings if "jump" in f.what] == [True]
+
+
+@pytest.mark.parametrize(("name", "turn"), [("y", 2 * np.pi), ("theta", 5.8)])
+def test_another_value_that_jumps_by_a_turn_or_an_angle_by_less_is_no_wrap(
+    tmp_path: Path, name: str, turn: float
+) -> None:
+    dataset = turning(tmp_path / "turns", name, turn)
+    assert not [f for f in check_up(dataset).findings if "full turn" in f.what]
