@@ -217,6 +217,12 @@ def test_every_fence_is_a_block_of_a_known_language() -> None:
         assert {block.language for block in blocks(page)} <= {"python", "sh", "toml", "text"}, page
 
 
+@pytest.mark.parametrize("page", [page for page, text in PAGES.items() if "load_policy(" in text])
+def test_a_policy_is_started_before_it_commands(page: str) -> None:
+    assert ").command(" not in PAGES[page]
+    assert 0 < PAGES[page].find("policy.start(") < PAGES[page].index("policy.command(")
+
+
 @pytest.mark.parametrize("command", [SET_UP, TEST])
 def test_the_set_up_commands_stand_alone_on_a_line(command: str) -> None:
     assert command in README.splitlines()

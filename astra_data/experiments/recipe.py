@@ -185,7 +185,10 @@ class Recipe(Config):
         except BadInputError as error:
             raise ValueError(f"select.judge: {error}") from None
         if len(self.seeds) < 2:
-            raise ValueError("select: expected two seeds or more, got 1: judges are of other seeds")
+            raise ValueError(
+                "select: expected two seeds or more, got 1: judges are of other seeds: "
+                "remove [select], or add a seed"
+            )
         if not any(method_named(row).trains_without_target for row in self.methods):
             raise ValueError("select: expected a row with policies of abstract states, got none")
         return self
