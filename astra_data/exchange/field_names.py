@@ -76,7 +76,7 @@ TURN_RATE = re.compile(
     r"(heading|yaw|theta|psi|turn(ing)?|rot(ation)?)_?(rate|vel|velocity|speed|dot))"
 )
 LENGTH = re.compile(
-    r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
+    r"(?!.*(heading|yaw|theta|psi|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque))(.+_)?(p|pos)?[xyz]"
 )
 QUATERNION = re.compile(r"(.+_)?(q|quat(ernion)?|orient(ation)?|rot(ation)?)_?[wxyz]")
 """A part of one, where all four are there."""

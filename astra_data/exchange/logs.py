@@ -1,6 +1,7 @@
 """CSV logs, cut into episodes, and what their fields are taken for."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,11 +30,16 @@ class Field:
     why: str
 
     @property
+    def plain(self) -> str:
+        """What patterns of names look at: `short` in small letters, digits and single underscores."""
+        return re.sub(r"[\W_]+", "_", self.short.lower()).strip("_") or self.short
+
+    @property
     def is_turn_rate(self) -> bool:
         """Whether a heading changes by it."""
-        if self.unit == "rad/s" and HEADING.fullmatch(self.short):
+        if self.unit == "rad/s" and HEADING.fullmatch(self.plain):
             return True
-        return self.unit in ("1", "rad/s") and TURN_RATE.fullmatch(self.short) is not None
+        return self.unit in ("1", "rad/s") and TURN_RATE.fullmatch(self.plain) is not None
 
     @property
     def taken_for(self) -> str:

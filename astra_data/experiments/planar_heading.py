@@ -24,7 +24,7 @@ class Heading:
 
     @classmethod
     def of(cls, states: Mapping[str, Field]) -> Self | None:
-        """Return that of the `states`, by their names; None if there is none."""
+        """Return that of the `states`, by their plain names; None if there is none."""
         for stem in (name[:-2] for name in states if HEADING.fullmatch(name[:-2])):
             if {f"{stem}_x", f"{stem}_y"} <= states.keys():
                 return cls((states[f"{stem}_x"], states[f"{stem}_y"]), "xy")
@@ -40,7 +40,7 @@ class Heading:
     @property
     def name(self) -> str:
         """What the angle is called."""
-        return "yaw" if "w" in self.axes else self.fields[0].short.removesuffix("_x" if self.axes else "")
+        return "yaw" if "w" in self.axes else self.fields[0].short[: -len("_x") if self.axes else None]
 
     def angle(self, values: Floats) -> Floats:
         """Return the angle (T,) of the fields' values (T, F)."""

@@ -63,7 +63,7 @@ class Planar:
     def _known_turn(self) -> Field | None:
         """The command of turning by its name, or as the only one in rad/s; None where nothing says so."""
         commands = self.logs.of("command")
-        named = [field for field in commands if field.is_turn_rate or _TURNS.fullmatch(field.short)]
+        named = [field for field in commands if field.is_turn_rate or _TURNS.fullmatch(field.plain)]
         by_unit = [field for field in commands if field.unit == "rad/s"]
         found = named or (by_unit if len(by_unit) == 1 else [])
         return found[0] if found else None
@@ -171,7 +171,7 @@ class Bicycle(Planar):
         if unicycle is None:
             return None
         steering = logs.of("command")[unicycle.meanings.index("turn")]
-        if steering.unit not in ("1", "rad") or not _STEERING.fullmatch(steering.short):
+        if steering.unit not in ("1", "rad") or not _STEERING.fullmatch(steering.plain):
             return None
         unit = cls(logs, unicycle.position, unicycle.heading)
         expected, turned = [], []
@@ -223,7 +223,7 @@ class Holonomic(Planar):
         along, across = ("east", "north") if self.is_in_world else ("forward", "left")
         commands = self.logs.of("command")
         return [
-            "turn" if field.is_turn_rate else along if field.short.endswith("x") else across
+            "turn" if field.is_turn_rate else along if field.plain.endswith("x") else across
             for field in commands
         ]
 
@@ -252,10 +252,10 @@ class Holonomic(Planar):
 
 def _pose(logs: Logs) -> tuple[tuple[Field, Field], Heading] | None:
     """Return the fields of a position that moves, and the heading; None if one is missing."""
-    states = {field.short: field for field in logs.of("state")}
-    for short, x in states.items():
-        y = states.get(f"{short[:-1]}y")
-        if short[-1] == "x" and y is not None and LENGTH.fullmatch(short) and _moves(logs, (x, y)):
+    states = {field.plain: field for field in logs.of("state")}
+    for name, x in states.items():
+        y = states.get(f"{name[:-1]}y")
+        if name[-1] == "x" and y is not None and LENGTH.fullmatch(name) and _moves(logs, (x, y)):
             return ((x, y), heading) if (heading := Heading.of(states)) else None
     return None
 
@@ -268,16 +268,16 @@ def _moves(logs: Logs, fields: Sequence[Field]) -> bool:
 def _are_along_axes(commands: Sequence[Field]) -> bool:
     """Return whether they are two speeds, by their names or units, one along x and one along y."""
     names = {
-        field.short
+        field.plain
         for field in commands
-        if field.unit == "m/s" or (field.unit == "1" and _SPEED_AXIS.fullmatch(field.short))
+        if field.unit == "m/s" or (field.unit == "1" and _SPEED_AXIS.fullmatch(field.plain))
     }
     return len(commands) == 2 and any(names == {f"{name[:-1]}x", f"{name[:-1]}y"} for name in names)
 
 
 def _are_sides(one: Field, other: Field) -> bool:
     """Return whether they are of the left and the right, as of wheels, by names that are alike otherwise."""
-    return _SIDE.sub("", one.short) == _SIDE.sub("", other.short)
+    return _SIDE.sub("", one.plain) == _SIDE.sub("", other.plain)
 
 
 def _unit_vector(pose: Floats) -> Floats:

@@ -51,7 +51,9 @@ class Direct:
         ]
         clauses += [f"{heading} as cosine and sine" for heading in self._headings]
         if parts := _quaternions(self.logs):
-            clauses.append(f"{', '.join(parts)} are a quaternion: make yaw of it in φ")
+            clauses.append(
+                f"{', '.join(field.short for field in parts)} are a quaternion: make yaw of it in φ"
+            )
         return "; ".join(clauses)
 
     @property
@@ -64,7 +66,7 @@ class Direct:
         """Which of the states are headings that go round in the logs: whole turns do not count."""
         spans = np.ptp(np.concatenate(self.states()), axis=0).tolist()
         return tuple(
-            field.unit == "rad" and HEADING.fullmatch(field.short) is not None and span > math.pi
+            field.unit == "rad" and HEADING.fullmatch(field.plain) is not None and span > math.pi
             for field, span in zip(self.moved, spans, strict=True)
         )
 
@@ -76,12 +78,12 @@ class Direct:
     def of(cls, logs: Logs) -> Self:
         """Return how it fits: commands move the states of their names, or else the first that may be."""
         parts = _quaternions(logs)
-        left = {field.short: field for field in logs.of("state") if field.short not in parts}
+        left = {field.plain: field for field in logs.of("state") if field not in parts}
         moved: list[Field | None] = []
         for command in logs.of("command"):
             names = _names(command, left)
             moved.append(next((left.pop(name) for name in names if name in left), None))
-        rest = [field for short, field in left.items() if not _SPEED.match(short)]
+        rest = [field for name, field in left.items() if not _SPEED.match(name)]
         filled = []
         for command, named in zip(logs.of("command"), moved, strict=True):
             field = named or next((one for one in rest if _may_move(command, one)), None)
@@ -174,16 +176,18 @@ def _shown(values: Floats, plain: int) -> Floats:
     return np.concatenate([values[:, :plain], np.cos(around), np.sin(around)], axis=1)
 
 
-def _quaternions(logs: Logs) -> list[str]:
-    """Return the names of states that are parts of whole quaternions, such as qw, qx, qy and qz."""
-    parts = [field.short for field in logs.of("state") if QUATERNION.fullmatch(field.short)]
-    return [part for part in parts if {f"{part[:-1]}{axis}" for axis in "wxyz"} <= {*parts}]
+def _quaternions(logs: Logs) -> list[Field]:
+    """Return the states that are parts of whole quaternions, such as qw, qx, qy and qz."""
+    parts = {field.plain: field for field in logs.of("state") if QUATERNION.fullmatch(field.plain)}
+    return [
+        field for part, field in parts.items() if {f"{part[:-1]}{axis}" for axis in "wxyz"} <= parts.keys()
+    ]
 
 
 def _names(command: Field, states: Mapping[str, Field]) -> list[str]:
-    """Return the names of the states that a command moves first of all."""
-    named = _SPEED.sub("", command.short)
-    names = [named, command.short, command.short.lstrip("u")]
+    """Return the plain names of the states that a command moves first of all."""
+    named = _SPEED.sub("", command.plain)
+    names = [named, command.plain, command.plain.lstrip("u")]
     if not command.is_turn_rate:
         return names
     headings = [name for name in states if HEADING.fullmatch(name) and _may_move(command, states[name])]
@@ -194,8 +198,8 @@ def _is_same(state: Field, command: Field) -> bool:
     """Return whether a state is what is commanded, and not what it is a rate of."""
     if "1" not in (command.unit, state.unit):
         return command.unit == state.unit
-    is_speed = state.is_turn_rate or _SPEED.match(state.short) is not None
-    return is_speed and command.short == state.short
+    is_speed = state.is_turn_rate or _SPEED.match(state.plain) is not None
+    return is_speed and command.plain == state.plain
 
 
 def _may_move(command: Field, state: Field) -> bool:

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -350,6 +351,55 @@ def test_a_dataset_is_begun_with_as_it_is(tmp_path: Path, place: str) -> None:
     assert other.state == one.state and other.action == one.action
     assert check_task(other) == []
     assert check(Path("other/other.toml"))["data"].state == "finished"
+
+
+ODOM = ("pose.pose.position.x", "pose.pose.position.y", "pose.pose.orientation.z", "pose.pose.orientation.w")
+ROS = (tuple(f"/odom:{path}" for path in ODOM), ("/cmd_vel:linear.x", "/cmd_vel:angular.z"))
+"""Names of states and commands, as of a mapping without `names`."""
+
+
+def driven(
+    place: Path, states: Sequence[str], commands: Sequence[str], given: np.ndarray | None = None
+) -> np.ndarray:
+    """Write a dataset of a unicycle: x, y, the quaternion's z and w, further commanded speeds; return it."""
+    if given is None:
+        given = np.random.default_rng(0).uniform([0, -1], [1, 1], (40, 2))
+    yaw = np.concatenate([[0], np.cumsum(0.1 * given[:-1, -1])])
+    ways = 0.1 * given[:, :1] * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    place_m = np.concatenate([np.zeros((1, 2)), np.cumsum(ways, axis=0)[:-1]])
+    values = np.column_stack([place_m, np.sin(yaw / 2), np.cos(yaw / 2), given])[:, : len(states)]
+    columns = (
+        Column(STATE, size=len(states), names=tuple(states)),
+        Column(ACTION, size=len(commands), names=tuple(commands)),
+    )
+    with DatasetWriter(place, columns=columns, fps=10, task="drive", description=DESCRIPTION) as out:
+        for uid in range(2):
+            table = {STATE: values.astype(np.float32), ACTION: given.astype(np.float32)}
+            out.add(Episode(uid, table))
+    return np.asarray(values)
+
+
+@pytest.mark.parametrize(
+    ("states", "commands"),
+    [
+        ROS,
+        ((*ROS[0], "/odom:twist.twist.linear.x", "/odom:twist.twist.angular.z"), ROS[1]),
+        (("pose.x", "pose.y", "Orientation.z", "Orientation.w"), ("v", "/cmd_vel:angular.z")),
+    ],
+)
+def test_names_with_dots_are_understood_and_kept(states: Sequence[str], commands: Sequence[str]) -> None:
+    values = driven(Path("ros"), states, commands)
+    kind = write_robot("base", Path("base"), [Path("ros")])
+    moved = ", ".join(states[:4])
+    assert kind.simulator == f"a unicycle: {moved}, driven by {commands[0]}, {commands[1]}"
+    task = task_named("base/base.py:TASK")
+    assert check_task(task) == []
+    assert task.state.names == tuple(states) and list(task.limits) == list(commands)
+    simulator = task.make_simulator(39)
+    simulator.reset_to(torch.from_numpy(task.abstraction(values[:-1])).float())
+    given = Dataset.open("ros").columns([ACTION])[ACTION][:39]
+    landed = simulator.step(torch.from_numpy(given))
+    np.testing.assert_allclose(landed, task.abstraction(values[1:]), atol=1e-5)
 
 
 def test_what_never_moves_is_a_part_of_the_task(tmp_path: Path) -> None:

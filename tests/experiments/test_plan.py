@@ -298,7 +298,10 @@ def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path, fake_recipe:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (SELECT.replace("[0, 7]", "[0]"), "select: expected two seeds or more, got 1: judges are of other seeds: remove .select., or add"),
+        (
+            SELECT.replace("[0, 7]", "[0]"),
+            "select: expected two seeds or more, got 1: judges are of other seeds: remove .select., or add",
+        ),
         (SELECT.replace(', "nas"]', "]"), "select.judge: expected a row that grounds its simulator"),
         (SELECT + 'judge = "target"\n', "expected a row that grounds its simulator as judge, got target"),
         (SELECT + 'judge = "nash"\n', "nash"),

@@ -5,7 +5,7 @@ import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.guessing import guess
-from astra_data.exchange.logs import Logs
+from astra_data.exchange.logs import Field, Logs
 from astra_data.experiments.planar_kinds import Planar
 from astra_data.experiments.robot_kinds import Direct
 
@@ -170,6 +170,25 @@ def test_no_command_moves_a_part_of_a_quaternion(tmp_path: Path, stem: str) -> N
     assert "make yaw of it" not in kind.simulator
     pose = {"x": T, "y": T % 9, "z": T % 4, "w": T % 7}  # a position and a turn rate
     assert "make yaw of it" not in Direct.of(logs(tmp_path, **pose, **commands)).simulator
+
+
+def test_speeds_are_no_position(tmp_path: Path) -> None:
+    speeds = {"odom_linear_x": T % 7, "odom_linear_y": T % 4}
+    kind = Planar.of(logs(tmp_path, **speeds, x=T, y=T % 9, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
+    assert kind is not None and [field.short for field in kind.position] == ["x", "y"]
+
+
+def test_names_with_dots_are_told_as_they_are() -> None:
+    """As of a dataset, whose columns keep their names."""
+    parts = [f"/imu:Orientation.{axis}" for axis in "xyzw"]
+    states = ["lift.pos", *parts, "Mast:Yaw"]
+    commands = ["Yaw.rate", "lift.pos"]
+    fields = [Field(name, "state", name, "1", 1.0, "") for name in states]
+    fields += [Field(f"cmd {name}", "command", name, "1", 1.0, "") for name in commands]
+    values = {field.name: np.sin((number + 1) * T) for number, field in enumerate(fields)}
+    kind = Direct.of(Logs(tuple(fields), (values,), {}))
+    assert [field.short for field in kind.moved] == ["Mast:Yaw", "lift.pos"]
+    assert kind.simulator.endswith(f"{', '.join(parts)} are a quaternion: make yaw of it in φ")
 
 
 def test_positions_may_be_called_px_and_py(tmp_path: Path) -> None:
