@@ -17,9 +17,7 @@ _SHOWN = 4
 
 def refuse_others(root: Path) -> None:
     """Raise BadInputError where `root` holds no dataset, or versions of one."""
-    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
-    if versions:
-        raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
+    refuse_versions(root)
     if not (root / "meta").is_dir():
         refuse_run(root)
         if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
@@ -31,6 +29,13 @@ def refuse_others(root: Path) -> None:
             f"{root}: no dataset there; check the path (`astra-data list` says where names are) "
             "or run the stage that writes it."
         )
+
+
+def refuse_versions(root: Path) -> None:
+    """Raise BadInputError where `root` holds versions of a dataset; name them."""
+    versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
+    if versions:
+        raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
 
 
 def refuse_run(root: Path) -> None:

@@ -31,7 +31,7 @@ from astra_data.exchange.field_names import (
     WEAK_FAILURE,
     Role,
 )
-from astra_data.exchange.importers.csv import csv_files
+from astra_data.exchange.log_files import csv_files
 from astra_data.exchange.logs import Field, Floats, Logs
 
 

@@ -15,12 +15,13 @@ from string import Template
 
 import numpy as np
 
+from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TERMINATED
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import locate
+from astra_data.dataset.versions import locate, names_at_home
 from astra_data.exchange.dataset_logs import logs_of
 from astra_data.exchange.field_names import Role
 from astra_data.exchange.guessing import guess
@@ -50,7 +51,8 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
             which are written too.
 
     Raises:
-        BadInputError: `name` is no name, `out` exists, or the logs are of no use: see `guess` and `logs_of`.
+        BadInputError: `name` is no name, `out` exists, or the logs are not there, or of no use: see `guess`
+            and `logs_of`.
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart")
@@ -79,14 +81,36 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
 
 
 def _dataset(logs: Sequence[Path]) -> Dataset | None:
-    """Return the dataset that `logs` name; None where they are files, or folders of them."""
-    if len(logs) != 1:
-        return None
+    """Return the dataset that `logs` name; None where they are files, or folders of them.
+
+    Raises:
+        BadInputError: one of several is a dataset, or nothing is there.
+        CorruptDatasetError: the dataset is incomplete or was altered.
+    """
+    folders = [folder for place in logs if (folder := _folder(place))]
+    if folders and len(logs) > 1:
+        raise BadInputError(
+            f"{' and '.join(map(str, logs))}: expected logs, or one dataset: `astra-data merge` them first"
+        )
+    return Dataset.open(folders[0]) if folders else None
+
+
+def _folder(place: Path) -> Path | None:
+    """Return the folder of the dataset that `place` names; None where it is another folder, or a file.
+
+    Raises:
+        BadInputError: there is no such place, or no such version.
+    """
     try:
-        folder = locate(logs[0])
+        folder = locate(place)
     except BadInputError:
-        return None
-    return Dataset.open(folder) if (folder / INFO_PATH).is_file() else None
+        if place.exists():
+            return None
+        if "@" in place.name:
+            raise
+        close = did_you_mean(str(place), names_at_home())
+        raise BadInputError(f"{place}: there is no such file, folder or dataset{close}") from None
+    return folder if folder != place or (folder / INFO_PATH).is_file() else None
 
 
 def _of_dataset(root: Path) -> dict[str, str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_dataset import DESCRIPTION
+from fake_dataset import DESCRIPTION, write_fake
 from on_meta import places
 from typer.testing import CliRunner
 
@@ -351,6 +351,40 @@ def test_a_dataset_is_begun_with_as_it_is(tmp_path: Path, place: str) -> None:
     assert other.state == one.state and other.action == one.action
     assert check_task(other) == []
     assert check(Path("other/other.toml"))["data"].state == "finished"
+
+
+@pytest.mark.parametrize(
+    ("places", "expected"),
+    [
+        (
+            ["walks", "home/walks/data-1.1.0"],
+            "walks and home/walks/data-1.1.0: expected .* `astra-data merge`",
+        ),
+        (["log.csv", "walks"], "log.csv and walks: expected logs, or one dataset"),
+        (["home/walks"], "walks holds versions of a dataset: name one of data-1.0.0, data-1.1.0"),
+        (["walks@data-3.0.0"], "walks has no version data-3.0.0 in .*home; it has data-1.0.0, data-1.1.0"),
+        (["walsk"], "walsk: there is no such file, folder or dataset: did you mean 'walks'"),
+        (["a/b"], "a/b: there is no such file, folder or dataset"),
+        (["bags"], "bags: expected CSV logs or a dataset, got a recording of ROS, drive.mcap"),
+    ],
+)
+def test_what_is_no_data_to_begin_with_is_told(tmp_path: Path, places: list[str], expected: str) -> None:
+    for version in ("1.0.0", "1.1.0"):
+        write_fake(tmp_path / f"home/walks/data-{version}")
+    arm(tmp_path / "log.csv")
+    (tmp_path / "bags").mkdir()
+    (tmp_path / "bags/drive.mcap").touch()
+    with pytest.raises(BadInputError, match=expected):
+        write_robot("cart", Path("cart"), [Path(place) for place in places])
+    assert not Path("cart").exists()
+
+
+def test_what_lerobot_recorded_is_opened_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    driven(Path("recorded"), *ROS)
+    shutil.rmtree("recorded/meta/astra")
+    command("new base --from recorded")
+    assert [line for line in caplog.messages if "recorded by LeRobot" in line] == caplog.messages != []
+    assert len(caplog.messages) == 1
 
 
 ODOM = ("pose.pose.position.x", "pose.pose.position.y", "pose.pose.orientation.z", "pose.pose.orientation.w")

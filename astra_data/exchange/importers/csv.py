@@ -5,7 +5,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import IO
 
 import numpy as np
@@ -16,7 +15,7 @@ from pyarrow import csv
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, Part, Source, refuse_dataset, row_count
+from astra_data.exchange.recording import Block, Part, Source, row_count
 
 SUFFIXES = (".csv", ".tsv")
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
@@ -41,23 +40,6 @@ def check_separator(name: str, stream: IO[bytes]) -> None:
             f"{name}: expected fields parted by {mark}, got {others[0]} in its header: "
             "write it with commas, or with tabs as .tsv"
         )
-
-
-def csv_files(place: Path) -> list[Path]:
-    """Return the CSV files in a folder, or the one that `place` is.
-
-    Raises:
-        BadInputError: there is none, or it is a dataset.
-    """
-    inside = sorted(place.iterdir()) if place.is_dir() else [place]
-    found = [path for path in inside if path.suffix.lower() in SUFFIXES]
-    if not found:
-        refuse_dataset(place)
-        raise BadInputError(
-            f"{place}: expected files that end in {' or '.join(SUFFIXES)}, found none: `import` takes "
-            "others, by a mapping"
-        )
-    return found
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
