@@ -52,6 +52,8 @@ def new(
         typer.echo(f"none of them is a time: {found.rate} rows a second were taken; set fps and TIMESTEP_S")
     if found.uneven:
         typer.echo(f"{found.uneven} (CHECK)")
+    if found.still:
+        typer.echo(f"{found.still} (CHECK)")
     for name, count in found.left_out.items():
         typer.echo(f"{name} has no number in {count} rows, which are left out: logs.toml says how (CHECK)")
     typer.echo(f"finished: {folder}; {folder}/README.md says how to go on, and CHECK marks what was guessed")

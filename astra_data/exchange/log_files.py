@@ -30,8 +30,8 @@ def csv_files(place: Path) -> list[Path]:
         raise BadInputError(
             f"{place}: expected CSV logs or a dataset, got a recording of ROS, {bags[0]}: make a dataset of "
             f"it, `astra-data import {shlex.quote(str(place))} --mapping recipes/imports/ros2_base.toml` "
-            "with that mapping or one like it (`astra-data recipes copy ros2_base`), and then name that dataset: "
-            "--from NAME"
+            "with that mapping or one like it (`astra-data recipes copy ros2_base`), and then name that "
+            "dataset: --from NAME"
         )
     raise BadInputError(
         f"{place}: expected files that end in {' or '.join(SUFFIXES)}, found none: `import` takes others, by "

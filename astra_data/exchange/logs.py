@@ -107,6 +107,19 @@ class Logs:
         flags = self.of("failure")
         return [any(bool(episode[field.name].any()) for field in flags) for episode in self.episodes]
 
+    @property
+    def still(self) -> str:
+        """Which commands never change, and what that means; nothing where all do."""
+        fields = self.of("command")
+        given = np.concatenate(self.values(fields))
+        named = [
+            f"{field.short} is {values[0]:g}"
+            for field, values in zip(fields, given.T, strict=True)
+            if not np.ptp(values)
+        ]
+        what = "it does" if len(named) == 1 else "they do"
+        return f"{' and '.join(named)} in all rows: no simulator learns what {what}" if named else ""
+
     def of(self, role: Role) -> tuple[Field, ...]:
         """Return the fields with a role."""
         return tuple(field for field in self.fields if field.role == role)

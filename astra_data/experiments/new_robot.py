@@ -184,6 +184,7 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
         "command_units": texts(field.unit for field in commands),
         "row": json.dumps([significant(value) for value in logs.values(states)[0][0]]),
         "bounds": repr(bounds).replace("'", '"'),
+        "still": f"; {logs.still}" if logs.still else "",
         "horizon": str(horizon),
         "guesses": "\n".join(lines),
     }

@@ -387,6 +387,16 @@ def test_what_lerobot_recorded_is_opened_once(tmp_path: Path, caplog: pytest.Log
     assert len(caplog.messages) == 1
 
 
+def test_a_command_that_never_changes_is_told(tmp_path: Path) -> None:
+    given = np.column_stack([np.sin(np.arange(40)), np.zeros(40), np.cos(np.arange(40))])
+    driven(Path("ros"), ROS[0], ("linear.x", "linear.y", "angular.z"), given)
+    shown = CliRunner().invoke(app, ["new", "base", "--from", "ros"])
+    still = "linear.y is 0 in all rows: no simulator learns what it does"
+    assert f"{still} (CHECK)\n" in shown.output
+    assert f"# CHECK: what was recorded; {still}\n" in Path("base/base.py").read_text()
+    assert check_task(task_named("base/base.py:TASK")) == []
+
+
 ODOM = ("pose.pose.position.x", "pose.pose.position.y", "pose.pose.orientation.z", "pose.pose.orientation.w")
 ROS = (tuple(f"/odom:{path}" for path in ODOM), ("/cmd_vel:linear.x", "/cmd_vel:angular.z"))
 """Names of states and commands, as of a mapping without `names`."""
