@@ -12,14 +12,16 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.command("list")
 def list_() -> None:
-    """List the recipes that come with the package."""
+    """List the recipes, and the mappings of `import`, that come with the package."""
     from rich.table import Table
 
-    from astra_data.experiments.shipped import shipped_recipes
+    from astra_data.experiments.shipped import shipped_mappings, shipped_recipes
 
     table = Table("recipe", "task", "what it is")
     for recipe in shipped_recipes():
         table.add_row(recipe.name, recipe.task, recipe.about)
+    for mapping in shipped_mappings():
+        table.add_row(mapping.name, "(a mapping, for import)", mapping.about)
     show_table(table)
 
 
@@ -30,8 +32,11 @@ def copy(
     ],
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to.")] = Path("recipes"),
 ) -> None:
-    """Copy a recipe, with the recipe that it is based on and the code of its task."""
-    from astra_data.experiments.shipped import copy_recipe, shipped
+    """Copy a recipe or mapping, with the recipe that it is based on and the code that it needs."""
+    from astra_data.experiments.shipped import IMPORTS, copy_recipe, shipped
 
     new = copy_recipe(name, folder)
-    typer.echo(f"finished: {len(new)} files; astra-data run {folder / shipped(name).path}")
+    path = shipped(name).path
+    place = folder / path
+    how = f"import LOGS --mapping {place}" if path.parts[0] == IMPORTS else f"run {place}"
+    typer.echo(f"finished: {len(new)} files; astra-data {how}")

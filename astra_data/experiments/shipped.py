@@ -16,6 +16,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 RECIPES = next(folder for folder in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes") if folder.is_dir())
 """The folder of recipes: in the installed package, or beside it in a checkout."""
 
+IMPORTS = "imports"
+"""The folder of mappings, below `RECIPES`."""
+
 _COMMAND = re.compile(r"(uv run |astra-data |python |--)")
 
 
@@ -73,13 +76,21 @@ def shipped_recipes() -> tuple[ShippedRecipe, ...]:
     return tuple(sorted(kept, key=lambda recipe: recipe.name))
 
 
+@cache
+def shipped_mappings() -> tuple[ShippedRecipe, ...]:
+    """Return all mappings of `import`, by name."""
+    texts = {path.relative_to(RECIPES): path.read_text() for path in (RECIPES / IMPORTS).glob("*.toml")}
+    found = [ShippedRecipe(path, tomllib.loads(text), _about(text)) for path, text in texts.items()]
+    return tuple(sorted(found, key=lambda mapping: mapping.name))
+
+
 def shipped(name: str) -> ShippedRecipe:
-    """Return the recipe of this name.
+    """Return the recipe, or the mapping, of this name.
 
     Raises:
         BadInputError: there is none.
     """
-    recipes = {recipe.name: recipe for recipe in shipped_recipes()}
+    recipes = {recipe.name: recipe for recipe in (*shipped_mappings(), *shipped_recipes())}
     if name not in recipes:
         raise BadInputError(f"no recipe '{name}' comes with astra-data{did_you_mean(name, recipes)}")
     return recipes[name]
