@@ -19,6 +19,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset import DatasetWriter
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
+from astra_data.exchange.logs import Floats
 from astra_data.experiments.new_robot import write_robot
 from astra_data.experiments.run import check, run
 from astra_data.worlds.registry import task_named
@@ -403,8 +404,8 @@ ROS = (tuple(f"/odom:{path}" for path in ODOM), ("/cmd_vel:linear.x", "/cmd_vel:
 
 
 def driven(
-    place: Path, states: Sequence[str], commands: Sequence[str], given: np.ndarray | None = None
-) -> np.ndarray:
+    place: Path, states: Sequence[str], commands: Sequence[str], given: Floats | None = None
+) -> Floats:
     """Write a dataset of a unicycle: x, y, the quaternion's z and w, further commanded speeds; return it."""
     if given is None:
         given = np.random.default_rng(0).uniform([0, -1], [1, 1], (40, 2))
