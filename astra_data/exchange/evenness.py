@@ -79,19 +79,19 @@ def ended(topic: str, times: int, gap_s: float, column: str, commanded: str | No
     """
     key = f'gap_s in [columns."{column}"]' if column else "split.gap_s"
     often = "once" if times == 1 else f"{times} times"
-    told = (
+    silence = (
         f"{topic} is silent for over {gap_s:g} s ({key}) {often} while others are not, and episodes end there"
     )
     # A column with a gap of its own cannot be latched.
     if commanded:
         latched = "" if column else f'latched = true in [columns."{commanded}"], or '
         return (
-            f"{told}, as is right where the robot stops by itself without commands; where it goes on with "
+            f"{silence}, as is right where the robot stops by itself without commands; where it goes on with "
             f"the last one, set {latched}a longer gap_s"
         )
     if column:
-        return f"{told}; where values may be held for longer, set a longer one"
-    return f"{told}: set latched = true where it is sent on change, or a longer gap_s"
+        return f"{silence}; where values may be held for longer, set a longer one"
+    return f"{silence}: set latched = true where it is sent on change, or a longer gap_s"
 
 
 def _share_odd(messages_per_row: float) -> float:
