@@ -131,8 +131,8 @@ def _rows(
     silent = sorted(resampler.topics.keys() - resampler.times.keys())
     if silent:
         raise BadInputError(f"{source}: no messages on {', '.join(silent)}")
-    for told in resampler.endings():
-        _log.warning("%s", told)
+    for silence in resampler.endings():
+        _log.warning("%s", silence)
 
 
 def _block(source: Source, rows: _Rows) -> Block:
