@@ -171,6 +171,10 @@ def _of_file(path: Path) -> ModuleType:
     return module
 
 
+_APPENDED: set[str] = set()
+"""Folders of files of the user's that stand at the end of Python's path."""
+
+
 @contextmanager
 def _among_neighbours(path: Path) -> Iterator[None]:
     """Let a file import those beside it, whatever files of their names other files of the user's imported.
@@ -184,19 +188,17 @@ def _among_neighbours(path: Path) -> Iterator[None]:
         for file, _ in _with_neighbours(path):
             if file.stem in loaded and _folder_of(loaded[file.stem]) in known:
                 theirs[file.stem] = sys.modules.pop(file.stem)
-    behind = len(places)
-    while behind and Path(places[behind - 1]) in known:
-        behind -= 1
-    sys.path.insert(behind, f"{folder}")
+    ours = [len(places) - 1 - places[::-1].index(place) for place in _APPENDED if place in places]
+    inserted = f"{folder}"
+    sys.path.insert(min(ours, default=len(places)), inserted)
     try:
         yield
     finally:
         sys.modules.update(theirs)
-        sys.path.reverse()
-        sys.path.remove(f"{folder}")  # the last, which is ours
-        sys.path.reverse()
+        sys.path[:] = [place for place in sys.path if place is not inserted]
     if f"{folder}" not in sys.path:
         sys.path.append(f"{folder}")  # what is imported later, too, unless the file failed
+        _APPENDED.add(f"{folder}")
 
 
 def _folder_of(module: ModuleType) -> Path | None:

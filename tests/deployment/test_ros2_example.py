@@ -114,6 +114,7 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros]:
     ros = Ros()
     for name, module in ros.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "run_policy", raising=False)
     monkeypatch.setattr("time.monotonic", lambda: ros.now)
     monkeypatch.setattr("time.sleep", lambda _: None)
     monkeypatch.setattr("signal.signal", lambda *_: None)

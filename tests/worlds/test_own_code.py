@@ -237,3 +237,17 @@ def test_the_digest_covers_data_that_the_files_name(tmp_path: Path) -> None:
     assert code_digest(f"{tmp_path}/cart.py:TASK") == first
     (tmp_path / "parts/cart.xml").write_text("<mujoco></mujoco>")
     assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
+
+
+def test_a_file_s_neighbours_come_before_those_of_others_whatever_was_appended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "gears_of_mine.py").write_text(f"FOLDER = '{folder}'\n")
+        (tmp_path / folder / "robot.py").write_text("from gears_of_mine import FOLDER\n")
+    (tmp_path / "one/robot.py").write_text("FOLDER = 'one'\n")  # does not import its neighbour
+    assert own_object(f"{tmp_path}/one/robot.py:FOLDER") == "one"
+    sys.path.append(f"{tmp_path}/policy")
+    assert own_object(f"{tmp_path}/two/robot.py:FOLDER") == "two"
