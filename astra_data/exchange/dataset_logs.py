@@ -20,15 +20,15 @@ def logs_of(data: Dataset) -> Logs:
     """
     fields = [Field(TIMESTAMP, "time", "time", "s", 1.0, f"{data.info['fps']} rows a second")]
     columns = data.specs([STATE, ACTION])
-    fields += [field for column in columns for field in _fields(column)]
+    of_columns = [field for column in columns for field in _fields(column)]
+    fields += of_columns
     ends = [name for name in (TERMINATED, SUCCESS) if name in data.features]
     if TERMINATED in ends:
         fields.append(Field(_FAILED, "failure", "failure", "1", 1.0, f"{TERMINATED}, and no success"))
     episodes = []
     for episode in data.episodes([STATE, ACTION, *ends]):
         values = np.column_stack([episode.columns[column.name] for column in columns]).astype(float)
-        names = [field.name for field in fields if field.role in ("state", "command")]
-        found = dict(zip(names, values.T, strict=True))
+        found = {field.name: series for field, series in zip(of_columns, values.T, strict=True)}
         found[TIMESTAMP] = np.arange(len(values)) / data.info["fps"]
         if TERMINATED in ends:
             failed = episode.columns[TERMINATED] & ~episode.columns.get(SUCCESS, np.zeros(len(values), bool))
