@@ -9,7 +9,7 @@ from astra_data.exchange.logs import Floats, Logs
 
 JUDGED_STEPS = 10
 """After so many steps a simulator should be better than nothing."""
-_CLEARLY = 1.05
+CLEARLY = 1.05
 """Errors that are larger by less than this factor may be chance."""
 
 
@@ -43,8 +43,13 @@ class Kind(Protocol):
 def badly_predicted(kind: Kind) -> list[str]:
     """Return the names of the states that standing still predicts clearly better after `JUDGED_STEPS`."""
     simulated, still = errors(kind, JUDGED_STEPS)
-    worse = simulated > _CLEARLY * still
+    worse = simulated > CLEARLY * still
     return [name for name, is_worse in zip(kind.names, worse, strict=True) if is_worse]
+
+
+def judged_steps(episodes: Sequence[Floats]) -> int:
+    """Return `JUDGED_STEPS`, or 1 where no episode is as long; over one step, what lags looks like a rate."""
+    return JUDGED_STEPS if any(len(values) > JUDGED_STEPS for values in episodes) else 1
 
 
 def errors(kind: Kind, steps: int) -> tuple[Floats, Floats]:

@@ -26,7 +26,8 @@ from astra_data.exchange.dataset_logs import logs_of
 from astra_data.exchange.field_names import Role
 from astra_data.exchange.guessing import guess
 from astra_data.exchange.logs import Logs
-from astra_data.experiments.planar_kinds import Bicycle, Holonomic, Planar
+from astra_data.experiments.fitted_kinds import Bicycle, Differential
+from astra_data.experiments.planar_kinds import Holonomic, Planar
 from astra_data.experiments.robot_kinds import Direct
 from astra_data.experiments.written_values import significant, texts
 
@@ -64,7 +65,8 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
             _drive(folder / "logs")
         data = _dataset(logs)
         found = logs_of(data) if data else guess(places or [folder / "logs"])
-        kind = Holonomic.of(found) or Bicycle.of(found) or Planar.of(found) or Direct.of(found)
+        kinds = (Holonomic, Bicycle, Differential, Planar)
+        kind = next(filter(None, (one.of(found) for one in kinds)), None) or Direct.of(found)
         values = _common(name, found) | kind.values()
         values["simulator"] = kind.simulator
         values |= _of_dataset(data.root) if data else _of_mapping(name, places)

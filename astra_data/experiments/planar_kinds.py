@@ -15,8 +15,9 @@ from astra_data.experiments.planar_heading import Heading
 from astra_data.experiments.written_values import numbers, typical
 
 _TURNS = re.compile(r"w|wz|omega|.*(turn|yaw|ang|(?<!th)rot|steer).*")
-_STEERING = re.compile(r"(.+_)?steer(ing)?(_?(angle|ang))?")
 _SIDE = re.compile(r"left|right|(?<![a-z])[vw]?[lr](?![a-z])")
+_COMMAND = {"turn": 0.0, "right": 2.0}
+"""Of which a written test takes a step; others are 1."""
 _SPEED_AXIS = re.compile(r"(.+_)?(v|vel|velocity|linear)_?[xy]")
 
 
@@ -78,8 +79,8 @@ class Planar:
     @classmethod
     def of(cls, logs: Logs) -> Self | None:
         """Return how it fits; None if it does not."""
-        pose, commands = _pose(logs), logs.of("command")
-        if pose is None or len(commands) != 2 or _are_along_axes(commands) or _are_sides(*commands):
+        pose, commands = pose_of(logs), logs.of("command")
+        if pose is None or len(commands) != 2 or _are_along_axes(commands) or are_sides(*commands):
             return None
         return cls(logs, *pose)
 
@@ -116,7 +117,7 @@ class Planar:
         starts = np.array([pose[0] for pose in poses])
         goal, close = typical([pose[:, :2] for pose in poses], self.logs.failed)
         before = np.array([[0.0, 0.0, math.pi / 2]])
-        command = np.array([[float(meaning != "turn") for meaning in self.meanings]])
+        command = np.array([[_COMMAND.get(meaning, 1.0) for meaning in self.meanings]])
         along, is_in_world = self._along(), "east" in self.meanings
         seen = "heading_x * east + heading_y * north, heading_x * north - heading_y * east"
         return {
@@ -139,65 +140,6 @@ class Planar:
             "command": numbers(command[0]),
             "after": numbers(_unit_vector(self.step(before, command)[0]).round(9)),
         }
-
-
-@dataclass(frozen=True)
-class Bicycle(Planar):
-    """A position, a heading, and commands of speed and of a steering angle: a car.
-
-    Attributes:
-        wheelbase_m: from axle to axle, as fitted to the logs; negative where it steers to the right.
-    """
-
-    wheelbase_m: float = 1.0
-
-    called = "bicycle"
-
-    @property
-    def simulator(self) -> str:
-        """What it is and what moves it, in a few words."""
-        side = ", steered to the right" if self.wheelbase_m < 0 else ""
-        return f"{super().simulator}, wheelbase {abs(self.wheelbase_m):g} m{side}"
-
-    @property
-    def meanings(self) -> list[str]:
-        """What each command is: "angle" for that of steering, and "speed"."""
-        return ["angle" if meaning == "turn" else meaning for meaning in super().meanings]
-
-    @classmethod
-    def of(cls, logs: Logs) -> Self | None:
-        """Return how it fits; None if it does not, or turns less like the logs than a unicycle."""
-        unicycle = Planar.of(logs)
-        if unicycle is None:
-            return None
-        steering = logs.of("command")[unicycle.meanings.index("turn")]
-        if steering.unit not in ("1", "rad") or not _STEERING.fullmatch(steering.plain):
-            return None
-        unit = cls(logs, unicycle.position, unicycle.heading)
-        expected, turned = [], []
-        for states, commands in zip(unit.states(), logs.values(logs.of("command")), strict=True):
-            expected.append((unit.step(states[:-1], commands[:-1]) - states[:-1])[:, 2])
-            turned.append(np.diff(states[:, 2]))
-        by_metre, rates = np.concatenate(expected), np.concatenate(turned)
-        share = float(by_metre @ np.arctan2(np.sin(rates), np.cos(rates)))
-        if share == 0:
-            return None
-        wheelbase_m = float(f"{by_metre @ by_metre / share:.3g}")
-        bicycle = cls(logs, unicycle.position, unicycle.heading, wheelbase_m)
-        return bicycle if errors(bicycle, 1)[0][2] < errors(unicycle, 1)[0][2] else None
-
-    def values(self) -> dict[str, str]:
-        """Return what its templates name."""
-        constant = f"\nWHEELBASE_M = {abs(self.wheelbase_m)!r}  # CHECK: fitted to the logs"
-        return super().values() | {"constant": constant, "parameter": ', "wheelbase_m": WHEELBASE_M'}
-
-    def _turn(self, given: dict[str, Floats]) -> Floats:
-        turn: Floats = given["speed"] * np.tan(given["angle"]) / self.wheelbase_m
-        return turn
-
-    def _along(self) -> str:
-        speed = "-speed" if self.wheelbase_m < 0 else "speed"
-        return f"turn = {speed} * angle.tan() / WHEELBASE_M\n        {super()._along()}"
 
 
 @dataclass(frozen=True)
@@ -230,7 +172,7 @@ class Holonomic(Planar):
     @classmethod
     def of(cls, logs: Logs) -> Self | None:
         """Return how it fits, with speeds of the frame that predicts the logs better; None if it does not."""
-        pose, commands = _pose(logs), logs.of("command")
+        pose, commands = pose_of(logs), logs.of("command")
         straight = [field for field in commands if not field.is_turn_rate]
         if pose is None or len(commands) - len(straight) != 1 or not _are_along_axes(straight):
             return None
@@ -250,7 +192,7 @@ class Holonomic(Planar):
         return f"east, north = forward * {cos} - left * {sin}, forward * {sin} + left * {cos}"
 
 
-def _pose(logs: Logs) -> tuple[tuple[Field, Field], Heading] | None:
+def pose_of(logs: Logs) -> tuple[tuple[Field, Field], Heading] | None:
     """Return the fields of a position that moves, and the heading; None if one is missing."""
     states = {field.plain: field for field in logs.of("state")}
     for name, x in states.items():
@@ -275,7 +217,7 @@ def _are_along_axes(commands: Sequence[Field]) -> bool:
     return len(commands) == 2 and any(names == {f"{name[:-1]}x", f"{name[:-1]}y"} for name in names)
 
 
-def _are_sides(one: Field, other: Field) -> bool:
+def are_sides(one: Field, other: Field) -> bool:
     """Return whether they are of the left and the right, as of wheels, by names that are alike otherwise."""
     return _SIDE.sub("", one.plain) == _SIDE.sub("", other.plain)
 

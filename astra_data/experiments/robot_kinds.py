@@ -12,7 +12,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.field_names import HEADING, QUATERNION
 from astra_data.exchange.logs import Field, Floats, Logs
-from astra_data.experiments.kind_errors import JUDGED_STEPS, errors
+from astra_data.experiments.kind_errors import errors, judged_steps
 from astra_data.experiments.written_values import numbers, texts, typical
 
 _SPEED = re.compile(r"^(vel_|velocity_|v|d)(?=[a-z])")
@@ -93,8 +93,7 @@ class Direct:
         if not found:
             cure = "make yaw of the quaternion" if parts else "name it as its command, cmd_q1 and q1"
             raise BadInputError(f"found no state that a command could move: {cure}")
-        # Over one step, what lags behind where it is put looks like a rate.
-        steps = JUDGED_STEPS if any(len(values) > JUDGED_STEPS for values in logs.values(found)) else 1
+        steps = judged_steps(logs.values(found))
         rates, targets = (
             errors(cls(logs, found, (is_rate,) * len(found)), steps)[0] for is_rate in (True, False)
         )

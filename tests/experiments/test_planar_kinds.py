@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planar_logs import poses_of, write
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.exchange.guessing import guess
 from astra_data.exchange.importing import import_dataset
 from astra_data.exchange.logs import Floats
+from astra_data.experiments.fitted_kinds import Bicycle
 from astra_data.experiments.new_robot import write_robot
-from astra_data.experiments.planar_kinds import Bicycle, Holonomic, Planar
+from astra_data.experiments.planar_kinds import Holonomic, Planar
 from astra_data.experiments.robot_kinds import Direct
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.walk_through import check_task
@@ -23,17 +25,7 @@ from astra_data.worlds.walk_through import check_task
 def drive(rows: int = 120, *, in_world: bool = False) -> tuple[Floats, Floats]:
     """Return poses (rows, 3), x, y and yaw, ten a second, and the commands (rows, 3): vx, vy, wz."""
     commands = np.random.default_rng(0).uniform(-1, 1, (rows, 3))
-    forward, left, turn = commands.T
-    yaw = np.cumsum(turn / 10) - turn / 10
-    cos, sin = (np.ones(rows), np.zeros(rows)) if in_world else (np.cos(yaw), np.sin(yaw))
-    speeds = np.column_stack([forward * cos - left * sin, forward * sin + left * cos, turn])
-    return np.cumsum(speeds / 10, axis=0) - speeds / 10, commands
-
-
-def write(path: Path, names: Sequence[str], *values: Floats) -> Path:
-    table = np.column_stack([np.arange(len(values[0])) / 10, *values])
-    np.savetxt(path, table, "%.7f", ",", header=",".join(["time", *names]), comments="")
-    return path
+    return poses_of(*commands.T, in_world=in_world), commands
 
 
 BASE = ("x", "y", "yaw", "vx", "vy", "wz", "cmd_vx", "cmd_vy", "cmd_wz")
@@ -201,64 +193,3 @@ def test_wheels_of_the_left_and_the_right_are_no_unicycle(tmp_path: Path, names:
     log = write(tmp_path / "log.csv", ["x", "y", "theta", *names], poses, commands[:, :2])
     assert Planar.of(guess([log])) is None and Bicycle.of(guess([log])) is None
     assert isinstance(write_robot("wheels", tmp_path / "wheels", [log]), Direct)
-
-
-def steer(wheelbase_m: float, rows: int = 120) -> tuple[Floats, Floats]:
-    """Return poses (rows, 3) of a car, ten a second, and the commands (rows, 2), speed and angle."""
-    commands = np.random.default_rng(0).uniform([-0.5, -0.4], [2, 0.4], (rows, 2))
-    speed, angle = commands.T
-    turn = speed * np.tan(angle) / wheelbase_m
-    yaw = np.cumsum(turn / 10) - turn / 10
-    speeds = np.column_stack([speed * np.cos(yaw), speed * np.sin(yaw), turn])
-    poses = np.cumsum(speeds / 10, axis=0) - speeds / 10
-    poses[:, 2] = np.arctan2(np.sin(yaw), np.cos(yaw))
-    return poses, commands
-
-
-@pytest.mark.parametrize("wheelbase_m", [0.26, -0.26])
-@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
-def test_a_car_is_steered_by_an_angle(tmp_path: Path, wheelbase_m: float, order: list[int]) -> None:
-    poses, commands = steer(wheelbase_m)
-    names = ["cmd_v", "cmd_steering_angle"]
-    columns = ["x", "y", "yaw", *(names[column] for column in order)]
-    log = write(tmp_path / "log.csv", columns, poses, commands[:, order])
-    shown = CliRunner().invoke(app, ["new", "racer", "--from", str(log), "--out", str(tmp_path / "racer")])
-    driven = ", ".join(["v", "steering_angle"][column] for column in order)
-    side = ", steered to the right" if wheelbase_m < 0 else ""
-    line = f"abstract simulator: a bicycle: x, y, yaw, driven by {driven}, wheelbase 0.26 m{side}\n"
-    assert line in shown.output and "standing still" not in shown.output
-    assert "WHEELBASE_M = 0.26  # CHECK" in (tmp_path / "racer/racer.py").read_text()
-    task = task_named(f"{tmp_path}/racer/racer.py:TASK")
-    assert check_task(task) == []
-    simulator = task.make_simulator(len(poses) - 1)
-    assert simulator.parameters == {"timestep_s": 0.1, "wheelbase_m": 0.26}
-    states = torch.from_numpy(poses).float()
-    simulator.reset_to(task.abstraction(states[:-1]))
-    landed = simulator.step(torch.from_numpy(commands[:-1, order]).float())
-    torch.testing.assert_close(landed, task.abstraction(states[1:]), atol=1e-4, rtol=0)
-    runpy.run_path(f"{tmp_path}/racer/test_racer.py")["test_a_step_of_the_simulator"]()
-
-
-@pytest.mark.parametrize("name", ["cmd_steering", "cmd_wz"])
-def test_a_rate_of_turning_is_no_steering_angle(tmp_path: Path, name: str) -> None:
-    poses, commands = drive()
-    commands[:, 1] = 0
-    columns = ["x", "y", "yaw", "cmd_v", name]
-    turned = write(tmp_path / "log.csv", columns, poses, commands[:, [0, 2]])
-    assert Bicycle.of(guess([turned])) is None
-    assert write_robot("robot", tmp_path / "robot", [turned]).simulator.startswith("a unicycle")
-
-
-def test_a_steering_rate_is_no_angle_even_where_it_would_fit(tmp_path: Path) -> None:
-    poses, commands = steer(0.26)
-    columns = ["x", "y", "yaw", "cmd_v", "cmd_steering_rad_s"]
-    assert Bicycle.of(guess([write(tmp_path / "log.csv", columns, poses, commands)])) is None
-    columns[-1] = "cmd_steering_rad"
-    assert Bicycle.of(guess([write(tmp_path / "log.csv", columns, poses, commands)])) is not None
-
-
-def test_a_car_that_never_drives_has_no_wheelbase(tmp_path: Path) -> None:
-    poses, commands = steer(0.26)
-    commands[:, 0] = 0.5 * (np.arange(len(commands)) == len(commands) - 1)  # in the last row alone
-    columns = ["x", "y", "yaw", "cmd_v", "cmd_steer"]
-    assert Bicycle.of(guess([write(tmp_path / "log.csv", columns, poses, commands)])) is None
