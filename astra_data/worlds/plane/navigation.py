@@ -77,9 +77,8 @@ class Navigation(PlanarObjective):
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states [x, y, vx, vy] (count, 4) at rest around the usual starts."""
         position = self._around(self.maze.start, rng, count)
-        if len(self.start_offsets_m) > 1:
-            position += np.array(self.start_offsets_m)[rng.integers(len(self.start_offsets_m), size=count)]
-        return _at_rest(position)
+        offsets = np.array(self.start_offsets_m)
+        return _at_rest(position + offsets[rng.integers(len(offsets), size=count)])
 
     def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw goals (count, 2) in m around the maze's goal cell."""

@@ -29,9 +29,11 @@ def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     diagonal = 0.5**0.5
     assert velocity[0].tolist() == pytest.approx([0.7 * diagonal, 0.7 * diagonal], abs=1e-6)
     assert place[0].tolist() == pytest.approx([0.1 + 0.19 * diagonal, 0.19 * diagonal], abs=1e-6)
-    _, turned = knock(
+    beside, turned = knock(
         before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7, turn_rad=torch.pi / 4
     )
+    # It begins where the body touches it, whichever way it leaves.
+    assert torch.equal(beside, place)
     assert turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
 
 
@@ -56,6 +58,15 @@ def test_other_balls_are_left_alone(after: list[float], ball: list[float]) -> No
     )
     assert torch.equal(place, torch.tensor([ball]))
     assert torch.equal(velocity, rolling)
+
+
+def test_a_ball_at_the_very_place_of_its_body_is_nowhere_undefined() -> None:
+    before, here, still = torch.tensor([[-0.1, 0.0]]), torch.zeros(1, 2), torch.zeros(1, 2)
+    place, velocity = knock(before, here, here, still, reach_m=0.19, speed_m_s=0.7)
+    asked = torch.ones(1, 1, dtype=torch.bool)
+    kicked = kick_away(here, here, still, asked, reach_m=0.35, speed_m_s=2.0)
+    for found in (place, velocity, kicked):
+        assert torch.equal(found, still)
 
 
 def test_a_kick_sends_balls_within_reach_straight_away() -> None:

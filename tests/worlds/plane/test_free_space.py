@@ -75,6 +75,17 @@ def test_a_start_in_a_blocked_cell_may_leave_but_not_go_deeper() -> None:
     reached, stopped = slide(ROOM, [1.95, 0.0], [1.95, 0.15])
     assert reached == pytest.approx([1.95, 0.15])
     assert not stopped
+    # Out of one wall it does not get into another, not even as deep.
+    reached, stopped = slide(ROOM, [1.95, 1.85], [1.85, 1.95])
+    assert stopped
+    assert reached == pytest.approx([1.85, 1.9], abs=2e-4)
+
+
+def test_the_edge_of_a_maze_without_outer_walls_stops_a_disc_too() -> None:
+    floor = Maze(rows=("000",) * 3, scale=1.0, start=(0, 0), goal=(2, 2))
+    reached, stopped = slide(floor, [1.35, -1.35], [1.45, -1.45])
+    assert stopped
+    assert reached == pytest.approx([1.4, -1.4], abs=2e-4)
 
 
 def test_a_wall_cannot_be_walked_through_from_inside() -> None:
@@ -105,6 +116,19 @@ def test_goal_distance_follows_the_goal() -> None:
     goal = torch.tensor([[-4.0, -4.0], [-3.6, -4.0]])
     position = torch.tensor([[0.0, -4.0], [0.0, -4.0]])
     assert distance(position, goal).tolist() == pytest.approx([4.0, 3.6], abs=0.1)
+    # As far as three standard deviations of a goal that is drawn, to either side.
+    corners = torch.tensor([[-4.6, -4.6], [-3.4, -3.4]])
+    assert distance(corners, corners).tolist() == pytest.approx([0.0, 0.0], abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("rows", "goal"), [(("11111", "10001", "11111"), (1, 1)), (("111", "101", "101", "101", "111"), (3, 1))]
+)
+def test_goal_distance_in_a_maze_that_is_not_square(rows: tuple[str, ...], goal: tuple[int, int]) -> None:
+    maze = Maze(rows=rows, scale=1.0, start=goal, goal=goal)
+    distance = GoalDistance.of_maze(maze, spacing_m=0.1)
+    here = torch.tensor([maze.cell_centre(*goal)])
+    assert distance(-here, here).tolist() == pytest.approx([2.0], abs=0.1)
 
 
 def test_points_outside_of_the_maze_have_the_values_of_its_edge() -> None:

@@ -37,6 +37,8 @@ def test_success_and_toppling_are_paid_once_each() -> None:
     assert TASK.reached(position, goal).tolist() == [True, False, False, False]
     reward = TASK.reward(position, position, goal, toppled)
     assert reward.tolist() == pytest.approx([10.0, 0.0, -10.0, 0.0], abs=1e-5)
+    rim = goal[:1] + torch.tensor([[0.0, 0.5]])
+    assert Navigation(U_MAZE, horizon=700, success_radius_m=0.5).reached(rim, goal[:1]).all()
 
 
 def test_policies_see_shares_of_the_mazes_half_extent_and_the_velocity() -> None:
@@ -62,6 +64,12 @@ def test_starts_have_as_many_places_as_there_are_offsets() -> None:
     which = np.round(2 * offsets[:, 0]).astype(int)
     assert np.bincount(which).tolist() == pytest.approx([1000] * 3, abs=100)
     np.testing.assert_allclose(offsets[which == 2], np.tile([1.0, 0.3], ((which == 2).sum(), 1)), atol=0.04)
+
+
+def test_a_single_offset_moves_all_starts() -> None:
+    plain = TASK.draw_starts(np.random.default_rng(0), 3)
+    task = Navigation(U_MAZE, horizon=9, start_offsets_m=((1.0, -0.5),))
+    np.testing.assert_allclose(task.draw_starts(np.random.default_rng(0), 3), plain + [1.0, -0.5, 0.0, 0.0])
 
 
 def test_waves_tell_the_position_finely() -> None:
@@ -110,6 +118,17 @@ def test_goals_have_to_be_within_their_cell() -> None:
     assert [divmod(int(field.argmin()), 50) for field in distance.fields] == [
         *zip(rows, columns, strict=True)
     ]
+
+
+def test_paths_to_the_goal_keep_the_clearance() -> None:
+    maze = replace(U_MAZE, scale=1.0, fine_m=0.05)
+    distance = Navigation(maze, horizon=1, spread_m=0.05, path_clearance_m=0.25).goal_distance
+    start, goal = (torch.tensor([maze.cell_centre(*cell)]) for cell in (maze.start, maze.goal))
+    # Along tangents of circles of 0.25 m around the inner wall's corners, which are 1 m apart.
+    away = np.hypot(1.5, 0.5)
+    bend = np.pi / 2 - np.arctan(0.5 / 1.5) + np.arcsin(0.25 / away)
+    expected = 2 * np.sqrt(away**2 - 0.25**2) + 2 * 0.25 * bend + 1.0
+    assert float(distance(start, goal)) == pytest.approx(expected, rel=0.04)
 
 
 def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -> None:
