@@ -30,7 +30,7 @@ class Pairing:
         abstract_state: the column of abstract states, with names, units, frames and roles.
         abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
         simulator: builds B simulators.
-        commands: the bounds of the task's commands; None for a simulator without a task.
+        commands: the bounds of the task's commands; None where they are ±1, and without a task.
         fps: the task's steps per second; None for a simulator without a task.
         columns: the states and commands of the task's robot; none for a simulator without a task.
     """

@@ -66,6 +66,7 @@ def test_a_reset_forgets_the_past() -> None:
     physics.set_state(np.array([0]), qpos[:1], qvel[:1])
     fresh = BatchedPhysics(ant_model(U_MAZE), 1, substeps=5, num_threads=1)
     fresh.set_state(np.arange(1), qpos[:1], qvel[:1])
+    np.testing.assert_array_equal(physics.state[0], fresh.state[0])
     for _ in range(5):
         physics.step(np.full((2, 8), 0.3))
         fresh.step(np.full((1, 8), 0.3))

@@ -30,6 +30,10 @@ def test_commands_of_one_are_left_to_the_bit() -> None:
     action = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (100, 2))).float()
     assert unit.are_normal and not DRIVE.are_normal
     assert torch.equal(unit.in_units(action), action) and unit.normal(action) is action
+    assert unit.in_units(torch.tensor([3.0, -3.0])).tolist() == [1.0, -1.0]
+    one_of_two = Commands({"vx": (-1.0, 1.0), "w": (-2.0, 2.0)})
+    assert not one_of_two.are_normal
+    assert one_of_two.in_units(torch.tensor([0.5, 0.5])).tolist() == [0.5, 1.0]
 
 
 def test_they_are_a_mapping_of_names_to_bounds() -> None:

@@ -66,6 +66,9 @@ def test_commands_vary_from_episode_to_episode() -> None:
     assert isinstance(simulator, VariedCommands)
     # 0.4 of ±1 becomes 0.6: 1.5 + 2.5 * 0.6 = 3 m/s for a tenth of a second.
     torch.testing.assert_close(simulator.step(torch.full((2, 1), 0.4)), torch.full((2, 1), 0.3))
+    # What is beyond ±1 is clipped before it is made shorter: 1.5 + 2.5 * 0.5 = 2.75 m/s.
+    shorter = TASK.varied_simulator(2, CommandVariation(action_scale=(-0.5, -0.5)))
+    torch.testing.assert_close(shorter.step(torch.full((2, 1), 4.0)), torch.full((2, 1), 0.275))
     torch.manual_seed(0)
     noisy = TASK.varied_simulator(500, CommandVariation(action_noise=(0.05, 0.05)))
     landed = noisy.step(torch.zeros(500, 1))

@@ -2,6 +2,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from astra_data.worlds.numpy_simulator import Floats, NumpySimulator
 
@@ -37,3 +38,17 @@ def test_the_function_may_change_its_arguments() -> None:
     before, first = simulator.state, simulator.step(command)
     second = simulator.step(command)
     assert [float(state) for state in (before, first, second, command)] == [0.0, 2.0, 4.0, 1.0]
+
+
+def test_the_function_may_return_the_same_array_again() -> None:
+    kept, given = np.zeros((1, 1), np.float32), {"timestep_s": 0.1}
+
+    def push(state: Floats, command: Floats) -> NDArray[np.float32]:
+        kept[:] = state + command
+        return kept
+
+    simulator = NumpySimulator(1, function=push, size=1, parameters=given)
+    first, second = simulator.step(torch.ones(1, 1)), simulator.step(torch.ones(1, 1))
+    given["timestep_s"] = 9.0
+    assert [float(state) for state in (first, second)] == [1.0, 2.0]
+    assert simulator.parameters == {"timestep_s": 0.1}

@@ -88,6 +88,13 @@ def test_a_speed_limit_shortens_and_does_not_turn(objective: Objective) -> None:
     expected = torch.tensor([[0.3, 0.4], [half, -half], [0.03, 0.04], [0.0, 0.0]])
     torch.testing.assert_close(limited, expected)
     assert torch.equal(objective.limit_command(action[:1], 2.0), action[:1])
+    assert not objective.limit_command(action, 0.0)[:, :2].any()
+
+
+def test_what_is_reached_or_missed_is_decided() -> None:
+    states = torch.zeros(3, 8)
+    states[:, 4:6] = torch.tensor([[1.6, 0.0], [0.0, 2.1], [0.0, 0.0]])  # in the goal, out, on the field
+    assert PLANAR["kicking"].decided(states, torch.tensor([[1.5, 0.0]] * 3)).tolist() == [True, True, False]
 
 
 def test_planar_objectives_know_their_maze_and_their_bodies() -> None:

@@ -108,7 +108,10 @@ def test_a_file_that_failed_hides_no_neighbours_of_others(
 
 def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
-    file.write_text("import sys\nfrom pathlib import Path\nTASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
+    imports = (
+        "from __future__ import annotations\nimport sys\nfrom pathlib import Path\nfrom typing import Any\n"
+    )
+    file.write_text(f"{imports}TASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
     with pytest.raises(BadInputError, match=r"mine.py has no 'TAKS'; it has TASK, reach$"):
         own_object(f"{file}:TAKS")
     with pytest.raises(BadInputError, match=r"none.py does not exist: expected a Python file"):
@@ -237,6 +240,14 @@ def test_the_digest_covers_data_that_the_files_name(tmp_path: Path) -> None:
     assert code_digest(f"{tmp_path}/cart.py:TASK") == first
     (tmp_path / "parts/cart.xml").write_text("<mujoco></mujoco>")
     assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
+
+
+def test_data_outside_of_its_folder_does_not_count(tmp_path: Path) -> None:
+    (tmp_path / "cart").mkdir()
+    (tmp_path / "cart/cart.py").write_text('XML = "../beside.xml"\n')
+    without = code_digest(f"{tmp_path}/cart/cart.py:TASK")
+    (tmp_path / "beside.xml").write_text("<mujoco/>")
+    assert code_digest(f"{tmp_path}/cart/cart.py:TASK") == without
 
 
 def test_a_file_s_neighbours_come_before_those_of_others_whatever_was_appended(

@@ -1,11 +1,14 @@
+from importlib.metadata import EntryPoint
+
 import numpy as np
 import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, STATE
+from astra_data.worlds import own_code
 from astra_data.worlds.plane.free_space import FreeSpace
-from astra_data.worlds.registry import TASKS, task_named
+from astra_data.worlds.registry import ENTRY_POINTS, TASKS, known_names, known_tasks, task_named
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import VariedSimulator
 
@@ -63,6 +66,16 @@ def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
     metres = maze.distance_field(np.array(maze.cell_centre(*maze.goal)))[start]
     # Below the largest command along one axis, 1 m/s, with time to spare.
     assert metres / (task.objective.horizon * task.timestep_s) < 0.8
+
+
+def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = ("rail-cart", "antmaze-umaze")
+    points = [EntryPoint(name, "small_cart:TASK", ENTRY_POINTS) for name in names]
+    monkeypatch.setattr(own_code, "entry_points", lambda group: points)
+    assert known_names() == (*TASKS, "rail-cart")
+    assert known_tasks()["antmaze-umaze"] is TASKS["antmaze-umaze"]
 
 
 def test_an_unknown_task_answers_with_the_known_ones() -> None:

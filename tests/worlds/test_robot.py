@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from small_cart import TASK, Cart, Reach
 
 from astra_data.core.errors import BadInputError
@@ -40,6 +41,17 @@ def test_an_episode_ends_at_its_goal() -> None:
         if step.terminated[0]:
             break
     assert step.success[0] and env.state[0, 0] >= env.goal[0, 0] > env.state[0, 0] - 0.225 - 1e-6
+
+
+def test_a_robot_that_fails_at_its_goal_does_not_succeed() -> None:
+    class Near(Reach):
+        def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+            return np.full((count, 1), 0.3)
+
+    env = replace(TASK, objective=Near(horizon=40)).target(1, seed=0)
+    env.reset()
+    step = env.step(torch.tensor([[1.0]]))  # to 0.36 m, pushed too hard
+    assert step.terminated.all() and env.failed.all() and not step.success.any()
 
 
 class Edge(Reach):
@@ -87,8 +99,11 @@ def test_the_same_seed_gives_the_same_goals_and_seeds() -> None:
         env = task.target(2, seed=seed)
         env.reset()
         goals.append(env.goal.tolist())
-    assert goals[0] == goals[1] != goals[2] and goals[0][0] != goals[0][1]
-    assert Noted.seeds[:2] == Noted.seeds[2:4] != Noted.seeds[4:]
+    env.reseed(1)
+    env.reset()
+    goals.append(env.goal.tolist())
+    assert goals[0] == goals[1] == goals[3] != goals[2] and goals[0][0] != goals[0][1]
+    assert Noted.seeds[:2] == Noted.seeds[2:4] == Noted.seeds[6:] != Noted.seeds[4:6]
     assert -1 not in Noted.seeds
 
 

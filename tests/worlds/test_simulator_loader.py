@@ -32,6 +32,9 @@ def test_a_task_brings_its_own_simulator() -> None:
     assert built(pairing, 5).state.shape == (5, 4)
     np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, [0, 1, 15, 16]])
     assert pairing_named("humanoid-kinematics").maze is None
+    # Commands of ±1 need no bounds.
+    assert pairing.commands is None
+    assert pairing_named("small_cart:TASK").commands == {"v": (-1.0, 4.0)}
 
 
 def test_a_class_of_a_file_is_known_by_its_name_and_the_files_digest() -> None:

@@ -8,9 +8,11 @@ from astra_data.methods.compass import CompassConfig
 from astra_data.worlds.variation import (
     AnyVariation,
     BallVariation,
+    CommandVariation,
     JointVariation,
     PlanarVariation,
     Variation,
+    noisy_command,
 )
 
 
@@ -32,9 +34,10 @@ def test_normal_parameters_are_between_minus_one_and_one() -> None:
     ends = variation.ranges().T
     torch.testing.assert_close(variation.normal(ends)[:, 0], torch.tensor([-1.0, 1.0]))
     assert variation.normal(ends)[:, 1:].abs().max() == 0.0
+    assert variation.normal(ends + 0.1)[:, 1:].abs().max() == 0.0  # however it was set
 
 
-KINDS = (PlanarVariation, BallVariation, JointVariation)
+KINDS = (PlanarVariation, BallVariation, JointVariation, CommandVariation)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -71,6 +74,13 @@ def test_of_any_ranges_a_simulator_takes_its_own() -> None:
         BadInputError, match=r"^expected ranges of friction, .*, got one of observation_scale$"
     ):
         ranges.of_kind(BallVariation)
+
+
+def test_noise_carries_no_command_beyond_one() -> None:
+    torch.manual_seed(0)
+    noisy = noisy_command(torch.tensor([[1.0, -1.0, 0.0]]).expand(1000, 3), torch.full((1000, 1), 0.1))
+    assert noisy.max() == 1.0 and noisy.min() == -1.0
+    assert float(noisy[:, 2].std()) == pytest.approx(0.1, rel=0.1)
 
 
 def test_an_upside_down_range_is_refused() -> None:

@@ -43,9 +43,13 @@ def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
     assert torch.equal(handed_out, HERE)
     assert torch.equal(states.state[1], HERE[0] + 1.0)
     assert states.blocked.tolist() == [True, False, True]
+    given = HERE.clone()
+    states.reset_to(given)
+    given.zero_()
+    assert torch.equal(states.state, HERE)
 
 
-@pytest.mark.parametrize(("fine_m", "radius_m"), [(0.25, 0.1), (0.1, 0.15), (0.1, 0.149)])
+@pytest.mark.parametrize(("fine_m", "radius_m"), [(0.25, 0.1), (0.1, 0.15), (0.1, 0.149), (0.1, 0.16)])
 def test_a_radius_between_the_cells_of_the_maze_is_refused(fine_m: float, radius_m: float) -> None:
     expected = f"radius_m: expected a multiple of the maze's fine_m, {fine_m} m, got {radius_m}: take another"
     with pytest.raises(BadInputError, match=expected):
@@ -118,6 +122,13 @@ def test_simulators_that_vary_keep_clear_as_well() -> None:
     inner.reset_to(start)
     settled = varied.settle(start, landed)
     torch.testing.assert_close(settled[:, 1], torch.full((3,), 5.5), atol=1e-3, rtol=0)
+
+
+def test_a_wall_that_stopped_a_step_counts_after_its_correction_too() -> None:
+    states = planar(3, 5)
+    states.blocked[2] = True
+    states.settle(HERE, HERE)
+    assert states.blocked.tolist() == [False, False, True]
 
 
 def test_corrections_slide_along_walls_and_keep_all_else() -> None:
