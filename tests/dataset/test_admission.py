@@ -124,6 +124,13 @@ def test_metadata_that_no_file_can_hold_is_refused_when_it_is_added(
     assert Dataset.open(tmp_path / "set").metadata["serial"] == [2**63 - 1]
 
 
+def test_metadata_may_be_as_long_and_as_large_as_is_said() -> None:
+    metadata = {"k" * 2**20: 1, "low": -(2**63), "high": 2**63 - 1, "text": "x" * 2**20}
+    Admission(COLUMNS).check(Episode(1, fake_columns(3, seed=1), metadata))
+    with pytest.raises(BadInputError, match="expected a text of valid characters as its name"):
+        Admission(COLUMNS).check(Episode(1, fake_columns(3, seed=1), {"k" * (2**20 + 1): 1}))
+
+
 def test_checking_an_episode_leaves_no_trace() -> None:
     admission = Admission(COLUMNS)
     episode = Episode(1, fake_columns(3, seed=1), {"success": True})

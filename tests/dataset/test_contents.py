@@ -3,6 +3,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES, alter_rows, edit, truncate
@@ -11,11 +12,17 @@ from fake_dataset import LENGTHS, fake_episodes, write_fake
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset
 from astra_data.dataset.contents import read_contents
+from astra_data.dataset.format import METADATA_PATH
 
 
 def drop_rows(root: Path) -> None:
     path = root / "data/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(path).slice(0, 50).drop_columns(["action"]), path)
+
+
+def repeat_the_last_row(root: Path) -> None:
+    table = pq.read_table(root / DATA)
+    pq.write_table(pa.concat_tables([table, table.slice(54)]), root / DATA)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +44,12 @@ def drop_rows(root: Path) -> None:
         ),
         (edit("meta/info.json", codebase_version="v2.1"), ["the format is v2.1, expected v3.0"]),
         (edit("meta/astra/subsets.json", uids=[1, 2]), ["lists other episodes"]),
+        (
+            lambda root: alter_rows(root / METADATA_PATH, "length", {1: 2}),
+            [f"{METADATA_PATH} or meta/astra/subsets.json lists other episodes"],
+        ),
         (drop_rows, ["has 50 rows, expected 55", "lacks column action"]),
+        (repeat_the_last_row, ["has 56 rows, expected 55"]),
         (
             lambda root: (root / "data/chunk-000/file-001.parquet").write_bytes(b""),
             ["file-001.parquet does not belong"],

@@ -43,7 +43,20 @@ def test_only_lists_of_numbers_are_columns() -> None:
     assert declared(**features) == [Column("count", "int64")]
 
 
-@pytest.mark.parametrize("info", [{"fps": 10, "features": {}}, {"fps": 9.5, "features": OWN}, {}])
+def test_one_frame_per_second_is_a_rate() -> None:
+    assert declared_columns(Path("set"), {"fps": 1, "features": OWN})[2] == 1
+
+
+@pytest.mark.parametrize(
+    "info",
+    [
+        {"fps": 10, "features": {}},
+        {"fps": 9.5, "features": OWN},
+        {"fps": 0.5, "features": OWN},
+        {"fps": 2**31, "features": OWN},
+        {},
+    ],
+)
 def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(info: dict[str, Any]) -> None:
     with pytest.raises(CorruptDatasetError, match="expected a whole number of frames per second"):
         declared_columns(Path("set"), info)

@@ -8,7 +8,7 @@ from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, write_fake, writer
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE, Column
-from astra_data.dataset.edit import delete, filter_episodes, merge, subset
+from astra_data.dataset.edit import delete, filter_episodes, merge, share, subset
 
 
 def write(root: Path, uids: range) -> Dataset:
@@ -78,6 +78,18 @@ def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int
         assert uids(direct) == uids(stepwise) < uids(made.root)
 
 
+def test_with_another_seed_the_shares_are_those_of_the_source(forty: Dataset, tmp_path: Path) -> None:
+    third = Dataset.open(filter_episodes(forty, max_return=6.0, out=tmp_path / "third"))  # uids 0 to 12
+    part = Dataset.open(subset(third, episodes=8, stratify="success", out=tmp_path / "part"))
+    assert part.description["config"]["strata"] == {"False": 7, "True": 6}
+    again = Dataset.open(subset(part, episodes=2, stratify="success", seed=9, out=tmp_path / "again"))
+    assert again.description["config"]["strata"] == {"False": 4, "True": 4}
+
+
+def test_shares_are_rounded_half_up() -> None:
+    assert [share(percent, 5) for percent in (9, 10, 29, 30, 150)] == [0, 1, 1, 2, 8]
+
+
 def test_every_stratified_subset_is_as_close_to_the_shares_as_it_can_be(tmp_path: Path) -> None:
     with writer(tmp_path / "set") as open_writer:
         for uid in (*range(0, 16, 2), *range(1, 7, 2)):  # 8 failures, 3 successes
@@ -103,11 +115,13 @@ def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tm
         subset(forty, episodes=3, stratify="sucess", out=tmp_path / "typo")
     with pytest.raises(BadInputError, match="either a number of episodes, or a percentage"):
         subset(forty, episodes=3, percent=3, out=tmp_path / "both")
+    with pytest.raises(BadInputError, match=r"a percentage \(and of how many\)"):
+        subset(forty, episodes=3, of=20, out=tmp_path / "of-what")
     assert [path.name for path in tmp_path.iterdir()] == ["more"]
 
 
 def test_delete_leaves_the_others(forty: Dataset, tmp_path: Path) -> None:
-    folder = delete(forty, [3, 39], out=tmp_path / "set")
+    folder = delete(forty, [39, 3, 39], out=tmp_path / "set")
     assert uids(folder) == set(range(40)) - {3, 39}
     assert_taken_over(forty, folder)
     assert Dataset.open(folder).description["config"] == {"episodes": [3, 39]}

@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,10 @@ def test_rows_locate_the_episodes_and_hold_their_statistics(
     for number, episode in enumerate(data):
         writer.append(len(episode[0]), chunk=number, file=10 + number, statistics=episode_statistics(episode))
     writer.close()
-    table = pq.read_table(tmp_path / "meta/episodes/chunk-000/file-000.parquet")
+    path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
+    # No more rows than that are held in memory.
+    assert pq.read_metadata(path).num_row_groups == math.ceil(3 / rows_at_once)
+    table = pq.read_table(path)
     assert table.column("episode_index").to_pylist() == [0, 1, 2]
     assert table.column("tasks").to_pylist() == [["walk"]] * 3
     assert table.column("length").to_pylist() == list(LENGTHS)

@@ -78,6 +78,7 @@ def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
         BadInputError, match=r"length 31, expected at most 30, the longest episode's, or padding"
     ):
         frames.windows(31)
+    assert len(frames.windows(30)) == 1
     with pytest.raises(BadInputError, match=r"past 6, expected 0 to 5"):
         frames.windows(6, past=6, padding="edge")
     with pytest.raises(BadInputError, match=r"past 1, expected 0 without padding"):

@@ -149,7 +149,13 @@ def test_without_metadata_and_column_success_is_unknown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "statistics", ["{", "{}", '{"observation.state": {"min": [0], "max": 1, "mean": {}}}']
+    "statistics",
+    [
+        "{",
+        "{}",
+        '{"observation.state": {"min": [0], "max": 1, "mean": {}}}',
+        '{"observation.state": {"min": [0, 2, 0], "max": [1, 1, 1], "mean": [0, 1, 0]}}',
+    ],
 )
 def test_malformed_statistics_are_told(tmp_path: Path, statistics: str) -> None:
     dataset = write_fake(tmp_path / "set")

@@ -2,13 +2,14 @@ import json
 from pathlib import Path
 
 import pytest
-from fake_dataset import write_fake
+from fake_dataset import fake_episode, write_fake, writer
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset
+from astra_data.dataset.columns import Episode
 from astra_data.dataset.edit import delete, merge, subset
 from astra_data.dataset.format import DATASET_PATH
-from astra_data.dataset.lineage import lineage, tree_lines
+from astra_data.dataset.lineage import lineage, recordings_of, tree_lines
 from astra_data.dataset.seal import sealed
 
 pytestmark = pytest.mark.usefixtures("home")
@@ -48,6 +49,25 @@ def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
     delete(made, [0], out=tmp_path / "home/fake/data-1.0.0")
     [line] = list(tree_lines(lineage(made)))[1:]
     assert line == f"└── fake@data-1.0.0  {first.content_hash[:8]}  (not found here)"
+
+
+def test_the_same_values_under_another_version_are_no_ancestor(tmp_path: Path) -> None:
+    first = write_fake(tmp_path / "elsewhere/first")
+    made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
+    same = Dataset.open(subset(first, episodes=5, out=tmp_path / "same"))
+    assert same.content_hash == first.content_hash
+    [line] = list(tree_lines(lineage(made)))[1:]
+    assert line.endswith("(not found here)")
+
+
+def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) -> None:
+    sources = {3: None, 8: 3, 5: 3, 9: 7, 7: None}
+    columns = fake_episode(0, 3).columns
+    with writer(tmp_path / "set") as open_writer:
+        for uid, source in sources.items():
+            open_writer.add(Episode(uid, columns, {} if source is None else {"source_episode": source}))
+    assert recordings_of(Dataset.open(tmp_path / "set")).tolist() == [0, 0, 0, 1, 1]
+    assert recordings_of(write_fake(tmp_path / "plain")).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path) -> None:

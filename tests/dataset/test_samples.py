@@ -14,8 +14,10 @@ def test_samples_come_one_by_one_too(frames: Frames) -> None:
     batch = everything(windows)
     assert_equal(windows[8], {name: values[8] for name, values in batch.items()})
     assert_equal(windows[-1], {name: values[-1] for name, values in batch.items()})
-    with pytest.raises(IndexError, match="sample 55 of 55"):
-        windows[55]
+    assert_equal(windows[-55], windows[0])
+    for beyond in (55, -56):
+        with pytest.raises(IndexError, match=f"sample {beyond} of 55"):
+            windows[beyond]
 
 
 @pytest.mark.parametrize(("workers", "padding"), [(0, "valid"), (0, "edge"), (2, "edge")])

@@ -50,3 +50,13 @@ def test_a_sentence_says_file_rows_and_episode(fake: Dataset) -> None:
     assert one == f"action: other values than were written in {name} rows 8 to 19 (episode 2)"
     sentence = f"other values than were written in {name} rows 50 to 54 (episode 4)"
     assert two == f"observation.state, action: {sentence}"
+
+
+def test_rows_are_counted_from_the_file_of_the_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)
+    dataset = write_fake(tmp_path / "set")
+    assert dataset.file_starts.tolist() == dataset.starts.tolist()  # a file for each episode
+    [sentence] = alterations(dataset, {0: [ACTION]}, np.array([2]))
+    assert sentence.endswith(f"file-002.parquet rows 0 to {LENGTHS[2] - 1} (episode 2)")
