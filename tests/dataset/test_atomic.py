@@ -57,6 +57,19 @@ def test_nothing_is_overwritten(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "set"]
 
 
+def test_a_folder_that_another_process_made_meanwhile_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(_folder: Path, target: Path) -> None:
+        (target / "theirs").mkdir(parents=True)
+        raise OSError(errno.ENOTEMPTY, "Directory not empty")
+
+    monkeypatch.setattr(os, "replace", late)
+    with pytest.raises(BadInputError, match="set exists already"), atomic_folder(tmp_path / "set"):
+        pass
+    assert [path.name for path in tmp_path.rglob("*")] == ["set", "theirs"]
+
+
 def test_only_the_folders_of_dead_processes_are_removed(tmp_path: Path) -> None:
     for name in (".set.tmp-1", ".set.tmp-2-1", ".sets.tmp-1"):
         (tmp_path / name).mkdir()

@@ -129,7 +129,8 @@ def split(episodes: list[int], frames: list[int], block: int) -> list[tuple[list
         for first in range(0, len(table), block):
             yield table.slice(first, block)
 
-    found = runs(Path("data/file.parquet"), blocks(), COLUMNS)
+    found = list(runs(Path("data/file.parquet"), blocks(), COLUMNS))
+    assert [run.row + len(run) for run in found] == np.cumsum([len(run) for run in found]).tolist()
     return [(run.columns[EPISODE_INDEX].tolist(), run.columns[FRAME_INDEX].tolist()) for run in found]
 
 
@@ -140,6 +141,8 @@ def test_rows_are_split_where_episodes_begin(block: int) -> None:
         ([1], [0]),
         ([2, 2], [0, 1]),
     ]
+    # Episodes may come in any order.
+    assert split([2, 2, 1], [0, 1, 0], block) == [([2, 2], [0, 1]), ([1], [0])]
     # One wrong value of either stays inside of its episode.
     assert split([0, 9, 0, 1], [0, 1, 2, 0], block) == [([0, 9, 0], [0, 1, 2]), ([1], [0])]
     assert split([0, 0, 0, 1], [0, 0, 2, 0], block) == [([0, 0, 0], [0, 0, 2]), ([1], [0])]
@@ -217,6 +220,8 @@ def test_long_episodes_are_as_exact_as_float32() -> None:
 def test_further_wrong_values_are_counted() -> None:
     [(_, fault)] = run_faults(a_run(**{INDEX: np.array([20, 9, 9, 9])}), number=3, row=20, fps=10)
     assert fault.endswith("expected 21 (3 values are wrong)")
+    [(_, fault)] = run_faults(a_run(**{INDEX: np.array([20, 9, 9, 23])}), number=3, row=20, fps=10)
+    assert fault.endswith("expected 21 (2 values are wrong)")
 
 
 @pytest.mark.parametrize(
