@@ -54,3 +54,15 @@ def test_episode_statistics_are_exact(tmp_path: Path) -> None:
             assert row[f"stats/{name}/count"] == [len(episode)]
             for key, values in independent(episode.columns[name]).items():
                 np.testing.assert_allclose(row[f"stats/{name}/{key}"], values, rtol=1e-12)
+
+
+def test_ranges_of_blocks_are_those_of_the_whole() -> None:
+    whole = {name: concatenated(name) for name in NAMES}
+    cuts = ((0, 3), (3, 40), (40, 55))
+    found = statistics.ranges({name: v[first:end] for name, v in whole.items()} for first, end in cuts)
+    for name, values in whole.items():
+        expected = independent(values)
+        assert set(found[name]) == {"min", "max", "mean"}
+        for key, value in found[name].items():
+            np.testing.assert_allclose(value, expected[key], rtol=1e-12)
+    assert statistics.ranges([]) == {}

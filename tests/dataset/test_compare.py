@@ -47,6 +47,8 @@ def test_long_lists_of_the_provenance_are_counted(tmp_path: Path) -> None:
     for recordings, told in (
         (["other.csv", *logs[1:]], "60 entries, then 60 entries, 1 of them new"),
         (logs[:2], "60 entries, then ['0.csv', '1.csv']"),
+        (logs[:5], "60 entries, then ['0.csv', '1.csv', '2.csv', '3.csv', '4.csv']"),
+        (logs[:6], "60 entries, then 6 entries, 0 of them new"),
     ):
         other = made(str(len(recordings)), recordings)
         assert differences(long, other).description == [f"config.recordings: {told}"]
