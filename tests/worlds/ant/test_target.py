@@ -78,6 +78,21 @@ def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> N
     assert env.failed.tolist() == [toppled, False]
     assert step.terminated.tolist() == [toppled, False]
     assert float(step.reward[0]) == pytest.approx(-10.0 * toppled, abs=0.1)
+    env.reset(step.terminated)
+    assert not env.failed.any()
+
+
+def test_a_saved_state_goes_on_alike() -> None:
+    env = AntMazeEnv(TASK, 2, seed=0, num_threads=1)
+    env.reset()
+    saved = env.state_dict()
+    observations = [env.step(torch.full((2, 2), 0.5)).observation]
+    for _ in range(2):
+        env.reset()  # with another goal, too
+        env.load_state_dict(saved)
+        observations.append(env.step(torch.full((2, 2), 0.5)).observation)
+    assert torch.equal(observations[0], observations[1])
+    assert torch.equal(observations[0], observations[2])
 
 
 def test_walls_are_felt_and_the_floor_is_not() -> None:

@@ -128,6 +128,7 @@ def test_heights_outside_of_the_range_end_an_episode(height: float, failed: bool
     assert (float(step.reward[0]) < 3.0) == failed  # without the bonus for health
     env.reset(step.terminated)
     assert not env.failed.any()
+    assert step.terminated.tolist() == [failed, False]  # what was handed out stays
 
 
 def test_a_saved_state_goes_on_alike() -> None:
