@@ -8,7 +8,7 @@ from fake_dataset import COLUMNS, fake_columns, fake_episode, writer
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.admission import Admission
-from astra_data.dataset.columns import ACTION, DONE, REWARD, TERMINATED, TRUNCATED, Episode
+from astra_data.dataset.columns import ACTION, DONE, REWARD, TERMINATED, TRUNCATED, Episode, Scalar
 
 
 def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_metadata_that_no_file_can_hold_is_refused_when_it_is_added(
 
 
 def test_metadata_may_be_as_long_and_as_large_as_is_said() -> None:
-    metadata = {"k" * 2**20: 1, "low": -(2**63), "high": 2**63 - 1, "text": "x" * 2**20}
+    metadata: dict[str, Scalar] = {"k" * 2**20: 1, "low": -(2**63), "high": 2**63 - 1, "text": "x" * 2**20}
     Admission(COLUMNS).check(Episode(1, fake_columns(3, seed=1), metadata))
     with pytest.raises(BadInputError, match="expected a text of valid characters as its name"):
         Admission(COLUMNS).check(Episode(1, fake_columns(3, seed=1), {"k" * (2**20 + 1): 1}))
