@@ -272,18 +272,6 @@ class Task:
         return self.varied.kind(self.simulator(num_envs, device), ranges)
 
 
-def roles(
-    names: tuple[str, ...],
-    units: list[str],
-    frames: list[str],
-    entries: list[str],
-    mirror: list[str] | None = None,
-) -> dict[str, Any]:
-    """Return a `Column`'s arguments on its entries: names, units, frames, roles and mirror images."""
-    astra = {"unit": units, "frame": frames, "role": entries}
-    return {"names": names, "astra": astra if mirror is None else {**astra, "mirror": mirror}}
-
-
 def _with_units(column: Column) -> list[str]:
     """Return the names of a column's values, with units where these are known: "speed_m_s"."""
     words = [

@@ -16,7 +16,7 @@ from astra_data.worlds.driven import DrivenSimulator
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.states import VariedPlanar
 from astra_data.worlds.registry import TASKS
-from astra_data.worlds.task import Task, roles
+from astra_data.worlds.task import Task
 from astra_data.worlds.variation import BallVariation, PlanarVariation
 
 ANT, WALKER, KICK = (TASKS[name] for name in ("antmaze-umaze", "humanoid-walker2d", "nao-kick"))
@@ -73,15 +73,6 @@ def test_ranges_are_completed_to_those_that_the_simulator_has() -> None:
     varied.reset_to(start)
     # 0.25 m/s at half the friction's factor.
     assert varied.step(torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3))[0, 2].item() == pytest.approx(0.125)
-
-
-def test_roles_become_what_a_column_takes() -> None:
-    words = roles(("a", "b"), ["m", "m"], ["world", "world"], ["position", "position"])
-    column = Column("place", size=2, **words)
-    assert column.names == ("a", "b")
-    assert column.astra == {"unit": ["m", "m"], "frame": ["world"] * 2, "role": ["position"] * 2}
-    mirrored = roles(("a",), ["rad"], ["joint"], ["invariant"], ["-a"])
-    assert mirrored["astra"]["mirror"] == ["-a"]
 
 
 def test_six_fields_make_a_task() -> None:

@@ -5,7 +5,8 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.dataset.columns import ACTION, STATE, Column
+from astra_data.dataset.columns import ACTION, STATE
+from astra_data.worlds.column_entries import ColumnEntry, column, free_body
 from astra_data.worlds.humanoid.abstraction import (
     beyond_extended_kinematics,
     beyond_kinematics,
@@ -13,34 +14,20 @@ from astra_data.worlds.humanoid.abstraction import (
 )
 from astra_data.worlds.humanoid.camera import photograph
 from astra_data.worlds.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
-from astra_data.worlds.humanoid.model import DAMPING, JOINTS, STATE_SIZE, STIFFNESS, TIMESTEP_S, CommandRanges
+from astra_data.worlds.humanoid.model import DAMPING, JOINTS, STIFFNESS, TIMESTEP_S, CommandRanges
 from astra_data.worlds.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
 from astra_data.worlds.humanoid.target import HumanoidEnv
 from astra_data.worlds.humanoid.varied import VariedHumanoid
 from astra_data.worlds.humanoid.walker2d import HumanoidWalker2d
-from astra_data.worlds.task import Task, Varied, roles
+from astra_data.worlds.task import Task, Varied
 from astra_data.worlds.variation import JointVariation
 
 _COUNT = len(JOINTS)
 _HORIZON = 1000
 """Of Gymnasium's Humanoid-v5: 15 s."""
 
-_STATE = roles(
-    (
-        *("x", "y", "z", "qw", "qx", "qy", "qz", *JOINTS),
-        *("vx", "vy", "vz", "wx", "wy", "wz", *(f"{joint}_rate" for joint in JOINTS)),
-    ),
-    ["m"] * 3 + ["1"] * 4 + ["rad"] * _COUNT + ["m/s"] * 3 + ["rad/s"] * (3 + _COUNT),
-    ["world"] * 7 + ["joint"] * _COUNT + ["world"] * 3 + ["body"] * 3 + ["joint"] * _COUNT,
-    ["position"] * 2
-    + ["invariant"]
-    + ["quaternion"] * 4
-    + ["invariant"] * _COUNT
-    + ["vector"] * 2
-    + ["invariant"] * (4 + _COUNT),
-)
 _COMMANDS = ("left_hip", "left_knee", "right_hip", "right_knee")
-_COMMAND = roles(_COMMANDS, ["1"] * 4, ["joint"] * 4, ["invariant"] * 4)
+_COMMAND = [ColumnEntry(name, "1", "joint", "invariant") for name in _COMMANDS]
 
 RANDOMIZED_ACTIONS = JointVariation(action_noise=(0.05, 0.05), action_scale=(-0.05, 0.05))
 """Of domain randomization, as printed in the paper (Section V-B)."""
@@ -95,8 +82,8 @@ def _task(
         make_simulator=kind,
         abstraction=kind.abstraction,
         beyond=beyond,
-        state=Column(STATE, size=STATE_SIZE, meaning="qpos (24) and qvel (23) of the humanoid", **_STATE),
-        action=Column(ACTION, size=4, meaning="commanded joint angles, ±1 over their ranges", **_COMMAND),
+        state=column(STATE, free_body(JOINTS), "qpos (24) and qvel (23) of the humanoid"),
+        action=column(ACTION, _COMMAND, "commanded joint angles, ±1 over their ranges"),
         commands=dict.fromkeys(_COMMANDS, (-1.0, 1.0)),
         abstract_state=kind.abstract_state,
         quantities=quantities,

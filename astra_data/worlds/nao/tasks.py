@@ -8,19 +8,20 @@ and the rewards are ours.
 from functools import partial
 from typing import Any
 
-from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE, Column
-from astra_data.worlds.nao.abstraction import STATE_SIZE, nao_beyond, nao_to_ball_agent, nao_to_point_mass
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
+from astra_data.worlds.column_entries import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, column
+from astra_data.worlds.nao.abstraction import nao_beyond, nao_to_ball_agent, nao_to_point_mass
 from astra_data.worlds.nao.body import TICK_S
 from astra_data.worlds.nao.kinematics import JOINTS
 from astra_data.worlds.nao.robot import CONTROL_STEP_S
-from astra_data.worlds.nao.target import BALL_SIZE, SPEED_M_S, NaoEnv
+from astra_data.worlds.nao.target import SPEED_M_S, NaoEnv
 from astra_data.worlds.plane.ball_agent import BallAgent
 from astra_data.worlds.plane.kicking import Kicking
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.plane.states import VariedPlanar
-from astra_data.worlds.task import Plane, Task, Varied, roles
+from astra_data.worlds.task import Plane, Task, Varied
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
 _RADIUS_M = 0.1
@@ -45,8 +46,6 @@ without printing ranges for them; these are the robot's."""
 _QUANTITIES = {"position_m": (0, 1), "velocity_m_s": (2, 3)}
 _BALL_QUANTITIES = {"ball_position_m": (4, 5), "ball_velocity_m_s": (6, 7)}
 
-Roles = tuple[tuple[str, ...], list[str], list[str], list[str], list[str]]
-
 
 def _mirrored(joint: str) -> str:
     """Return the joint of a joint's mirror image: sides swap, and roll angles change sign."""
@@ -54,78 +53,53 @@ def _mirrored(joint: str) -> str:
     return f"-{other}" if joint.endswith("Roll") else other
 
 
-_STATE_ROLES: Roles = (
-    (
-        *("x", "y", "cos_heading", "sin_heading", "vx", "vy", *JOINTS),
-        *("gyro_x", "gyro_y", "gyro_z", "roll", "pitch", "load_left", "load_right"),
-        *("step_sine", "step_cosine", "planned_forward", "planned_left", "planned_turn"),
-    ),
-    [
-        *(["m"] * 2 + ["1"] * 2 + ["m/s"] * 2 + ["rad"] * len(JOINTS)),
-        *(["rad/s"] * 3 + ["rad"] * 2 + ["50 N"] * 2 + ["1"] * 2 + ["m/s"] * 2 + ["rad/s"]),
-    ],
-    ["world"] * 6 + ["joint"] * len(JOINTS) + ["body"] * 12,
-    ["position"] * 2 + ["vector"] * 4 + ["invariant"] * (len(JOINTS) + 12),
-    [
-        *([""] * 6 + [_mirrored(joint) for joint in JOINTS]),
-        *("-gyro_x", "gyro_y", "-gyro_z", "-roll", "pitch", "load_right", "load_left"),
-        *("-step_sine", "-step_cosine", "planned_forward", "-planned_left", "-planned_turn"),
-    ],
-)
-_BALL_ROLES: Roles = (
-    ("ball_x", "ball_y", "ball_vx", "ball_vy", "ball_unseen"),
-    ["m"] * 2 + ["m/s"] * 2 + ["s"],
-    ["world"] * 4 + ["body"],
-    ["position"] * 2 + ["vector"] * 2 + ["invariant"],
-    [""] * 4 + ["ball_unseen"],
-)
-_COMMAND_ROLES: Roles = (
-    ("command_vx", "command_vy"),
-    ["0.25 m/s"] * 2,
-    ["world"] * 2,
-    ["vector"] * 2,
-    [""] * 2,
-)
-_KICK_ROLES: Roles = (("kick",), ["1"], ["body"], ["invariant"], ["kick"])
-_PLANAR_ROLES: Roles = (
-    ("x", "y", "vx", "vy"),
-    ["m"] * 2 + ["m/s"] * 2,
-    ["world"] * 4,
-    ["position"] * 2 + ["vector"] * 2,
-    [""] * 4,
-)
+_STATE = [
+    ColumnEntry("x", "m", "world", "position"),
+    ColumnEntry("y", "m", "world", "position"),
+    ColumnEntry("cos_heading", "1", "world", "vector"),
+    ColumnEntry("sin_heading", "1", "world", "vector"),
+    ColumnEntry("vx", "m/s", "world", "vector"),
+    ColumnEntry("vy", "m/s", "world", "vector"),
+    *(ColumnEntry(joint, "rad", "joint", "invariant", _mirrored(joint)) for joint in JOINTS),
+    ColumnEntry("gyro_x", "rad/s", "body", "invariant", "-gyro_x"),
+    ColumnEntry("gyro_y", "rad/s", "body", "invariant", "gyro_y"),
+    ColumnEntry("gyro_z", "rad/s", "body", "invariant", "-gyro_z"),
+    ColumnEntry("roll", "rad", "body", "invariant", "-roll"),
+    ColumnEntry("pitch", "rad", "body", "invariant", "pitch"),
+    ColumnEntry("load_left", "50 N", "body", "invariant", "load_right"),
+    ColumnEntry("load_right", "50 N", "body", "invariant", "load_left"),
+    ColumnEntry("step_sine", "1", "body", "invariant", "-step_sine"),
+    ColumnEntry("step_cosine", "1", "body", "invariant", "-step_cosine"),
+    ColumnEntry("planned_forward", "m/s", "body", "invariant", "planned_forward"),
+    ColumnEntry("planned_left", "m/s", "body", "invariant", "-planned_left"),
+    ColumnEntry("planned_turn", "rad/s", "body", "invariant", "-planned_turn"),
+]
+_BALL = [
+    ColumnEntry("ball_x", "m", "world", "position"),
+    ColumnEntry("ball_y", "m", "world", "position"),
+    ColumnEntry("ball_vx", "m/s", "world", "vector"),
+    ColumnEntry("ball_vy", "m/s", "world", "vector"),
+]
+_UNSEEN = ColumnEntry("ball_unseen", "s", "body", "invariant", "ball_unseen")
+_COMMAND = [
+    ColumnEntry("command_vx", "0.25 m/s", "world", "vector"),
+    ColumnEntry("command_vy", "0.25 m/s", "world", "vector"),
+]
+_KICK = ColumnEntry("kick", "1", "body", "invariant", "kick")
 
 
 def _columns(*, ball: bool) -> dict[str, Any]:
-    size = STATE_SIZE + BALL_SIZE * ball
-    state = roles(*(_with(_STATE_ROLES, _BALL_ROLES) if ball else _STATE_ROLES))
-    goal = roles(("goal_x", "goal_y"), ["m"] * 2, ["world"] * 2, ["position"] * 2)
-    command = roles(*(_with(_COMMAND_ROLES, _KICK_ROLES) if ball else _COMMAND_ROLES[:4]))
+    state, command, abstract = _STATE, _COMMAND, [*PLANAR_STATE]
+    if ball:
+        state, command, abstract = [*state, *_BALL, _UNSEEN], [*command, _KICK], [*abstract, *_BALL]
     meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
     wish = ", and above 0.5 to stand and kick" if ball else ""
-    aim = "the middle of the goal line" if ball else "where to go"
     return {
-        "state": Column(STATE, size=size, meaning=meaning, **state),
-        "goal": Column(GOAL, size=2, meaning=aim, **goal),
-        "action": Column(
-            ACTION, size=2 + ball, meaning=f"commanded planar velocity, ±1 per axis{wish}", **command
-        ),
+        "state": column(STATE, state, meaning),
+        "goal": column(GOAL, PLANAR_GOAL, "the middle of the goal line" if ball else "where to go"),
+        "action": column(ACTION, command, f"commanded planar velocity, ±1 per axis{wish}"),
+        "abstract_state": column(ABSTRACT_STATE, abstract, "abstract state of the target before the action"),
     }
-
-
-def _with(known: Roles, more: Roles, count: int | None = None) -> Roles:
-    (names, *words), (further, *further_words) = known, more
-    units, frames, entries, mirror = (
-        mine + its[:count] for mine, its in zip(words, further_words, strict=True)
-    )
-    return (*names, *further[:count]), units, frames, entries, mirror
-
-
-def _abstract(*, ball: bool) -> Column:
-    names, units, frames, entries, _ = _with(_PLANAR_ROLES, _BALL_ROLES, 4) if ball else _PLANAR_ROLES
-    entries_of = roles(names, units, frames, entries)
-    meaning = "abstract state of the target before the action"
-    return Column(ABSTRACT_STATE, size=8 if ball else 4, meaning=meaning, **entries_of)
 
 
 def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
@@ -135,7 +109,6 @@ def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
         beyond=nao_beyond,
         **_columns(ball=ball),
         commands=dict.fromkeys(("vx", "vy", *(["kick"] if ball else [])), (-1.0, 1.0)),
-        abstract_state=_abstract(ball=ball),
         quantities=_QUANTITIES | (_BALL_QUANTITIES if ball else {}),
         timestep_s=CONTROL_STEP_S,
         facts={"stand_in": "mujoco", "tick_s": TICK_S},

@@ -1,0 +1,68 @@
+"""The entries of a task's columns, one row each."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from astra_data.dataset.columns import Column
+
+
+class ColumnEntry(NamedTuple):
+    """One value of a column, in the words of `Column.astra`."""
+
+    name: str
+    unit: str
+    frame: str
+    role: str
+    mirror: str = ""
+
+
+PLANAR_STATE = (
+    ColumnEntry("x", "m", "world", "position"),
+    ColumnEntry("y", "m", "world", "position"),
+    ColumnEntry("vx", "m/s", "world", "vector"),
+    ColumnEntry("vy", "m/s", "world", "vector"),
+)
+"""Abstract states of a robot in the plane."""
+
+PLANAR_GOAL = (
+    ColumnEntry("goal_x", "m", "world", "position"),
+    ColumnEntry("goal_y", "m", "world", "position"),
+)
+
+
+def column(name: str, entries: Sequence[ColumnEntry], meaning: str) -> Column:
+    """Return the column `name` with `entries`; it has mirror images only if one of them has."""
+    names, units, frames, roles, mirror = zip(*entries, strict=True)
+    astra = {"unit": [*units], "frame": [*frames], "role": [*roles]}
+    if any(mirror):
+        astra["mirror"] = [*mirror]
+    return Column(name, size=len(entries), names=names, meaning=meaning, astra=astra)
+
+
+def free_body(joints: Sequence[str], mirrored: Sequence[str] = ()) -> list[ColumnEntry]:
+    """Return the entries of MuJoCo's qpos, then qvel, of a free body with hinge joints.
+
+    Args:
+        joints: their names, in the model's order.
+        mirrored: the joint that each becomes in the mirror image, "-hip_2" with its sign changed; by default
+            there are no mirror images.
+    """
+    paired = [*zip(joints, mirrored or joints, strict=True)]
+    entries = [
+        ColumnEntry("x", "m", "world", "position"),
+        ColumnEntry("y", "m", "world", "position"),
+        ColumnEntry("z", "m", "world", "invariant", "z"),
+        *(ColumnEntry(name, "1", "world", "quaternion") for name in ("qw", "qx", "qy", "qz")),
+        *(ColumnEntry(joint, "rad", "joint", "invariant", mirror) for joint, mirror in paired),
+        ColumnEntry("vx", "m/s", "world", "vector"),
+        ColumnEntry("vy", "m/s", "world", "vector"),
+        ColumnEntry("vz", "m/s", "world", "invariant", "vz"),
+        ColumnEntry("wx", "rad/s", "body", "invariant", "-wx"),
+        ColumnEntry("wy", "rad/s", "body", "invariant", "wy"),
+        ColumnEntry("wz", "rad/s", "body", "invariant", "-wz"),
+        *(
+            ColumnEntry(f"{joint}_rate", "rad/s", "joint", "invariant", f"{mirror}_rate")
+            for joint, mirror in paired
+        ),
+    ]
+    return entries if mirrored else [entry._replace(mirror="") for entry in entries]
