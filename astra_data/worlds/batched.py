@@ -97,3 +97,8 @@ class TargetEnv(BatchedEnv, Protocol):
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
         ...
+
+
+def rows_in(mask: Tensor | None, num_envs: int) -> NDArray[np.intp]:
+    """Return the rows (n,) in `mask` (B,), or all B of `num_envs` without one."""
+    return np.arange(num_envs) if mask is None else np.flatnonzero(mask.numpy())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.batched import BatchedEnv, TargetEnv
+from astra_data.worlds.batched import BatchedEnv, TargetEnv, rows_in
 from astra_data.worlds.registry import TASKS
 
 TARGETS = {name: TASKS[name] for name in ("antmaze-umaze", "nao-navigation", "nao-kick", "humanoid-extended")}
@@ -104,3 +104,8 @@ def test_a_target_set_to_a_recorded_state_shows_it(name: str) -> None:
     env.reset_to(np.array([2, 0]), recorded[[2, 0]].double().numpy())
     assert torch.equal(env.state[[2, 0]], recorded[[2, 0]])
     assert not torch.equal(env.state[1], recorded[1])
+
+
+def test_rows_of_a_mask_are_those_that_are_true() -> None:
+    assert rows_in(None, 3).tolist() == [0, 1, 2]
+    assert rows_in(torch.tensor([False, True, True]), 3).tolist() == [1, 2]

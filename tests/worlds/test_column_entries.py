@@ -30,5 +30,5 @@ def test_a_free_body_is_mirrored_by_its_joints() -> None:
 
 
 def test_a_mirror_image_that_no_entry_has_is_refused() -> None:
-    with pytest.raises(BadInputError, match="mirror -right of left"):
+    with pytest.raises(BadInputError, match="mirror '-right' of left"):
         column("state", free_body(("left",), ("-right",)), "qpos and qvel")

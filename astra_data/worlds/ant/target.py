@@ -15,12 +15,13 @@ from astra_data.worlds.ant.body import (
     standing_pose,
     up_cosine,
 )
-from astra_data.worlds.batched import Step
+from astra_data.worlds.batched import Step, rows_in
 from astra_data.worlds.batched_mujoco import BatchedPhysics, Floats, wall_geoms
 from astra_data.worlds.objective import PlanarObjective
+from astra_data.worlds.planar_target import PlanarTarget
 
 
-class AntMazeEnv:
+class AntMazeEnv(PlanarTarget):
     """B ants in a maze; action: world-frame velocity command in m/s, (B, 2), clipped to ±1 per axis.
 
     State (B, 29): qpos (15) then qvel (14), as in Gymnasium. Observation (B, 31): state, then goal (2).
@@ -57,10 +58,8 @@ class AntMazeEnv:
             controller: the low-level controller, by default the one shipped.
             num_threads: physics threads, by default one per core.
         """
-        self.objective = objective
-        self.num_envs = num_envs
+        super().__init__(objective, num_envs, start_anywhere=start_anywhere, starts=starts)
         self.leg_scale = leg_scale
-        self.start_anywhere, self.starts = start_anywhere, starts
         self.controller = controller or VelocityController.load()
         model = ant_model(objective.maze, leg_scale=leg_scale)
         self.physics = BatchedPhysics(
@@ -70,8 +69,6 @@ class AntMazeEnv:
             watched_geoms=wall_geoms(model),
             num_threads=num_threads,
         )
-        self.goal = torch.zeros(num_envs, 2)
-        self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self.reseed(seed)
 
     @property
@@ -89,21 +86,15 @@ class AntMazeEnv:
         """Which ants touched a wall in their last step, (B,) bool."""
         return torch.from_numpy(self.physics.touching.copy())
 
-    def reseed(self, seed: int) -> None:
-        """Restart the random numbers of starts, goals and headings at `seed`."""
-        self._rng = np.random.default_rng(seed)
-
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Set the ants in `mask` (B,), by default all, upright at new starts with random headings."""
-        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
+        rows = rows_in(mask, self.num_envs)
         count = len(rows)
-        objective = self.objective
-        draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
         qpos = standing_pose(count)
-        qpos[:, :2] = (draw(self._rng, count) if self.starts is None else self.starts[rows])[:, :2]
+        qpos[:, :2] = self._start(rows)[:, :2]
         yaw = self._rng.uniform(-np.pi, np.pi, count)
         qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
-        self.goal[rows] = torch.from_numpy(objective.draw_goals(self._rng, count)).float()
+        self._aim(rows)
         self.reset_to(rows, np.concatenate([qpos, np.zeros((count, STATE_SIZE - POSITIONS))], axis=1))
         return self._observe()
 
@@ -127,18 +118,5 @@ class AntMazeEnv:
         before = self.position
         torques = self.controller(self.physics.qpos, self.physics.qvel, command)
         self.physics.step(torques, None if active is None else active.numpy())
-        after = self.position
-        success = self.objective.reached(after, self.goal)
-        self.failed = torch.from_numpy(up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE)
-        if self.objective.ends_at_walls:
-            self.failed |= self.wall_contact
-        self.failed &= ~success
-        return Step(
-            observation=self._observe(),
-            reward=self.objective.reward(before, after, self.goal, self.failed),
-            terminated=success | self.failed,
-            success=success,
-        )
-
-    def _observe(self) -> Tensor:
-        return torch.cat([self.state, self.goal], dim=-1)
+        toppled = up_cosine(self.physics.qpos[:, 3:7]) < TOPPLE_COSINE
+        return self._judged(before, self.position, toppled)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.batched import Step
+from astra_data.worlds.batched import Step, rows_in
 from astra_data.worlds.batched_mujoco import Floats
 from astra_data.worlds.humanoid import CommandRanges, Humanoids, Locomotion
 from astra_data.worlds.humanoid.model import COMMANDED, JOINTS, STATE_SIZE
@@ -86,7 +86,7 @@ class HumanoidEnv:
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Set the humanoids in `mask` (B,), by default all, almost upright and at rest."""
-        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
+        rows = rows_in(mask, self.num_envs)
         self.reset_to(rows, self.locomotion.draw_starts(self._rng, len(rows)))
         return self._observe()
 

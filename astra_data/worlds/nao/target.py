@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.batched import Step
+from astra_data.worlds.batched import Step, rows_in
 from astra_data.worlds.nao.abstraction import STATE_SIZE
 from astra_data.worlds.nao.perception import BallSight, Localisation, PerceptionErrors
 from astra_data.worlds.nao.robot import CONTROL_STEP_S, BatchedNao
 from astra_data.worlds.objective import PlanarObjective
+from astra_data.worlds.planar_target import PlanarTarget
 from astra_data.worlds.plane.ball import asks_to_kick
 from astra_data.worlds.plane.geometry import wrapped
 
@@ -33,7 +34,7 @@ BALL_SIZE = 5
 """With a ball there follow its estimated position (2) and velocity (2), and the time since it was seen."""
 
 
-class NaoEnv:
+class NaoEnv(PlanarTarget):
     """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
 
     With a ball, actions are (B, 3), and a third entry above 0.5 asks for a kick, however far the ball is: the
@@ -78,16 +79,13 @@ class NaoEnv:
         """
         if leg_scale != 1.0:
             raise BadInputError(f"evaluate.leg_scale: expected 1 for a NAO, got {leg_scale}")
-        self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
-        self.starts = starts
+        super().__init__(objective, num_envs, start_anywhere=start_anywhere, starts=starts)
         self.has_ball, self.action_size = ball, objective.action_size
         self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
         errors = errors or PerceptionErrors()
         self.localisation = Localisation(num_envs, errors, CONTROL_STEP_S)
         self.sight = BallSight(num_envs, errors, CONTROL_STEP_S)
         self.observation_size = STATE_SIZE + BALL_SIZE * ball + 2
-        self.goal = torch.zeros(num_envs, 2)
-        self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self.reseed(seed)
 
     @property
@@ -129,17 +127,15 @@ class NaoEnv:
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of starts, goals, headings, traits, errors and sensors at `seed`."""
-        self._rng = np.random.default_rng(seed)
+        super().reseed(seed)
         self.robots.reseed(seed)
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Set the robots in `mask` (B,), by default all, to new starts with random headings."""
-        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask.numpy())
-        objective, rng = self.objective, self._rng
-        draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
-        start = draw(rng, len(rows)) if self.starts is None else self.starts[rows]
-        self.goal[rows] = torch.from_numpy(objective.draw_goals(rng, len(rows))).float()
-        yaw = rng.uniform(-np.pi, np.pi, len(rows))
+        rows = rows_in(mask, self.num_envs)
+        start = self._start(rows)
+        self._aim(rows)
+        yaw = self._rng.uniform(-np.pi, np.pi, len(rows))
         self._stand(rows, np.column_stack([start[:, :2], yaw]), start[:, 4:6] if self.has_ball else None)
         return self._observe()
 
@@ -166,18 +162,7 @@ class NaoEnv:
         if self.has_ball:
             estimated = self.localisation.pose
             self.sight.update(self.robots.ball, self.robots.pose, estimated, self._rng, moving)
-        after = self.truth
-        success = self.objective.reached(after, self.goal)
-        failed = torch.from_numpy(self.robots.fallen.copy()) | self.objective.missed(after, self.goal)
-        if self.objective.ends_at_walls:
-            failed |= self.wall_contact
-        self.failed = failed & ~success
-        return Step(
-            observation=self._observe(),
-            reward=self.objective.reward(before, after, self.goal, self.failed),
-            terminated=success | self.failed,
-            success=success,
-        )
+        return self._judged(before, self.truth, self.robots.fallen)
 
     def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
         """Turn commands (B, 2) in the world frame into forward, left and turning speed (B, 3).
@@ -218,6 +203,3 @@ class NaoEnv:
         self.sight.restore(arrays)
         self.goal = state["goal"].clone()
         self._rng.bit_generator.state = json.loads(bytes(state["drawn"].tolist()))
-
-    def _observe(self) -> Tensor:
-        return torch.cat([self.state, self.goal], dim=-1)
