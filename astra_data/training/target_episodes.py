@@ -46,7 +46,7 @@ def in_target(
         begin: starts the policy.
         episodes: their number.
         seed: of the target.
-        leg_scale: of the ant.
+        leg_scale: factor on the legs' length, of tasks with the fact `leg_scale`: the ant's.
         num_threads: of the physics, by default one per core; the outcome is the same with any number.
         progress: called with the fraction done and the speed.
         asked: counts commands beyond what was recorded.
@@ -54,8 +54,10 @@ def in_target(
     Raises:
         BadInputError: the robot has no legs of another length.
     """
-    if leg_scale != 1.0 and task.robot is not None:
-        raise BadInputError(f"leg_scale: the robot of {task.name} has one length of legs: expected 1")
+    if leg_scale != 1.0 and "leg_scale" not in task.facts:
+        raise BadInputError(
+            f"leg_scale: the robot of {task.name} has one length of legs: expected 1, got {leg_scale:g}"
+        )
     legs = {} if leg_scale == 1.0 else {"leg_scale": leg_scale}
     env = task.target(episodes, seed=seed, num_threads=num_threads, **legs)
     env.reset()

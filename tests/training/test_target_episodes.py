@@ -9,6 +9,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.simulator_episodes import Act
 from astra_data.training.target_episodes import in_target
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
 
 
 def driving(speed: float) -> Act:
@@ -101,9 +103,11 @@ def test_progress_is_told_by_the_horizon() -> None:
     assert len(told) == TASK.objective.horizon and told[-1] == pytest.approx(0.99)
 
 
-def test_a_robot_of_ones_own_has_one_length_of_legs() -> None:
-    with pytest.raises(BadInputError, match="leg_scale: the robot of rail-cart has one length of legs"):
-        in_target(TASK, lambda goal: driving(0.9), 1, seed=3, leg_scale=1.25)
+@pytest.mark.parametrize("task", [TASK, TASKS["nao-navigation"], TASKS["humanoid-walker2d"]])
+def test_only_the_ant_has_legs_of_several_lengths(task: Task) -> None:
+    expected = rf"leg_scale: the robot of {task.name} has one length of legs: expected 1, got 1\.25"
+    with pytest.raises(BadInputError, match=expected):
+        in_target(task, lambda goal: driving(0.9), 1, seed=3, leg_scale=1.25)
 
 
 class Apart(Cart):

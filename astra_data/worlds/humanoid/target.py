@@ -32,7 +32,6 @@ class HumanoidEnv:
         num_envs: int,
         *,
         seed: int,
-        leg_scale: float = 1.0,
         start_anywhere: bool = False,
         starts: Floats | None = None,
         ranges: CommandRanges | None = None,
@@ -44,17 +43,14 @@ class HumanoidEnv:
             locomotion: reward, ends and starts.
             num_envs: B.
             seed: of starts.
-            leg_scale: 1, for a humanoid's legs cannot be scaled.
             start_anywhere: false, for there is no maze.
             starts: without effect: a humanoid starts upright.
             ranges: joint angles of commands.
             num_threads: physics threads, by default one per core.
 
         Raises:
-            BadInputError: `leg_scale` or `start_anywhere` has another value.
+            BadInputError: `start_anywhere` is true.
         """
-        if leg_scale != 1.0:
-            raise BadInputError(f"evaluate.leg_scale: expected 1 for a humanoid, got {leg_scale}")
         if start_anywhere:
             raise BadInputError("collect.start: expected 'task' for a humanoid, got 'anywhere'")
         self.locomotion = locomotion

@@ -7,7 +7,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.core.errors import BadInputError
 from astra_data.worlds.batched import Step, rows_in
 from astra_data.worlds.nao.abstraction import STATE_SIZE
 from astra_data.worlds.nao.perception import BallSight, Localisation, PerceptionErrors
@@ -55,7 +54,6 @@ class NaoEnv(PlanarTarget):
         *,
         seed: int,
         ball: bool = False,
-        leg_scale: float = 1.0,
         start_anywhere: bool = False,
         starts: Floats | None = None,
         errors: PerceptionErrors | None = None,
@@ -68,17 +66,11 @@ class NaoEnv(PlanarTarget):
             num_envs: B.
             seed: of everything random.
             ball: whether there is a ball.
-            leg_scale: 1, for a NAO's legs cannot be scaled.
             start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
             starts: abstract states (B, X) to start at in place of drawn ones.
             errors: of the estimates.
             num_threads: of the physics, by default one per core.
-
-        Raises:
-            BadInputError: `leg_scale` has another value.
         """
-        if leg_scale != 1.0:
-            raise BadInputError(f"evaluate.leg_scale: expected 1 for a NAO, got {leg_scale}")
         super().__init__(objective, num_envs, start_anywhere=start_anywhere, starts=starts)
         self.has_ball, self.action_size = ball, objective.action_size
         self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from nao_values import NO_ERRORS
 
-from astra_data.core.errors import BadInputError
 from astra_data.worlds.nao.target import Floats, NaoEnv
 from astra_data.worlds.registry import TASKS
 
@@ -186,8 +185,3 @@ def test_robots_can_be_stood_where_a_state_believes_them() -> None:
     np.testing.assert_allclose(one.robots.pose[:, :2], state[:, :2], atol=1e-6)
     np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), state[:, 2], atol=1e-6)
     np.testing.assert_allclose(one.robots.ball, state[:, 29:31], atol=1e-6)
-
-
-def test_its_legs_are_as_they_are() -> None:
-    with pytest.raises(BadInputError, match="leg_scale: expected 1"):
-        env(leg_scale=1.25)
