@@ -55,6 +55,7 @@ def test_rows_outside_of_a_mask_go_on(name: str) -> None:
     assert torch.equal(env.state[2], state[2])
     assert not torch.equal(env.state[:2], state[:2])
     assert torch.equal(step.observation[2], after[2])
+    assert float(step.reward[2]) == 0.0
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -74,6 +75,46 @@ def test_seeds_repeat_starts_and_goals(name: str) -> None:
         one.reset()
     assert torch.equal(env.goal, other.goal)
     assert torch.equal(env.state, other.state)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_the_same_seed_gives_the_same_bytes(name: str) -> None:
+    def run(seed: int) -> bytes:
+        env = TARGETS[name].target(COUNT, seed=seed, num_threads=2)
+        seen = [env.reset()]
+        for count, action in enumerate(actions(env, 5)):
+            step = env.step(action)
+            seen += [step.observation, step.reward]
+            if count == 2:
+                seen.append(env.reset(torch.tensor([True, False, True])))
+        return b"".join(values.numpy().tobytes() for values in seen)
+
+    assert run(1) == run(1)
+    assert run(1) != run(2)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_reseeding_starts_the_draws_anew(name: str) -> None:
+    env = TARGETS[name].target(2, seed=5, num_threads=1)
+    first = env.reset()
+    assert not torch.equal(env.reset(), first)
+    env.reseed(5)
+    assert torch.equal(env.reset(), first)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_reseeding_starts_all_that_is_random_anew(name: str) -> None:
+    """Also the noise of sensors, in targets that were built with another seed and have moved."""
+    seen = []
+    for seed in (1, 2):
+        env = TARGETS[name].target(COUNT, seed=seed, num_threads=1)
+        for action in actions(env, seed):
+            env.step(action)
+        for _ in range(2):
+            env.reseed(5)
+            env.reset()
+            seen.append(torch.stack([env.step(action).observation for action in actions(env, 3)]))
+    assert all(torch.equal(seen[0], other) for other in seen[1:])
 
 
 @pytest.mark.parametrize("name", TARGETS)

@@ -31,45 +31,6 @@ def rolled(env: AntMazeEnv, rows: list[int], angle: float) -> None:
     env.reset_to(np.array(rows), state)
 
 
-def test_the_same_seed_gives_the_same_bytes() -> None:
-    def run(seed: int) -> bytes:
-        env = AntMazeEnv(TASK, 3, seed=seed, num_threads=2)
-        observations = [env.reset()]
-        generator = torch.Generator().manual_seed(0)
-        for count in range(5):
-            step = env.step(2 * torch.rand(3, 2, generator=generator) - 1)
-            observations += [step.observation, step.reward]
-            if count == 2:
-                observations.append(env.reset(torch.tensor([True, False, True])))
-        return b"".join(values.numpy().tobytes() for values in observations)
-
-    assert run(1) == run(1)
-    assert run(1) != run(2)
-
-
-def test_reseeding_starts_the_draws_anew() -> None:
-    env = AntMazeEnv(TASK, 2, seed=5, num_threads=1)
-    first = env.reset()
-    assert not torch.equal(env.reset(), first)
-    env.reseed(5)
-    assert torch.equal(env.reset(), first)
-
-
-def test_a_partial_reset_leaves_the_other_rows() -> None:
-    env = AntMazeEnv(TASK, 3, seed=0, num_threads=1)
-    before = env.reset()
-    after = env.reset(torch.tensor([False, True, False]))
-    assert (before == after).all(dim=1).tolist() == [True, False, True]
-
-
-def test_inactive_rows_are_frozen() -> None:
-    env = placed([[-4, 4], [-4, 4]])
-    before = env.state
-    step = env.step(torch.ones(2, 2), active=torch.tensor([True, False]))
-    assert (env.state == before).all(dim=1).tolist() == [False, True]
-    assert float(step.reward[1]) == 0.0
-
-
 @pytest.mark.parametrize(("degrees", "toppled"), [(0.0, False), (60.0, False), (100.0, True), (180.0, True)])
 def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> None:
     env = placed([[-4, 4], [-4, 4]])

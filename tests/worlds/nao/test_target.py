@@ -141,32 +141,6 @@ def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
     assert success.tolist() == [True, False]
 
 
-def test_the_same_seed_gives_the_same_bytes_and_states_can_be_resumed() -> None:
-    one, other = (env("nao-kick", 2) for _ in range(2))
-    action = torch.tensor([[0.7, 0.2, 0.0], [-0.5, 0.9, 1.0]])
-    for _ in range(3):
-        assert torch.equal(one.step(action).observation, other.step(action).observation)
-    fresh = env("nao-kick", 2)
-    fresh.load_state_dict(one.state_dict())
-    for _ in range(3):
-        assert torch.equal(one.step(action).observation, fresh.step(action).observation)
-
-
-def test_reseeding_starts_all_that_is_random_anew() -> None:
-    """Also the noise of the gyroscope, in robots that were built with another seed and have walked."""
-    action = torch.tensor([[0.7, 0.2]] * 3)
-    seen = []
-    for seed in (1, 2):
-        made = TASKS["nao-navigation"].target(3, seed=seed, num_threads=1)
-        for _ in range(seed):
-            made.step(action)
-        for _ in range(2):
-            made.reseed(5)
-            made.reset()
-            seen.append(torch.stack([made.step(action).observation for _ in range(3)]))
-    assert all(torch.equal(seen[0], other) for other in seen[1:])
-
-
 def test_a_state_has_the_noise_that_comes_next() -> None:
     one, action = env(), torch.tensor([[0.7, 0.2]] * 3)
     one.step(action)
