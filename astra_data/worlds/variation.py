@@ -67,10 +67,6 @@ class Variation(Config):
         """Return lower and upper end of every parameter, (P, 2), in the order of `names`."""
         return torch.tensor([getattr(self, name) for name in self.names])
 
-    def by_name(self, parameters: Tensor) -> dict[str, Tensor]:
-        """Return the columns (B,) of `parameters` (B, P) by their names."""
-        return dict(zip(self.names, parameters.unbind(-1), strict=True))
-
     def draw(self, count: int, device: torch.device | str = "cpu") -> Tensor:
         """Draw the parameters (count, P) of as many episodes, from torch's global generator."""
         low, high = self.ranges().to(device).unbind(-1)
@@ -224,9 +220,7 @@ class VariedSimulator(ABC):
 
     def by_name(self) -> dict[str, Tensor]:
         """Return the parameters by name, (B, 1) each."""
-        return {
-            name: column.unsqueeze(-1) for name, column in self.variation.by_name(self.parameters).items()
-        }
+        return dict(zip(self.variation.names, self.parameters.split(1, dim=-1), strict=True))
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""

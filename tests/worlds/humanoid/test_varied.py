@@ -82,7 +82,7 @@ def test_rows_have_their_own_parameters_and_seeds_repeat_them(kind: Kind) -> Non
         alone = varied(kind, state[row : row + 1], WIDE)
         alone.parameters = parameters[row : row + 1].clone()
         alone.parameters[:, WIDE.names.index("action_noise")] = 0.0
-        strength = WIDE.by_name(parameters)["action_noise"][row]
+        strength = together.by_name()["action_noise"][row]
         landed = alone.step(ACTION + strength * noise[row])
         torch.testing.assert_close(landed[0], after[row], atol=1e-5, rtol=1e-5)
     torch.manual_seed(3)
