@@ -1,6 +1,7 @@
 """Abstract simulators that are MuJoCo models, reset and stepped in batches by `mujoco.rollout`."""
 
 import copy
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -10,14 +11,55 @@ from torch import Tensor
 
 from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
+from astra_data.worlds.batched_mujoco import Floats
 from astra_data.worlds.free_states import FreeStates
+
+
+class ColdSteps:
+    """Steps of B copies of a MuJoCo model without actuator states, by several threads.
+
+    Every step starts cold, without the solver's warm start from the last one: pairs need that, for their
+    states have just been reset.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int | None = None) -> None:
+        """Prepare steps of `num_envs` copies of `model`; there is by default one thread per core."""
+        self._data = [mujoco.MjData(model) for _ in range(min(num_threads or cores(), num_envs))]
+        self._rollout = Rollout(nthread=len(self._data))
+
+    def __call__(
+        self,
+        model: mujoco.MjModel | Sequence[mujoco.MjModel],
+        motion: Floats,
+        control: Floats,
+        *,
+        substeps: int,
+    ) -> Floats:
+        """Return where `substeps` physics steps under a constant control lead.
+
+        Args:
+            model: the model, or one for each of the B copies, which differ in numbers alone.
+            motion: qpos then qvel, (B, nq + nv).
+            control: of the actuators, (B, nu).
+            substeps: their number.
+
+        Returns:
+            qpos then qvel after them, (B, nq + nv).
+        """
+        one = model if isinstance(model, mujoco.MjModel) else model[0]
+        after_time = slice(1, 1 + one.nq + one.nv)
+        initial = np.zeros((len(motion), mujoco.mj_stateSize(one, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
+        initial[:, after_time] = motion
+        states, _ = self._rollout.rollout(
+            model, self._data, initial, np.repeat(control[:, None], substeps, axis=1)
+        )
+        return np.asarray(states[:, -1, after_time])
 
 
 class MujocoModel(FreeStates):
     """B copies of a MuJoCo model; state: qpos (nq) then qvel (nv), action: the motors' controls (nu).
 
-    Every step starts cold, without the solver's warm start from the last one: pairs need that, for their
-    states have just been reset.
+    Every step starts cold.
 
     Attributes:
         state: (B, nq + nv) float32.
@@ -45,8 +87,7 @@ class MujocoModel(FreeStates):
         self.model = copy.deepcopy(model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.substeps = substeps
-        self._data = [mujoco.MjData(self.model) for _ in range(min(num_threads or cores(), num_envs))]
-        self._rollout = Rollout(nthread=len(self._data))
+        self._steps = ColdSteps(self.model, num_envs, num_threads)
         initial = np.concatenate([model.qpos0, np.zeros(model.nv)])
         super().__init__(torch.from_numpy(np.tile(initial, (num_envs, 1))).float())
 
@@ -57,10 +98,7 @@ class MujocoModel(FreeStates):
 
     def step(self, action: Tensor) -> Tensor:
         """Apply controls `action` (B, nu), clipped by the motors; return the new state (B, nq + nv)."""
-        model, count = self.model, len(self.state)
-        initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
-        initial[:, 1 : 1 + self.state.shape[1]] = self.state.numpy()
-        control = np.repeat(action.double().numpy()[:, None], self.substeps, axis=1)
-        states, _ = self._rollout.rollout(model, self._data, initial, control)
-        self.state = torch.from_numpy(states[:, -1, 1 : 1 + self.state.shape[1]]).float()
+        motion, control = self.state.double().numpy(), action.double().numpy()
+        landed = self._steps(self.model, motion, control, substeps=self.substeps)
+        self.state = torch.from_numpy(landed).float()
         return self.state

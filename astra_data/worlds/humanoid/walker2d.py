@@ -25,18 +25,16 @@ It leaves out:
 from collections.abc import Mapping
 from copy import copy
 
-import mujoco
 import numpy as np
 import torch
-from mujoco.rollout import Rollout
 from torch import Tensor
 
-from astra_data.core.cores import cores
 from astra_data.dataset.columns import ABSTRACT_STATE, Column
 from astra_data.worlds.free_states import FreeStates
 from astra_data.worlds.humanoid.abstraction import humanoid_to_walker2d
 from astra_data.worlds.humanoid.model import CONTACT_M, CONTROL_SUBSTEPS, STANDING, TIMESTEP_S, CommandRanges
 from astra_data.worlds.humanoid.walker import sole_clearance, walker_model
+from astra_data.worlds.mujoco_model import ColdSteps
 
 _JOINTS = ("left_hip", "left_knee", "right_hip", "right_knee")
 _POSE = slice(0, 6)
@@ -92,8 +90,7 @@ class HumanoidWalker2d(FreeStates):
         self.ranges = ranges or CommandRanges()
         self._model = walker_model()
         self._models = [self._model]
-        self._data = [mujoco.MjData(self._model) for _ in range(min(num_threads or cores(), num_envs))]
-        self._rollout = Rollout(nthread=len(self._data))
+        self._steps = ColdSteps(self._model, num_envs, num_threads)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -136,16 +133,13 @@ class HumanoidWalker2d(FreeStates):
 
     def step(self, action: Tensor) -> Tensor:
         """Follow the commands `action` (B, 4) for one control step; return the new state (B, 15)."""
-        model, count = self._model, len(self.state)
-        initial = np.zeros((count, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
         motion, sunk = self.state[:, _MOTION].cpu().double(), self.memory[:, 0].cpu()
         motion[:, 0] += sunk
-        # After the time and x, which are 0 at the start of every step.
-        initial[:, 2 : 2 + _MOTION.stop] = motion.numpy()
         targets = self.ranges.targets(action.cpu().double()).numpy()
-        control = np.repeat(targets[:, None], CONTROL_SUBSTEPS, axis=1)
-        states, _ = self._rollout.rollout(self._models, self._data, initial, control)
-        motion = torch.from_numpy(states[:, -1, 2 : 2 + _MOTION.stop].copy())
+        # Before z comes x, which is 0 at the start of every step.
+        placed = np.pad(motion.numpy(), ((0, 0), (1, 0)))
+        landed = self._steps(self._models, placed, targets, substeps=CONTROL_SUBSTEPS)
+        motion = torch.from_numpy(landed[:, 1:].copy())
         contacts = (sole_clearance(motion[:, _POSE]) < CONTACT_M).to(motion.dtype)
         motion[:, 0] -= sunk
         self.state = torch.cat([motion, contacts], dim=-1).float().to(self.state.device)
