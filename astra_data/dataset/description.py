@@ -32,6 +32,15 @@ def full_name(description: Mapping[str, Any]) -> str:
     return f"{description['name']}@data-{description['version']}"
 
 
+def identity_of(description: Mapping[str, Any]) -> dict[str, str]:
+    """Return name, version and hash, as the datasets made from one list it among their parents."""
+    return {
+        "name": description["name"],
+        "version": description["version"],
+        "hash": description["content_hash"],
+    }
+
+
 def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     """Return the contents of meta/astra/dataset.json, without the content hash.
 

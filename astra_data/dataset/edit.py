@@ -17,8 +17,7 @@ from astra_data.dataset.compare import schema_differences, world_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.uids import new_uid, renamed_metadata
-from astra_data.dataset.versions import successor
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.versions import next_version
 
 MOST_UIDS = 8
 """Uids listed in a message."""
@@ -196,15 +195,14 @@ def merge(
         )
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
-    description, folder = successor(
-        first, "episodes", stage="merge", config=config, name=name, out=out, parents=tuple(others)
-    )
-    with DatasetWriter.like(first, folder, description) as writer:
+    with next_version(
+        first, "episodes", stage="merge", config=config, name=name, out=out, others=others
+    ) as writer:
         for source, named in zip(sources, names, strict=True):
             for episode in source.episodes():
                 metadata = renamed_metadata(episode.uid, episode.metadata, named)
                 writer.add(replace(episode, uid=named[episode.uid], metadata=metadata))
-    return folder
+    return writer.root
 
 
 def _write(
@@ -219,12 +217,13 @@ def _write(
 ) -> Path:
     if not kept:
         raise BadInputError(f"{source.reference}: no episode would be left of its {len(source)}")
-    description, folder = successor(source, "episodes", stage=stage, config=config, name=name, out=out)
-    with DatasetWriter.like(source, folder, description, subset_seed=seed) as writer:
+    with next_version(
+        source, "episodes", stage=stage, config=config, name=name, out=out, subset_seed=seed
+    ) as writer:
         chosen = [index for index, uid in enumerate(_uids(source)) if uid in kept]
         for episode in source.episodes(episodes=chosen):
             writer.add(episode)
-    return folder
+    return writer.root
 
 
 def _uids(source: Dataset) -> list[int]:

@@ -13,7 +13,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset.column_statistics import ranges
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, Ints, read_contents
-from astra_data.dataset.description import full_name
+from astra_data.dataset.description import full_name, identity_of
 from astra_data.dataset.digests import Digests, altered_columns, digests_of, read_digests
 from astra_data.dataset.format import INFO_PATH, OUR_FOLDER
 from astra_data.dataset.lerobot_recording import open_recording
@@ -78,11 +78,7 @@ class Dataset(Contents):
     @property
     def identity(self) -> dict[str, str]:
         """Name, version and hash, as the datasets made from this one list them among their parents."""
-        return {
-            "name": self.description["name"],
-            "version": self.description["version"],
-            "hash": self.content_hash,
-        }
+        return identity_of(self.description)
 
     def __len__(self) -> int:
         """Return the number of episodes E."""

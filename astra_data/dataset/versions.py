@@ -10,15 +10,17 @@ episodes the second, one of the description alone the third.
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.description import NAME, VERSION
+from astra_data.dataset.columns import Column
+from astra_data.dataset.description import NAME, VERSION, identity_of
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 
 Change = Literal["columns", "episodes", "description"]
 
@@ -136,6 +138,46 @@ def open_dataset(dataset: str | Path) -> Dataset:
 
 
 def successor(
+    source: Mapping[str, Any],
+    change: Change,
+    *,
+    stage: str,
+    config: Mapping[str, Any],
+    name: str | None = None,
+    out: Path | None = None,
+    parents: Iterable[Mapping[str, str]] = (),
+    **more: Any,  # noqa: ANN401 - JSON
+) -> tuple[dict[str, Any], Path]:
+    """Describe the version that follows `source`, and return its folder: `out`, or by default one at home.
+
+    Args:
+        source: the description of its first parent; name, seeds, environment and simulator are carried over.
+        change: the kind of change, which determines the version.
+        stage: the stage that writes it.
+        config: the stage's settings.
+        name: of a new dataset, which begins with version 1.0.0; by default that of `source`.
+        out: its folder; the version then does not depend on those at home.
+        parents: the identities of further parents.
+        more: keys of the description that differ from those of `source`.
+
+    Returns:
+        the description that `DatasetWriter` takes, and the folder.
+    """
+    kept = {key: source[key] for key in ("name", "seeds", "environment", "simulator")}
+    taken = versions_at_home(name or source["name"]) if out is None else []
+    version = Version.parse(source["version"])
+    if name in (None, source["name"]):
+        version = version.next(change, taken)
+    else:
+        kept["name"] = name
+        version = taken[-1].next(change, taken) if taken else Version(1, 0, 0)
+    identities = [identity_of(source), *parents]
+    changed = {"version": str(version), "stage": stage, "config": dict(config), "parents": identities}
+    description = {**kept, **changed, **more}
+    return description, home_of(description) if out is None else out
+
+
+def next_version(
     source: Dataset,
     change: Change,
     *,
@@ -143,33 +185,40 @@ def successor(
     config: Mapping[str, Any],
     name: str | None = None,
     out: Path | None = None,
-    parents: Iterable[Dataset] = (),
-    **more: Any,  # noqa: ANN401 - JSON
-) -> tuple[dict[str, Any], Path]:
-    """Describe the version that follows `source`, and return its folder: `out`, or by default one at home.
+    more: Sequence[Column] = (),
+    subset_seed: int | None = None,
+    others: Iterable[Dataset] = (),
+    **changed: Any,  # noqa: ANN401 - JSON
+) -> DatasetWriter:
+    """Prepare to write the version that follows `source`; its folder is the writer's `root`.
 
     Args:
-        source: its first parent; name, seeds, environment and simulator are carried over.
-        change: the kind of change, which determines the version.
+        source: its first parent; columns, fps, task and description are carried over.
+        change: see `successor`, as for `stage`, `config`, `name` and `out`.
         stage: the stage that writes it.
         config: the stage's settings.
-        name: of a new dataset, which begins with version 1.0.0; by default that of `source`.
-        out: its folder; the version then does not depend on those at home.
-        parents: further parents.
-        more: keys of the description that differ from those of `source`.
-
-    Returns:
-        the description that `DatasetWriter` takes, and the folder.
+        name: of a new dataset.
+        out: its folder, by default its place at home.
+        more: columns besides those of `source`.
+        subset_seed: of the permutation of the subsets, by default that of `source`.
+        others: further parents.
+        changed: keys of the description that differ from those of `source`.
     """
-    kept = {key: source.description[key] for key in ("name", "seeds", "environment", "simulator")}
-    taken = versions_at_home(name or source.description["name"]) if out is None else []
-    version = Version.parse(source.description["version"])
-    if name in (None, source.description["name"]):
-        version = version.next(change, taken)
-    else:
-        kept["name"] = name
-        version = taken[-1].next(change, taken) if taken else Version(1, 0, 0)
-    identities = [dataset.identity for dataset in (source, *parents)]
-    changed = {"version": str(version), "stage": stage, "config": dict(config), "parents": identities}
-    description = {**kept, **changed, **more}
-    return description, home_of(description) if out is None else out
+    description, folder = successor(
+        source.description,
+        change,
+        stage=stage,
+        config=config,
+        name=name,
+        out=out,
+        parents=[other.identity for other in others],
+        **changed,
+    )
+    return DatasetWriter(
+        folder,
+        [*source.schema, *more],
+        fps=source.info["fps"],
+        task=source.task,
+        description=description,
+        subset_seed=source.subset_seed if subset_seed is None else subset_seed,
+    )

@@ -119,29 +119,6 @@ class DatasetWriter:
         self._exit = ExitStack()
         self._is_open = False
 
-    @classmethod
-    def like(
-        cls,
-        source: Dataset,
-        root: Path,
-        description: Mapping[str, Any],
-        *,
-        more: Sequence[Column] = (),
-        subset_seed: int | None = None,
-    ) -> "DatasetWriter":
-        """Prepare to write to `root` a dataset like `source`, with additional columns `more`.
-
-        The permutation of the subsets is that of `source`, unless `subset_seed` is given.
-        """
-        return cls(
-            root,
-            [*source.schema, *more],
-            fps=source.info["fps"],
-            task=source.task,
-            description=description,
-            subset_seed=source.subset_seed if subset_seed is None else subset_seed,
-        )
-
     @property
     def content_hash(self) -> str:
         """The hash of all episodes added so far."""

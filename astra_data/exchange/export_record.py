@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 from astra_data.core.config import Config, Count, Number, faults_of
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Column, Episode
-from astra_data.dataset.description import ContentHash
+from astra_data.dataset.description import ContentHash, identity_of
 from astra_data.dataset.meta_files import NameText, VersionText
 from astra_data.dataset.reader import Dataset
 
@@ -88,7 +88,7 @@ class ExportRecord(Config):
     @property
     def identity(self) -> dict[str, str]:
         """Name, version and hash, as among the parents of the dataset that is made of the export."""
-        return {"name": self.name, "version": self.version, "hash": self.content_hash}
+        return identity_of(dict(self))
 
     @classmethod
     def parse(cls, text: str | bytes, origin: str) -> "ExportRecord":

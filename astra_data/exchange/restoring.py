@@ -11,7 +11,7 @@ import numpy as np
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
 from astra_data.dataset.description import ContentHash, full_name
-from astra_data.dataset.versions import Version, home_of, versions_at_home
+from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.exchange.export_record import ExportRecord
 from astra_data.exchange.mapping import ColumnMapping, ImportMapping
@@ -89,21 +89,17 @@ def write_restored(
         CorruptDatasetError: values differ from those that were exported; nothing is written.
     """
     began = time.perf_counter()
-    name, version = options.get("name", record.name), Version(1, 0, 0)
-    if name == record.name:
-        taken = versions_at_home(name) if out is None else []
-        version = Version.parse(record.version).next("description", taken)
-    description = {
-        "name": name,
-        "version": str(version),
-        "parents": [record.identity],
-        "stage": "import",
-        "config": {"recordings": list(recordings)},
-        "seeds": record.seeds,
-        "environment": record.environment,
-        "simulator": record.simulator,
-    }
-    root = home_of(description) if out is None else out
+    name = options.get("name", record.name)
+    anew: dict[str, Any] = {} if name == record.name else {"version": "1.0.0"}  # whatever is at home
+    description, root = successor(
+        dict(record),
+        "description",
+        stage="import",
+        config={"recordings": list(recordings)},
+        name=name,
+        out=out,
+        **anew,
+    )
     frames = 0
     with DatasetWriter(
         root,

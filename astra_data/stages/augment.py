@@ -36,8 +36,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.endings import outcome_of
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import open_dataset, successor
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.versions import next_version, open_dataset
 from astra_data.worlds.own_code import is_own_code
 from astra_data.worlds.plane.relocation import Copy, Relocation, Rotations
 from astra_data.worlds.registry import TASKS, task_named
@@ -147,7 +146,9 @@ def augment(
         tries=config.tries,
     )
     held_out, copies = _shares(source, relocation, config, seed)
-    description, out = successor(
+    taken = set(source.uids.tolist())
+    placed, lost, moving = 0, 0, _moving(source)
+    with next_version(
         source,
         "episodes",
         stage="augment",
@@ -155,10 +156,7 @@ def augment(
         name=name,
         out=out,
         seeds=source.description["seeds"] | {"augment": seed},
-    )
-    taken = set(source.uids.tolist())
-    placed, lost, moving = 0, 0, _moving(source)
-    with DatasetWriter.like(source, out, description) as writer:
+    ) as writer:
         for index, episode in enumerate(source.episodes()):
             if held_out[index] or config.keep_originals:
                 metadata = {**episode.metadata, "held_out": bool(held_out[index])}
@@ -181,7 +179,7 @@ def augment(
             )
         skipped = int((~held_out & (copies == 0)).sum())
         writer.made = {"copies": placed, "copies_without_place": lost, "episodes_not_copied": skipped}
-    return out
+    return writer.root
 
 
 def _task_of(source: Dataset, task: str | None) -> Task:

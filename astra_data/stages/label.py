@@ -28,8 +28,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.endings import outcome_of
 from astra_data.dataset.expected_columns import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import successor
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.versions import next_version
 from astra_data.exchange.sharing.pull import opened
 from astra_data.worlds.expecting import judged, paid
 from astra_data.worlds.own_code import explained
@@ -89,16 +88,16 @@ def label(
         raise BadInputError(f"{source.reference} has goals and outcomes already: there is nothing to label")
     for warning in remarks(source, world):
         _log.warning(warning)
-    description, out = successor(
+    steps = successes = failures = at_goal = 0
+    with next_version(
         source,
         "columns",
         stage="label",
         config={"task": world.name, "seed": seed, "columns": [column.name for column in more]},
         name=name,
         out=out,
-    )
-    steps = successes = failures = at_goal = 0
-    with DatasetWriter.like(source, out, description, more=more) as writer:
+        more=more,
+    ) as writer:
         for number, episode in enumerate(source.episodes(), start=1):
             labelled = with_outcomes(world, episode, seed)
             writer.add(labelled)
@@ -114,7 +113,7 @@ def label(
             f"{source.reference}: {at_goal} episodes terminate at their goal and are labelled as failures, "
             f"for {TERMINATED} does not say why: import {SUCCESS} as well if they ended because they arrived",
         )
-    return out
+    return writer.root
 
 
 def remarks(source: Dataset, task: Task) -> list[str]:

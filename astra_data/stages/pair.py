@@ -28,8 +28,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.expected_columns import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.versions import open_dataset, successor
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.versions import next_version, open_dataset
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.registry import TASKS
@@ -88,15 +87,6 @@ def pair(
     bounds = (
         {} if pairing.commands is None else {"commands": {k: list(v) for k, v in pairing.commands.items()}}
     )
-    description, out = successor(
-        source,
-        "columns",
-        stage="pair",
-        config=config.model_dump(mode="json"),
-        name=name,
-        out=out,
-        simulator={"id": pairing.id, **pairing.origin, **batch.parameters, **bounds},
-    )
     meanings = {
         ABSTRACT_STATE: "abstract state of the target before the action",
         ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
@@ -105,7 +95,16 @@ def pair(
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps, simulating, reset_error = 0, 0.0, 0.0
     jumps = np.zeros(added[0].size, np.int64)
-    with DatasetWriter.like(source, out, description, more=added) as writer:
+    with next_version(
+        source,
+        "columns",
+        stage="pair",
+        config=config.model_dump(mode="json"),
+        name=name,
+        out=out,
+        more=added,
+        simulator={"id": pairing.id, **pairing.origin, **batch.parameters, **bounds},
+    ) as writer:
         for episodes in in_blocks(source.episodes(), _BLOCK):
             before = time.perf_counter()
             state, action, next_state = (
@@ -147,7 +146,7 @@ def pair(
             f"{pairing.id} lands more than π from where the robot was: {', '.join(wrapped)}; "
             "a heading that wraps: make cos and sin of it in φ"
         )
-    return out
+    return writer.root
 
 
 def pair_steps(

@@ -1,10 +1,22 @@
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.versions import Version, home_of, locate, names_at_home, open_dataset, successor
+from astra_data.dataset.columns import Column
+from astra_data.dataset.versions import (
+    Version,
+    home_of,
+    locate,
+    names_at_home,
+    next_version,
+    open_dataset,
+    successor,
+)
 
 
 def versions(*texts: str) -> list[Version]:
@@ -70,24 +82,43 @@ def test_a_folder_without_a_dataset_hides_none_of_the_same_name(
 
 def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) -> None:
     source = write_fake(tmp_path / "first")
-    description, folder = successor(source, "episodes", stage="subset", config={"count": 2})
+    description, folder = successor(source.description, "episodes", stage="subset", config={"count": 2})
     assert description["version"] == "1.1.0"
     assert description["parents"] == [source.identity]
     assert folder == home_of(description) == home / source.description["name"] / "data-1.1.0"
     folder.mkdir(parents=True)
-    assert successor(source, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
-    elsewhere = successor(source, "columns", stage="pair", config={}, out=tmp_path / "here")
+    assert successor(source.description, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
+    elsewhere = successor(source.description, "columns", stage="pair", config={}, out=tmp_path / "here")
     assert (elsewhere[0]["version"], elsewhere[1]) == ("2.0.0", tmp_path / "here")
     assert open_dataset(tmp_path / "first").reference == source.reference
 
 
+def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path) -> None:
+    source, other = write_fake(tmp_path / "first"), write_fake(tmp_path / "other")
+    labels = {"stage": "label", "config": {}, "out": tmp_path / "next", "simulator": {"id": "one"}}
+    more = [Column("phase")]
+    with next_version(source, "columns", more=more, subset_seed=3, others=[other], **labels) as writer:
+        for episode in source.episodes():
+            phase = np.zeros(len(episode), np.float32)
+            writer.add(replace(episode, columns={**episode.columns, "phase": phase}))
+    written = open_dataset(writer.root)
+    assert written.root == tmp_path / "next"
+    assert written.schema == [*source.schema, *more]
+    assert (written.task, written.info["fps"]) == (source.task, source.info["fps"])
+    assert (written.subset_seed, source.subset_seed) == (3, 0)
+    assert written.description["parents"] == [source.identity, other.identity]
+    assert (written.description["version"], written.description["simulator"]) == ("2.0.0", {"id": "one"})
+    assert next_version(source, "columns", **labels | {"out": tmp_path / "again"}).root == tmp_path / "again"
+
+
 def test_a_successor_of_another_name_begins_anew(home: Path, tmp_path: Path) -> None:
     source = write_fake(tmp_path / "first")
-    description, folder = successor(source, "episodes", stage="subset", config={}, name="half")
+    asked: dict[str, Any] = {"stage": "subset", "config": {}, "name": "half"}
+    description, folder = successor(source.description, "episodes", **asked)
     assert (description["name"], description["version"]) == ("half", "1.0.0")
     assert description["parents"] == [source.identity]
     folder.mkdir(parents=True)
-    assert successor(source, "episodes", stage="subset", config={}, name="half")[0]["version"] == "1.1.0"
+    assert successor(source.description, "episodes", **asked)[0]["version"] == "1.1.0"
     assert names_at_home() == ["half"]
 
 

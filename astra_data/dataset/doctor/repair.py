@@ -37,7 +37,7 @@ from astra_data.dataset.plain import (
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.seal import altered_files
-from astra_data.dataset.versions import Version, successor
+from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 
 _LOST = "success, return and the like of the episodes are lost"
@@ -262,10 +262,10 @@ def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[
 def _description(
     folder: Path, info: Mapping[str, Any], sources: Sequence[Dataset], old: Mapping[str, Any]
 ) -> dict[str, Any]:
-    config = {"folder": folder.name}
+    config, parents = {"folder": folder.name}, []
     if sources:
         first, *others = sources
-        return successor(first, "episodes", stage="repair", config=config, out=folder, parents=others)[0]
+        old, parents = first.description, [other.identity for other in others]
     if not old:
         return {
             "name": name_of(folder),
@@ -273,11 +273,7 @@ def _description(
             "config": config,
             "environment": robot_of(info),
         }
-    kept = {key: old[key] for key in ("name", "seeds", "environment", "simulator")}
-    version = Version.parse(old["version"])
-    parent = {"name": old["name"], "version": old["version"], "hash": old["content_hash"]}
-    changed = {"version": str(version.next("episodes")), "parents": [parent]}
-    return {**kept, **changed, "stage": "repair", "config": config}
+    return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]
 
 
 def _subset_seed(folder: Path, altered: Collection[str]) -> int:
