@@ -33,7 +33,7 @@ def statistics(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def episode_statistics(columns: Iterable[Array]) -> NDArray[np.float64]:
     """Return `STATISTICS` (9, sum of sizes) of `columns` (T,) or (T, size), side by side."""
-    values = [column if column.ndim > 1 else column[:, None] for column in columns]
+    values = [as_rows(column) for column in columns]
     rows = np.empty((sum(column.shape[1] for column in values), len(values[0])))
     np.concatenate([column.T for column in values], out=rows)
     return statistics(rows)
@@ -64,7 +64,7 @@ def global_statistics(
         for block in read_arrays(paths, [column for column in columns if column.name in names]):
             begin, end = end, end + len(next(iter(block.values())))
             for row, (column, index) in zip(rows, chosen, strict=True):
-                row[begin:end] = block[column.name].reshape(end - begin, -1)[:, index]
+                row[begin:end] = as_rows(block[column.name])[:, index]
         for row, (column, _) in zip(rows, chosen, strict=True):
             parts[column.name].append(statistics(row[None].astype(np.float64)))
     stats: dict[str, dict[str, list[Any]]] = {}

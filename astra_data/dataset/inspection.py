@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.numbers import as_rows
 from astra_data.dataset.columns import STATE, TERMINATED, Array, Column
 from astra_data.dataset.endings import Endings
 from astra_data.dataset.format import STATS_PATH
@@ -157,7 +158,7 @@ def _empty_spreads(dataset: Dataset, columns: list[Column]) -> list[Spread]:
 
 
 def _count(spread: Spread, values: Array) -> None:
-    table = values.reshape(len(values), spread.column.size).astype(np.float64)
+    table = as_rows(values).astype(np.float64)
     span = np.where(spread.high > spread.low, spread.high - spread.low, 1.0)
     bins = np.clip((table - spread.low) / span * BINS, 0, BINS - 1).astype(np.int64)
     flat = (bins + BINS * np.arange(spread.column.size)).ravel()

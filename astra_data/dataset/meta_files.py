@@ -137,6 +137,4 @@ def _read(path: Path, name: str, model: type[BaseModel]) -> dict[str, Any]:
         validated(found, model, name)
     except RecipeError as error:
         raise CorruptDatasetError(str(error).replace(":\n  ", ": ").replace("\n  ", "; ")) from error
-    except RecursionError as error:
-        raise CorruptDatasetError(f"{name} is nested too deeply") from error
     return found

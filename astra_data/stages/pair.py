@@ -196,7 +196,7 @@ def pair_steps(
             )
         largest = max(largest, float(difference.max()))
         with explained(f"step of {pairing.id}"):
-            reached = batch.step(torch.from_numpy(action[rows].reshape(size, -1))).numpy()
+            reached = batch.step(torch.from_numpy(as_rows(action[rows]))).numpy()
         if reached.shape != wanted.shape:
             raise BadInputError(
                 f"step of {pairing.id} returns shape {reached.shape}, expected {tuple(wanted.shape)}"
