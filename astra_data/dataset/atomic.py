@@ -20,7 +20,7 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         BadInputError: `target` exists, or this process is writing it already.
         DiskError: it cannot be written.
     """
-    _refuse(target)
+    refuse_existing(target)
     with hidden_folder(target) as folder:
         yield folder
         publish(folder, target)
@@ -36,12 +36,12 @@ def atomic_file(target: Path) -> Iterator[Path]:
         BadInputError: `target` exists, or this process is writing it already.
         DiskError: it cannot be written.
     """
-    _refuse(target)
+    refuse_existing(target)
     with hidden_folder(target) as folder:
         path = folder / target.name
         yield path
         sync(path)
-        _refuse(target)
+        refuse_existing(target)
         move(path, target)
 
 
@@ -54,16 +54,21 @@ def publish(folder: Path, target: Path) -> None:
     """
     with writing(target):
         sync_tree(folder)
-        _refuse(target)
+        refuse_existing(target)
         try:
             os.replace(folder, target)
         except OSError:
             # Another process may have created it in between.
-            _refuse(target)
+            refuse_existing(target)
             raise
         sync(target.parent)
 
 
-def _refuse(target: Path) -> None:
-    if target.exists():
+def refuse_existing(target: Path) -> None:
+    """Refuse to write where something is.
+
+    Raises:
+        BadInputError: `target` exists, or is a link to nothing.
+    """
+    if target.exists() or target.is_symlink():
         raise BadInputError(f"{target} exists already; delete it or choose another folder.")

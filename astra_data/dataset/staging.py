@@ -20,6 +20,7 @@ from astra_data.core.errors import AstraDataError, BadInputError, DiskError
 from astra_data.core.lock import held
 from astra_data.dataset import format as layout
 from astra_data.dataset.admission import Admission
+from astra_data.dataset.atomic import refuse_existing
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import changed_values
 from astra_data.dataset.plain import read_object
@@ -215,13 +216,13 @@ class StagedWriter:
 
     def _refuse_root(self) -> None:
         """Refuse an existing `root`; if nothing is staged that is not in it, remove the staged episodes."""
-        if not self._holds_work() or self._is_written():
-            discard(self.folder, self.root)
-            raise BadInputError(f"{self.root} exists already; delete it or choose another folder.")
-        raise BadInputError(
-            f"{self.root} exists already and is another dataset than the interrupted recording, which left "
-            f"{self._left()} in {self.folder}: move one of the two away."
-        )
+        if self._holds_work() and not self._is_written():
+            raise BadInputError(
+                f"{self.root} exists already and is another dataset than the interrupted recording, which "
+                f"left {self._left()} in {self.folder}: move one of the two away."
+            )
+        discard(self.folder, self.root)
+        refuse_existing(self.root)
 
     def _is_written(self) -> bool:
         """Return whether the dataset at `root` holds every staged episode, value for value."""

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.digest import file_digest
-from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import write_manifest
 from astra_data.core.provenance import origin
-from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.atomic import atomic_folder, refuse_existing
 from astra_data.dataset.columns import Column
 from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, TORCHSCRIPT, write_graphs
 from astra_data.deployment.lerobot.files import write_lerobot_files
@@ -39,8 +38,7 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
         BadInputError: the row trains no policy, an artefact of it is not there, code of the task cannot be
             written as a graph, or `out` exists.
     """
-    if out.exists():
-        raise BadInputError(f"{out} exists already; delete it or choose another folder.")
+    refuse_existing(out)
     trained = trained_policy(run, row, seed=seed, percent=percent)
     deployed = trained.running()
     digests = {stage: file_digest(path) for stage, path in trained.files.items()}

@@ -12,6 +12,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
+from astra_data.dataset.atomic import refuse_existing
 from astra_data.dataset.columns import (
     DONE,
     GOAL,
@@ -79,8 +80,7 @@ def label(
         if column.name not in source.features
     ]
     if not more and out is not None:
-        if out.exists() or out.is_symlink():
-            raise BadInputError(f"{out} exists already; delete it or choose another folder.")
+        refuse_existing(out)
         make_folder(out.parent)
         out.symlink_to(source.root.resolve())
         return out

@@ -12,7 +12,7 @@ from racing import ROUNDS, race
 
 from astra_data.core.errors import BadInputError, DiskError
 from astra_data.core.lock import held
-from astra_data.dataset.atomic import atomic_file, atomic_folder
+from astra_data.dataset.atomic import atomic_file, atomic_folder, refuse_existing
 
 
 @pytest.mark.parametrize("writing", [atomic_folder, atomic_file])
@@ -68,6 +68,13 @@ def test_a_folder_that_another_process_made_meanwhile_is_left_to_it(
     with pytest.raises(BadInputError, match="set exists already"), atomic_folder(tmp_path / "set"):
         pass
     assert [path.name for path in tmp_path.rglob("*")] == ["set", "theirs"]
+
+
+def test_a_link_to_nothing_is_not_overwritten(tmp_path: Path) -> None:
+    refuse_existing(tmp_path / "set")
+    (tmp_path / "set").symlink_to(tmp_path / "nothing")
+    with pytest.raises(BadInputError, match="exists already; delete it or choose another folder"):
+        refuse_existing(tmp_path / "set")
 
 
 def test_only_the_folders_of_dead_processes_are_removed(tmp_path: Path) -> None:
