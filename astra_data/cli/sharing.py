@@ -31,6 +31,7 @@ def card(
 
     opened = open_dataset(dataset)
     written = load_recipe(notes, Notes) if notes else Notes()
+    opened.require_whole()
     for path in write_card(opened, out or Path(f"{opened.description['name']}.md"), written):
         typer.echo(f"written: {path}")
 

@@ -12,6 +12,7 @@ from damaged import DATA, alter, as_in_0_1, drop, edit
 from numpy.typing import NDArray
 from small_run import TASK
 
+from astra_data.cli.sharing import card
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
@@ -20,8 +21,6 @@ from astra_data.dataset.edit import delete, filter_episodes, merge, subset
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, METADATA_PATH, SUBSETS_PATH
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.exchange.exporters import export
-from astra_data.exchange.sharing.card import write_card
-from astra_data.exchange.sharing.notes import Notes
 from astra_data.exchange.sharing.push import push
 from astra_data.stages.augment import AugmentConfig, augment
 from astra_data.stages.pair import PairConfig, pair
@@ -44,7 +43,7 @@ COMMANDS: dict[str, Command] = {
         TASK, AugmentConfig(episodes=10), dataset=root, seed=0, out=out, progress=silent
     ),
     "pair": lambda root, out: pair(TASK, PairConfig(), dataset=root, out=out, progress=silent),
-    "card": lambda root, out: write_card(opened(root), out, Notes()),
+    "card": lambda root, out: card(str(root), out=out),
     "export": lambda root, out: export(opened(root), out, format="d4rl"),
     "diff": lambda root, _: differences(opened(root), opened(root)),
     "inspect": lambda root, _: inspect_dataset(opened(root)),

@@ -45,7 +45,7 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
     """Write the card of `dataset` to `out` and, if the dataset has planar positions, their figure beside it.
 
     Args:
-        dataset: any.
+        dataset: any of which every value was verified, for the card states the hash of all of them.
         out: the Markdown file, which is not replaced by another; the figure, `<stem>-coverage.png`, is.
         notes: the part of the card that a person writes.
         source: where it is shared, as `pull` takes it; if None, the card shows how to open a folder.
@@ -56,19 +56,6 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
     Raises:
         BadInputError: `out` is there already, with other contents.
         DiskError: `out` cannot be written.
-        CorruptDatasetError: a value was altered: the card states the hash of all of them.
-    """
-    dataset.require_whole()
-    return write_card_of_checked(dataset, out, notes, source=source)
-
-
-def write_card_of_checked(
-    dataset: Dataset, out: Path, notes: Notes, *, source: str | None = None
-) -> list[Path]:
-    """Write the card as `write_card` does, of a dataset of which `check` has just read every value.
-
-    Raises:
-        BadInputError, DiskError: as `write_card`.
     """
     positions = visited(dataset)
     figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
@@ -105,7 +92,7 @@ def render_card(
         "Limits": notes.limits,
         "Contents": _counts(dataset),
         "Columns": _columns(dataset),
-        "Provenance": _folded("How it was made, and the sum of its values", _provenance(description)),
+        "Provenance": _folded(_provenance(description)),
         "Citation": f"The method that these datasets are made for:\n\n{CITATION}",
     }
     front = [f"---\n{data.to_yaml()}\n---", f"# {description['name']}", notes.summary, _opening(dataset)]
@@ -113,7 +100,8 @@ def render_card(
     return "\n\n".join(part.strip() for part in parts if part) + "\n"
 
 
-def _folded(summary: str, text: str) -> str:
+def _folded(text: str) -> str:
+    summary = "How it was made, and the sum of its values"
     return f"<details>\n<summary>{summary}</summary>\n\n{text}\n\n</details>"
 
 

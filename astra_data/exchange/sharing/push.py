@@ -11,7 +11,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.versions import Version, open_dataset
 from astra_data.exchange.sharing.address import Hub, Url, parse_place
-from astra_data.exchange.sharing.card import write_card_of_checked
+from astra_data.exchange.sharing.card import write_card
 from astra_data.exchange.sharing.hub import HubStore
 from astra_data.exchange.sharing.notes import Notes
 from astra_data.exchange.sharing.store import RemoteFolder, Store
@@ -71,7 +71,7 @@ def push(
         place = Url(f"{place}/{local.description['name']}")
     with TemporaryDirectory() as folder:
         card = Path(folder)
-        write_card_of_checked(local, card / "README.md", written, source=str(place))
+        write_card(local, card / "README.md", written, source=str(place))
         store: Store
         if isinstance(place, Hub):
             store = hub = HubStore(place.repo)
