@@ -6,9 +6,8 @@ from pathlib import Path
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.opening import refuse_run, refuse_versions
 from astra_data.exchange.importers.csv import SUFFIXES
+from astra_data.exchange.importers.mcap import BAGS
 from astra_data.exchange.recording import refuse_dataset
-
-_BAGS = (".mcap", ".mcap.zstd", ".mcap.zst", ".db3", ".db3.zstd")
 
 
 def csv_files(place: Path) -> list[Path]:
@@ -26,7 +25,7 @@ def csv_files(place: Path) -> list[Path]:
     refuse_dataset(place)
     refuse_run(place)
     files = [*inside, *sorted(place.glob("*/*"))]  # a bag is a folder itself
-    if bags := [path.name for path in files if path.name.lower().endswith(_BAGS)]:
+    if bags := [path.name for path in files if path.name.lower().endswith(BAGS)]:
         raise BadInputError(
             f"{place}: expected CSV logs or a dataset, got a recording of ROS, {bags[0]}: make a dataset of "
             f"it, `astra-data import {shlex.quote(str(place))} --mapping recipes/imports/ros2_base.toml` "

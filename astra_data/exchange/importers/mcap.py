@@ -21,6 +21,10 @@ from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
 from astra_data.exchange.resampling import Resampler
 
 SUFFIXES = (".mcap",)
+_COMPRESSED = (".mcap.zstd", ".mcap.zst")
+_SQLITE = (".db3", ".db3.zstd")
+BAGS = (*SUFFIXES, *_COMPRESSED, *_SQLITE)
+"""Endings of the names of recordings of ROS, of which those in `SUFFIXES` are read."""
 
 _log = logging.getLogger(__name__)
 
@@ -38,12 +42,12 @@ class _Rows:
 def advice(names: Sequence[str]) -> str:
     """Say how to make MCAP of the files `names`, where another tool does; else nothing."""
     for name in names:
-        if name.lower().endswith((".db3", ".db3.zstd")):
+        if name.lower().endswith(_SQLITE):
             return (
                 "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, storage_id: mcap, "
                 "all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and import NEW"
             )
-        if name.lower().endswith((".mcap.zstd", ".mcap.zst")):
+        if name.lower().endswith(_COMPRESSED):
             return f"{name} is compressed as a whole: run `zstd -d {name}`, and import the .mcap"
     return ""
 
