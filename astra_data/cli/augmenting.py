@@ -57,24 +57,23 @@ def augment(
     seed: Annotated[int, typer.Option(help="Seed of all randomness.")] = 0,
 ) -> None:
     """Make more episodes by rotating and translating them; the dataset must not be paired yet."""
-    from astra_data.core.config import validated
+    from astra_data.core.config import only_given, validated
     from astra_data.dataset.versions import locate
     from astra_data.experiments.display import shown
     from astra_data.stages.augment import AugmentConfig
     from astra_data.stages.augment import augment as augment_dataset
 
-    options = {
-        "copies": copies,
-        "episodes": episodes,
-        "rotations": rotations,
-        "translations": translations,
-        "held_out_share": held_out_share,
-        "keep_originals": keep_originals,
-        "margin_m": margin_m,
-        "min_steps": min_steps,
-        "tries": tries,
-    }
-    given = {key: value for key, value in options.items() if value is not None}
+    given = only_given(
+        copies=copies,
+        episodes=episodes,
+        rotations=rotations,
+        translations=translations,
+        held_out_share=held_out_share,
+        keep_originals=keep_originals,
+        margin_m=margin_m,
+        min_steps=min_steps,
+        tries=tries,
+    )
     config = validated(given, AugmentConfig, "augment")
     with shown("augment") as progress:
         folder = augment_dataset(

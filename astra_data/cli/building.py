@@ -1,7 +1,7 @@
 """`astra-data collect` and `astra-data pair`, for a recipe or on their own."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -114,33 +114,33 @@ def collect(
     resume: Resume = False,
 ) -> None:
     """Collect a dataset in the target environment."""
-    settings = {
-        "behavior": behavior,
-        "episodes": episodes,
-        "least_steps": least_steps,
-        "max_steps": max_steps,
-        "start": start,
-        "hold_s": hold_s,
-        "ppo_steps": ppo_steps,
-        "sac_steps": sac_steps,
-        "sac_episode_steps": sac_episode_steps,
-        "random_share": random_share,
-        "clearance_m": clearance_m,
-        "policy": policy,
-        "grounding": grounding,
-        "target_encoder": target_encoder,
-        "plan": plan,
-    }
-    given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
+    from astra_data.core.config import only_given, validated
+
+    given = only_given(
+        behavior=behavior,
+        episodes=episodes,
+        least_steps=least_steps,
+        max_steps=max_steps,
+        start=start,
+        hold_s=hold_s,
+        ppo_steps=ppo_steps,
+        sac_steps=sac_steps,
+        sac_episode_steps=sac_episode_steps,
+        random_share=random_share,
+        clearance_m=clearance_m,
+        policy=policy,
+        grounding=grounding,
+        target_encoder=target_encoder,
+        plan=plan,
+    )
     if task.endswith(".toml"):
-        refuse(given | _given(name=name, out=out, resume=resume), "collect")
+        refuse({**given, "name": name, "out": out, "resume": resume or None}, "collect")
         run_stage(Path(task), "collect", seeds=seeds or (), jobs=jobs, root=root)
         return
     if len(seeds or ()) > 1 or jobs is not None:
         raise BadInputError("collect: a task takes one --seed and no --jobs, which are for recipes")
     import torch
 
-    from astra_data.core.config import validated
     from astra_data.experiments.display import shown
     from astra_data.stages.collect import CollectConfig
     from astra_data.stages.collect import collect as collect_dataset
@@ -181,14 +181,15 @@ def pair(
     out: Out = None,
 ) -> None:
     """Add to every transition the abstract simulator's next state from the same state and action."""
-    given = _given(reset_tolerance=reset_tolerance)
+    from astra_data.core.config import only_given, validated
+
+    given = only_given(reset_tolerance=reset_tolerance)
     if dataset.endswith(".toml"):
-        refuse(given | _given(simulator=simulator, name=name, out=out), "pair")
+        refuse({**given, "simulator": simulator, "name": name, "out": out}, "pair")
         run_stage(Path(dataset), "pair", seeds=seeds or (), jobs=jobs, root=root)
         return
     if seeds or jobs is not None:
         raise BadInputError("pair: a dataset takes neither --seed nor --jobs, which are for recipes")
-    from astra_data.core.config import validated
     from astra_data.dataset.versions import locate
     from astra_data.experiments.display import shown
     from astra_data.stages.pair import PairConfig
@@ -202,7 +203,3 @@ def pair(
             simulator, config, dataset=locate(dataset), name=name, out=out, progress=progress
         )
     typer.echo(f"finished: {folder}")
-
-
-def _given(**options: Any) -> dict[str, Any]:  # noqa: ANN401 - of any type
-    return {key: value for key, value in options.items() if value is not None and value is not False}

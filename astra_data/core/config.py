@@ -71,6 +71,11 @@ def own_settings[C: Config](given: Config | None, usual: C) -> C:
     return given
 
 
+def only_given(**options: Any) -> dict[str, Any]:  # noqa: ANN401 - of any type
+    """Return the options that are not None: those to be set, where None stands for the usual value."""
+    return {key: value for key, value in options.items() if value is not None}
+
+
 def as_json(**settings: Config | str | int | None) -> str:
     """Return settings as JSON, by their names."""
     plain = {k: v.model_dump(mode="json") if isinstance(v, Config) else v for k, v in settings.items()}

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import did_you_mean
+from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
 from astra_data.core.wording import first_few
 from astra_data.dataset.columns import Scalar
@@ -145,14 +145,13 @@ def filter_episodes(
         }
         for key, (low, high) in ranges.items()
     ]
-    config = {
-        "success": success,
-        "min_return": min_return,
-        "max_return": max_return,
-        "min_length": min_length,
-        "max_length": max_length,
-    }
-    config = {key: value for key, value in config.items() if value is not None}
+    config = only_given(
+        success=success,
+        min_return=min_return,
+        max_return=max_return,
+        min_length=min_length,
+        max_length=max_length,
+    )
     return _write(source, set.intersection(*met), stage="filter", config=config, name=name, out=out)
 
 

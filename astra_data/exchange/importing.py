@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from astra_data.core.config import did_you_mean, validated
+from astra_data.core.config import did_you_mean, only_given, validated
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.admission import is_text
 from astra_data.dataset.columns import TRUNCATED, Episode
@@ -86,8 +86,7 @@ def import_dataset(
     if not recordings:
         raise BadInputError("expected one recording or more to import, got none")
     began = time.perf_counter()
-    given = {"name": name, "fps": fps, "task": task, "format": file_format}
-    options = {key: value for key, value in given.items() if value is not None}
+    options = only_given(name=name, fps=fps, task=task, format=file_format)
     settings = None
     if mapping is not None:
         read = read_mapping(mapping)

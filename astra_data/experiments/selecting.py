@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import validated
+from astra_data.core.config import only_given, validated
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import alone_in
 from astra_data.core.manifest import read_manifest
@@ -48,9 +48,7 @@ def select(
     folder, settings = Path(run), settings_of(run)
     add_all(settings.get("own_methods", {}))
     asked: dict[str, Any] = settings.get("select") or {}
-    given = {"judge": judge, "episodes": episodes}
-    asked = asked | {key: value for key, value in given.items() if value is not None}
-    config = validated(asked, SelectConfig, f"{folder}: select")
+    config = validated(asked | only_given(judge=judge, episodes=episodes), SelectConfig, f"{folder}: select")
     recipe = Reported(
         name=folder.name,
         task=settings["task"],

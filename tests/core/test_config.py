@@ -4,8 +4,20 @@ from typing import Literal
 import pytest
 from pydantic import Field, ValidationError
 
-from astra_data.core.config import Config, did_you_mean, faults_of, load_recipe, own_settings, validated
+from astra_data.core.config import (
+    Config,
+    did_you_mean,
+    faults_of,
+    load_recipe,
+    only_given,
+    own_settings,
+    validated,
+)
 from astra_data.core.errors import BadInputError, RecipeError
+
+
+def test_an_option_of_0_or_false_is_given() -> None:
+    assert only_given(steps=0, resume=False, name="", out=None) == {"steps": 0, "resume": False, "name": ""}
 
 
 class Training(Config):
