@@ -94,6 +94,7 @@ def import_dataset(
     chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
+    format_ = FORMATS[chosen]
     if settings:
         settings.refuse_timeless(chosen, str(mapping))
     sources = named_apart(bounded([source for r in recordings for source in _sources(r, chosen)], max_bytes))
@@ -102,22 +103,23 @@ def import_dataset(
         raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
     if settings and chosen == "mcap" and not settings.split.files:
         _refuse_parts(sources)
-    sources, left_out = _without_bad(sources, chosen, settings) if skip_bad else (sources, ())
-    records = {source: record for source in sources if (record := _record(source, chosen))}
-    for source, record in records.items():
-        recorded = _restored(source, chosen, record)
+    left_out: tuple[str, ...] = ()
+    if skip_bad:
         if settings is None:
-            if len(sources) > 1:
-                raise BadInputError(
-                    f"{source} is an export of astra-data: import each on its own, then merge"
-                )
-            root, frames = write_restored(record, recorded, options, identities(sources), out)
-            seconds = time.perf_counter() - began
-            return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
-        deque(recorded, maxlen=0)  # verifies the sums
+            raise BadInputError("--skip-bad needs a --mapping, which tells what is missing")
+        sources, left_out = importable(sources, format_, settings)
+    records = _records(sources, format_)
+    if records and settings is None:
+        if len(sources) > 1:
+            raise BadInputError(
+                f"{next(iter(records))} is an export of astra-data: import each on its own, then merge"
+            )
+        return _restored_export(sources[0], format_, records[sources[0]], options, out, began)
+    for source, record in records.items():
+        deque(_restored(source, format_, record), maxlen=0)  # verifies the sums
     settings = settings or _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
-    cuts = episodes(sources, FORMATS[chosen], settings, cutter)
+    cuts = episodes(sources, format_, settings, cutter)
     first = next(cuts, None)
     if first is None:
         refuse_rejected(cutter.tally, settings)
@@ -152,7 +154,7 @@ def import_dataset(
     # Where episodes are parts of files, their origins are no files' names.
     are_files = settings.split.files and origins <= set(names)
     unused = tuple(name for name in names if are_files and name not in origins)
-    unread = () if chosen == "minari" else other_files(recordings, _suffixes(FORMATS[chosen]))
+    unread = () if chosen == "minari" else other_files(recordings, _suffixes(format_))
     seconds = time.perf_counter() - began
     return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, left_out)
 
@@ -168,22 +170,34 @@ def _refuse_parts(sources: Sequence[Source]) -> None:
             )
 
 
-def _without_bad(
-    sources: Sequence[Source], file_format: str, mapping: ImportMapping | None
-) -> tuple[list[Source], tuple[str, ...]]:
-    if mapping is None:
-        raise BadInputError("--skip-bad needs a --mapping, which tells what is missing")
-    return importable(sources, FORMATS[file_format], mapping)
+def _records(sources: Sequence[Source], format_: ModuleType) -> dict[Source, ExportRecord]:
+    """Return the records of those `sources` that are our own exports."""
+    records = {}
+    for source in sources:
+        with explained(source, format_):
+            if record := read_record(format_, source):
+                records[source] = record
+    return records
 
 
-def _record(source: Source, file_format: str) -> ExportRecord | None:
-    with explained(source, FORMATS[file_format]):
-        return read_record(FORMATS[file_format], source)
+def _restored(source: Source, format_: ModuleType, record: ExportRecord) -> Iterator[Episode]:
+    with explained(source, format_):
+        yield from restored(format_, source, record)
 
 
-def _restored(source: Source, file_format: str, record: ExportRecord) -> Iterator[Episode]:
-    with explained(source, FORMATS[file_format]):
-        yield from restored(FORMATS[file_format], source, record)
+def _restored_export(
+    source: Source,
+    format_: ModuleType,
+    record: ExportRecord,
+    options: Mapping[str, Any],
+    out: Path | None,
+    began: float,
+) -> ImportReport:
+    """Write our own export back as it was."""
+    recorded = _restored(source, format_, record)
+    root, frames = write_restored(record, recorded, options, identities([source]), out)
+    seconds = time.perf_counter() - began
+    return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
 
 
 def _common_format(recordings: Sequence[Path]) -> str:
