@@ -18,6 +18,7 @@ from astra_data.dataset.columns import (
     INDEX,
     TASK_INDEX,
     TIMESTAMP,
+    Array,
     Column,
 )
 
@@ -64,6 +65,30 @@ _ENCODINGS = {"float32": "BYTE_STREAM_SPLIT", "int64": "DELTA_BINARY_PACKED"}
 def stored_columns(columns: Sequence[Column]) -> list[Column]:
     """Return all columns of a dataset in the order of the file: the given ones, the uid, LeRobot's own."""
     return [*columns, EPISODE_UID_COLUMN, *DEFAULT_COLUMNS]
+
+
+def reserved_values(steps: int, *, uid: int, episode: int, start: int, fps: float) -> dict[str, Array]:
+    """Return the uid and LeRobot's own columns of an episode, (T,) each, in the order of the file.
+
+    Args:
+        steps: T.
+        uid: the episode's uid.
+        episode: its index.
+        start: index of its first step in the dataset.
+        fps: steps per second.
+
+    Returns:
+        ints, and timestamps in s as float64.
+    """
+    frames = np.arange(steps)
+    return {
+        EPISODE_UID: np.full(steps, uid),
+        TIMESTAMP: frames / fps,
+        FRAME_INDEX: frames,
+        EPISODE_INDEX: np.full(steps, episode),
+        INDEX: frames + start,
+        TASK_INDEX: np.zeros_like(frames),
+    }
 
 
 def arrow_type(dtype: str, size: int) -> pa.DataType:

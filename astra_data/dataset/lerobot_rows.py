@@ -12,6 +12,7 @@ from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.digests import Digests
+from astra_data.dataset.format import reserved_values
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.plain import PlainColumn, Run, runs
 
@@ -72,15 +73,7 @@ class Rows:
             uid: its uid.
         """
         steps = len(run) - self.dropped
-        frames = np.arange(steps)
-        reserved = {
-            names.EPISODE_UID: np.full(steps, uid),
-            names.EPISODE_INDEX: np.full(steps, episode),
-            names.FRAME_INDEX: frames,
-            names.INDEX: frames + start,
-            names.TASK_INDEX: np.zeros_like(frames),
-            names.TIMESTAMP: frames / self.fps,
-        }
+        reserved = reserved_values(steps, uid=uid, episode=episode, start=start, fps=self.fps)
         if spec.name in reserved:
             return reserved[spec.name].astype(spec.dtype)
         if spec.name in (names.TRUNCATED, names.DONE):

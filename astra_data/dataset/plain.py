@@ -13,7 +13,7 @@ import pyarrow as pa
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
-from astra_data.dataset.format import STATS_PATH, TASKS_PATH, arrow_type
+from astra_data.dataset.format import STATS_PATH, TASKS_PATH, arrow_type, reserved_values
 from astra_data.dataset.parquet import UNREADABLE, open_parquet, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4
@@ -237,15 +237,9 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
         row: index of its first row in the dataset.
         fps: steps per second.
     """
-    frame = np.arange(len(run))
-    expected: dict[str, Array] = {
-        names.INDEX: row + frame,
-        names.EPISODE_INDEX: np.full(len(run), number),
-        names.FRAME_INDEX: frame,
-        names.TIMESTAMP: frame / fps,
-    }
-    if names.EPISODE_UID in run.columns:
-        expected[names.EPISODE_UID] = np.full(len(run), run.columns[names.EPISODE_UID][0])
+    uid = run.columns.get(names.EPISODE_UID, [0])[0]
+    expected = reserved_values(len(run), uid=uid, episode=number, start=row, fps=fps)
+    del expected[names.TASK_INDEX]  # LeRobot's datasets may have several tasks
     for name, values in run.columns.items():
         wrong = ~np.isfinite(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)
         if name == names.TIMESTAMP:

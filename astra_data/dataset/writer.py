@@ -157,15 +157,10 @@ class DatasetWriter:
             raise BadInputError(f"{self.root}: add episodes inside `with DatasetWriter(...) as writer:`.")
         self._admission.admit(episode)
         length = len(episode)
-        frames = np.arange(length)
-        values = {name: episode.columns[name] for name in self._columns} | {
-            names.EPISODE_UID: np.full(length, episode.uid),
-            names.TIMESTAMP: (frames / self._fps).astype(np.float32),
-            names.FRAME_INDEX: frames,
-            names.EPISODE_INDEX: np.full(length, len(self._lengths)),
-            names.INDEX: frames + self._frames,
-            names.TASK_INDEX: np.zeros_like(frames),
-        }
+        values = {name: episode.columns[name] for name in self._columns} | layout.reserved_values(
+            length, uid=episode.uid, episode=len(self._lengths), start=self._frames, fps=self._fps
+        )
+        values[names.TIMESTAMP] = values[names.TIMESTAMP].astype(np.float32)
         chunk, file = self._data.locate()
         arrays = [to_arrow(values[field.name], field.type) for field in self._schema]
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))

@@ -30,6 +30,20 @@ def test_constants_are_lerobots(lerobot: SimpleNamespace) -> None:
     assert defaults == lerobot.names.DEFAULT_FEATURES
 
 
+def test_the_columns_of_lerobot_come_in_the_order_of_the_file() -> None:
+    values = layout.reserved_values(3, uid=7, episode=2, start=10, fps=4)
+    assert list(values) == [column.name for column in layout.stored_columns([])]
+    assert {name: column.tolist() for name, column in values.items()} == {
+        "episode_uid": [7, 7, 7],
+        "timestamp": [0.0, 0.25, 0.5],
+        "frame_index": [0, 1, 2],
+        "episode_index": [2, 2, 2],
+        "index": [10, 11, 12],
+        "task_index": [0, 0, 0],
+    }
+    assert values["timestamp"].dtype == "float64"
+
+
 def test_the_arrow_schema_is_lerobots(lerobot: SimpleNamespace) -> None:
     stored = layout.stored_columns(COLUMNS)
     features = {column.name: column.feature() | {"shape": (column.size,)} for column in stored}
