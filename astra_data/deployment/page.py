@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from astra_data.reports.formatting import table
+
 _PAGE = """\
 # {task}: {row}, seed {seed}
 
@@ -87,5 +89,5 @@ def _table(values: Mapping[str, Any]) -> str:
     """Return the lists in the description of a column as a table, one row for each value."""
     lists = {key: entries for key, entries in values.items() if not isinstance(entries, str)}
     titles = [key.removesuffix("s") if key != "names" else "name" for key in lists]
-    rows = [titles, ["---"] * len(titles), *zip(*lists.values(), strict=True)]
-    return "\n".join(f"| {' | '.join(map(str, row))} |" for row in rows)
+    rows = (map(str, row) for row in zip(*lists.values(), strict=True))
+    return table(titles, rows, words=len(titles))
