@@ -1,18 +1,13 @@
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from command_line import call
 
-from astra_data.cli import app as cli
 from astra_data.core.errors import AstraDataError
 from astra_data.dataset.versions import open_dataset
 from astra_data.stages.augment import AugmentConfig
 
 pytestmark = pytest.mark.usefixtures("home")
-
-
-def call(*arguments: str) -> Result:
-    return CliRunner().invoke(cli.app, arguments)
 
 
 def test_a_dataset_is_augmented_beside_itself(home: Path) -> None:

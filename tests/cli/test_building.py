@@ -1,9 +1,8 @@
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from command_line import call
 
-from astra_data.cli import app as cli
 from astra_data.core.errors import AstraDataError
 from astra_data.dataset import Dataset, StagedWriter
 from astra_data.dataset.columns import Episode
@@ -12,10 +11,6 @@ from astra_data.dataset.versions import open_dataset
 pytestmark = pytest.mark.usefixtures("home")
 
 SMALL = ["--episodes", "2", "--max-steps", "3"]
-
-
-def call(*arguments: str) -> Result:
-    return CliRunner().invoke(cli.app, arguments)
 
 
 def test_a_dataset_is_collected_and_paired_without_a_recipe(home: Path) -> None:

@@ -1,10 +1,9 @@
 from pathlib import Path
 
 import pytest
+from command_line import call, output_of
 from fake_dataset import write_fake
-from typer.testing import CliRunner
 
-from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.edit import subset
 from astra_data.dataset.versions import open_dataset, versions_at_home
@@ -17,18 +16,14 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "fake@data-1.0.0"
 
 
-def run(*arguments: str) -> str:
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> None:
-    assert "(fake@data-1.1.0, 2 episodes, " in run("subset", fake, "--percent", "40", "--stratify", "success")
-    assert "(fake@data-1.2.0, 3 episodes, " in run("delete", fake, "--episode", "13", "--episode", "0")
-    assert "(fake@data-1.3.0, 2 episodes, " in run("filter", fake, "--success")
-    assert "(fake@data-1.4.0, 3 episodes, " in run("filter", fake, "--no-success")
-    assert "(fake@data-1.4.0, 5 episodes, 55 " in run(
+    assert "(fake@data-1.1.0, 2 episodes, " in output_of(
+        "subset", fake, "--percent", "40", "--stratify", "success"
+    )
+    assert "(fake@data-1.2.0, 3 episodes, " in output_of("delete", fake, "--episode", "13", "--episode", "0")
+    assert "(fake@data-1.3.0, 2 episodes, " in output_of("filter", fake, "--success")
+    assert "(fake@data-1.4.0, 3 episodes, " in output_of("filter", fake, "--no-success")
+    assert "(fake@data-1.4.0, 5 episodes, 55 " in output_of(
         "merge", "fake@data-1.3.0", "fake@data-1.4.0", "--out", str(tmp_path / "here")
     )
     assert open_dataset(tmp_path / "here").verify() == []
@@ -38,7 +33,7 @@ def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> No
 def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str, tmp_path: Path) -> None:
     def uids(*arguments: str) -> list[int]:
         out = tmp_path / "-".join(arguments)
-        run(*arguments[:1], fake, *arguments[1:], "--out", str(out))
+        output_of(*arguments[:1], fake, *arguments[1:], "--out", str(out))
         return [int(uid) for uid in open_dataset(out).uids]
 
     # Returns are half the uids; lengths are 7, 1, 12, 30 and 5.
@@ -51,13 +46,13 @@ def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str
 
 
 def test_a_refused_edit_writes_nothing(fake: str) -> None:
-    result = CliRunner().invoke(app, ["delete", fake, "--episode", "1"])
+    result = call("delete", fake, "--episode", "1")
     assert isinstance(result.exception, BadInputError)
     assert len(versions_at_home("fake")) == 1
 
 
 def test_a_recipe_says_its_sizes_itself() -> None:
-    result = CliRunner().invoke(app, ["subset", "r.toml", "--percent", "50"])
+    result = call("subset", "r.toml", "--percent", "50")
     assert str(result.exception) == "subset: a recipe sets this itself, in [sweep]: leave out --percent"
-    result = CliRunner().invoke(app, ["subset", "fake", "--percent", "50", "--seed", "0", "--seed", "1"])
+    result = call("subset", "fake", "--percent", "50", "--seed", "0", "--seed", "1")
     assert isinstance(result.exception, BadInputError)

@@ -4,16 +4,11 @@ from pathlib import Path
 
 import matplotlib.image
 import pytest
+from command_line import call
 from fake_dataset import COLUMNS, write_fake
 from toy_logs import Columns, toy_columns, write_logs
-from typer.testing import CliRunner, Result
 
-from astra_data.cli import app as cli
 from astra_data.core.errors import AstraDataError
-
-
-def call(*arguments: str) -> Result:
-    return CliRunner().invoke(cli.app, arguments)
 
 
 def test_a_dataset_is_shown_and_drawn(tmp_path: Path) -> None:

@@ -1,11 +1,10 @@
 from pathlib import Path
 
 import pytest
+from command_line import output_of
 from fake_dataset import write_fake
 from shared_files import contents
-from typer.testing import CliRunner
 
-from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, SharingError
 from astra_data.dataset import Dataset
 
@@ -18,35 +17,29 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dataset:
     return write_fake(tmp_path / "fake")
 
 
-def call(*words: str) -> str:
-    result = CliRunner().invoke(app, words, catch_exceptions=False)
-    assert result.exit_code == 0
-    return result.stdout
-
-
 def test_a_version_goes_to_a_folder_and_back(fake: Dataset, tmp_path: Path) -> None:
     place = f"file://{tmp_path}/shared"
-    assert call("push", str(fake.root), "./shared") == f"shared: {place}/fake@data-1.0.0\n"
+    assert output_of("push", str(fake.root), "./shared") == f"shared: {place}/fake@data-1.0.0\n"
     home = tmp_path / "home/fake/data-1.0.0"
-    assert call("pull", f"{place}/fake", "--version", "1.0.0") == f"fake@data-1.0.0: {home}\n"
+    assert output_of("pull", f"{place}/fake", "--version", "1.0.0") == f"fake@data-1.0.0: {home}\n"
     assert contents(home) == contents(fake.root)
     out = tmp_path / "out"
-    assert call("pull", f"{place}/fake", "--out", str(out)) == f"fake@data-1.0.0: {out}\n"
+    assert output_of("pull", f"{place}/fake", "--out", str(out)) == f"fake@data-1.0.0: {out}\n"
     with pytest.raises(BadInputError, match=r"no version data-2\.0\.0"):
-        call("pull", f"{place}/fake", "--version", "2.0.0")
+        output_of("pull", f"{place}/fake", "--version", "2.0.0")
     with pytest.raises(SharingError, match=r"bytes, of which at most 10 are taken"):
-        call("pull", f"{place}/fake", "--out", str(tmp_path / "large"), "--max-bytes", "10")
+        output_of("pull", f"{place}/fake", "--out", str(tmp_path / "large"), "--max-bytes", "10")
 
 
 def test_a_card_is_written_with_its_notes(fake: Dataset, tmp_path: Path) -> None:
     (tmp_path / "notes.toml").write_text('license = "mit"\n')
-    assert call("card", str(fake.root)) == "written: fake.md\nwritten: fake-coverage.png\n"
+    assert output_of("card", str(fake.root)) == "written: fake.md\nwritten: fake-coverage.png\n"
     assert "license: unknown" in (tmp_path / "fake.md").read_text()
     out = tmp_path / "it.md"
-    call("card", str(fake.root), "--out", str(out), "--notes", "notes.toml")
+    output_of("card", str(fake.root), "--out", str(out), "--notes", "notes.toml")
     assert "license: mit" in out.read_text()
 
 
 def test_private_is_for_the_hub(fake: Dataset) -> None:
     with pytest.raises(BadInputError, match="private is for the Hugging Face Hub"):
-        call("push", str(fake.root), "./shared", "--private")
+        output_of("push", str(fake.root), "./shared", "--private")
