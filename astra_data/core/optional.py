@@ -19,12 +19,22 @@ EXTRAS = {
     "jinja2": "report",
     "onnxruntime": "deploy",
     "onnxscript": "deploy",
+    "lerobot": "lerobot",
+    "datasets": "lerobot",
+    "h5py": "hdf5",
+    "minari": "minari",
+    "mcap": "mcap",
+    "mcap_protobuf": "mcap",
+    "mcap_ros2": "mcap",
+    "ray": "ray",
+    "trackio": "trackio",
+    "rerun": "view",
 }
-"""Which extra brings each package that whole rooms of the code import."""
+"""Which extra brings each package."""
 
 
-def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
-    """Import `module`, which is installed with the optional extra `extra`.
+def optional(module: str) -> Any:  # noqa: ANN401 - a module
+    """Import `module` of a package in `EXTRAS`.
 
     Raises:
         BadInputError: it is not installed; the message says how to install it.
@@ -32,13 +42,13 @@ def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
     try:
         return import_module(module)
     except ImportError as error:
-        raise _not_installed(module, extra) from error
+        raise _not_installed(module.partition(".")[0]) from error
 
 
 def missing_extra(error: ModuleNotFoundError) -> BadInputError | None:
     """Return an error that says which extra brings the missing module; None if none of `EXTRAS` does."""
     package = (error.name or "").partition(".")[0]
-    return _not_installed(package, EXTRAS[package]) if package in EXTRAS else None
+    return _not_installed(package) if package in EXTRAS else None
 
 
 def cure(extra: str) -> str:
@@ -46,5 +56,5 @@ def cure(extra: str) -> str:
     return f'uv sync --extra {extra} in a checkout, else pip install "astra-data[{extra}]"'
 
 
-def _not_installed(module: str, extra: str) -> BadInputError:
-    return BadInputError(f"{module.partition('.')[0]} is needed and not installed: {cure(extra)}")
+def _not_installed(package: str) -> BadInputError:
+    return BadInputError(f"{package} is needed and not installed: {cure(EXTRAS[package])}")

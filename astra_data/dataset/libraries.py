@@ -22,7 +22,7 @@ def to_huggingface(root: Path) -> "datasets.Dataset":
     Raises:
         BadInputError: datasets is not installed.
     """
-    library = optional("datasets", "lerobot")
+    library = optional("datasets")
     rows: datasets.Dataset = library.Dataset(pa.concat_tables(map(pq.read_table, data_files(root))))
     return rows
 
@@ -38,6 +38,6 @@ def to_lerobot(root: Path, name: str, **options: Any) -> "LeRobotDataset":  # no
     Raises:
         BadInputError: lerobot is not installed.
     """
-    library = optional("lerobot.datasets.lerobot_dataset", "lerobot")
+    library = optional("lerobot.datasets.lerobot_dataset")
     opened: LeRobotDataset = library.LeRobotDataset(f"local/{name}", root=root, **options)
     return opened

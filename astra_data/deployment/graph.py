@@ -82,7 +82,7 @@ def write_graphs(deployed: RunningPolicy, folder: Path) -> Written:
     Raises:
         BadInputError: code of the task cannot be traced, or a graph gives other commands than the policy.
     """
-    optional("onnxscript", "deploy")
+    optional("onnxscript")
     if isinstance(deployed.policy, OwnPolicy):
         raise BadInputError(
             f"{deployed.policy.name} is a policy of another learner, which cannot be traced: export it with "
@@ -109,7 +109,7 @@ def load_onnx(path: Path) -> Graph:
     Raises:
         BadInputError: onnxruntime is not installed.
     """
-    runtime = optional("onnxruntime", "deploy")
+    runtime = optional("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
     session = runtime.InferenceSession(path, options, providers=["CPUExecutionProvider"])

@@ -92,7 +92,7 @@ def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[tuple[Any, D
         BadInputError: h5py is not installed.
         OSError: something could not be written; what there is at `path` is of no use.
     """
-    h5py = optional("h5py", "hdf5")
+    h5py = optional("h5py")
     disk = Disk(path)
     try:
         with h5py.File(disk, "w", track_order=track_order) as file:

@@ -44,7 +44,7 @@ class McapFile:
 
     def messages(self, *, checked: bool) -> Iterator[tuple[str, Any]]:
         """Yield each message with its topic, in the order of the file; `checked` by its sums, or not."""
-        records = optional("mcap.records", "mcap")
+        records = optional("mcap.records")
         wanted = {number: channel.topic for number, channel in self._channels.items()}
         for record in self._records(checked=checked):
             if isinstance(record, records.Message):
@@ -81,7 +81,7 @@ class McapFile:
             BadInputError: they have an encoding that cannot be read, or a package is missing.
         """
         packages = "mcap_protobuf", "mcap_ros2"
-        factories = [optional(f"{package}.decoder", "mcap").DecoderFactory() for package in packages]
+        factories = [optional(f"{package}.decoder").DecoderFactory() for package in packages]
         channel = self._channels[number]
         if channel.message_encoding == "json":
             return json.loads
@@ -106,7 +106,7 @@ class McapFile:
                 self._whole_bytes, self.is_cut = _whole_bytes(stream, content), True
                 return
             stream.seek(0)
-            summary = optional("mcap.reader", "mcap").make_reader(stream).get_summary()
+            summary = optional("mcap.reader").make_reader(stream).get_summary()
         if summary is None:
             return
         self._channels, self._schemas = dict(summary.channels), dict(summary.schemas)
@@ -124,7 +124,7 @@ class McapFile:
 
     def _records(self, *, checked: bool) -> Iterator[Any]:
         """Yield the records of the data, those of chunks unpacked, and `checked` by their sums."""
-        reading, records = optional("mcap.stream_reader", "mcap"), optional("mcap.records", "mcap")
+        reading, records = optional("mcap.stream_reader"), optional("mcap.records")
         with self._source.open() as stream:
             if self._chunks is not None:
                 for index in self._chunks:
@@ -144,7 +144,7 @@ class McapFile:
                         return
                     else:
                         yield record
-            except optional("mcap.exceptions", "mcap").EndOfFile:
+            except optional("mcap.exceptions").EndOfFile:
                 if self._whole_bytes is None:
                     raise
 

@@ -10,7 +10,7 @@ Everything else stays unloaded until an environment is made.
 
 from astra_data.core.optional import optional
 
-gymnasium = optional("gymnasium", "sim")
+gymnasium = optional("gymnasium")
 
 _FACES = "astra_data.training.gymnasium"
 _GROUNDED = "astra_data.experiments.grounded_env"

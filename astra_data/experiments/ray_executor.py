@@ -116,7 +116,7 @@ class Mailbox:
 def _connect(address: str, jobs: int | None) -> Any:  # noqa: ANN401 - the module
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
-    ray = optional("ray", "ray")
+    ray = optional("ray")
     local = {"num_cpus": jobs or cores(), "include_dashboard": False} if address == HERE else {}
     try:
         ray.init(address, log_to_driver=False, logging_level="ERROR", **local)

@@ -214,7 +214,7 @@ class _PointWatcher:
 
 def _tracked(project: str, recipe: str) -> Log:
     """Return a function that logs each point as a run of a trackio project."""
-    trackio = optional("trackio", "trackio")
+    trackio = optional("trackio")
 
     def log(line: dict[str, Any]) -> None:
         named = {key: line[key] for key in ("method", "percent", "seed")}

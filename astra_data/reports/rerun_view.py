@@ -73,7 +73,7 @@ def view(
         CorruptDatasetError: a file cannot be read.
         DiskError: the recording cannot be written.
     """
-    rerun = optional("rerun", "view")
+    rerun = optional("rerun")
     if save is not None and save.suffix != ".rrd":
         raise BadInputError(f"--save {save}: expected a file that ends in .rrd")
     known = {int(uid): index for index, uid in enumerate(dataset.uids)}

@@ -34,7 +34,7 @@ def compare_with_lerobot(root: Path, report: Report) -> None:
         BadInputError: lerobot is not installed.
     """
     os.environ["HF_HUB_OFFLINE"] = "1"
-    optional("lerobot", "lerobot")
+    optional("lerobot")
     import datasets.config  # noqa: PLC0415 - slow, and only after the environment is set
     from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415
 

@@ -40,7 +40,7 @@ def write(dataset: Dataset, path: Path, out: Path) -> None:
         BadInputError: a next state is not the state of the following step, as Minari assumes, or the name of
             `out` is not a valid id.
     """
-    minari = optional("minari", "minari")
+    minari = optional("minari")
     from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here
     from minari.serialization import serialize_space  # noqa: PLC0415 - an extra
 

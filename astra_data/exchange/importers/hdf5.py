@@ -25,7 +25,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     Raises:
         BadInputError: groups or fields are missing, or are stored in another file.
     """
-    h5py = optional("h5py", "hdf5")
+    h5py = optional("h5py")
     with h5py.File(source.path, "r") as file:
         for origin, datasets in _episodes(h5py, file, mapping.episodes, str(source)):
             if mapping.episodes is None:
@@ -53,7 +53,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 def record(source: Source) -> str | None:
     """Return the record of an export of ours, None if it has none."""
-    h5py = optional("h5py", "hdf5")
+    h5py = optional("h5py")
     with h5py.File(source.path, "r") as file:
         found = file
         for part in RECORD.split("/"):
@@ -75,7 +75,7 @@ def layout(source: Source) -> dict[str, Any]:
     Raises:
         BadInputError: it is none of them.
     """
-    h5py = optional("h5py", "hdf5")
+    h5py = optional("h5py")
     with h5py.File(source.path, "r") as file:
         fields = stored_datasets(h5py, file)
         if {"observations", "actions"} <= fields.keys():

@@ -70,7 +70,7 @@ def is_dataset(path: Path) -> bool:
 
 def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
     """Open the dataset; Minari itself reads whole episodes, and follows links into other files."""
-    h5py = optional("h5py", "minari")
+    minari, h5py = optional("minari"), optional("h5py")
     for path in (source.path / "data").rglob("*.hdf5"):
         if not path.is_file():
             raise BadInputError(f"{path} is a device or a pipe, expected a file")
@@ -79,7 +79,7 @@ def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
             datasets = stored_datasets(h5py, file)
             check_storage(datasets, str(source))
             source.refuse_beyond(unpacked_bytes(datasets))
-    return optional("minari", "minari").MinariDataset(source.path / "data")
+    return minari.MinariDataset(source.path / "data")
 
 
 def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari

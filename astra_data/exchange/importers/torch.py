@@ -61,7 +61,7 @@ def layout(source: Source) -> dict[str, Any]:
 
 def _tensors(source: Source) -> dict[str, Any]:
     """Return the tensors of the dictionary in the file, by name; what else it holds is left out."""
-    torch = optional("torch", "sim")
+    torch = optional("torch")
     if not is_zipfile(source.path):
         raise BadInputError(f"{source}: expected a file that torch.save wrote")
     with ZipFile(source.path) as archive:
