@@ -1,6 +1,6 @@
 """Exact statistics of columns in float64, with LeRobot's names and shapes."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from astra_data.core.numbers import as_rows
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import QUANTILES, STATISTICS, STORED_STATISTICS
 from astra_data.dataset.parquet import read_arrays
+from astra_data.dataset.plain import PlainColumn
 
 BLOCK_VALUES = 2**26
 """Values held in memory at once: 256 MiB of float32."""
@@ -37,6 +38,14 @@ def episode_statistics(columns: Iterable[Array]) -> NDArray[np.float64]:
     rows = np.empty((sum(column.shape[1] for column in values), len(values[0])))
     np.concatenate([column.T for column in values], out=rows)
     return statistics(rows)
+
+
+def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tuple[C, slice]]:
+    """Yield each of `columns` with the slice of its values, where those of all stand side by side."""
+    first = 0
+    for column in columns:
+        yield column, slice(first, first + column.size)
+        first += column.size
 
 
 def global_statistics(

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from astra_data.dataset.column_statistics import side_by_side
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.format import EPISODES_PATH, STATISTICS, STORED_STATISTICS, episodes_schema
 from astra_data.dataset.parquet import RotatingWriter, to_lists
@@ -57,14 +58,10 @@ class EpisodeRows:
         rows: list[Array] = [lengths, chunks, files, ends - lengths, ends]
         arrays = [pa.array(episodes), pa.array([[self._task]] * count), *map(pa.array, rows)]
         stacked = np.stack(self._statistics)
-        first = 0
-        for column in self._columns:
-            part = stacked[:, :, first : first + column.size]
-            first += column.size
+        for _, part in side_by_side(self._columns):
             for name in STORED_STATISTICS:
-                arrays.append(
-                    to_lists(lengths[:, None] if name == "count" else part[:, STATISTICS.index(name)])
-                )
+                values = lengths[:, None] if name == "count" else stacked[:, STATISTICS.index(name), part]
+                arrays.append(to_lists(values))
         arrays += [pa.array(np.full(count, chunk)), pa.array(np.full(count, file))]
         self._writer.write(pa.Table.from_arrays(arrays, schema=self._schema))
         self._episodes += count

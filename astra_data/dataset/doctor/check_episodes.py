@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.dataset import columns as names
-from astra_data.dataset.column_statistics import episode_statistics
+from astra_data.dataset.column_statistics import episode_statistics, side_by_side
 from astra_data.dataset.description import ContentHash
 from astra_data.dataset.digests import Digests, run_alterations
 from astra_data.dataset.doctor.findings import Report
@@ -155,30 +155,24 @@ class EpisodeChecks:
         self._lowest = lowest if self._lowest is None else np.minimum(self._lowest, lowest)
         self._highest = highest if self._highest is None else np.maximum(self._highest, highest)
         kinds = STATISTICS if self._is_ours else ("min", "max", "mean")
-        first = 0
-        for column in self._columns:
-            last = first + column.size
+        for column, part in side_by_side(self._columns):
             for kind in kinds:
                 self._compare(
                     f"{kind} of {column.name} in episode {number}",
                     row.get(f"stats/{column.name}/{kind}"),
-                    found[STATISTICS.index(kind), first:last],
+                    found[STATISTICS.index(kind), part],
                 )
-            first = last
 
     def _check_extremes(self) -> None:
         stored = read_statistics(self._root)
         if isinstance(stored, str):
             self._report.fault("statistics", f"{STATS_PATH} {stored}")
             return
-        first = 0
-        for column in self._columns:
-            last = first + column.size
+        for column, part in side_by_side(self._columns):
             for kind, values in (("min", self._lowest), ("max", self._highest)):
                 if values is not None:
                     found = stored.get(column.name, {}).get(kind)
-                    self._compare(f"{kind} of {column.name}", found, values[first:last])
-            first = last
+                    self._compare(f"{kind} of {column.name}", found, values[part])
 
     def _compare(self, what: str, stored: object, expected: NDArray[np.float64]) -> None:
         if is_close(stored, expected, EXACT if self._is_ours else ESTIMATED):
