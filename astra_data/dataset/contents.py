@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +34,12 @@ class Contents:
         metadata: the episodes' metadata, key to one value per episode, None where one has none.
         uids: uid of each episode, (E,).
         lengths: steps of each episode, (E,).
-        starts: first row of each episode, (E,).
         order: the permutation of episode indices whose prefixes are the nested subsets.
         subset_seed: its seed.
         task: the task of all episodes.
         paths: the data files in order.
         file_starts: first row of each file.
-        recorded: its files, where LeRobot recorded it and rows have to be converted; None for ours.
+        recorded: where LeRobot recorded it, how its rows are converted; None for ours.
     """
 
     root: Path
@@ -48,13 +48,17 @@ class Contents:
     metadata: dict[str, list[Scalar | None]]
     uids: Ints
     lengths: Ints
-    starts: Ints
     order: list[int]
     subset_seed: int
     task: str
     paths: list[Path]
     file_starts: Ints
     recorded: RecordedFiles | None = None
+
+    @cached_property
+    def starts(self) -> Ints:
+        """First row of each episode, (E,)."""
+        return np.cumsum(self.lengths) - self.lengths
 
 
 def read_contents(root: Path) -> Contents:
@@ -116,7 +120,6 @@ def read_contents(root: Path) -> Contents:
         metadata=metadata,
         uids=uids,
         lengths=lengths,
-        starts=starts,
         order=[position[uid] for uid in subsets["uids"]],
         subset_seed=subsets["seed"],
         task=tasks[0],

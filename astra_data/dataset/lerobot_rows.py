@@ -1,20 +1,16 @@
 """Rows that LeRobot recorded, as those of ours."""
 
-import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.digests import Digests
 from astra_data.dataset.format import reserved_values
-from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.plain import PlainColumn, Run, runs
+from astra_data.dataset.plain import PlainColumn, Run
 
 Ints = NDArray[np.int64]
 RECORDED_TASK = "recorded.task_index"
@@ -134,50 +130,19 @@ class Rows:
 
 @dataclass(frozen=True)
 class RecordedFiles:
-    """The files of a recording, and the E episodes in them that have steps.
+    """What is known of the files of a recording, and of the E episodes in them that have steps.
 
     Attributes:
-        root: its folder.
-        paths: the data files in order.
         rows: how their rows become ours.
-        uids: uid of each episode, (E,).
-        lengths: steps of each episode, (E,).
         first_rows: the row of the files in which each episode begins, (E,).
         total_rows: rows of all files.
         digests: those of the values when the recording was opened.
     """
 
-    root: Path
-    paths: Sequence[Path]
     rows: Rows
-    uids: Ints
-    lengths: Ints
     first_rows: Ints
     total_rows: int
     digests: Digests
-
-    def blocks(self, specs: Sequence[Column], chosen: Ints) -> Iterator[dict[str, Array]]:
-        """Yield the columns `specs` of the episodes `chosen` (n,), in order, one at a time.
-
-        Raises:
-            CorruptDatasetError: a file cannot be read, or has other episodes than before.
-        """
-        dropped = self.rows.dropped
-        wanted = None
-        if len(chosen) < len(self.lengths):
-            wanted = np.zeros(self.total_rows, dtype=bool)
-            for episode in chosen:
-                first = self.first_rows[episode]
-                wanted[first : first + self.lengths[episode] + dropped] = True
-        columns = self.rows.stored_for([spec.name for spec in specs])
-        tables = read_blocks(self.paths, [column.name for column in columns], wanted)
-        found = (run for run in runs(self.root / "data", tables, columns) if len(run) > dropped)
-        starts = np.cumsum(self.lengths) - self.lengths
-        for episode, run in itertools.zip_longest(chosen.tolist(), found):
-            if run is None or episode is None or len(run) != self.lengths[episode] + dropped:
-                raise CorruptDatasetError("its files were altered while they were read")
-            place = (episode, int(starts[episode]), int(self.uids[episode]))
-            yield {spec.name: self.rows.values(spec, run, *place) for spec in specs}
 
 
 def lacking(recorded: Iterable[Column]) -> list[str]:

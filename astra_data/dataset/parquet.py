@@ -111,6 +111,25 @@ def read_blocks(
             raise CorruptDatasetError(f"{name} cannot be read ({in_short(error)})") from error
 
 
+def rows_of(
+    chosen: NDArray[np.int64], starts: NDArray[np.int64], lengths: NDArray[np.int64], total: int
+) -> NDArray[np.bool_] | None:
+    """Return the mask (total,) of the rows of episodes, as `read_blocks` takes it; None for all.
+
+    Args:
+        chosen: indices of the episodes, (n,).
+        starts: first row of each episode, (E,).
+        lengths: rows of each episode, (E,).
+        total: rows of all files.
+    """
+    if len(chosen) == len(starts):
+        return None
+    wanted = np.zeros(total, dtype=bool)
+    for episode in chosen:
+        wanted[starts[episode] : starts[episode] + lengths[episode]] = True
+    return wanted
+
+
 def read_arrays(
     paths: Sequence[Path], columns: Sequence[Column], wanted: NDArray[np.bool_] | None = None
 ) -> Iterator[dict[str, Array]]:

@@ -1,6 +1,7 @@
 """The values of a dataset as its data files have them; `Dataset` verifies them."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 
 import numpy as np
 
@@ -9,7 +10,9 @@ from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.contents import Contents, Ints
 from astra_data.dataset.description import ContentHash
 from astra_data.dataset.digests import Digests, alteration, digests_of
-from astra_data.dataset.parquet import read_arrays
+from astra_data.dataset.lerobot_rows import RecordedFiles
+from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of
+from astra_data.dataset.plain import runs
 
 
 def read_values(
@@ -25,14 +28,9 @@ def read_values(
     if not columns:
         return
     if contents.recorded is not None:
-        for position, block in enumerate(contents.recorded.blocks(columns, episodes)):
-            yield block, episodes[position : position + 1]
+        yield from _converted(contents, contents.recorded, columns, episodes)
         return
-    wanted = None
-    if len(episodes) < len(contents.lengths):
-        wanted = np.zeros(int(contents.lengths.sum()), dtype=bool)
-        for episode in episodes:
-            wanted[contents.starts[episode] : contents.starts[episode] + contents.lengths[episode]] = True
+    wanted = rows_of(episodes, contents.starts, contents.lengths, int(contents.lengths.sum()))
     ends = np.cumsum(contents.lengths[episodes])
     rest: dict[str, Array] = {}
     row = first = 0
@@ -47,6 +45,24 @@ def read_values(
         row, first = row + cut, last
     if rest or first < len(episodes):
         raise CorruptDatasetError("the data files have other rows than when the dataset was opened")
+
+
+def _converted(
+    contents: Contents, recorded: RecordedFiles, columns: Sequence[Column], episodes: Ints
+) -> Iterator[tuple[dict[str, Array], Ints]]:
+    """Yield what `read_values` does of a recording of LeRobot, an episode at a time."""
+    rows = recorded.rows
+    lengths = contents.lengths + rows.dropped
+    wanted = rows_of(episodes, recorded.first_rows, lengths, recorded.total_rows)
+    stored = rows.stored_for([column.name for column in columns])
+    tables = read_blocks(contents.paths, [column.name for column in stored], wanted)
+    found = (run for run in runs(contents.root / "data", tables, stored) if len(run) > rows.dropped)
+    for position, (episode, run) in enumerate(zip_longest(episodes.tolist(), found)):
+        if run is None or episode is None or len(run) != lengths[episode]:
+            raise CorruptDatasetError("its files were altered while they were read")
+        place = (episode, int(contents.starts[episode]), int(contents.uids[episode]))
+        values = {column.name: rows.values(column, run, *place) for column in columns}
+        yield values, episodes[position : position + 1]
 
 
 def measure(contents: Contents) -> tuple[str, Digests]:
