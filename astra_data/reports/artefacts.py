@@ -21,10 +21,14 @@ METRICS = "metrics.json"
 GAP = "gap.json"
 
 
-class Artefact(BaseModel):
-    """A file that a stage wrote, with its time and origin if recorded."""
+class Written(BaseModel):
+    """A part of a file that a stage wrote; frozen."""
 
     model_config = ConfigDict(frozen=True)
+
+
+class Artefact(Written):
+    """A file that a stage wrote, with its time and origin if recorded."""
 
     wall_seconds: float | None = None
     """Run time of the stage, in s."""
@@ -36,10 +40,8 @@ class Artefact(BaseModel):
     machine: Machine | None = None
 
 
-class Outcomes(BaseModel):
+class Outcomes(Written):
     """Outcomes of a policy's episodes, one number per episode."""
-
-    model_config = ConfigDict(frozen=True)
 
     success: list[float]
     """1 where the goal was reached, else 0."""
@@ -107,10 +109,8 @@ class Evaluation(Artefact):
         return found
 
 
-class CurvePoint(BaseModel):
+class CurvePoint(Written):
     """One point of a learning curve."""
-
-    model_config = ConfigDict(frozen=True)
 
     steps: float
     success: float | None
@@ -130,10 +130,8 @@ class CurveFile(Artefact):
     """Of a training that may be done again: what each try reached; the points are those of the one kept."""
 
 
-class Foresight(BaseModel):
+class Foresight(Written):
     """How well failures are foreseen on held-out episodes."""
-
-    model_config = ConfigDict(frozen=True)
 
     failures: int
     auc: dict[str, float | None] | None = None
@@ -152,10 +150,8 @@ class Metrics(Artefact):
     """By what foresees them; empty without a failure model."""
 
 
-class Band(BaseModel):
+class Band(Written):
     """An error at each horizon; no interval where a single episode is that long."""
-
-    model_config = ConfigDict(frozen=True)
 
     mean: list[float]
     low: list[float | None]

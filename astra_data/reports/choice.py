@@ -5,9 +5,9 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from astra_data.reports.artefacts import Artefact, read_json
+from astra_data.reports.artefacts import Artefact, Written, read_json
 from astra_data.reports.schema import Calibration, Choice, Ranked
 from astra_data.reports.statistics import Correlation, mean_interval, mean_rank_correlation
 
@@ -22,10 +22,8 @@ Measured = Mapping[tuple[str, int], float]
 """Row and seed → the success in the target."""
 
 
-class Candidate(BaseModel):
+class Candidate(Written):
     """A trained policy, and its success with each judge."""
-
-    model_config = ConfigDict(frozen=True)
 
     row: str
     seed: int

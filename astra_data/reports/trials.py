@@ -2,27 +2,23 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from astra_data.reports.artefacts import Artefact, read_json
+from astra_data.reports.artefacts import Artefact, Written, read_json
 
 TRIALS = "trials.json"
 
 
-class Tried(BaseModel):
+class Tried(Written):
     """A candidate in a round: 1 or 0 for each of its trials."""
-
-    model_config = ConfigDict(frozen=True)
 
     row: str
     seed: int
     success: list[int]
 
 
-class TrialRound(BaseModel):
+class TrialRound(Written):
     """A round. All of its candidates meet the same starts and goals."""
-
-    model_config = ConfigDict(frozen=True)
 
     trials: int
     """Of each candidate."""
