@@ -57,7 +57,7 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
     key = item.key
     if not experiment.has(key):
         return Condition("missing")
-    faults, manifest = _examined(key, experiment, verify=verify)
+    faults, manifest = examined(key, experiment, verify=verify)
     if why := faults or (verify and _unreadable(key, experiment)):
         return Condition("damaged", why)
     if why := experiment.outdated(key) or _replaced(item, experiment, manifest):
@@ -65,17 +65,12 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
     return Condition("finished", _remark(key, experiment, manifest))
 
 
-def damage(key: str, experiment: Experiment, *, verify: bool) -> str:
-    """Return what is wrong with the files of the artefact `key`: their sizes or, with `verify`, their bytes.
+def examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Manifest | None]:
+    """Return what is wrong with the files of the artefact `key`, and its manifest if it has one.
 
-    Of datasets, what the metadata and the footers of the files show or, with `verify`, all values.
+    Their sizes are compared or, with `verify`, their bytes. Of datasets, it is what the metadata and the
+    footers of the files show or, with `verify`, all values.
     """
-    faults, _ = _examined(key, experiment, verify=verify)
-    return faults
-
-
-def _examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Manifest | None]:
-    """Return what `damage` does, and the manifest of the artefact `key` if it has one."""
     folder, stage = experiment.place(key), _stage(key)
     manifest = None
     try:
@@ -120,7 +115,7 @@ def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, 
         if not read:
             return reasons
         verified |= read
-        faults = {key: damage(key, experiment, verify=True) for key in sorted(read)}
+        faults = {key: examined(key, experiment, verify=True)[0] for key in sorted(read)}
         reasons |= {key: f"damaged ({why})" for key, why in faults.items() if why}
 
 

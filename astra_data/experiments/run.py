@@ -14,7 +14,7 @@ from astra_data.core.durable import clean, folder_for, make_folder, move, write_
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
 from astra_data.core.naming import RECORD, RUNS, stage_of_key
-from astra_data.experiments.condition import Condition, can_be_made_again, condition, damage, to_make_again
+from astra_data.experiments.condition import Condition, can_be_made_again, condition, examined, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
 from astra_data.experiments.display import display
@@ -245,7 +245,7 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
         stage, root = stage_of_key(key), experiment.folder.parent
         if not experiment.has(key):
             fault = "missing"
-        elif why := damage(key, experiment, verify=not STAGES[stage].makes_dataset):
+        elif why := examined(key, experiment, verify=not STAGES[stage].makes_dataset)[0]:
             fault = f"damaged ({why})"
         else:
             continue
