@@ -221,12 +221,11 @@ def _record(
             **({} if plan is None else {"starts": plan.starts[rows.start : rows.stop]}),
         )
         env.reset()
-        acting = behavior.of(rows) if isinstance(behavior, PlannedCommands | MixedBehavior) else behavior
-        acting.start(len(rows), batch_seed)
+        behavior.start(rows, batch_seed)
         steps += record(
             world,
             env,
-            acting,
+            behavior,
             rows,
             writer,
             max_steps=config.max_steps if plan is None else plan.longest,

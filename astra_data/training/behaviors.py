@@ -30,8 +30,8 @@ def held_steps(hold_s: HoldTimes, timestep_s: float) -> tuple[int, int]:
 class Behavior(Protocol):
     """Acts on B robots."""
 
-    def start(self, count: int, seed: int) -> None:
-        """Begin new episodes of B = `count` robots; `seed` decides everything random."""
+    def start(self, rows: range, seed: int) -> None:
+        """Begin new episodes, numbered `rows`, of as many robots; `seed` decides everything random."""
         ...
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -69,11 +69,11 @@ class RandomCommands:
         self._hold_steps = hold_steps
         self._watch = watch
 
-    def start(self, count: int, seed: int) -> None:
-        """Begin new episodes of B = `count` robots."""
+    def start(self, rows: range, seed: int) -> None:
+        """Begin new episodes of as many robots as `rows`."""
         self._rng = generator(seed, "behavior")
-        self._command = np.zeros((count, self._size))
-        self._left = np.zeros(count, dtype=int)
+        self._command = np.zeros((len(rows), self._size))
+        self._left = np.zeros(len(rows), dtype=int)
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return commands (B, A); goals are ignored, and so are states unless walls are watched for."""
@@ -132,9 +132,9 @@ class PolicyBehavior:
     def __init__(self, running: RunningPolicy) -> None:
         self._running = running
 
-    def start(self, count: int, seed: int) -> None:
-        """Begin new episodes of B = `count` robots."""
-        self._running.start(count, torch.Generator().manual_seed(derive(seed, "behavior")))
+    def start(self, rows: range, seed: int) -> None:
+        """Begin new episodes of as many robots as `rows`."""
+        self._running.start(len(rows), torch.Generator().manual_seed(derive(seed, "behavior")))
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return actions (B, A) for target states (B, S) and goals (B, G)."""
@@ -144,22 +144,15 @@ class PolicyBehavior:
 class MixedBehavior:
     """A policy on a part of the robots, random commands on the others."""
 
-    def __init__(self, policy: Behavior, random: Behavior, share: float, first: int = 0) -> None:
-        """Let `random` act on a `share` of all episodes, spread evenly, so that the first n have it as well.
+    def __init__(self, policy: Behavior, random: Behavior, share: float) -> None:
+        """Let `random` act on a `share` of all episodes, spread evenly: the first n have it as well."""
+        self._policy, self._random, self._share = policy, random, share
 
-        The robots' episodes are those from number `first` on.
-        """
-        self._policy, self._random, self._share, self._first = policy, random, share, first
-
-    def of(self, rows: range) -> "MixedBehavior":
-        """Return the same for the episodes `rows`."""
-        return MixedBehavior(self._policy, self._random, self._share, rows.start)
-
-    def start(self, count: int, seed: int) -> None:
-        """Begin new episodes of B = `count` robots."""
-        self._policy.start(count, seed)
-        self._random.start(count, seed)
-        episodes = self._first + torch.arange(count + 1, dtype=torch.float64)
+    def start(self, rows: range, seed: int) -> None:
+        """Begin the episodes `rows`."""
+        self._policy.start(rows, seed)
+        self._random.start(rows, seed)
+        episodes = torch.arange(rows.start, rows.stop + 1, dtype=torch.float64)
         before = torch.floor(episodes * self._share + 1e-9)
         self.is_random = (before.diff() > 0).unsqueeze(1)
 

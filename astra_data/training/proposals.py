@@ -142,7 +142,7 @@ def drawn(task: Task, config: SuggestConfig, seed: int) -> Proposals:
     start = torch.from_numpy(draw(generator(seed, "proposed starts"), count)).float()
     goal = torch.from_numpy(objective.draw_goals(generator(seed, "proposed goals"), count)).float()
     commands = RandomCommands(objective.action_size, held_steps(config.hold_s, task.timestep_s))
-    commands.start(count, derive(seed, "proposed commands"))
+    commands.start(range(count), derive(seed, "proposed commands"))
     action = [commands.act(start, goal).clone() for _ in range(config.max_steps)]
     return Proposals(start, goal, torch.stack(action))
 

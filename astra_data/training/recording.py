@@ -47,7 +47,7 @@ def record(
     Args:
         task: of the target.
         env: the target, reset, with a row for each of `rows`.
-        behavior: started on as many robots.
+        behavior: started on these rows.
         rows: numbers of the episodes.
         writer: of the dataset.
         max_steps: after which episodes are truncated.

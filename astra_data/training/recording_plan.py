@@ -97,16 +97,12 @@ class PlannedCommands:
     """A behavior that plays commands whatever the robot does."""
 
     def __init__(self, action: Tensor) -> None:
-        """Play `action` (T, B, A) of ±1."""
+        """Play `action` (T, E, A) of ±1, that of all episodes."""
         self._action = action
 
-    def of(self, rows: range) -> "PlannedCommands":
-        """Return the behavior of the episodes `rows` alone."""
-        return PlannedCommands(self._action[:, rows.start : rows.stop])
-
-    def start(self, count: int, seed: int) -> None:
-        """Begin again; there is nothing random."""
-        self._left: Iterator[Tensor] = iter(self._action)
+    def start(self, rows: range, seed: int) -> None:
+        """Begin the episodes `rows`; there is nothing random."""
+        self._left: Iterator[Tensor] = iter(self._action[:, rows.start : rows.stop])
 
     def act(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return the actions (B, A) of the next step."""

@@ -136,7 +136,7 @@ def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
     behavior, task = PolicyBehavior(running), running.task
     env = task.target(_TEST_EPISODES, seed=derive(seed, "starts"), num_threads=num_threads)
     env.reset()
-    behavior.start(_TEST_EPISODES, seed)
+    behavior.start(range(_TEST_EPISODES), seed)
     active, lasted = torch.ones(_TEST_EPISODES, dtype=torch.bool), 0
     for _ in range(task.objective.horizon):
         if not active.any():

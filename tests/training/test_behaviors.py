@@ -28,7 +28,7 @@ def nearest(behavior: RandomCommands) -> float:
     """Return the least clearance in m of robots that do exactly as they are told for a minute."""
     simulator = TASK.simulator(len(STARTS))
     simulator.reset_to(torch.cat([STARTS, torch.zeros_like(STARTS)], dim=-1))
-    behavior.start(len(STARTS), seed=0)
+    behavior.start(range(len(STARTS)), seed=0)
     least = np.inf
     for _ in range(310):
         action = behavior.act(believed(simulator.state[:, :2]), torch.zeros(len(STARTS), 2))
@@ -52,7 +52,7 @@ def test_commands_that_are_watched_keep_clear_of_walls() -> None:
 
 def test_a_robot_that_is_too_near_is_led_away() -> None:
     behavior = RandomCommands(2, HOLD, WallWatch(TASK, 0.3))
-    behavior.start(64, seed=0)
+    behavior.start(range(64), seed=0)
     near = torch.tensor([[0.0, 2.35]]).expand(64, 2)
     command = behavior.act(believed(near), torch.zeros(64, 2))
     assert float(command[:, 1].max()) < 0.0
@@ -60,8 +60,8 @@ def test_a_robot_that_is_too_near_is_led_away() -> None:
 
 def test_commands_are_held_and_repeat_with_the_seed() -> None:
     first, second = RandomCommands(2, (4, 4)), RandomCommands(2, (4, 4))
-    first.start(5, seed=1)
-    second.start(5, seed=1)
+    first.start(range(5), seed=1)
+    second.start(range(5), seed=1)
     state = believed(torch.zeros(5, 2))
     commands = torch.stack([first.act(state, state[:, :2]) for _ in range(8)])
     assert torch.equal(commands, torch.stack([second.act(state, state[:, :2]) for _ in range(8)]))
@@ -71,7 +71,7 @@ def test_commands_are_held_and_repeat_with_the_seed() -> None:
 
 def test_each_axis_of_a_command_is_drawn_by_itself() -> None:
     behavior = RandomCommands(4, (1, 1))
-    behavior.start(500, seed=0)
+    behavior.start(range(500), seed=0)
     command = behavior.act(torch.zeros(500, 47), torch.zeros(500, 0))
     assert command.shape == (500, 4)
     correlation = torch.corrcoef(command.T) - torch.eye(4)
@@ -86,7 +86,7 @@ def commands_of(behavior: RandomCommands, steps: int) -> Tensor:
 
 def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_before() -> None:
     behavior = StressCommands(3, (1, 1))
-    behavior.start(200, seed=0)
+    behavior.start(range(200), seed=0)
     commands = commands_of(behavior, 20)
     assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200))
     assert (commands[0] != 0).all()
@@ -99,7 +99,7 @@ def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_befo
 
 def test_short_and_long_times_of_stress_are_alike_frequent() -> None:
     behavior = StressCommands(2, (2, 31))
-    behavior.start(200, seed=0)
+    behavior.start(range(200), seed=0)
     times = behavior._times(20_000)
     assert times.min() == 2
     assert times.max() == 31
@@ -124,32 +124,31 @@ def test_stress_keeps_clear_of_walls_where_they_are_watched() -> None:
 def test_random_commands_are_spread_over_the_robots(share: float, expected: list[bool]) -> None:
     policy, random = RandomCommands(2, (1, 1)), StressCommands(2, (1, 1))
     mixed = MixedBehavior(policy, random, share)
-    mixed.start(6, seed=0)
+    mixed.start(range(6), seed=0)
     assert mixed.is_random[:, 0].tolist() == expected
     state = believed(torch.zeros(6, 2))
     acted = mixed.act(state, state[:, :2])
     for behavior, rows in ((policy, ~mixed.is_random[:, 0]), (random, mixed.is_random[:, 0])):
-        behavior.start(6, seed=0)
+        behavior.start(range(6), seed=0)
         torch.testing.assert_close(acted[rows], behavior.act(state, state[:, :2])[rows])
 
 
 def test_a_share_of_many_robots_is_exact() -> None:
     mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
-    mixed.start(100, seed=0)
+    mixed.start(range(100), seed=0)
     assert int(mixed.is_random.sum()) == 29
 
 
 @pytest.mark.parametrize("batch", [1, 7, 25])
 def test_batches_of_any_size_have_the_share_of_one(batch: int) -> None:
     mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
-    mixed.start(100, seed=0)
-    found = []
+    mixed.start(range(100), seed=0)
+    expected, found = mixed.is_random[:, 0].tolist(), []
     for first in range(0, 100, batch):
         rows = range(first, min(first + batch, 100))
-        acting = mixed.of(rows)
-        acting.start(len(rows), seed=first)
-        found += acting.is_random[:, 0].tolist()
-    assert found == mixed.is_random[:, 0].tolist()
+        mixed.start(rows, seed=first)
+        found += mixed.is_random[:, 0].tolist()
+    assert found == expected
 
 
 def test_a_command_is_held_for_a_step_at_least() -> None:
@@ -160,7 +159,7 @@ def test_a_command_is_held_for_a_step_at_least() -> None:
 def test_commands_that_all_keep_clear_are_not_chosen_among() -> None:
     """Otherwise robots in a corridor would be told to keep to its middle."""
     behavior = RandomCommands(2, HOLD, WallWatch(TASK, 0.1))
-    behavior.start(400, seed=0)
+    behavior.start(range(400), seed=0)
     command = behavior.act(believed(STARTS[1:2].expand(400, 2)), torch.zeros(400, 2))
     for along_axis in command.T:
         assert float(along_axis.std()) == pytest.approx(1 / 3**0.5, rel=0.1)

@@ -35,10 +35,10 @@ def test_commands_are_held_in_turn_and_the_last_one_on(tmp_path: Path) -> None:
 
 
 def test_they_are_played_step_by_step_and_again_from_the_start() -> None:
-    played = PlannedCommands(torch.arange(6.0).view(3, 2, 1)).of(range(1, 2))
+    played = PlannedCommands(torch.arange(6.0).view(3, 2, 1))
     nothing = torch.empty(1, 0)
     for _ in range(2):
-        played.start(1, seed=0)
+        played.start(range(1, 2), seed=0)
         assert [played.act(nothing, nothing).item() for _ in range(3)] == [1.0, 3.0, 5.0]
 
 
