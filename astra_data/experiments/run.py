@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from astra_data.core.config import did_you_mean
 from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
@@ -27,7 +26,6 @@ from astra_data.experiments.own_methods import OwnMethod, add_all
 from astra_data.experiments.plan import check_stage, plan, stage_of, stages_until
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
-from astra_data.experiments.recipe import Recipe
 from astra_data.methods import grounded_as
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import TASKS, task_named
@@ -119,7 +117,7 @@ def run_stage(
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} has data, {recipe.data}: there is nothing to collect")
-    part = Selection.of(recipe, seeds=seeds)
+    part = Selection.of(recipe, () if method is None else (method,), seeds)
     if add:
         experiment.published()
     planned = plan(
@@ -131,7 +129,7 @@ def run_stage(
         publish=experiment.results if publish else None,
         add_to=experiment.published_in if add else None,
     )
-    make(experiment, _selected(recipe, planned, stage, method), jobs=jobs, device=device)
+    make(experiment, _selected(planned, stage, method), jobs=jobs, device=device)
     return folder / stage
 
 
@@ -271,9 +269,7 @@ def finished(item: Item, experiment: Experiment) -> bool:
     return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
 
 
-def _selected(recipe: Recipe, items: tuple[Item, ...], stage: str, method: str | None) -> list[Item]:
-    if method is not None and method not in recipe.methods:
-        raise BadInputError(f"the recipe has no method '{method}'{did_you_mean(method, recipe.methods)}")
+def _selected(items: tuple[Item, ...], stage: str, method: str | None) -> list[Item]:
     if method is not None and stage in ("ground", "align"):
         method = grounded_as(method)
 
