@@ -48,9 +48,22 @@ def toy_episodes(
         windows=windows,
         reference="toy@data-1.0.0",
         content_hash="0",
+        has_rewards=True,
+        uids=torch.arange(len(state)),
+        recordings=torch.arange(len(state)),
     )
 
 
 def no_episodes() -> PairedEpisodes:
     empty = torch.zeros(1, 1)
-    return PairedEpisodes(empty, empty, empty.bool(), PairedWindows(*[empty] * 11), "toy@data-1.0.0", "abc")
+    return PairedEpisodes(
+        target_state=empty,
+        reward=empty,
+        terminated=empty.bool(),
+        windows=PairedWindows(*[empty] * 11),
+        reference="toy@data-1.0.0",
+        content_hash="abc",
+        has_rewards=True,
+        uids=torch.arange(1),
+        recordings=torch.arange(1),
+    )

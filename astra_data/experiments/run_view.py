@@ -75,7 +75,7 @@ def view_run(
     task, drawn = task_named(recipe.task), selection.seeds[0]
     episodes.check(task)
     replays = {name: replay_open_loop(task, one, episodes, seed=drawn) for name, one in of.items()}
-    view(dataset, uids or _uids(episodes), save=save, replays=_by_episode(replays, episodes))
+    view(dataset, uids or episodes.uids.tolist(), save=save, replays=_by_episode(replays, episodes))
     return _lacking({name: replay for name, replay in replays.items() if name != RAW})
 
 
@@ -92,7 +92,7 @@ def _result(run: str | Path, item: Item) -> Path:
 def _chosen(episodes: PairedEpisodes, uids: Sequence[int], groundings: Sequence[Item]) -> PairedEpisodes:
     """Return the episodes `uids`, else the first that were held out."""
     if uids:
-        return episodes.select(torch.isin(_uids_of(episodes), torch.tensor(uids)).nonzero()[:, 0])
+        return episodes.select(torch.isin(episodes.uids, torch.tensor(uids)).nonzero()[:, 0])
     if groundings:
         call = groundings[0].call
         assert isinstance(call, partial)
@@ -100,22 +100,14 @@ def _chosen(episodes: PairedEpisodes, uids: Sequence[int], groundings: Sequence[
     return episodes.select(torch.arange(min(SHOWN, len(episodes))))
 
 
-def _uids_of(episodes: PairedEpisodes) -> torch.Tensor:
-    assert episodes.uids is not None
-    return episodes.uids
-
-
-def _uids(episodes: PairedEpisodes) -> list[int]:
-    uids: list[int] = _uids_of(episodes).tolist()
-    return uids
-
-
 def _by_episode(
     replays: Mapping[str, OpenLoopReplay], episodes: PairedEpisodes
 ) -> dict[int, list[ReplayedEpisode]]:
     """Return the replays of each episode, without what comes after it, by its uid."""
     found: dict[int, list[ReplayedEpisode]] = {}
-    for number, (uid, steps) in enumerate(zip(_uids(episodes), episodes.lengths.tolist(), strict=True)):
+    for number, (uid, steps) in enumerate(
+        zip(episodes.uids.tolist(), episodes.lengths.tolist(), strict=True)
+    ):
         for name, replay in replays.items():
             measures = {"hazard": replay.hazard, "disagreement": replay.disagreement}
             known = {key: values for key, values in measures.items() if values is not None}

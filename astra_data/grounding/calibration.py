@@ -7,16 +7,16 @@ from torch.nn import functional
 _MOST_FOLDS = 5
 
 
-def folds(fails: Tensor, recordings: Tensor | None = None) -> list[Tensor]:
+def folds(fails: Tensor, recordings: Tensor) -> list[Tensor]:
     """Split episodes at random, those that fail (E,) and the others alike; return who is in each fold, (E,).
 
-    Copies stay with the episode that they are of: `recordings` (E,) are the same for them; None where there
-    are no copies. There are as many folds as recordings with a failure, at most five; none with a single one.
+    Copies stay with the episode that they are of: `recordings` (E,) are the same for them. There are as many
+    folds as recordings with a failure, at most five; none with a single one.
     """
     # Numbered as they come, so that without copies each episode is drawn for in turn.
     known: dict[int, int] = {}
-    names = range(len(fails)) if recordings is None else recordings.tolist()
-    recording = torch.tensor([known.setdefault(name, len(known)) for name in names], device=fails.device)
+    numbered = [known.setdefault(name, len(known)) for name in recordings.tolist()]
+    recording = torch.tensor(numbered, device=fails.device)
     failing = torch.bincount(recording[fails], minlength=len(known)) > 0
     count = min(_MOST_FOLDS, int(failing.sum()))
     if count < 2:

@@ -51,12 +51,12 @@ class PairedEpisodes:
         windows: everything else, (E, T, ...), with the mask of real steps.
         reference: name and version of the dataset.
         content_hash: its hash.
+        has_rewards: whether rewards were recorded; otherwise they are 0 here.
+        uids: of the episodes, (E,) int64.
+        recordings: the number of the recording that each is, or is a copy of, (E,) int64.
         held_out: the episodes that the dataset marks as held out, (E,) bool; None if it marks none.
         dropped_place: the entries of s_i with the robot's position, if φ drops all of them.
         commands: the bounds of the commands, where these are not ±1 in their own units.
-        has_rewards: whether rewards were recorded; otherwise they are 0 here.
-        uids: of the episodes, (E,) int64; None if they are from no dataset.
-        recordings: the number of the recording that each is, or is a copy of, (E,) int64; None: each its own.
     """
 
     target_state: Tensor
@@ -65,12 +65,12 @@ class PairedEpisodes:
     windows: PairedWindows
     reference: str
     content_hash: str
+    has_rewards: bool
+    uids: Tensor
+    recordings: Tensor
     held_out: Tensor | None = None
     dropped_place: tuple[int, ...] = ()
     commands: Commands | None = None
-    has_rewards: bool = True
-    uids: Tensor | None = None
-    recordings: Tensor | None = None
 
     @property
     def named(self) -> dict[str, str]:
@@ -133,12 +133,12 @@ class PairedEpisodes:
             ),
             reference=dataset.reference,
             content_hash=dataset.content_hash,
-            held_out=torch.tensor(held_out, device=device) if held_out.any() else None,
-            dropped_place=_dropped_place(dataset),
-            commands=commands,
             has_rewards=REWARD in padded,
             uids=torch.tensor(uids, device=device),
             recordings=torch.tensor(recordings, device=device),
+            held_out=torch.tensor(held_out, device=device) if held_out.any() else None,
+            dropped_place=_dropped_place(dataset),
+            commands=commands,
         )
 
     def check(self, task: Task) -> None:
@@ -182,9 +182,9 @@ class PairedEpisodes:
             reward=self.reward[episodes],
             terminated=self.terminated[episodes],
             windows=_gather(self.windows, episodes),
+            uids=self.uids[episodes],
+            recordings=self.recordings[episodes],
             held_out=None if self.held_out is None else self.held_out[episodes],
-            uids=None if self.uids is None else self.uids[episodes],
-            recordings=None if self.recordings is None else self.recordings[episodes],
         )
 
     def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:
@@ -202,8 +202,7 @@ class PairedEpisodes:
                     "held out: take a larger subset"
                 )
             return self.select((~self.held_out).nonzero()[:, 0]), self.select(self.held_out.nonzero()[:, 0])
-        each = torch.arange(len(self)) if self.recordings is None else self.recordings
-        names, each = each.unique(return_inverse=True)
+        names, each = self.recordings.unique(return_inverse=True)
         training, held_out = divided(self.reference, len(names), held_out_share, seed)
         return self._of_recordings(each, training), self._of_recordings(each, held_out)
 

@@ -53,7 +53,8 @@ def test_the_prior_weighs_as_much_as_a_failure_however_many_members_there_are(me
 def test_folds_share_failing_and_other_episodes_alike(failing: int, count: int) -> None:
     torch.manual_seed(0)
     fails = torch.arange(40) >= 40 - failing
-    found = folds(fails)
+    each = torch.arange(40)
+    found = folds(fails, each)
     assert len(found) == count
     if found:
         assert torch.equal(torch.stack(found).sum(0), torch.ones(40, dtype=torch.long))
@@ -61,7 +62,7 @@ def test_folds_share_failing_and_other_episodes_alike(failing: int, count: int) 
             sizes = [int((fold & rows).sum()) for fold in found]
             assert max(sizes) - min(sizes) <= 1
         assert found[0].nonzero().squeeze(1).tolist() != [*range(0, 40, count)]  # at random
-    assert not torch.equal(torch.stack(folds(fails) or [fails]), torch.stack(found or [~fails]))
+    assert not torch.equal(torch.stack(folds(fails, each) or [fails]), torch.stack(found or [~fails]))
 
 
 def test_copies_are_in_the_fold_of_their_recording() -> None:
@@ -76,6 +77,6 @@ def test_copies_are_in_the_fold_of_their_recording() -> None:
         assert int((fold & fails).sum()) == int((fold & ~fails).sum()) == 3
     assert folds(recordings == 9, recordings) == []
     torch.manual_seed(1)
-    alone, shuffled = folds(fails), torch.tensor([7, 3, 11, 0, 5, 9, 1, 10, 2, 8, 6, 4])
+    alone, shuffled = folds(fails, torch.arange(12)), torch.tensor([7, 3, 11, 0, 5, 9, 1, 10, 2, 8, 6, 4])
     torch.manual_seed(1)
     assert torch.equal(torch.stack(alone), torch.stack(folds(fails, shuffled)))
