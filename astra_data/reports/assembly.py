@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pydantic import JsonValue
-
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
 from astra_data.methods import method_named
@@ -31,7 +29,7 @@ from astra_data.reports.costs import DATASET_STAGES, Files, seconds, seed_cost, 
 from astra_data.reports.mean_bands import mean_band
 from astra_data.reports.merging import merge
 from astra_data.reports.origins import dataset_uses, merged_origins
-from astra_data.reports.runs import Runs
+from astra_data.reports.runs import Reported, Runs
 from astra_data.reports.schema import (
     BandMeans,
     Choice,
@@ -47,42 +45,36 @@ from astra_data.worlds.score import SUCCESS, Score
 
 
 def assemble(
-    recipe: str,
-    task: str,
-    methods: Sequence[str],
-    asked: Sequence[int],
+    reported: Reported,
     *,
     root: Path,
     command: str,
     replicates: int,
     scores: tuple[Score, ...] = (SUCCESS,),
-    settings: Mapping[str, JsonValue] | None = None,
-    groundings: Mapping[str, str] | None = None,
     percent: int | None = None,
     paper_success: Mapping[str, float] | None = None,
     published: Results | None = None,
 ) -> Results:
-    """Read the artefacts under `root` of every row, for the seeds in `asked` that it has finished.
+    """Read the artefacts under `root` of every row, for the seeds that it has finished.
 
-    `percent` selects the dataset size, if there are several. Results in `published` are merged in, unless
-    there are newer ones under `root`, which for a choice is one among all policies of the outcome.
+    The task is given by its name, as in its evaluations. `percent` selects the dataset size, if there are
+    several. Results in `published` are merged in, unless there are newer ones under `root`, which for a
+    choice is one among all policies of the outcome.
 
     Raises:
         MissingStageError: no row has an evaluation and nothing is published; or a row lacks other artefacts
             for some of its finished seeds.
         BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
     """
-    read = Runs(recipe, root, tuple(methods), tuple(asked), groundings or {}, percent)
-    settings = dict(settings or {})
-    sources = []
+    read, sources = Runs(reported, root, percent), []
     if published:
         # The published results may be of the recipe that this one is based on.
-        own = {"recipe": recipe, "command": command, "settings": settings}
+        own = {"recipe": reported.name, "command": command, "settings": dict(reported.settings)}
         sources.append(published.model_copy(update=own))
     judged = read_judged(root)
     if read.any_finished or not published:
-        sources.append(_read(read, task, command, scores, settings, judged))
-    merged = merge(sources, methods=methods, seeds=asked, replicates=replicates)
+        sources.append(_read(read, command, scores, judged))
+    merged = merge(sources, methods=reported.methods, seeds=reported.seeds, replicates=replicates)
     printed = {row: value for row, value in (paper_success or {}).items() if row in merged.methods}
     choice = published.choice if published else None
     if judged:
@@ -90,8 +82,8 @@ def assemble(
             judged,
             percent,
             measured=_measured(merged),
-            rows=methods,
-            seeds=asked,
+            rows=reported.methods,
+            seeds=reported.seeds,
             replicates=replicates,
         )
         if not published or (found and _is_among_all(found, merged)):
@@ -116,18 +108,11 @@ def _measured(results: Results) -> dict[tuple[str, int], float]:
     }
 
 
-def _read(
-    read: Runs,
-    task: str,
-    command: str,
-    scores: tuple[Score, ...],
-    settings: dict[str, JsonValue],
-    judged: Judged | None,
-) -> Results:
+def _read(read: Runs, command: str, scores: tuple[Score, ...], judged: Judged | None) -> Results:
     """Return the results under one root, before rows are summarised and compared."""
     evaluations = read.required("evaluate", EVALUATION, Evaluation)
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
-    episodes = check_alike(evaluations, task)
+    episodes = check_alike(evaluations, read.reported.task)
     metrics = read.optional("ground", METRICS, Metrics)
     gaps = read.optional("ground", GAP, Gap)
     curves = read.optional("train", CURVE, CurveFile)
@@ -179,11 +164,11 @@ def _read(
     started = {method_named(row).initial or row: of for row, of in first.items()}
     timed: Files = {**files, "train": _listed(started | curves)}
     return Results(
-        recipe=read.recipe,
-        task=task,
+        recipe=read.reported.name,
+        task=read.reported.task,
         command=command,
         scores=scores,
-        settings=settings,
+        settings=dict(read.reported.settings),
         origins=_origins({**files, "report": {"all": [Artefact.model_validate(origin())]}}),
         wall_seconds=seconds(timed, "wall_seconds"),
         cpu_seconds=seconds(timed, "cpu_seconds"),

@@ -1,14 +1,14 @@
 """Find the artefacts of all rows and seeds of a recipe."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.naming import artefact_key, base_method
+from astra_data.core.naming import artefact_key
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.methods import grounded_as
 from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
@@ -22,7 +22,7 @@ class Reported:
     """What stages of a whole recipe need of it, small enough to be sent to another process.
 
     Attributes:
-        name: of the recipe's file, without its ending. task: name of a task.
+        name: of the recipe's file, without its ending. task: as `task_named` takes it.
         methods: rows, in the order of the table. seeds: those to report, as far as they are finished.
         settings: all settings of the recipe.
         percents: dataset sizes in percent that every row is repeated on; empty if only on the whole.
@@ -35,43 +35,32 @@ class Reported:
     settings: Mapping[str, JsonValue]
     percents: tuple[int, ...] = ()
 
-    @property
-    def groundings(self) -> Mapping[str, str]:
-        """Row → the method whose grounding and alignment it uses."""
-        return {row: grounded_as(row) for row in self.methods}
-
 
 @dataclass(frozen=True)
 class Runs:
     """The artefacts of one recipe: `root`/<stage>/<method>/seed_<seed>/.
 
     Attributes:
-        recipe: the recipe's name.
+        reported: what is reported of the recipe.
         root: its folder of runs.
-        methods: the rows.
-        seeds: those to report, as far as their evaluation is finished.
-        groundings: row → the row whose grounding and alignment it uses, if not its base row's.
         percent: the dataset size, if there are several.
     """
 
-    recipe: str
+    reported: Reported
     root: Path
-    methods: tuple[str, ...]
-    seeds: tuple[int, ...]
-    groundings: Mapping[str, str] = field(default_factory=dict)
     percent: int | None = None
 
     def __post_init__(self) -> None:
         """Check that there are rows and seeds."""
-        if not self.methods or not self.seeds:
+        if not self.reported.methods or not self.reported.seeds:
             raise BadInputError(
-                f"{self.recipe}: expected methods and seeds, got none; name some in the recipe"
+                f"{self.reported.name}: expected methods and seeds, got none; name some in the recipe"
             )
 
     def owner(self, stage: str, method: str) -> str:
         """Return the row in whose folder the artefact is: rows may share a grounding and its alignment."""
         if stage in SHARED_BY_ROWS and not (self.root / stage / method).is_dir():
-            return self.groundings.get(method, base_method(method))
+            return grounded_as(method)
         return method
 
     def path(self, stage: str, method: str, seed: int, name: str) -> Path:
@@ -82,9 +71,11 @@ class Runs:
     def _seeds(self) -> dict[str, tuple[int, ...]]:
         return {
             method: tuple(
-                seed for seed in self.seeds if self.path("evaluate", method, seed, EVALUATION).exists()
+                seed
+                for seed in self.reported.seeds
+                if self.path("evaluate", method, seed, EVALUATION).exists()
             )
-            for method in self.methods
+            for method in self.reported.methods
         }
 
     @property
@@ -120,7 +111,8 @@ class Runs:
         """Read the metadata of the datasets that a stage wrote, by seed."""
         percent = self.percent if stage == "subset" else None
         paths = {
-            seed: self.root / artefact_key(stage, "", seed, percent) / DATASET_PATH for seed in self.seeds
+            seed: self.root / artefact_key(stage, "", seed, percent) / DATASET_PATH
+            for seed in self.reported.seeds
         }
         return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}
 
@@ -144,7 +136,7 @@ class Runs:
         size = "" if self.percent is None else f"percent_{self.percent:03d}/"
         raise MissingStageError(
             f"expected {name} in {self.root / stage}/<method>/{size}seed_<seed>/, found none for {absent}; "
-            f"run the recipe {self.recipe} again: it goes on with what is missing"
+            f"run the recipe {self.reported.name} again: it goes on with what is missing"
         )
 
     def _read[T: Artefact](
@@ -157,6 +149,6 @@ class Runs:
             found = paths.setdefault(self.owner(stage, method), {})
             found |= {seed: self.path(stage, method, seed, name) for seed in self.finished[method]}
         return {
-            owner: {seed: read_json(model, found[seed]) for seed in self.seeds if seed in found}
+            owner: {seed: read_json(model, found[seed]) for seed in self.reported.seeds if seed in found}
             for owner, found in paths.items()
         }

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,19 +96,15 @@ def report(
     read = _read(recipe, root)
     known = {} if add_to is None else by_size(read_published(add_to))
     task = task_named(recipe.task)
+    named = replace(recipe, task=task.name)  # not where its file is
     sizes = {
         percent: assemble(
-            recipe.name,
-            task.name,
-            tuple(recipe.methods),
-            tuple(recipe.seeds),
+            named,
             root=root,
             command=command,
             replicates=config.bootstrap_replicates,
-            settings=recipe.settings,
-            groundings=recipe.groundings,
-            percent=percent,
             scores=task.objective.scores,
+            percent=percent,
             paper_success=config.paper_success,
             published=known.get(percent),
         ).model_copy(update={"stand_in": task.facts.get("stand_in")})
@@ -202,10 +199,7 @@ def _made(recipe: Reported, root: Path, published: Container[int | None]) -> Seq
     """Return the dataset sizes with a finished row, here or published; the first without any."""
     percents = recipe.percents or (None,)
     made = [
-        percent
-        for percent in percents
-        if percent in published
-        or Runs(recipe.name, root, recipe.methods, recipe.seeds, recipe.groundings, percent).any_finished
+        percent for percent in percents if percent in published or Runs(recipe, root, percent).any_finished
     ]
     return made or percents[:1]
 

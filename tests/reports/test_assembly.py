@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, edit_json, outcomes, write_choice, write_elsewhere, write_runs
+from fake_runs import ROWS, SEEDS, FakeRecipe, edit_json, outcomes, write_choice, write_elsewhere, write_runs
 from safetensors.numpy import load_file, save_file
 
 from astra_data.core.errors import MissingStageError
@@ -22,10 +22,7 @@ def assembled(
     published: Results | None = None,
 ) -> Results:
     return assemble(
-        "antmaze_u",
-        "antmaze-u",
-        methods,
-        seeds,
+        FakeRecipe(methods=methods, seeds=seeds),
         root=root,
         command="",
         replicates=10,
@@ -65,10 +62,7 @@ def test_results_are_the_ones_worked_out_by_hand(results: Results) -> None:
 
 def test_the_papers_figures_are_those_of_reported_rows(root: Path) -> None:
     found = assemble(
-        "antmaze_u",
-        "antmaze-u",
-        ROWS,
-        SEEDS,
+        FakeRecipe(),
         root=root,
         command="",
         replicates=10,

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_dataset import write_fake
-from fake_runs import ROWS, SEEDS, edit_json, outcomes, write_runs
+from fake_runs import FakeRecipe, edit_json, outcomes, write_runs
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
@@ -28,7 +28,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def results(root: Path) -> Results:
-    return assemble("antmaze_u", "antmaze-u", ROWS, SEEDS, root=root, command="", replicates=10)
+    return assemble(FakeRecipe(), root=root, command="", replicates=10)
 
 
 def drawn(

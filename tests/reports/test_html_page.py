@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, write_runs
+from fake_runs import SEEDS, FakeRecipe, write_runs
 from html_pages import Page, read_page
 from PIL import Image
 
@@ -33,7 +33,7 @@ def published(name: str) -> tuple[Page, Any]:
 
 def toy(parent: Path, seeds: tuple[int, ...] = SEEDS) -> Results:
     root = write_runs(parent)
-    return assemble("toy", "antmaze-u", ROWS, seeds, root=root, command="astra-data run", replicates=100)
+    return assemble(FakeRecipe("toy", seeds=seeds), root=root, command="astra-data run", replicates=100)
 
 
 def shows(cell: str, values: list[float], digits: int = 2) -> bool:

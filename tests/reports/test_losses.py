@@ -1,5 +1,5 @@
 import pytest
-from fake_runs import ROWS, SEEDS, write_runs
+from fake_runs import ROWS, SEEDS, FakeRecipe, write_runs
 
 from astra_data.reports.assembly import assemble
 from astra_data.reports.comparing import summarised
@@ -11,7 +11,7 @@ from astra_data.worlds.score import RETURN, SURVIVED_STEPS
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     root = write_runs(tmp_path_factory.mktemp("losses"))
-    return assemble("toy", "antmaze-u", ROWS, SEEDS, root=root, command="", replicates=100)
+    return assemble(FakeRecipe("toy"), root=root, command="", replicates=100)
 
 
 def changed(results: Results, row: str, **of: object) -> Results:

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import ROWS, SEEDS, band, edit_json, write_elsewhere, write_runs
+from fake_runs import ROWS, SEEDS, FakeRecipe, band, edit_json, write_elsewhere, write_runs
 
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.reports.assembly import assemble
@@ -19,7 +19,7 @@ def assembled(
     published: Results | None = None,
 ) -> Results:
     found = assemble(
-        "antmaze_u", "antmaze-u", methods, seeds, root=root, command="", replicates=10, published=published
+        FakeRecipe(methods=methods, seeds=seeds), root=root, command="", replicates=10, published=published
     )
     # Published results come from a file.
     return Results.model_validate_json(found.model_dump_json(by_alias=True))

@@ -2,7 +2,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from fake_runs import ROWS, SEEDS, write_runs
+from fake_runs import ROWS, FakeRecipe, write_runs
 
 from astra_data.reports.assembly import assemble
 from astra_data.reports.comparing import improvement, summarised
@@ -31,7 +31,7 @@ def test_a_published_page_is_what_its_numbers_give(path: Path) -> None:
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     root = write_runs(tmp_path_factory.mktemp("page"))
     command = "astra-data run recipes/antmaze_u.toml"
-    return assemble("antmaze_u", "antmaze-u", ROWS, SEEDS, root=root, command=command, replicates=100)
+    return assemble(FakeRecipe(), root=root, command=command, replicates=100)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from fake_runs import MADE, ROWS, SEEDS, write_evaluation, write_json, write_runs
+from fake_runs import MADE, ROWS, SEEDS, FakeRecipe, write_evaluation, write_json, write_runs
 
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.reports.artefacts import EVALUATION, Evaluation, Gap
@@ -18,10 +18,9 @@ def runs(
     root: Path,
     methods: tuple[str, ...] = ROWS,
     seeds: tuple[int, ...] = SEEDS,
-    groundings: dict[str, str] | None = None,
     percent: int | None = None,
 ) -> Runs:
-    return Runs("antmaze_u", root, methods, seeds, groundings or {}, percent)
+    return Runs(FakeRecipe(methods=methods, seeds=seeds), root, percent)
 
 
 def test_a_row_has_the_seeds_that_it_has_finished_of_those_asked_for(root: Path) -> None:
@@ -37,11 +36,12 @@ def test_a_row_has_the_seeds_that_it_has_finished_of_those_asked_for(root: Path)
 
 
 def test_rows_share_the_artefacts_of_their_base_or_of_the_row_that_is_named(root: Path) -> None:
-    read = runs(root, ("astra_plus", "nas"), groundings={"nas": "astra"})
-    assert read.owner("ground", "astra_plus") == read.owner("align", "nas") == "astra"
-    assert read.owner("train", "nas") == "nas"
-    (root / "ground/nas").mkdir()
-    assert (read.owner("ground", "nas"), read.owner("align", "nas")) == ("nas", "astra")
+    named = "astra_task_reward"
+    read = runs(root, ("astra_plus", named))
+    assert read.owner("ground", "astra_plus") == read.owner("align", named) == "astra"
+    assert read.owner("train", named) == named
+    (root / "ground" / named).mkdir()
+    assert (read.owner("ground", named), read.owner("align", named)) == (named, "astra")
     # Both rows have all seeds of the one grounding, which is read once.
     assert list(runs(root).optional("ground", "gap.json", Gap)) == ["astra"]
 

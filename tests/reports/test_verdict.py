@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from fake_runs import ROWS, SEEDS, write_choice, write_runs
+from fake_runs import SEEDS, FakeRecipe, write_choice, write_runs
 
 from astra_data.reports.assembly import assemble
 from astra_data.reports.comparing import summarised
@@ -25,7 +25,7 @@ def made(parent: Path, *, select: bool = False, seeds: tuple[int, ...] = SEEDS) 
     root = write_runs(parent)
     if select:
         write_choice(root)
-    return assemble("toy", "antmaze-u", ROWS, seeds, root=root, command="", replicates=100)
+    return assemble(FakeRecipe("toy", seeds=seeds), root=root, command="", replicates=100)
 
 
 def with_success(results: Results, **shares: list[float]) -> Results:
