@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from astra_data.core.durable import (
 )
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
+from astra_data.core.manifest import write_manifest
 
 CHECKPOINT = "checkpoint.safetensors"
 """Name, or the end of it, of the file that a training goes on from."""
@@ -37,8 +38,14 @@ def refuse_finished(out: Path) -> None:
 
 
 @contextmanager
-def finished_folder(out: Path, *, replace: bool = False, config: str | None = None) -> Iterator[Path]:
-    """Yield a working folder that becomes `out` when the block succeeds.
+def finished_folder(
+    out: Path,
+    *,
+    replace: bool = False,
+    config: str | None = None,
+    made_from: Mapping[str, str | None] | None = None,
+) -> Iterator[Path]:
+    """Yield a working folder that becomes `out` when the block succeeds, without checkpoints of trainings.
 
     After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than the
     settings: the next call yields it again with its contents, so that training can resume from its last
@@ -49,6 +56,7 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
         out: the finished folder.
         replace: replace an existing `out`.
         config: the settings as JSON, written to `config.json`; a working folder with others is refused.
+        made_from: for its manifest, see `write_manifest`; without it, none is written.
 
     Raises:
         BadInputError: `out` exists and `replace` is not set, was begun with other settings, or is being made
@@ -80,6 +88,10 @@ def finished_folder(out: Path, *, replace: bool = False, config: str | None = No
                     discard(partial, out)
                     remove_empty(made)
             raise
+        for checkpoint in partial.glob(f"*{CHECKPOINT}"):
+            checkpoint.unlink()
+        if made_from is not None:
+            write_manifest(partial, made_from)
         clean(partial)
         sync_tree(partial)
         _put(partial, out, old)
@@ -92,12 +104,6 @@ def _empty(folder: Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink()
-
-
-def remove_checkpoints(folder: Path) -> None:
-    """Remove what trainings in `folder` would have been resumed from; they are over."""
-    for checkpoint in folder.glob(f"*{CHECKPOINT}"):
-        checkpoint.unlink()
 
 
 def _put(partial: Path, out: Path, old: Path) -> None:

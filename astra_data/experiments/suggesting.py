@@ -10,7 +10,6 @@ from astra_data.core.artefact import finished_folder
 from astra_data.core.config import Config, validated
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import write_manifest
 from astra_data.core.naming import RUNS, artefact_key, reference_of
 from astra_data.core.progress import Progress, part, silent
 from astra_data.experiments.experiment import load_experiment
@@ -88,10 +87,11 @@ def suggest(
         committee = Committee.of(task, [load_grounding(folder / one / GROUNDING) for one in places])
     except BadInputError as error:
         raise BadInputError(f"{folder}: ground/{base}: {error}") from None
-    with finished_folder(target, replace=out is None, config=asked.model_dump_json(indent=1)) as made:
+    made_from = {one: file_digest(folder / one / GROUNDING) for one in places}
+    settings_text = asked.model_dump_json(indent=1)
+    with finished_folder(target, replace=out is None, config=settings_text, made_from=made_from) as made:
         found = suggested(task, committee, asked.suggest, seed=seed, progress=part(progress, 0.0, 0.95))
         _write(made, task, found, asked)
-        write_manifest(made, {one: file_digest(folder / one / GROUNDING) for one in places})
     progress(1.0, f"{len(found.taken)} episodes")
     return target, found, asked.task
 

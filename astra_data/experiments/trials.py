@@ -8,7 +8,7 @@ from shutil import copy2
 from astra_data.core.artefact import finished_folder
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import alone_in
-from astra_data.core.manifest import read_manifest, write_manifest
+from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
 from astra_data.experiments.selecting import select
@@ -142,9 +142,8 @@ def _write(folder: Path, judged: Judged, trials: TrialsFile) -> None:
     out = folder / FOLDER
     manifest = read_manifest(out)
     assert manifest is not None
-    with finished_folder(out, replace=True) as partly:
+    with finished_folder(out, replace=True, made_from=manifest.made_from) as partly:
         for name in ("config.json", SELECTED):
             copy2(out / name, partly / name)
         (partly / TRIALS).write_text(trials.model_dump_json(indent=1))
         (partly / "select.md").write_text(select_page(folder.name, judged, trials))
-        write_manifest(partly, manifest.made_from)

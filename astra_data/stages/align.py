@@ -8,10 +8,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.artefact import CHECKPOINT, finished_folder, remove_checkpoints
+from astra_data.core.artefact import CHECKPOINT, finished_folder
 from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
-from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -88,7 +87,8 @@ def align(
     bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
     grounding_digest = file_digest(grounding_file)
     settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
-    with finished_folder(out, config=settings_text) as folder:
+    made_from = {"dataset": episodes.content_hash, "grounding": grounding_digest}
+    with finished_folder(out, config=settings_text, made_from=made_from) as folder:
         descent = Descent(encoder, config, checkpoint=folder / CHECKPOINT)
         while not descent.is_over:
             torch.manual_seed(derive(seed, f"alignment update {descent.done}"))
@@ -109,8 +109,6 @@ def align(
             **_agreement(model, encoder, held_out, bandwidths),
         }
         (folder / METRICS).write_text(json.dumps(metrics, indent=1))
-        remove_checkpoints(folder)
-        write_manifest(folder, {"dataset": episodes.content_hash, "grounding": grounding_digest})
 
 
 def _losses(

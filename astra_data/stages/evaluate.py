@@ -20,7 +20,6 @@ from astra_data.core.checkpoint import save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -122,7 +121,7 @@ def evaluate(
         row = _policy(world, policy if isinstance(policy, PolicyFile) else None, read, config)
     shared = _shared_simulators(world, read.get("reference"), config) if row.shown_abstract else {}
     simulators = row.simulators | shared
-    manifest = {name: file_digest(file) for name, file in read.items()}
+    made_from = {name: file_digest(file) for name, file in read.items()}
     asked = None if recorded is None else RecordedRange.of(recorded, world.limits)
     tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
     results: dict[str, Any] = {
@@ -144,12 +143,11 @@ def evaluate(
     results, tensors = results | figures, tensors | paths
     if asked is not None:
         results["beyond_recorded"] = asked.share
-    with finished_folder(out) as folder:
+    with finished_folder(out, made_from=made_from) as folder:
         save_tensors(folder / TRAJECTORIES, tensors, {})
         results |= stopwatch.spent()
         (folder / EVALUATION).write_text(json.dumps(results, indent=1))
         (folder / "config.json").write_text(config.model_dump_json(indent=1))
-        write_manifest(folder, manifest)
     first = world.objective.scores[0]
     where = "target" if world.has_target else f"{tested_in} simulator"
     progress(1.0, f"{first.title} in the {where} {first.text(fmean(results[tested_in][first.measure]))}")

@@ -3,10 +3,9 @@
 import json
 from pathlib import Path
 
-from astra_data.core.artefact import finished_folder, remove_checkpoints
+from astra_data.core.artefact import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
@@ -63,7 +62,8 @@ def ground(
     training, held_out = episodes.split(config.held_out_share, seed)
     named = {"task": world.name, "method": method, **episodes.named}
     settings_text = as_json(**named, seed=seed, ground=config, settings=settings)
-    with finished_folder(out, config=settings_text) as folder:
+    made_from = {"dataset": episodes.content_hash}
+    with finished_folder(out, config=settings_text, made_from=made_from) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
         stopwatch = Stopwatch()
         grounding, metrics = fit(fitting)
@@ -73,5 +73,3 @@ def ground(
         save_grounding(folder / GROUNDING, grounding, episodes)
         (folder / METRICS).write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / GAP).write_text(json.dumps(gap, indent=1))
-        remove_checkpoints(folder)
-        write_manifest(folder, {"dataset": episodes.content_hash})

@@ -13,7 +13,6 @@ from astra_data.core.artefact import finished_folder
 from astra_data.core.config import Config, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
-from astra_data.core.manifest import write_manifest
 from astra_data.core.naming import artefact_key
 from astra_data.core.progress import Progress, silent
 from astra_data.methods import method_named
@@ -124,12 +123,11 @@ def report(
     foreseen = measured_foresight(root, [*groundings], recipe.seeds, [*sized])
     rates = failure_rates(foreseen)
     inlined = images | ({"reliability": png(reliability(rates))} if rates else {})
-    with finished_folder(root / "report", replace=True) as folder:
+    with finished_folder(root / "report", replace=True, made_from=read) as folder:
         write_results(found, page, images, folder, "results")
         write_file(folder / HTML, render_html(found, inlined, foresight_lines(foreseen)))
         if isinstance(found, Results) and found.headline == SUCCESS:
             write_file(folder / "eval_info.json", json.dumps(eval_info(found), indent=1))
-        write_manifest(folder, read)
     if publish is not None:
         kept = {} if add_to is None else published_figures(publish, recipe.name)
         publish_results(found, page, kept | images, publish)

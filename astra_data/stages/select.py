@@ -15,7 +15,6 @@ from astra_data.core.config import AtOnce, Config, Number
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import write_manifest
 from astra_data.core.naming import artefact_key, reference_of
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
@@ -159,7 +158,8 @@ def select(
         _check(bench, recipe, root, judge)
     made_from, stopwatch = digests(contests, root), Stopwatch()
     total, found = sum(len(bench.entries) for bench in contests), list[Candidate]()
-    with finished_folder(root / FOLDER, config=config.model_dump_json(indent=1)) as folder:
+    settings_text = config.model_dump_json(indent=1)
+    with finished_folder(root / FOLDER, config=settings_text, made_from=made_from) as folder:
         begun = folder / _BEGUN
         known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
         for bench in contests:
@@ -190,7 +190,6 @@ def select(
         begun.unlink()
         (folder / SELECTED).write_text(judged.model_dump_json(indent=1))
         (folder / "select.md").write_text(select_page(recipe.name, judged))
-        write_manifest(folder, made_from)
     first = judged.ranked(judged.percents[-1])[0]
     progress(1.0, f"{first.row}, seed {first.seed}: {first.lower:.2f} in the lower quartile of its judges")
 

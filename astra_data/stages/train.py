@@ -3,11 +3,10 @@
 import json
 from pathlib import Path
 
-from astra_data.core.artefact import finished_folder, remove_checkpoints
+from astra_data.core.artefact import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
@@ -102,7 +101,8 @@ def train(
         train=config,
         settings=settings,
     )
-    with finished_folder(out, config=settings_text) as folder:
+    read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
+    with finished_folder(out, config=settings_text, made_from=read) as folder:
         training = Training(
             task=world,
             config=config,
@@ -122,6 +122,3 @@ def train(
             policy, curve = base.learn(training)
         policy.save(folder / POLICY)
         (folder / CURVE).write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
-        remove_checkpoints(folder)
-        read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
-        write_manifest(folder, read)

@@ -9,9 +9,10 @@ import pytest
 import torch
 from failing_disk import failing
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artefact import CHECKPOINT, finished_folder
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.errors import BadInputError, DiskError
+from astra_data.core.manifest import MANIFEST, read_manifest
 
 
 def test_a_folder_appears_when_it_is_finished(tmp_path: Path) -> None:
@@ -22,6 +23,16 @@ def test_a_folder_appears_when_it_is_finished(tmp_path: Path) -> None:
         assert folder == tmp_path / "train" / ".seed_0.partial"
     assert [path.name for path in out.iterdir()] == ["a"]
     assert not folder.exists()
+
+
+def test_a_finished_folder_says_what_it_was_made_from_and_has_no_checkpoints(tmp_path: Path) -> None:
+    with finished_folder(tmp_path / "out", made_from={"dataset": "d1", "initial": None}) as folder:
+        for name in ("weights", CHECKPOINT, f"adaptation_{CHECKPOINT}"):
+            (folder / name).touch()
+    manifest = read_manifest(tmp_path / "out")
+    assert manifest is not None and manifest.made_from == {"dataset": "d1"}
+    assert manifest.files.keys() == {"weights"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"weights", MANIFEST}
 
 
 def test_an_interrupted_folder_is_found_again(tmp_path: Path) -> None:
