@@ -21,10 +21,10 @@ from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
 from astra_data.methods.method import Method
-from astra_data.training.build_env import EnvConfig
+from astra_data.training.build_env import EnvConfig, Simulation
 from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.own_policy import ActingPolicy, OwnPolicy
-from astra_data.training.policy_file import PolicyFile, Simulation
+from astra_data.training.policy_file import PolicyFile
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.train import InSimulator, Training
 from astra_data.worlds.registry import task_named

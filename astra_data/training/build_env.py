@@ -112,52 +112,58 @@ RENAMED = {
 
 
 @dataclass(frozen=True)
-class EnvParts:
-    """What a training environment is made of, beside its switches.
+class Simulation:
+    """The abstract simulator that a policy is trained in.
 
     Attributes:
         thinness: 1 where there is no data, 0 where there is enough, on the maze's fine grid (height, width);
             None where there is no maze.
-        scatter: factor of the state noise, (X, X); zeros without.
-        starts: recorded moments, if episodes may start there.
+        scatter: factor of the noise added in training, (X, X); zeros where there is none.
+        world: the switches of the environment.
         variation: ranges of the simulator's parameters, drawn for each episode.
     """
 
     thinness: Tensor | None
     scatter: Tensor
-    starts: DataStarts | None = None
+    world: EnvConfig
     variation: Variation | None = None
 
 
 @torch.no_grad()
-def env_parts(
+def simulation_of(
     task: Task,
-    config: EnvConfig,
+    world: EnvConfig,
     episodes: PairedEpisodes,
     grounding: Grounding,
     variation: Variation | None = None,
-) -> EnvParts:
-    """Derive thinness, scatter and starts from paired episodes, as far as `config` asks for them."""
-    windows = episodes.windows
+) -> Simulation:
+    """Derive thinness, and scatter if `world` asks for it, from paired episodes."""
+    state = episodes.windows.state
     thinness = None
     if task.plane is not None:
-        thinness = _thinness(task.maze, episodes.steps(windows.state)[:, :2], config.support_density)
-    starts = None
-    if config.data_start_share > 0:
-        every = grounding.start_stride
-        moments = windows.mask[:, ::every].bool()
-        hidden = _remembered(task, _used(grounding, config), episodes, every)
-        starts = DataStarts(
-            state=windows.state[:, ::every][moments],
-            goal=windows.goal[:, ::every][moments],
-            previous_action=windows.previous_action[:, ::every][moments],
-            hidden=None if hidden is None else hidden[moments],
-        )
-    size = windows.state.shape[-1]
-    scatter = windows.state.new_zeros(size, size)
-    if config.residual_noise:
-        scatter = config.residual_noise * grounding.scatter(episodes)
-    return EnvParts(thinness, scatter, starts, variation)
+        thinness = _thinness(task.maze, episodes.steps(state)[:, :2], world.support_density)
+    scatter = state.new_zeros(state.shape[-1], state.shape[-1])
+    if world.residual_noise:
+        scatter = world.residual_noise * grounding.scatter(episodes)
+    return Simulation(thinness, scatter, world, variation)
+
+
+@torch.no_grad()
+def data_starts(
+    task: Task, world: EnvConfig, episodes: PairedEpisodes, grounding: Grounding
+) -> DataStarts | None:
+    """Return the recorded moments that episodes may start from; None unless `world` asks for them."""
+    if not world.data_start_share:
+        return None
+    windows, every = episodes.windows, grounding.start_stride
+    moments = windows.mask[:, ::every].bool()
+    hidden = _remembered(task, _used(grounding, world), episodes, every)
+    return DataStarts(
+        state=windows.state[:, ::every][moments],
+        goal=windows.goal[:, ::every][moments],
+        previous_action=windows.previous_action[:, ::every][moments],
+        hidden=None if hidden is None else hidden[moments],
+    )
 
 
 @torch.no_grad()
@@ -202,29 +208,37 @@ def _thinness(maze: Maze, positions: Tensor, density: float) -> Tensor:
 
 def training_env(
     task: Task,
-    config: EnvConfig,
-    parts: EnvParts,
+    simulation: Simulation,
     grounding: Grounding,
     *,
     num_envs: int,
     device: str,
+    starts: DataStarts | None = None,
     shows_parameters: bool = False,
 ) -> SimulatorEnv:
     """Build the environment: the task in the raw, varied, scattered or grounded simulator.
 
-    With `shows_parameters`, observations end with the normalised parameters of a simulator that varies.
+    Args:
+        task: the task.
+        simulation: what is derived from data, and the switches.
+        grounding: that the simulator is corrected by.
+        num_envs: episodes side by side.
+        device: torch device.
+        starts: recorded moments, see `data_starts`; without them, all episodes start where the task does.
+        shows_parameters: end observations with the normalised parameters of a simulator that varies.
 
     Raises:
-        BadInputError: `config` asks for what needs a maze, and the task has none.
+        BadInputError: the switches ask for what needs a maze, and the task has none.
     """
+    config = simulation.world
     if task.plane is None and (config.support_penalty or config.limits_commands):
         raise task.without_maze()
-    scatter = parts.scatter if config.residual_noise else None
+    scatter = simulation.scatter if config.residual_noise else None
     thinness = None
-    if config.support_penalty and parts.thinness is not None:
-        thinness = config.support_penalty * parts.thinness
+    if config.support_penalty and simulation.thinness is not None:
+        thinness = config.support_penalty * simulation.thinness
     used = _used(grounding, config)
-    simulator = used.simulator(task, num_envs, device, variation=parts.variation, scatter=scatter)
+    simulator = used.simulator(task, num_envs, device, variation=simulation.variation, scatter=scatter)
     return SimulatorEnv(
         task.objective,
         simulator,
@@ -235,7 +249,7 @@ def training_env(
         thinness=thinness,
         disagreement_penalty=config.disagreement_penalty,
         change_penalty=config.change_penalty,
-        starts=parts.starts,
-        data_start_share=config.data_start_share if parts.starts else 0.0,
+        starts=starts,
+        data_start_share=config.data_start_share if starts else 0.0,
         shows_parameters=shows_parameters,
     )

@@ -7,8 +7,8 @@ from statistics import fmean
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.grounding.protocols import Grounding
-from astra_data.training.build_env import EnvParts, training_env
-from astra_data.training.policy_file import PolicyFile, Simulation, running
+from astra_data.training.build_env import Simulation, training_env
+from astra_data.training.policy_file import PolicyFile, running
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.simulator_episodes import in_simulator, started
 from astra_data.worlds.task import Task
@@ -18,8 +18,7 @@ _EPISODES = 100
 
 def own_world(task: Task, simulation: Simulation, grounding: Grounding, num_envs: int) -> SimulatorEnv:
     """Build the simulator that a policy was trained in; episodes start where the task does."""
-    parts = EnvParts(simulation.thinness, simulation.scatter, variation=simulation.variation)
-    return training_env(task, simulation.world, parts, grounding, num_envs=num_envs, device="cpu")
+    return training_env(task, simulation, grounding, num_envs=num_envs, device="cpu")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.policy import Policy, PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.training.build_env import EnvConfig
+from astra_data.training.build_env import EnvConfig, Simulation
 from astra_data.training.own_policy import KINDS, OwnPolicy, SavedPolicy
 from astra_data.training.running_policy import Observed, RunningPolicy
 from astra_data.worlds.task import Task
@@ -44,23 +44,6 @@ def add_policy_kind(made: type[SavedPolicy]) -> None:
             f"policies of kind '{made.kind}' are the package's or another learner's: rename that of "
             f"{made.__name__}"
         )
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """The abstract simulator that a policy was trained in.
-
-    Attributes:
-        thinness: of the data, (height, width); None where there is no maze.
-        scatter: factor of the noise added in training, (X, X); zeros where there was none.
-        world: the switches of the environment.
-        variation: ranges of the simulator's parameters, drawn for each episode.
-    """
-
-    thinness: Tensor | None
-    scatter: Tensor
-    world: EnvConfig
-    variation: Variation | None = None
 
 
 @dataclass(frozen=True)

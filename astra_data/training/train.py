@@ -29,8 +29,15 @@ from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.ppo import Ppo, PpoConfig
 from astra_data.learning.recorded import Recorded
 from astra_data.learning.sac import Sac, SacConfig
-from astra_data.training.build_env import EnvConfig, env_parts, recorded_steps, training_env
-from astra_data.training.policy_file import PolicyFile, Simulation
+from astra_data.training.build_env import (
+    EnvConfig,
+    Simulation,
+    data_starts,
+    recorded_steps,
+    simulation_of,
+    training_env,
+)
+from astra_data.training.policy_file import PolicyFile
 from astra_data.training.ramp import Ramp
 from astra_data.training.simulator_env import RewardSource, SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv
@@ -215,17 +222,19 @@ class InSimulator:
         switches = switches.model_copy(update={"reward": switches.reward or self.reward})
         usual: Variation | None = getattr(training.task.varied, self.ranges) if self.ranges else None
         variation = settings if isinstance(settings, Variation) else usual
-        parts = env_parts(training.task, switches, training.episodes, training.grounding, variation)
+        task, episodes, grounding = training.task, training.episodes, training.grounding
+        starts = data_starts(task, switches, episodes, grounding)
+        simulation = simulation_of(task, switches, episodes, grounding, variation)
         env = training_env(
-            training.task,
-            switches,
-            parts,
-            training.grounding,
+            task,
+            simulation,
+            grounding,
             num_envs=config.num_envs,
             device=training.device,
+            starts=starts,
             shows_parameters=shows_parameters,
         )
-        return env, Simulation(parts.thinness, parts.scatter, switches, parts.variation)
+        return env, simulation
 
 
 def train_in(

@@ -17,7 +17,13 @@ from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.residual import ResidualModel, ResidualShape
-from astra_data.training.build_env import EnvConfig, env_parts, recorded_steps, training_env
+from astra_data.training.build_env import (
+    EnvConfig,
+    data_starts,
+    recorded_steps,
+    simulation_of,
+    training_env,
+)
 from astra_data.training.ramp import Ramp
 from astra_data.training.simulator_env import policy_observation
 from astra_data.worlds.plane.free_space import FreeSpace
@@ -62,10 +68,10 @@ def test_without_switches_it_is_the_plain_simulator(
         GroundedSimulator: grounding,
     }
     for kind, used in kinds.items():
-        parts = env_parts(TASK, config, episodes, used)
-        assert not parts.scatter.any()
-        assert parts.starts is None
-        world = training_env(TASK, config, parts, used, num_envs=4, device="cpu")
+        simulation = simulation_of(TASK, config, episodes, used)
+        assert not simulation.scatter.any()
+        assert data_starts(TASK, config, episodes, used) is None
+        world = training_env(TASK, simulation, used, num_envs=4, device="cpu")
         assert type(world.simulator) is kind
         assert type(world.simulator.simulator) is PointMass
         assert world.simulator.scatter is None
@@ -120,9 +126,9 @@ def test_rows_may_differ_by_their_members(episodes: PairedEpisodes) -> None:
     used = HistoryGrounding(model, None, tuple(members))
     for keeps in (False, True):
         config = EnvConfig(keep_member=keeps, data_start_share=0.5)
-        world = training_env(
-            TASK, config, env_parts(TASK, config, episodes, used), used, num_envs=16, device="cpu"
-        )
+        simulation = simulation_of(TASK, config, episodes, used)
+        starts = data_starts(TASK, config, episodes, used)
+        world = training_env(TASK, simulation, used, num_envs=16, device="cpu", starts=starts)
         world.reset()  # half of them from recorded moments, with what the simulator remembers of them
         start = torch.cat([HERE, torch.zeros(2)]).expand(16, 4)
         world.simulator.start(start, torch.arange(16), torch.zeros(16, 2))
@@ -139,7 +145,7 @@ def test_starts_within_the_data_know_what_a_failure_model_remembers(
     seen = {}
     for reward in ("abstract", "blend"):
         config = EnvConfig.model_validate({"reward": reward, "data_start_share": 0.5})
-        starts = env_parts(TASK, config, episodes, foresees).starts
+        starts = data_starts(TASK, config, episodes, foresees)
         assert starts is not None
         assert starts.hidden is not None
         seen[reward] = starts.hidden
@@ -153,17 +159,17 @@ def test_scatter_is_what_the_simulator_does_not_explain(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     config = EnvConfig(residual_noise=2.0)
-    parts = env_parts(TASK, config, episodes, NO_GROUNDING)
-    world = training_env(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
-    assert world.simulator.scatter is parts.scatter
-    deviations = (parts.scatter @ parts.scatter.T).diagonal().sqrt()
+    simulation = simulation_of(TASK, config, episodes, NO_GROUNDING)
+    world = training_env(TASK, simulation, NO_GROUNDING, num_envs=1, device="cpu")
+    assert world.simulator.scatter is simulation.scatter
+    deviations = (simulation.scatter @ simulation.scatter.T).diagonal().sqrt()
     torch.testing.assert_close(deviations, 2 * torch.tensor([0.01, 0.02, 0.1, 0.2]), rtol=0.1, atol=0)
     grounding.model.residual_factor.copy_(torch.eye(4))
-    assert torch.equal(env_parts(TASK, config, episodes, grounding).scatter, 2 * torch.eye(4))
+    assert torch.equal(simulation_of(TASK, config, episodes, grounding).scatter, 2 * torch.eye(4))
 
 
 def test_data_is_thin_where_nobody_was(episodes: PairedEpisodes) -> None:
-    thinness = env_parts(TASK, EnvConfig(), episodes, NO_GROUNDING).thinness
+    thinness = simulation_of(TASK, EnvConfig(), episodes, NO_GROUNDING).thinness
     assert thinness is not None
     cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     far = HERE + torch.tensor([[1.5, 0.0], [0.0, -1.5]])
@@ -178,7 +184,7 @@ def test_what_is_enough_is_a_share_of_the_usual_density(episodes: PairedEpisodes
     everywhere = torch.cat([extent * (torch.rand(2, 400, 2) - 0.5), torch.zeros(2, 400, 2)], dim=-1)
     spread = replace(episodes, windows=replace(episodes.windows, state=everywhere))
     little, more = (
-        env_parts(TASK, EnvConfig(support_density=share), spread, NO_GROUNDING).thinness
+        simulation_of(TASK, EnvConfig(support_density=share), spread, NO_GROUNDING).thinness
         for share in (0.4, 0.8)
     )
     assert little is not None and more is not None
@@ -189,31 +195,31 @@ def test_what_is_enough_is_a_share_of_the_usual_density(episodes: PairedEpisodes
 
 def test_thin_data_costs_its_share_of_the_penalty(episodes: PairedEpisodes) -> None:
     config = EnvConfig(support_penalty=0.3)
-    parts = env_parts(TASK, config, episodes, NO_GROUNDING)
-    world = training_env(TASK, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
-    assert world.thinness is not None and parts.thinness is not None
-    torch.testing.assert_close(world.thinness, 0.3 * parts.thinness)
-    free = training_env(TASK, EnvConfig(), parts, NO_GROUNDING, num_envs=1, device="cpu")
+    simulation = simulation_of(TASK, config, episodes, NO_GROUNDING)
+    world = training_env(TASK, simulation, NO_GROUNDING, num_envs=1, device="cpu")
+    assert world.thinness is not None and simulation.thinness is not None
+    torch.testing.assert_close(world.thinness, 0.3 * simulation.thinness)
+    free = training_env(TASK, replace(simulation, world=EnvConfig()), NO_GROUNDING, num_envs=1, device="cpu")
     assert free.thinness is None
 
 
 def test_what_needs_a_maze_is_refused_without_one(episodes: PairedEpisodes) -> None:
     nowhere = replace(TASK, plane=None)
     plain, *asked = EnvConfig(), EnvConfig(support_penalty=0.3), EnvConfig(command_limit=1.0)
-    parts = env_parts(nowhere, plain, episodes, NO_GROUNDING)
-    assert parts.thinness is None
-    world = training_env(nowhere, plain, parts, NO_GROUNDING, num_envs=1, device="cpu")
+    simulation = simulation_of(nowhere, plain, episodes, NO_GROUNDING)
+    assert simulation.thinness is None
+    world = training_env(nowhere, simulation, NO_GROUNDING, num_envs=1, device="cpu")
     assert world.thinness is None
     for config in asked:
         with pytest.raises(BadInputError, match="expected a task in a maze"):
-            training_env(nowhere, config, parts, NO_GROUNDING, num_envs=1, device="cpu")
+            training_env(nowhere, replace(simulation, world=config), NO_GROUNDING, num_envs=1, device="cpu")
 
 
 def test_recorded_starts_come_with_the_history_before_them(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     config = EnvConfig(data_start_share=1.0)
-    starts = env_parts(TASK, config, episodes, grounding).starts
+    starts = data_starts(TASK, config, episodes, grounding)
     assert starts is not None
     assert starts.hidden is not None
     assert len(starts.state) == len(starts.hidden) == 700
@@ -235,8 +241,9 @@ def test_a_recorded_start_is_one_of_the_recorded_moments(
         episodes, windows=replace(episodes.windows, mask=(torch.arange(400) < 3) * torch.ones(2, 1))
     )
     config = EnvConfig(data_start_share=1.0)
-    parts = env_parts(TASK, config, few, grounding)
-    world = training_env(TASK, config, parts, grounding, num_envs=64, device="cpu")
+    simulation = simulation_of(TASK, config, few, grounding)
+    starts = data_starts(TASK, config, few, grounding)
+    world = training_env(TASK, simulation, grounding, num_envs=64, device="cpu", starts=starts)
     world.reset()
     moments = few.steps(few.windows.state)
     assert len(moments) == 6
@@ -244,7 +251,7 @@ def test_a_recorded_start_is_one_of_the_recorded_moments(
 
 
 def test_plenty_of_data_is_no_bonus(episodes: PairedEpisodes) -> None:
-    thinness = env_parts(TASK, EnvConfig(), episodes, NO_GROUNDING).thinness
+    thinness = simulation_of(TASK, EnvConfig(), episodes, NO_GROUNDING).thinness
     assert thinness is not None
     assert (float(thinness.min()), float(thinness.max())) == (0.0, 1.0)
 
@@ -253,7 +260,7 @@ def test_data_counts_for_what_is_near_it(episodes: PairedEpisodes) -> None:
     """A kernel of 0.25 m ends at four of its deviations, 1 m."""
     here = torch.cat([HERE, torch.zeros(2)]).expand(2, 400, 4)
     alone = replace(episodes, windows=replace(episodes.windows, state=here))
-    thinness = env_parts(TASK, EnvConfig(), alone, NO_GROUNDING).thinness
+    thinness = simulation_of(TASK, EnvConfig(), alone, NO_GROUNDING).thinness
     assert thinness is not None
     cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     near, far = (HERE + torch.tensor([[apart, 0.0], [-apart, 0.0], [0.0, -apart]]) for apart in (0.8, 1.2))
@@ -267,7 +274,7 @@ def test_the_usual_density_is_that_of_the_free_space() -> None:
     places = (free + 0.5) * TASK.maze.fine_m - torch.as_tensor(TASK.maze.half_extent)
     state = torch.cat([places, torch.zeros(len(places), 2)], dim=-1).float()[None]
     everywhere = toy_episodes(state, torch.zeros(1, len(places), 2), next_state=state)
-    thinness = env_parts(TASK, EnvConfig(support_density=2.0), everywhere, NO_GROUNDING).thinness
+    thinness = simulation_of(TASK, EnvConfig(support_density=2.0), everywhere, NO_GROUNDING).thinness
     assert thinness is not None
     cells = FreeSpace.of_maze(TASK.maze, radius_m=0.0).cells
     assert float(thinness[cells(HERE[None])]) == pytest.approx(0.5, abs=0.02)
@@ -276,7 +283,7 @@ def test_the_usual_density_is_that_of_the_free_space() -> None:
 def test_episodes_begin_at_every_so_many_steps_as_the_grounding_says(episodes: PairedEpisodes) -> None:
     """A residual model's memory is large: it is kept for every tenth step."""
     used = ResidualGrounding(ResidualModel(ResidualShape(4, 2, hidden_size=8, layers=1)))
-    starts = env_parts(TASK, EnvConfig(data_start_share=1.0), episodes, used).starts
+    starts = data_starts(TASK, EnvConfig(data_start_share=1.0), episodes, used)
     windows = episodes.windows
     assert starts is not None and starts.hidden is not None and len(starts.hidden) == 40 + 30
     for found, recorded in (

@@ -9,10 +9,10 @@ from small_cart import TASK
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.build_env import EnvConfig
+from astra_data.training.build_env import EnvConfig, Simulation
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import own_world, reached_in_own_world
-from astra_data.training.policy_file import PolicyFile, Simulation
+from astra_data.training.policy_file import PolicyFile
 
 SIMULATION = Simulation(None, torch.zeros(1, 1), EnvConfig())
 

@@ -14,8 +14,8 @@ from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticSh
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.build_env import EnvConfig
-from astra_data.training.policy_file import PolicyFile, Simulation, running
+from astra_data.training.build_env import EnvConfig, Simulation
+from astra_data.training.policy_file import PolicyFile, running
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
 

@@ -9,10 +9,10 @@ from constant_policy import Constant
 from small_cart import TASK, Last
 
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.build_env import EnvConfig
+from astra_data.training.build_env import EnvConfig, Simulation
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import own_world
-from astra_data.training.policy_file import PolicyFile, Simulation, running
+from astra_data.training.policy_file import PolicyFile, running
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.simulator_episodes import in_simulator, started
 
