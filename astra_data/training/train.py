@@ -62,31 +62,12 @@ class TrainConfig(EnvConfig):
     most_of_horizon: Share = 0.85
     """Share of the horizon that those which succeed may take; later they hardly arrive in time."""
 
-    @property
-    def imitates(self) -> bool:
-        """Whether the learner also imitates recorded actions."""
-        return False
-
 
 class PpoTrainConfig(TrainConfig, PpoConfig):
     """Training by PPO."""
 
     learner: Literal["ppo"] = "ppo"
     """Proximal policy optimisation."""
-
-    def make_learner(
-        self,
-        env: BatchedEnv,
-        shape: PolicyShape,
-        device: str,
-        *,
-        horizon: int,
-        seed: int,
-        recorded: Recorded | None,
-    ) -> Ppo:
-        """Build the learner and a new policy of `shape`; nothing `recorded` is imitated."""
-        policy = ActorCritic(ActorCriticShape(**asdict(shape), clips_mean=self.clipped_mean)).to(device)
-        return Ppo(env, policy, self, horizon=horizon, seed=seed)
 
 
 class SacTrainConfig(TrainConfig, SacConfig):
@@ -96,24 +77,6 @@ class SacTrainConfig(TrainConfig, SacConfig):
     """Soft actor-critic."""
     num_envs: AtOnce = 32
     """Environments stepped side by side."""
-
-    @property
-    def imitates(self) -> bool:
-        """Whether the learner also imitates recorded actions."""
-        return self.imitation_weight > 0
-
-    def make_learner(
-        self,
-        env: BatchedEnv,
-        shape: PolicyShape,
-        device: str,
-        *,
-        horizon: int,
-        seed: int,
-        recorded: Recorded | None,
-    ) -> Sac:
-        """Build the learner and a new policy of `shape`, which imitates the `recorded` actions."""
-        return Sac(env, SoftActor(shape).to(device), self, horizon=horizon, seed=seed, recorded=recorded)
 
     @model_validator(mode="after")
     def _learns_from_one_reward(self) -> Self:
@@ -134,6 +97,29 @@ AnyTrainConfig = Annotated[
     Discriminator(_learner),
 ]
 """Training by the `learner` that is named, by default PPO."""
+
+
+def imitates(config: PpoTrainConfig | SacTrainConfig) -> bool:
+    """Return whether the learner also imitates recorded actions."""
+    return isinstance(config, SacTrainConfig) and config.imitation_weight > 0
+
+
+def learner_of(
+    config: PpoTrainConfig | SacTrainConfig,
+    env: BatchedEnv,
+    shape: PolicyShape,
+    device: str,
+    *,
+    horizon: int,
+    seed: int,
+    recorded: Recorded | None,
+) -> Ppo | Sac:
+    """Build the learner and a new policy of `shape`; by SAC, it may imitate the `recorded` actions."""
+    if isinstance(config, SacTrainConfig):
+        actor = SoftActor(shape).to(device)
+        return Sac(env, actor, config, horizon=horizon, seed=seed, recorded=recorded)
+    policy = ActorCritic(ActorCriticShape(**asdict(shape), clips_mean=config.clipped_mean)).to(device)
+    return Ppo(env, policy, config, horizon=horizon, seed=seed)
 
 
 @dataclass(frozen=True)
@@ -210,7 +196,7 @@ class InSimulator:
         memory_size = 0 if env.latent_size else training.config.memory_size
         episodes = training.episodes
         config, recorded = training.config, None
-        if config.imitates:
+        if imitates(config):
             recorded = recorded_steps(training.task, episodes, training.grounding)
         policy, curve = train_in(env, config, memory_size, training, training.simulated_steps, recorded)
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
@@ -252,8 +238,8 @@ def train_in(
     """
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
-    learner = config.make_learner(
-        env, shape, training.device, horizon=horizon, seed=training.seed, recorded=recorded
+    learner = learner_of(
+        config, env, shape, training.device, horizon=horizon, seed=training.seed, recorded=recorded
     )
     return learner.policy, optimise(learner, env, config.penalty_ramp, training)
 

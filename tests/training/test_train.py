@@ -31,6 +31,8 @@ from astra_data.training.train import (
     SacTrainConfig,
     Training,
     _lately,
+    imitates,
+    learner_of,
     optimise,
     train_in,
 )
@@ -102,16 +104,16 @@ def test_each_learner_gets_its_policy_in_the_asked_sizes() -> None:
     shape = PolicyShape(1, 1, 5, hidden_sizes=(8, 6))
     recorded = Recorded(torch.zeros(1, 9, 1), torch.zeros(1, 9, 1), torch.zeros(1, 9, 1), torch.tensor([9]))
     given: dict[str, Any] = {"horizon": 7, "seed": 3, "recorded": recorded}
-    ppo = PPO.make_learner(ToyWorld(4), shape, "cpu", **given)
+    ppo = learner_of(PPO, ToyWorld(4), shape, "cpu", **given)
     assert type(ppo) is Ppo and type(ppo.policy) is ActorCritic
     assert ppo.policy.shape == ActorCriticShape(1, 1, 5, hidden_sizes=(8, 6))
     assert (ppo.total_steps, ppo.acting.horizon) == (48, 7)
-    sac = SAC.make_learner(ToyWorld(4), shape, "cpu", **given)
+    sac = learner_of(SAC, ToyWorld(4), shape, "cpu", **given)
     assert type(sac) is Sac and type(sac.policy) is SoftActor
     assert sac.policy.shape == shape
     assert sac.acting.horizon == 7
     imitating = SAC.model_copy(update={"imitation_weight": 0.4})
-    assert [config.imitates for config in (PPO, SAC, imitating)] == [False, False, True]
+    assert [imitates(config) for config in (PPO, SAC, imitating)] == [False, False, True]
 
 
 @pytest.mark.parametrize("config", [PPO, SAC])
