@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artefact_key
-from astra_data.dataset.inspection import visited
+from astra_data.dataset.inspection import Map, visited
 from astra_data.dataset.reader import Dataset
 from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.reports.figures import (
@@ -20,7 +20,6 @@ from astra_data.reports.figures import (
     Scored,
     SimulatorReturns,
     Strip,
-    Visits,
     data_efficiency,
     learning_curves,
     open_loop_error,
@@ -208,13 +207,13 @@ def figure_of_sizes(found: SizesResults, root: Path) -> Figure:
         }
         for method in found.methods()
     }
-    covered: dict[str, list[Visits]] = {}
+    covered: dict[str, list[Map]] = {}
     for folder in _subsets(found, root):
         dataset = Dataset.open(folder)
         for label, role in (("position (m)", "position"), ("velocity (m/s)", "vector")):
             planar = visited(dataset, role)
             if planar is not None:
-                covered.setdefault(label, []).append(Visits(planar.counts, planar.extent))
+                covered.setdefault(label, []).append(planar)
     return data_efficiency(
         score,
         [size.percent for size in found.sizes],

@@ -18,7 +18,7 @@ from astra_data.reports.figures.motion import Panel, dynamics_mismatch, trajecto
 from astra_data.reports.figures.open_loop import OpenLoop, open_loop_error
 from astra_data.reports.figures.reliability import reliability
 from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
-from astra_data.reports.figures.sizes import Scored, Visits, data_efficiency
+from astra_data.reports.figures.sizes import Scored, data_efficiency
 from astra_data.reports.figures.strips import Strip, strips
 from astra_data.reports.figures.style import method_colour, method_title, png
 from astra_data.reports.figures.suggestions import information_map
@@ -32,7 +32,6 @@ __all__ = [
     "Scored",
     "SimulatorReturns",
     "Strip",
-    "Visits",
     "coverage",
     "data_efficiency",
     "dynamics_mismatch",

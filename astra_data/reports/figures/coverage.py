@@ -1,8 +1,10 @@
 """What a dataset covers: visited positions and velocities (the paper's data-efficiency figure)."""
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from astra_data.reports.figures.style import style
@@ -22,16 +24,21 @@ def coverage(counts: Ints, extent: tuple[float, float, float, float], label: str
     with style():
         figure = Figure(figsize=(4.2, 3.6), layout="constrained")
         axes = figure.subplots()
-        image = axes.imshow(
-            np.where(counts > 0, counts, np.nan),
-            origin="lower",
-            extent=extent,
-            cmap="viridis",
-            norm=LogNorm(vmin=1, vmax=max(2, int(counts.max()))),
-            interpolation="nearest",
-        )
-        axes.grid(visible=False)
+        image = draw_visits(axes, counts, extent, int(counts.max()))
         axes.set_xlabel(f"x {label} ({unit})")
         axes.set_ylabel(f"y {label} ({unit})")
         figure.colorbar(image, ax=axes, label="steps")
     return figure
+
+
+def draw_visits(axes: Axes, counts: Ints, extent: tuple[float, float, float, float], most: int) -> AxesImage:
+    """Draw `counts` on a logarithmic scale from 1 to `most`, but to 2 at least; others as in `coverage`."""
+    axes.grid(visible=False)
+    return axes.imshow(
+        np.where(counts > 0, counts, np.nan),
+        origin="lower",
+        extent=extent,
+        cmap="viridis",
+        norm=LogNorm(vmin=1, vmax=max(2, most)),
+        interpolation="nearest",
+    )

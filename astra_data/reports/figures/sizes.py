@@ -5,29 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from astra_data.core.naming import is_plus
+from astra_data.dataset.inspection import Map
+from astra_data.reports.figures.coverage import draw_visits
 from astra_data.reports.figures.style import method_colour, method_title, score_axis, style
 from astra_data.worlds.score import Score
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Visits:
-    """How often the cells of a plane were visited.
-
-    Attributes:
-        counts: indexed [y, x] from the lower left, (height, width).
-        extent: left, right, bottom and top edge.
-    """
-
-    counts: Ints
-    extent: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -50,7 +37,7 @@ def data_efficiency(
     score: Score,
     percents: Sequence[int],
     rows: Mapping[str, Mapping[int, Scored]],
-    covered: Mapping[str, Sequence[Visits]],
+    covered: Mapping[str, Sequence[Map]],
     tested: str = "in the target",
 ) -> Figure:
     """Draw a map per size for each of `covered`, and below them a score with a band per row.
@@ -89,20 +76,12 @@ def data_efficiency(
         return figure
 
 
-def _maps(panels: Sequence[Axes], visits: Sequence[Visits], label: str) -> None:
+def _maps(panels: Sequence[Axes], visits: Sequence[Map], label: str) -> None:
     """Draw one map per panel, with the colours and the limits of the one that covers most."""
-    most = max(2, max(int(visit.counts.max()) for visit in visits))
+    most = max(int(visit.counts.max()) for visit in visits)
     extents = np.array([visit.extent for visit in visits])
     for axes, visit in zip(panels, visits, strict=True):
-        axes.imshow(
-            np.where(visit.counts > 0, visit.counts, np.nan),
-            origin="lower",
-            extent=visit.extent,
-            cmap="viridis",
-            norm=LogNorm(vmin=1, vmax=most),
-            interpolation="nearest",
-        )
-        axes.grid(visible=False)
+        draw_visits(axes, visit.counts, visit.extent, most)
         axes.tick_params(labelleft=axes is panels[0], labelsize=6.5)
     panels[0].set_xlim(extents[:, 0].min(), extents[:, 1].max())
     panels[0].set_ylim(extents[:, 2].min(), extents[:, 3].max())

@@ -1,12 +1,13 @@
 import numpy as np
 
-from astra_data.reports.figures.sizes import Scored, Visits, data_efficiency
+from astra_data.dataset.inspection import Map
+from astra_data.reports.figures.sizes import Scored, data_efficiency
 from astra_data.reports.figures.style import png
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS
 
 
 def test_data_efficiency_has_a_map_per_size_and_a_band_per_row() -> None:
-    visits = [Visits(np.full((2, 3), count), (0.0, 3.0, 0.0, 2.0)) for count in (4, 1, 9)]
+    visits = [Map(np.full((2, 3), count), np.zeros(2), 1.0) for count in (4, 1, 9)]
     nas = {
         100: Scored(np.array([0.6, 0.8]), 0.7, 0.6, 0.8),
         # This size has a seed less than the others.
