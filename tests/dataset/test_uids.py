@@ -29,3 +29,7 @@ def test_metadata_name_the_episodes_by_their_new_uids() -> None:
     assert renamed_metadata(2, {"source_episode": 1}, names) == {"source_episode": 11}
     assert renamed_metadata(2, {"source_episode": 5}, names) == {"source_episode": 5}
     assert renamed_metadata(2, {}, names) == {}
+
+
+def test_new_uids_are_below_two_to_the_63() -> None:
+    assert all(0 <= new_uid(uid, b"origin", {uid}) < 2**63 for uid in range(64))

@@ -111,3 +111,13 @@ def test_what_rests_stays_and_what_is_restored_goes_on() -> None:
     again.restore(arrays)
     again.update(np.ones((2, 3)), np.random.default_rng(1), everyone(2))
     np.testing.assert_array_equal(again.pose, place.pose)
+
+
+def test_a_robot_that_turns_past_the_back_is_estimated_where_it_was_a_moment_ago() -> None:
+    exact = PerceptionErrors(white_m=0.0, drift_m=0.0, drift_rad=0.0, jumps_per_s=0.0, latency_s=0.05)
+    localisation, rng = Localisation(1, exact, 0.1), np.random.default_rng(0)
+    localisation.reset(np.array([0]), np.array([[0.0, 0.0, np.pi - 0.1]]), rng)
+    localisation.update(np.array([[0.2, 0.0, 0.1 - np.pi]]), rng, np.array([True]))
+    x, _, heading = localisation.pose[0]
+    assert x == pytest.approx(0.1)
+    assert abs(heading) == pytest.approx(np.pi)
