@@ -11,7 +11,7 @@ COLUMN = Column(STATE, size=4, names=("x", "heading", "rate", "arm"), astra=UNIT
 
 def findings(*largest: float) -> list[Finding]:
     angles = Angles(COLUMN)
-    for uid, share in enumerate((0.5, -1.0)):
+    for uid, share in enumerate((0.5, -1.0, 0.25)):
         angles.add(Episode(uid, {STATE: np.outer([0.0, share], largest).astype(np.float32)}))
     return angles.findings()
 
