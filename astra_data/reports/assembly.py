@@ -53,13 +53,14 @@ def assemble(
     scores: tuple[Score, ...] = (SUCCESS,),
     percent: int | None = None,
     paper_success: Mapping[str, float] | None = None,
+    compare: Sequence[str] = ("astra",),
     published: Results | None = None,
 ) -> Results:
     """Read the artefacts under `root` of every row, for the seeds that it has finished.
 
     The task is given by its name, as in its evaluations. `percent` selects the dataset size, if there are
-    several. Results in `published` are merged in, unless there are newer ones under `root`, which for a
-    choice is one among all policies of the outcome.
+    several. Rows of the methods in `compare` are compared with the others. Results in `published` are merged
+    in, unless there are newer ones under `root`, which for a choice is one among all policies of the outcome.
 
     Raises:
         MissingStageError: no row has an evaluation and nothing is published; or a row lacks other artefacts
@@ -74,7 +75,9 @@ def assemble(
     judged = read_judged(root)
     if read.any_finished or not published:
         sources.append(_read(read, command, scores, judged))
-    merged = merge(sources, methods=reported.methods, seeds=reported.seeds, replicates=replicates)
+    merged = merge(
+        sources, methods=reported.methods, seeds=reported.seeds, replicates=replicates, compare=compare
+    )
     printed = {row: value for row, value in (paper_success or {}).items() if row in merged.methods}
     choice = published.choice if published else None
     if judged:

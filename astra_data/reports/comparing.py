@@ -1,12 +1,20 @@
 """Summaries of rows over their seeds, and comparisons between rows."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from astra_data.core.naming import PLUS, is_plus
 from astra_data.reports.schema import MethodResults, Validity
-from astra_data.reports.statistics import Comparison, correlation, probability_of_improvement, summarise
+from astra_data.reports.statistics import (
+    Comparison,
+    Difference,
+    correlation,
+    paired_difference,
+    probability_of_improvement,
+    summarise,
+)
 from astra_data.worlds.score import Score
 
 SHARED_WORLDS = ("raw", "grounded")
@@ -24,23 +32,40 @@ def summarised(row: MethodResults, replicates: int) -> MethodResults:
 
 
 def improvement(
-    rows: Mapping[str, MethodResults], score: Score, replicates: int
+    rows: Mapping[str, MethodResults], score: Score, replicates: int, methods: Sequence[str] = ("astra",)
 ) -> dict[str, dict[str, Comparison]]:
-    """Compare ASTRA with every row that is trained alike: with the [plus] settings, or without.
+    """Compare the rows of `methods` with those that are trained alike: with the [plus] settings, or without.
 
     Rows that are trained in no simulator have no [plus] settings and are compared with both.
     """
-    scores = {method: np.array(row.measures()[score.measure]) for method, row in rows.items()}
     compared = {method: row for method, row in rows.items() if row.role in (None, "floor")}
     return {
         ours: {
-            other: probability_of_improvement(scores[ours], scores[other], replicates=replicates)
+            other: _compared(rows[ours], row, score, replicates)
             for other, row in compared.items()
             if other != ours and (is_plus(other) == is_plus(ours) or row.simulated_success is None)
         }
-        for ours in ("astra", f"astra{PLUS}")
+        for method in methods
+        for ours in (method, f"{method}{PLUS}")
         if ours in rows
     }
+
+
+def _compared(row: MethodResults, other: MethodResults, score: Score, replicates: int) -> Comparison:
+    ours, theirs = (np.array(one.measures()[score.measure]) for one in (row, other))
+    found = probability_of_improvement(ours, theirs, replicates=replicates)
+    return replace(found, difference=_difference(row, other, score))
+
+
+def _difference(row: MethodResults, other: MethodResults, score: Score) -> Difference | None:
+    """Return the difference on the seeds that both have; None where these are fewer than two."""
+    ours, theirs = (
+        dict(zip(one.seeds, one.measures()[score.measure] or (), strict=True)) for one in (row, other)
+    )
+    shared = [seed for seed in ours if seed in theirs]
+    if len(shared) < 2:
+        return None
+    return paired_difference(*(np.array([of[seed] for seed in shared]) for of in (ours, theirs)))
 
 
 def validity(rows: Mapping[str, MethodResults], replicates: int) -> dict[str, Validity]:

@@ -118,10 +118,17 @@ def _alt(results: Results, score: Score) -> str:
 
 
 def _comparisons(results: Results) -> list[list[str]]:
-    """Return the probabilities of improvement that have an interval, and so more than one seed."""
-    rows = results.methods
+    """Return the comparisons of rows that have an interval, and so more than one seed."""
+    rows, digits = results.methods, results.headline.digits
     return [
-        [rows[ours].title, rows[other].title, f"{of.probability:.2f}", f"[{of.low:.2f}, {of.high:.2f}]"]
+        [
+            rows[ours].title,
+            rows[other].title,
+            f"{of.probability:.2f}",
+            f"[{of.low:.2f}, {of.high:.2f}]",
+            f"{by.mean:.{digits}f}" if (by := of.difference) else "-",
+            f"[{by.low:.{digits}f}, {by.high:.{digits}f}]" if by else "-",
+        ]
         for ours, others in results.probability_of_improvement.items()
         for other, of in others.items()
         if of.low is not None

@@ -14,7 +14,12 @@ from astra_data.reports.seed_table import lines_of, row_of
 
 
 def merge(
-    sources: Sequence[Results], *, methods: Sequence[str], seeds: Sequence[int], replicates: int
+    sources: Sequence[Results],
+    *,
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    replicates: int,
+    compare: Sequence[str],
 ) -> Results:
     """Return one Results of those `methods` and `seeds` that any of the `sources` has, compared anew.
 
@@ -47,7 +52,7 @@ def merge(
             "seeds": [seed for seed in seeds if seed in reported],
             "methods": rows,
             "unfinished": [method_title(method) for method in methods if method not in rows],
-            "probability_of_improvement": improvement(rows, sources[-1].headline, replicates),
+            "probability_of_improvement": improvement(rows, sources[-1].headline, replicates, compare),
             "predictive_validity": validity(rows, replicates) if sources[-1].tested_in == "target" else {},
             "throughput": reduce(_sum, (source.throughput for source in sources)),
         }

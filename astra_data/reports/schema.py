@@ -266,7 +266,7 @@ class Results(Section):
     unfinished: list[str] = Field(default_factory=list)
     """Titles of the recipe's rows without a finished seed."""
     probability_of_improvement: dict[str, dict[str, Comparison]] = Field(default_factory=dict)
-    """ASTRA's row → comparable row → probability that a seed of the first beats one of the second."""
+    """Compared row, ASTRA's by default → comparable row → how likely and by how much the first is better."""
     predictive_validity: dict[str, Validity] = Field(default_factory=dict)
     """By shared test simulator: "raw", and "grounded" if there is one."""
     choice: Choice | None = Field(default=None, exclude_if=lambda choice: choice is None)

@@ -58,6 +58,9 @@ class ReportConfig(Config):
     paper_success: dict[str, Share] = Field(default_factory=dict)
     """Row → the success rate that the paper prints for it, shown beside ours."""
 
+    compare: tuple[str, ...] = ("astra",)
+    """Methods that are compared with every row that is trained alike, each with and without [plus]."""
+
     bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
     """Bootstrap resamples per interval."""
 
@@ -90,7 +93,7 @@ def report(
     """
     from astra_data.reports.figures import png, reliability
 
-    for row in (*config.trajectory_methods, *config.paper_success):
+    for row in (*config.trajectory_methods, *config.paper_success, *config.compare):
         method_named(row)
     read = _read(recipe, root)
     known = {} if add_to is None else by_size(read_published(add_to))
@@ -105,6 +108,7 @@ def report(
             scores=task.objective.scores,
             percent=percent,
             paper_success=config.paper_success,
+            compare=config.compare,
             published=known.get(percent),
         ).model_copy(update={"stand_in": task.facts.get("stand_in")})
         for percent in _made(recipe, root, known)

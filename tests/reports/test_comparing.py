@@ -55,10 +55,32 @@ def test_astra_is_compared_with_rows_that_are_trained_alike() -> None:
     assert improvement({"iql": rows["iql"]}, SUCCESS, 100) == {}
 
 
+def test_other_methods_are_compared_where_they_are_named() -> None:
+    rows = {name: row(simulated_success=[0.0] * 3) for name in ("nas", "astra", "nas_plus", "a_plus")}
+    found = improvement(rows, SUCCESS, 100, ["a", "nas"])
+    assert {ours: [*others] for ours, others in found.items()} == {
+        "a_plus": ["nas_plus"],
+        "nas": ["astra"],
+        "nas_plus": ["a_plus"],
+    }
+
+
+def test_a_difference_is_over_the_seeds_that_both_rows_have() -> None:
+    rows = {
+        "astra": row(seeds=[3, 1, 2], success=[0.9, 0.5, 0.3]),
+        "iql": row(seeds=[1, 2, 4], success=[0.1, 0.2, 0.8]),
+        "nas": row(seeds=[3], success=[0.4]),
+    }
+    found = improvement(rows, SUCCESS, 100)["astra"]
+    assert found["iql"].difference is not None and found["nas"].difference is None
+    assert found["iql"].difference.mean == pytest.approx((0.4 + 0.1) / 2)
+
+
 def test_rows_are_compared_by_the_headline() -> None:
     rows = {"astra": row(returns=[2.0, 3.0, 4.0]), "iql": row(returns=[1.0, 1.0, 3.0])}
     wins = improvement(rows, RETURN, 100)["astra"]["iql"]
     assert wins.probability == pytest.approx((2 + 2.5 + 3) / 9)
+    assert wins.difference is not None and wins.difference.mean == pytest.approx(4 / 3)
 
 
 def test_validity_is_over_the_policies_that_were_tested_in_a_simulator() -> None:

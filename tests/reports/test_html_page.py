@@ -190,6 +190,8 @@ def test_enough_seeds_are_compared_and_correlated(tmp_path: Path) -> None:
     assert "withheld" not in page.text
     # Of nine pairs of seeds ASTRA wins seven and ties two: 0.5, 0.25, 0.75 against 0.25, 0, 0.25.
     assert [line[:3] for line in page.table("Probability")[1:]] == [["ASTRA", "Direct transfer", "0.89"]]
+    (line,) = page.table("Probability")[1:]
+    assert line[4:] == ["0.33", "[-0.03, 0.69]"]  # 0.25, 0.25 and 0.5, with t = 4.303
     assert [line[:2] for line in page.table("Correlation")[1:]] == [["raw", "12"], ["grounded", "9"]]
 
 
@@ -255,7 +257,10 @@ def test_correlations_and_comparisons_stand_below_their_names(tmp_path: Path) ->
     page, values = published("antmaze_long_fresh")
     found = [of for others in values["probability_of_improvement"].values() for of in others.values()]
     assert [line[2:] for line in page.table("Probability")[1:]] == [
-        [f"{of['probability']:.2f}", f"[{of['low']:.2f}, {of['high']:.2f}]"] for of in found
+        [f"{of['probability']:.2f}", f"[{of['low']:.2f}, {of['high']:.2f}]"]
+        + [f"{by['mean']:.2f}", f"[{by['low']:.2f}, {by['high']:.2f}]"]
+        for of in found
+        for by in [of["difference"]]
     ]
 
 

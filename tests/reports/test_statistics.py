@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from rliable import metrics  # type: ignore[import-untyped]
 from scipy import stats
-from scipy.stats import pearsonr, rankdata, spearmanr, trim_mean
+from scipy.stats import pearsonr, rankdata, spearmanr, trim_mean, ttest_rel
 
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Results
@@ -16,6 +16,7 @@ from astra_data.reports.statistics import (
     correlation,
     mean_interval,
     mean_rank_correlation,
+    paired_difference,
     probability_of_improvement,
     share_interval,
     summarise,
@@ -100,7 +101,8 @@ def test_published_intervals_come_out_again() -> None:
     ours, theirs = np.array(astra.success), np.array(other.success)
     assert summarise(ours) == astra.summary["success"]
     published = found.probability_of_improvement["astra"]["direct_transfer"]
-    assert probability_of_improvement(ours, theirs) == published
+    difference = paired_difference(ours, theirs)
+    assert replace(probability_of_improvement(ours, theirs), difference=difference) == published
     rows = [row for row in found.methods.values() if "raw" in row.simulator_returns]
     simulated = [np.array(row.simulator_returns["raw"]) for row in rows]
     target = [np.array(row.returns) for row in rows]
@@ -141,6 +143,16 @@ def test_the_probability_of_improvement_has_a_95_percent_interval() -> None:
     back = probability_of_improvement(others, scores, replicates=2000)
     mirrored = 1 - np.array([found.probability, expected[1], expected[0]])
     assert [back.probability, back.low, back.high] == pytest.approx(mirrored, abs=0.03)
+
+
+def test_the_difference_of_paired_seeds_is_that_of_a_paired_t_test() -> None:
+    rng = np.random.default_rng(0)
+    seeds = rng.normal(0, 1, 7)
+    ours, theirs = seeds + rng.normal(0.3, 0.1, 7), seeds + rng.normal(0, 0.1, 7)
+    found = paired_difference(ours, theirs)
+    interval = ttest_rel(ours, theirs).confidence_interval(0.95)
+    expected = [(ours - theirs).mean(), interval.low, interval.high]
+    assert [found.mean, found.low, found.high] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("seeds", [1, 5, 8])

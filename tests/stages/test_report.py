@@ -103,10 +103,19 @@ def test_the_manifest_names_the_evaluations(folder: Path) -> None:
     assert evaluations and manifest.made_from == digests
 
 
-def test_a_paper_figure_of_no_row_is_refused(root: Path) -> None:
-    config = CONFIG.model_copy(update={"paper_success": {"astar": 0.4}})
+@pytest.mark.parametrize("changed", [{"paper_success": {"astar": 0.4}}, {"compare": ("astar",)}])
+def test_a_row_that_is_no_method_is_refused(root: Path, changed: dict[str, object]) -> None:
+    config = CONFIG.model_copy(update=changed)
     with pytest.raises(BadInputError, match="astar"):
         report(FakeRecipe(), root=root, command="", publish=None, progress=lambda *_: None, config=config)
+
+
+def test_the_methods_that_are_named_are_compared(root: Path) -> None:
+    config = CONFIG.model_copy(update={"compare": ("direct_transfer",)})
+    report(FakeRecipe(), root=root, command="", publish=None, progress=lambda *_: None, config=config)
+    compared = json.loads((root / "report/results.json").read_text())["probability_of_improvement"]
+    assert [*compared] == ["direct_transfer"]
+    assert compared["direct_transfer"]["astra"]["difference"]["mean"] < 0
 
 
 def test_origin_is_what_the_artefacts_recorded(values: Any, folder: Path) -> None:  # noqa: ANN401 - JSON
