@@ -1,13 +1,11 @@
 """Weights and training states on disk, as safetensors and JSON: written atomically, never pickled."""
 
 import json
-import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
@@ -65,9 +63,21 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, metadata
 
 
+def save_state(checkpoint: Path, state: Nested, metadata: Mapping[str, Any]) -> None:
+    """Write the state of a training and `metadata` (JSON values) to `checkpoint`, for `resumed`.
+
+    Raises:
+        BadInputError: the state has no tensors, or something that no training state has.
+        DiskError: as `save_tensors`.
+    """
+    tensors: dict[str, Tensor] = {}
+    apart = _taken_apart(state, tensors)
+    save_tensors(checkpoint, tensors, {**metadata, "state": apart})
+
+
 @contextmanager
 def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Yield the state (as passed to `flatten`) and the metadata of `checkpoint`; the block resumes from them.
+    """Yield the state and the metadata that `save_state` wrote; the block resumes from them.
 
     Raises:
         BadInputError: it cannot be read, or lacks something that the block needs, as one of an older version.
@@ -77,7 +87,7 @@ def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]
     except BadInputError as error:
         raise BadInputError(f"{error}: remove {checkpoint.parent}") from None
     try:
-        yield unflatten(tensors), metadata
+        yield _put_together(metadata["state"], tensors), metadata
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise BadInputError(
             f"{checkpoint}: expected a checkpoint of this version, found something else ({error}): "
@@ -145,79 +155,39 @@ def _is_usable(name: str, tensor: Tensor) -> bool:
     return not (tensor.isnan() if name.endswith("_std") else ~tensor.isfinite()).any()
 
 
-def flatten(nested: Mapping[Any, Nested]) -> dict[str, Tensor]:
-    """Turn nested containers of tensors and numbers into flat, named tensors; `unflatten` is the inverse.
-
-    The parts of a name encode the containers: `key` and `#3` (an int key) of a dict, `[0]` of a list, `(0)`
-    of a tuple. The suffix `=` marks a number; `=none`, `={}`, `=[]` and `=()` mark None and empty containers.
+def _taken_apart(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 - a JSON value
+    """Add the tensors of a training state to `tensors`; return all else of it as JSON, for `_put_together`.
 
     Raises:
-        BadInputError: a key has other characters than letters, digits, `_`, `.` and `-`, or a value is
-            of another type.
+        BadInputError: a value is of another type than a training state has, or a key is no str or int.
     """
-    return dict(_leaves(nested, "")) if nested else {}
-
-
-def unflatten(flat: Mapping[str, Tensor]) -> dict[Any, Any]:
-    """Restore the nested containers from the result of `flatten`."""
-    tree: dict[str, Any] = {}
-    for path, tensor in flat.items():
-        *parents, last = path.split("/")
-        branch = tree
-        for part in parents:
-            branch = branch.setdefault(part, {})
-        name, number, kind = last.partition("=")
-        branch[name] = _EMPTY[kind]() if kind else tensor.item() if number else tensor
-    return {_key(part): _container(value) for part, value in tree.items()}
-
-
-_EMPTY: dict[str, Callable[[], Any]] = {"none": lambda: None, "{}": dict, "[]": list, "()": tuple}
-
-
-def _leaves(value: Nested, path: str) -> Iterator[tuple[str, Tensor]]:
-    prefix = f"{path}/" if path else ""
     match value:
         case Tensor():
-            yield path, value
-        case bool():
-            yield f"{path}=", torch.tensor(value)
-        case int():
-            yield f"{path}=", torch.tensor(value, dtype=torch.int64)
-        case float():
-            yield f"{path}=", torch.tensor(value, dtype=torch.float64)
-        case None:
-            yield f"{path}=none", torch.empty(0)
-        case Mapping() | list() | tuple() if not value:
-            brackets = "{}" if isinstance(value, Mapping) else "[]" if isinstance(value, list) else "()"
-            yield f"{path}={brackets}", torch.empty(0)
-        case Mapping():
-            for key, item in value.items():
-                yield from _leaves(item, prefix + _part(key, path))
-        case list() | tuple():
-            left, right = "[]" if isinstance(value, list) else "()"
-            for index, item in enumerate(value):
-                yield from _leaves(item, f"{prefix}{left}{index}{right}")
-        case _:
-            raise BadInputError(f"{path}: expected tensors and numbers, got {type(value).__name__}")
+            name = str(len(tensors))
+            tensors[name] = value
+            return {"tensor": name}
+        case None | bool() | int() | float():
+            return value
+        case list():
+            return [_taken_apart(item, tensors) for item in value]
+        case tuple():
+            return {"tuple": [_taken_apart(item, tensors) for item in value]}
+        case Mapping() if all(isinstance(key, str | int) for key in value):
+            return {"items": [[key, _taken_apart(item, tensors)] for key, item in value.items()]}
+    raise BadInputError(
+        f"expected tensors, numbers, and containers of them by str or int, got {type(value).__name__}"
+    )
 
 
-def _part(key: object, path: str) -> str:
-    if type(key) is int:
-        return f"#{key}"
-    if isinstance(key, str) and re.fullmatch(r"[\w.-]+", key):
-        return key
-    raise BadInputError(f"{path or 'top'}: expected keys of letters, digits, '_', '.' and '-', got {key!r}")
-
-
-def _key(part: str) -> str | int:
-    return int(part[1:]) if part.startswith("#") else part
-
-
-def _container(value: Any) -> Any:  # noqa: ANN401 - any nested value
-    if not isinstance(value, dict) or not value:
-        return value
-    first = next(iter(value))
-    if first[0] not in "[(":
-        return {_key(part): _container(item) for part, item in value.items()}
-    items = [_container(value[part]) for part in sorted(value, key=lambda part: int(part[1:-1]))]
-    return items if first[0] == "[" else tuple(items)
+def _put_together(state: Any, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - a training state
+    """Return the training state that `_taken_apart` was given."""
+    match state:
+        case {"tensor": name}:
+            return tensors[name]
+        case {"tuple": items}:
+            return tuple(_put_together(item, tensors) for item in items)
+        case {"items": items}:
+            return {key: _put_together(item, tensors) for key, item in items}
+        case list():
+            return [_put_together(item, tensors) for item in state]
+    return state

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.checkpoint import flatten, resumed, save_tensors
+from astra_data.core.checkpoint import resumed, save_state
 from astra_data.core.stopwatch import Alarm, Stopwatch
 
 CHECKPOINT_SECONDS = 60.0
@@ -43,8 +43,8 @@ class Logbook:
         return self._alarm.rings
 
     def keep(self, state: Mapping[str, Any]) -> None:
-        """Write a checkpoint: `state` (see `flatten`), the points and the time spent."""
+        """Write a checkpoint: `state` (see `save_state`), the points and the time spent."""
         if self._checkpoint is not None:
             metadata = {"points": self.points, "spent": self.stopwatch.spent()}
-            save_tensors(self._checkpoint, flatten(state), metadata)
+            save_state(self._checkpoint, state, metadata)
         self._alarm.reset()

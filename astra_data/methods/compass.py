@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.core.artefact import CHECKPOINT
-from astra_data.core.checkpoint import resumed, save_tensors
+from astra_data.core.checkpoint import resumed, save_state
 from astra_data.core.config import AtOnce, Count, own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
@@ -94,7 +94,7 @@ class Search:
 
     def save(self, checkpoint: Path) -> None:
         """Write the checkpoint that `begin` resumes from."""
-        save_tensors(checkpoint, {"box": self.box.ranges()}, vars(self) | {"box": self.box.model_dump()})
+        save_state(checkpoint, {"box": self.box.ranges()}, vars(self) | {"box": self.box.model_dump()})
 
     def narrow(self, names: Iterable[str], shrink: float) -> None:
         """Shrink the box around the point by the factor `shrink`, along the parameters in `names`."""

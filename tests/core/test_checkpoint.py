@@ -9,12 +9,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from astra_data.core.checkpoint import (
-    flatten,
     load_tensors,
     resumed,
+    save_state,
     save_tensors,
     understood,
-    unflatten,
 )
 from astra_data.core.errors import BadInputError
 
@@ -57,9 +56,10 @@ def test_a_failed_save_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_nothing_is_not_saved(tmp_path: Path) -> None:
-    assert unflatten(flatten({})) == {}
     with pytest.raises(BadInputError, match="at least one tensor"):
         save_tensors(tmp_path / "a.safetensors", {}, {})
+    with pytest.raises(BadInputError, match="at least one tensor"):
+        save_state(tmp_path / "a.safetensors", {"steps": 3}, {})
 
 
 def test_files_that_are_missing_damaged_or_foreign_are_refused(tmp_path: Path) -> None:
@@ -103,24 +103,35 @@ def test_weights_that_are_not_finite_are_refused(
         {"a": torch.ones(2, 3), "b.c": 1, "d": -0.1, "e": True, "f": None},
         {"empty": [{}, [], ()], "list": [1, [2.5, None], (torch.zeros(0),)], "tuple": ()},
         {"state": {0: {"step": torch.tensor(3.0)}, 11: {"step": torch.tensor(4)}}, "0": {-1: False}},
-        {"long": list(range(12))},
+        {"long": list(range(12)), "large": [2**70, float("inf"), 1 / 3]},
+        {"a/b": 1, "": 1, "#1": 1, "a": {True: 1}, "tensor": 2, "items": [], "tuple": ()},
+        {},
     ],
 )
 def test_nested_states_come_back(nested: dict[Any, Any], tmp_path: Path) -> None:
-    flat = flatten(nested)
-    assert all(isinstance(tensor, Tensor) for tensor in flat.values())
-    assert_same(unflatten(flat), nested)
-    save_tensors(tmp_path / "state.safetensors", flat, {})
-    loaded, _ = load_tensors(tmp_path / "state.safetensors")
-    assert_same(unflatten({path: loaded[path] for path in flat}), nested)
+    path = tmp_path / "state.safetensors"
+    save_state(path, {"nested": nested, "last": torch.ones(1)}, {"points": [1]})
+    with resumed(path) as (state, metadata):
+        assert_same(state, {"nested": nested, "last": torch.ones(1)})
+        assert metadata["points"] == [1]
 
 
-@pytest.mark.parametrize(
-    "nested", [{"a/b": 1}, {"": 1}, {"#1": 1}, {("a",): 1}, {"a": {True: 1}}, {"a": "text"}]
-)
-def test_what_cannot_come_back_is_refused(nested: dict[Any, Any]) -> None:
+@pytest.mark.parametrize("nested", [{("a",): 1}, {"a": "text"}, {"a": {1.5: 1}}, {"a": [{1}]}])
+def test_what_cannot_come_back_is_refused(nested: dict[Any, Any], tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="expected"):
-        flatten(nested)
+        save_state(tmp_path / "state.safetensors", nested, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_of_an_older_version_is_refused(tmp_path: Path) -> None:
+    """Up to 0.2, the names of the tensors said where in the state they are."""
+    path = tmp_path / "checkpoint.safetensors"
+    save_tensors(path, {"network/weight": torch.ones(2), "steps=": torch.tensor(3)}, {"points": []})
+    with (
+        pytest.raises(BadInputError, match=f"expected a checkpoint of this version.*: remove {tmp_path}"),
+        resumed(path),
+    ):
+        pass
 
 
 def _train(network: nn.Module, optimizer: torch.optim.Optimizer, steps: int) -> None:
@@ -141,16 +152,16 @@ def test_a_resumed_training_equals_one_that_was_never_interrupted(tmp_path: Path
     path = tmp_path / "checkpoint.safetensors"
     network, optimizer = _network()
     _train(network, optimizer, 3)
-    save_tensors(path, flatten({"network": network.state_dict(), "optimizer": optimizer.state_dict()}), {})
+    save_state(path, {"network": network.state_dict(), "optimizer": optimizer.state_dict()}, {})
     _train(network, optimizer, 3)
 
-    resumed, resumed_optimizer = _network()
-    state = unflatten(load_tensors(path)[0])
-    assert_same(state["optimizer"]["param_groups"][0]["betas"], (0.8, 0.9))
-    resumed.load_state_dict(state["network"])
-    resumed_optimizer.load_state_dict(state["optimizer"])
-    _train(resumed, resumed_optimizer, 3)
-    assert_same(dict(resumed.state_dict()), dict(network.state_dict()))
+    again, again_optimizer = _network()
+    with resumed(path) as (state, _):
+        assert_same(state["optimizer"]["param_groups"][0]["betas"], (0.8, 0.9))
+        again.load_state_dict(state["network"])
+        again_optimizer.load_state_dict(state["optimizer"])
+    _train(again, again_optimizer, 3)
+    assert_same(dict(again.state_dict()), dict(network.state_dict()))
 
 
 def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -175,7 +186,7 @@ def test_tensors_come_to_the_device_that_is_asked_for(tmp_path: Path) -> None:
 
 
 def test_a_network_of_another_size_does_not_go_on(tmp_path: Path) -> None:
-    save_tensors(tmp_path / "a.safetensors", flatten(nn.Linear(2, 1).state_dict()), {})
+    save_state(tmp_path / "a.safetensors", nn.Linear(2, 1).state_dict(), {})
     with (
         pytest.raises(BadInputError, match=f"(?s)expected a checkpoint of this version.*: remove {tmp_path}"),
         resumed(tmp_path / "a.safetensors") as (state, _),

@@ -4,10 +4,10 @@ from typing import Any
 import pytest
 import torch
 from gpu import needs_cuda
+from kept_states import came_back
 from pydantic import ValidationError
 from torch import Tensor
 
-from astra_data.core.checkpoint import flatten, unflatten
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.iql import Experience, Iql, IqlConfig, transitions
@@ -269,7 +269,7 @@ def test_resuming_gives_the_same_parameters_to_the_bit(updates: int) -> None:
     for _ in range(updates):
         begun.iterate()
     resumed = learner(walks(), settings, memory=8)
-    resumed.load_state_dict(unflatten(flatten(begun.state_dict())))
+    resumed.load_state_dict(came_back(begun.state_dict()))
     trained(resumed)
     assert all(map(torch.equal, whole.policy.parameters(), resumed.policy.parameters()))
 

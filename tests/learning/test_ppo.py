@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import torch
+from kept_states import came_back
 from torch import Tensor
 from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall
 
-from astra_data.core.checkpoint import flatten, unflatten
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.ppo import Ppo, PpoConfig
 from astra_data.worlds.batched import BatchedEnv
@@ -68,7 +68,7 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int, normalize: b
     begun = ppo(world, 6, horizon=7, memory=memory)
     for _ in range(3):
         begun.iterate()
-    saved = copy.deepcopy(unflatten(flatten({"ppo": begun.state_dict(), "world": world.state_dict()})))
+    saved = came_back({"ppo": begun.state_dict(), "world": world.state_dict()})
     begun.iterate()  # goes on elsewhere; must not reach into what was saved
     resumed = ppo(other_world, 6, horizon=7, memory=memory)
     resumed.load_state_dict(saved["ppo"], other_world.load_state_dict(saved["world"]))

@@ -2,10 +2,10 @@ import math
 
 import pytest
 import torch
+from kept_states import came_back
 from pydantic import ValidationError
 from toy_worlds import Slope
 
-from astra_data.core.checkpoint import flatten, unflatten
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student, Teacher
 from astra_data.learning.rma import Adaptation, RmaConfig
 
@@ -87,10 +87,7 @@ def test_resuming_gives_the_same_parameters_to_the_bit() -> None:
     begun.iterate()
     begun.iterate()
     assert isinstance(begun.env, Slope)
-    saved = unflatten(flatten({"learner": begun.state_dict(), "world": begun.env.state_dict()}))
-    saved = {
-        name: unflatten({k: v.clone() for k, v in flatten(value).items()}) for name, value in saved.items()
-    }
+    saved = came_back({"learner": begun.state_dict(), "world": begun.env.state_dict()})
     begun.iterate()  # goes on elsewhere; must not reach into what was saved
     resumed = begin(4, 4)
     assert isinstance(resumed.env, Slope)

@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 import torch
+from kept_states import came_back
 from torch import nn
 from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall
 
-from astra_data.core.checkpoint import flatten, unflatten
 from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.policy import PolicyShape, features_of
 from astra_data.learning.networks.soft_actor import SoftActor
@@ -96,7 +96,7 @@ def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
     begun = sac(world, 60, **settings)
     for _ in range(3):
         begun.iterate()
-    saved = copy.deepcopy(unflatten(flatten({"sac": begun.state_dict(), "world": world.state_dict()})))
+    saved = came_back({"sac": begun.state_dict(), "world": world.state_dict()})
     resumed = sac(other_world, 60, **settings)
     resumed.load_state_dict(saved["sac"], other_world.load_state_dict(saved["world"]))
     assert resumed.steps == whole.steps / 2

@@ -9,7 +9,7 @@ from spending import SPENT, spend
 from stopping import Stopped
 from toy_episodes import toy_episodes
 
-from astra_data.core.checkpoint import flatten, save_tensors
+from astra_data.core.checkpoint import save_state
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -204,6 +204,6 @@ def test_after_an_interruption_it_goes_on(
 def test_a_checkpoint_of_another_version_is_refused(learn: Learn, tmp_path: Path) -> None:
     state: dict[str, Any] = {"networks": {"weight": torch.zeros(1)}, "updates": 3}
     clocks = {"points": [], "spent": SPENT}
-    save_tensors(tmp_path / "checkpoint.safetensors", flatten(state), clocks)
+    save_state(tmp_path / "checkpoint.safetensors", state, clocks)
     with pytest.raises(BadInputError, match="expected a checkpoint of this version"):
         learn()

@@ -8,7 +8,7 @@ import torch
 from small_run import TRAIN
 from stopping import Stopped, stop_past
 
-from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.checkpoint import resumed, save_state
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
@@ -176,8 +176,9 @@ def test_a_checkpoint_of_another_version_is_told(
     with pytest.raises(Stopped):
         make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop_past(0.7))
     (checkpoint,) = tmp_path.rglob("checkpoint.safetensors")
-    tensors, told = load_tensors(checkpoint)
-    save_tensors(checkpoint, {name: value for name, value in tensors.items() if "acting" not in name}, told)
+    with resumed(checkpoint) as (state, told):
+        del state["learner"]["acting"]
+    save_state(checkpoint, state, told)
     with pytest.raises(
         BadInputError, match=r"expected a checkpoint of this version, found .*'acting'.* remove "
     ):
