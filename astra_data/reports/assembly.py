@@ -8,7 +8,6 @@ from astra_data.core.provenance import origin
 from astra_data.methods import method_named
 from astra_data.reports.artefacts import (
     CURVE,
-    EVALUATION,
     GAP,
     METRICS,
     TRAJECTORIES,
@@ -113,7 +112,7 @@ def _measured(results: Results) -> dict[tuple[str, int], float]:
 
 def _read(read: Runs, command: str, scores: tuple[Score, ...], judged: Judged | None) -> Results:
     """Return the results under one root, before rows are summarised and compared."""
-    evaluations = read.required("evaluate", EVALUATION, Evaluation)
+    evaluations = read.evaluations()
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
     episodes = check_alike(evaluations, read.reported.task)
     metrics = read.optional("ground", METRICS, Metrics)

@@ -11,7 +11,7 @@ from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import artefact_key
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.methods import grounded_as
-from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, read_json
+from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, Evaluation, read_json
 
 SHARED_BY_ROWS = ("ground", "align")
 """Stages whose artefacts a "_plus" row takes from its base row."""
@@ -94,9 +94,9 @@ class Runs:
             self._require("evaluate", EVALUATION, dict.fromkeys(self.methods, self.seeds))
         return {method: found for method, found in self._seeds.items() if found}
 
-    def required[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
-        """Read a file for every row and finished seed: row → seed → file."""
-        return self._read(stage, name, model, tuple(self.finished))
+    def evaluations(self) -> dict[str, dict[int, Evaluation]]:
+        """Read the evaluation of every row and finished seed: row → seed → file."""
+        return self._read("evaluate", EVALUATION, Evaluation, tuple(self.finished))
 
     def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
         """Read a file for the rows that have it for all finished seeds (or none): owner → seed → file."""

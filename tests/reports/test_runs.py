@@ -5,7 +5,7 @@ import pytest
 from fake_runs import MADE, ROWS, SEEDS, FakeRecipe, write_evaluation, write_json, write_runs
 
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.reports.artefacts import EVALUATION, Evaluation, Gap
+from astra_data.reports.artefacts import Gap
 from astra_data.reports.runs import Runs
 
 
@@ -31,7 +31,7 @@ def test_a_row_has_the_seeds_that_it_has_finished_of_those_asked_for(root: Path)
         "astra": (0,),
         "astra_plus": (0, 1),
     }
-    found = runs(root, ("astra",)).required("evaluate", EVALUATION, Evaluation)
+    found = runs(root, ("astra",)).evaluations()
     assert [file.seed for file in found["astra"].values()] == list(found["astra"]) == [0, 2]
 
 
