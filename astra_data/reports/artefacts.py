@@ -21,13 +21,13 @@ METRICS = "metrics.json"
 GAP = "gap.json"
 
 
-class Written(BaseModel):
+class WrittenPart(BaseModel):
     """A part of a file that a stage wrote; frozen."""
 
     model_config = ConfigDict(frozen=True)
 
 
-class Artefact(Written):
+class Artefact(WrittenPart):
     """A file that a stage wrote, with its time and origin if recorded."""
 
     wall_seconds: float | None = None
@@ -40,7 +40,7 @@ class Artefact(Written):
     machine: Machine | None = None
 
 
-class Outcomes(Written):
+class Outcomes(WrittenPart):
     """Outcomes of a policy's episodes, one number per episode."""
 
     success: list[float]
@@ -109,7 +109,7 @@ class Evaluation(Artefact):
         return found
 
 
-class CurvePoint(Written):
+class CurvePoint(WrittenPart):
     """One point of a learning curve."""
 
     steps: float
@@ -130,7 +130,7 @@ class CurveFile(Artefact):
     """Of a training that may be done again: what each try reached; the points are those of the one kept."""
 
 
-class Foresight(Written):
+class Foresight(WrittenPart):
     """How well failures are foreseen on held-out episodes."""
 
     failures: int
@@ -150,7 +150,7 @@ class Metrics(Artefact):
     """By what foresees them; empty without a failure model."""
 
 
-class Band(Written):
+class Band(WrittenPart):
     """An error at each horizon; no interval where a single episode is that long."""
 
     mean: list[float]

@@ -7,7 +7,7 @@ from statistics import fmean
 import numpy as np
 from pydantic import Field
 
-from astra_data.reports.artefacts import Artefact, Written, read_json
+from astra_data.reports.artefacts import Artefact, WrittenPart, read_json
 from astra_data.reports.schema import Calibration, Choice, Ranked
 from astra_data.reports.statistics import Correlation, mean_interval, mean_rank_correlation
 
@@ -22,7 +22,7 @@ Measured = Mapping[tuple[str, int], float]
 """Row and seed → the success in the target."""
 
 
-class Candidate(Written):
+class Candidate(WrittenPart):
     """A trained policy, and its success with each judge."""
 
     row: str

@@ -91,7 +91,7 @@ class Runs:
             MissingStageError: no row has one.
         """
         if not self.any_finished:
-            self._require("evaluate", EVALUATION, dict.fromkeys(self.methods, self.seeds))
+            self._require("evaluate", EVALUATION, dict.fromkeys(self.reported.methods, self.reported.seeds))
         return {method: found for method, found in self._seeds.items() if found}
 
     def evaluations(self) -> dict[str, dict[int, Evaluation]]:

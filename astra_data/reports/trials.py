@@ -4,12 +4,12 @@ from pathlib import Path
 
 from pydantic import Field
 
-from astra_data.reports.artefacts import Artefact, Written, read_json
+from astra_data.reports.artefacts import Artefact, WrittenPart, read_json
 
 TRIALS = "trials.json"
 
 
-class Tried(Written):
+class Tried(WrittenPart):
     """A candidate in a round: 1 or 0 for each of its trials."""
 
     row: str
@@ -17,7 +17,7 @@ class Tried(Written):
     success: list[int]
 
 
-class TrialRound(Written):
+class TrialRound(WrittenPart):
     """A round. All of its candidates meet the same starts and goals."""
 
     trials: int

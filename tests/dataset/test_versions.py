@@ -95,9 +95,11 @@ def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) 
 
 def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path) -> None:
     source, other = write_fake(tmp_path / "first"), write_fake(tmp_path / "other")
-    labels = {"stage": "label", "config": {}, "out": tmp_path / "next", "simulator": {"id": "one"}}
+    labels: dict[str, Any] = {"stage": "label", "config": {}, "simulator": {"id": "one"}}
     more = [Column("phase")]
-    with next_version(source, "columns", more=more, subset_seed=3, others=[other], **labels) as writer:
+    with next_version(
+        source, "columns", more=more, subset_seed=3, others=[other], out=tmp_path / "next", **labels
+    ) as writer:
         for episode in source.episodes():
             phase = np.zeros(len(episode), np.float32)
             writer.add(replace(episode, columns={**episode.columns, "phase": phase}))
@@ -108,7 +110,8 @@ def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path)
     assert (written.subset_seed, source.subset_seed) == (3, 0)
     assert written.description["parents"] == [source.identity, other.identity]
     assert (written.description["version"], written.description["simulator"]) == ("2.0.0", {"id": "one"})
-    assert next_version(source, "columns", **labels | {"out": tmp_path / "again"}).root == tmp_path / "again"
+    again = next_version(source, "columns", out=tmp_path / "again", **labels)
+    assert again.root == tmp_path / "again"
 
 
 def test_a_successor_of_another_name_begins_anew(home: Path, tmp_path: Path) -> None:
