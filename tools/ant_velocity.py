@@ -19,7 +19,7 @@ from astra_data.worlds.ant.body import (
 )
 from astra_data.worlds.batched import Step
 from astra_data.worlds.batched_mujoco import BatchedPhysics, Bools
-from astra_data.worlds.geometry import rotation_matrix
+from astra_data.worlds.rotation import rotation_matrix
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,9 @@ from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.history import HistoryEncoder, mlp
 from astra_data.training.running_policy import target_observation
 from astra_data.worlds.humanoid.model import CommandRanges
-from astra_data.worlds.humanoid.skeleton import rotation
 from astra_data.worlds.humanoid.target import HumanoidEnv
 from astra_data.worlds.registry import task_named
+from astra_data.worlds.rotation import rotation
 from astra_data.worlds.task import Task
 
 ROWS = ("behavior_cloning", "nas", "astra", "nas_plus", "astra_plus")

@@ -32,10 +32,10 @@ from astra_data.stages.augment import AugmentConfig, _free_uid, _moving, _shares
 from astra_data.stages.collect import CollectConfig, collect
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.worlds.ant.body import WALL_REACH_M, up_cosine
-from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.relocation import Relocation
 from astra_data.worlds.registry import TASKS
+from astra_data.worlds.rotation import rotation_matrix
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
 

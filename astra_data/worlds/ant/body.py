@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.rotation import rotation_matrix
 
 Floats = NDArray[np.float64]
 

@@ -14,8 +14,9 @@ from torch.nn import functional
 
 from astra_data.core.numbers import normalised
 from astra_data.worlds.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
-from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
+from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity
 from astra_data.worlds.humanoid.spread import VELOCITY_M_S, in_spreads
+from astra_data.worlds.rotation import rotation
 
 _HEIGHT = 2
 _QUATERNION = slice(3, 7)

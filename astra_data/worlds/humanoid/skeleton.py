@@ -160,15 +160,3 @@ def mass_velocity(joints: Tensor, rates: Tensor) -> Tensor:
     lever = skeleton.moved @ placed.centres - skeleton.moved.sum(-1, keepdim=True) * placed.anchors
     velocity: Tensor = (rates.unsqueeze(-1) * torch.linalg.cross(placed.axes, lever)).sum(-2)
     return velocity
-
-
-def rotation(quaternion: Tensor) -> Tensor:
-    """Return body-to-world rotations (..., 3, 3) of unit quaternions (..., 4) wxyz."""
-    w, x, y, z = quaternion.unbind(-1)
-    entries = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    rows: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
-    return rows

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.nao.bodies import MOTORS, TICKS, BatchedBodies
 from astra_data.worlds.nao.body import TICK_S, nao_model
 from astra_data.worlds.nao.kinematics import TO_MOTORS, leg_angles
@@ -18,6 +17,7 @@ from astra_data.worlds.nao.traits import Traits, TraitSpread
 from astra_data.worlds.nao.walk import WalkEngine, WalkStyle
 from astra_data.worlds.plane.ball import BALL_RADIUS_M
 from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.rotation import rotation_matrix
 
 CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS

@@ -5,7 +5,7 @@ import torch
 
 from astra_data.worlds.batched_mujoco import Floats
 from astra_data.worlds.humanoid.model import FEET, humanoid_model
-from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity, rotation
+from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity
 
 
 def posed(joints: Floats, rates: Floats) -> mujoco.MjData:
@@ -34,12 +34,3 @@ def test_centre_of_mass_and_feet_are_mujocos(dtype: torch.dtype, atol: float) ->
         theirs = [data.geom(name).xpos for name in FEET]
         np.testing.assert_allclose(feet.reshape(20, 2, 3)[row], theirs, atol=atol)
         np.testing.assert_allclose(velocity.reshape(20, 3)[row], data.subtree_linvel[1], atol=atol)
-
-
-def test_rotation_is_mujocos() -> None:
-    drawn = torch.randn(10, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    quaternions = drawn / drawn.norm(dim=1, keepdim=True)
-    for quaternion, ours in zip(quaternions, rotation(quaternions), strict=True):
-        theirs = np.zeros(9)
-        mujoco.mju_quat2Mat(theirs, quaternion.numpy())
-        np.testing.assert_allclose(ours.reshape(9), theirs, atol=1e-14)
