@@ -1,9 +1,7 @@
 """COMPASS: identify the simulator's parameters with a causal model of the trajectory gap.
 
 After Huang et al., "What Went Wrong? Closing the Sim-to-Real Gap via Differentiable Causal Discovery" (CoRL
-2023). They collect from the target in every iteration; here there are only the recorded episodes, and
-simulators are reset to the target's state at the start of short windows: replays of whole episodes drift too
-far apart to be informative.
+2023), from recorded episodes alone.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,9 +1,6 @@
 """Rapid motor adaptation: infer the simulator's parameters online (Section V-A; after Kumar et al. 2021).
 
-The parameters and their ranges are those that the paper prints for COMPASS, as the task has them. Kumar et
-al.'s policy has no memory; ours has that of every policy of a raw simulator, and differs from domain
-randomization in the parameters that vary and in the extrinsics alone. Without it, it learned
-nothing on the Long Maze in a million steps, after which others begin to succeed.
+The parameters and their ranges are those that the paper prints for COMPASS, as the task has them.
 """
 
 from dataclasses import dataclass, replace

@@ -1,31 +1,7 @@
 """The humanoid's joints without its body: they follow commands, whatever happens to its balance.
 
-All joints of the humanoid are there. Commanded joints approach their targets, all others zero, as position
-control moves a massless joint against its damping: the difference decays at the rate K / (D + d), with the
-paper's gains K and D and the joint's damping d: 13 per second at the hips, 18 at the knees. Within the range
-of commands no motor exceeds its torque. Against the humanoid under random commands, each held for 7 steps,
-angles of commanded joints are off by 0.24 rad after 10 steps; those of joints that reach their targets at
-once by 0.36 rad, of joints that do not move by 0.30 rad.
-
-The extended simulator adds the centre of mass and its velocity, and lean and angular velocity of the torso.
-The centre of mass moves as if the torso were level, so that its motion relative to the feet follows from the
-joints alone. Its velocity approaches the value that it would have if the lower foot did not move, with a time
-constant of 0.3 s, about that of a toppling body of its height; the height integrates the velocity. Without
-that lag, massless joints throw the body about: under those commands, its velocity along x is off by 3.3 m/s
-after a single step, with it by 0.17 m/s. The torso's angular velocity decays with the same time constant.
-
-Both leave out:
-
-* Forces. No load slows a joint, no contact pushes it, and none overshoots its target. Rates are part of the
-  state, but the next state does not depend on them.
-* The world, without the extension: height, balance, walking and falling are not in the state.
-
-The extended one leaves out:
-
-* Falling by itself, for there is no gravity. A centre of mass that has left the feet stays beside them, and
-  sinks no faster than it did. The state does show a fall, so that a correction can make one.
-* The causes and effects of the torso's rotation: legs move the centre of mass as if it were upright.
-* Flight, slipping and double support: one foot always stands, the other never brakes. There is no floor.
+Joints approach their targets, those that no command moves zero, as position control moves a massless joint;
+the extended simulator adds the centre of mass and the torso's lean. What both leave out: docs/humanoid.md.
 """
 
 from collections.abc import Mapping

@@ -3,10 +3,6 @@
 All reward forward velocity and staying up, as `Locomotion` does; the costs of effort and contact forces,
 which are small in the target, are left out. There is no goal to reach: an episode that lasts to the horizon
 without a fall succeeds.
-
-Under random commands the reward of a step differs from the target's, costs aside, by 0.1 to 0.2 (root mean
-square) where the centre of mass is known but not the heading, by 0.6 in the plane, and by 2 for the joints
-alone. The latter is unrelated to the target's reward under such commands, for it assumes a level torso.
 """
 
 from abc import abstractmethod

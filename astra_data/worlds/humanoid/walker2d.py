@@ -1,25 +1,7 @@
 """The most abstract simulator of the humanoid: a walker in the plane, with legs under one rigid link.
 
-It is the humanoid reduced to the plane of x and z. The legs' links, feet, joints, motors and masses are the
-humanoid's; trunk, head and arms are one link with their mass and centre of mass at joint angles of zero. It
-stands, steps, swings its legs and falls forward or backward, with the same physics and position control.
-
-It leaves out:
-
-* Falling to the side, as a humanoid that learns to walk mostly does. No policy is punished for it here, or
-  learns to shift its weight from foot to foot.
-* Turning. The walker always faces along x; a humanoid that has turned walks in another direction.
-* Waist, hips' other axes, arms. The humanoid's are held by limited motors, and give way to gravity and to the
-  legs' motion; here they are stiff.
-* Collisions between the legs.
-* Rolling. Feet are spheres in both, but a rolled humanoid lifts one of them at joint angles at which the
-  walker stands on both. Contacts after a step follow from joints and torso here, and differ from those of a
-  humanoid in that pose.
-* The effect of the waist and the hips' other axes on the height of the feet. At the humanoid's torso height
-  the walker's feet would often be inside the floor, which would throw it into the air. So a walker that is
-  set with its feet too low gets a floor that is lower by that much until it is set again: in every step,
-  where it is corrected or `[plus] residual_noise` adds noise.
-* The warm start of MuJoCo's solver from step to step.
+It is the humanoid reduced to the plane of x and z, with the same physics and position control. What it leaves
+out: docs/humanoid.md.
 """
 
 from collections.abc import Mapping

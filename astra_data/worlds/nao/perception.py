@@ -1,9 +1,4 @@
-"""A NAO's estimates of its own pose and of the ball. Batched numpy, no physics.
-
-Magnitudes of the errors are those of 65 000 rows of a physical robot's log (Badger RoboCup, published with
-Corrado et al., arXiv 2310.18247), where the estimate of a ball at rest scattered by 45 mm at 1 m and 106 mm
-beyond 3 m, and the robot's own position jumped by 0.2 m or more five to six times a minute; the rest is ours.
-"""
+"""A NAO's estimates of its own pose and of the ball. Batched numpy, no physics."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,4 @@
-"""The NAO's tasks, on simulated stand-ins: navigation in an S-shaped maze, and kicking (Section V-C).
-
-What the paper leaves open: a control step is 16 ticks of the robot's 12 ms, 0.192 s, for a robot that covers
-9 to 13 m at 0.25 m/s in 500 steps cannot be controlled at more than 10 Hz; the maze, its starts, the field
-and the rewards are ours.
-"""
+"""The NAO's tasks, on simulated stand-ins: navigation in an S-shaped maze, and kicking (Section V-C)."""
 
 from functools import partial
 from typing import Any
