@@ -55,7 +55,7 @@ _FLOOR, _WALL, _LEG = 1, 2, 4
 SIDES = (("L", 1.0), ("R", -1.0))
 
 
-def nao_model(maze: Maze | None = None, *, ball: bool = False, friction: float = 0.6) -> mujoco.MjModel:
+def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel:
     """Build a NAO on a floor.
 
     qpos: torso x, y, z, quaternion (7), left leg's six joints, right leg's six, the ball's pose (7).
@@ -64,7 +64,6 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False, friction: float =
     Args:
         maze: walls to add, one box per wall cell; none for an open floor.
         ball: add a ball.
-        friction: between soles and floor.
     """
     root = ElementTree.Element("mujoco", model="nao")
     ElementTree.SubElement(root, "compiler", angle="degree", fusestatic="true", autolimits="true")
@@ -79,7 +78,7 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False, friction: float =
         ls_iterations="10",
     )
     world = ElementTree.SubElement(root, "worldbody")
-    _geom(world, "floor", "plane", (0, 0, 1), friction=(friction, 0.005, 0.0), collides=(_FLOOR, 0))
+    _geom(world, "floor", "plane", (0, 0, 1), collides=(_FLOOR, 0))
     if maze:
         size = (0.5 * maze.scale, 0.5 * maze.scale, WALL_HEIGHT_M / 2)
         for row, column in maze.wall_cells():

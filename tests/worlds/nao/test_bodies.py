@@ -82,7 +82,8 @@ def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> 
     before = robots.qpos.copy()
     robots.step(np.arange(2), targets(2), noise(2))
     for row, (friction, stiffness) in enumerate(((0.3, 0.8), (0.7, 1.0))):
-        model = nao_model(friction=friction)
+        model = nao_model()
+        model.geom("floor").friction[0] = friction
         model.actuator_gainprm[:, 0] = stiffness * STIFFNESS_NM_PER_RAD
         model.actuator_biasprm[:, 1] = -stiffness * STIFFNESS_NM_PER_RAD
         data = mujoco.MjData(model)
