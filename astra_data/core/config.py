@@ -19,7 +19,7 @@ AtOnce = Annotated[int, Field(ge=1, le=10**6)]
 """A number of things that are in memory at the same time."""
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
-Number = Annotated[int, Field(ge=0, le=10**12)]
+CountFromZero = Annotated[int, Field(ge=0, le=10**12)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 _UNNAMED = ""

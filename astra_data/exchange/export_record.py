@@ -9,7 +9,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from astra_data.core.config import Config, Count, Number, faults_of
+from astra_data.core.config import Config, Count, CountFromZero, faults_of
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Column, Episode
 from astra_data.dataset.description import ContentHash, identity_of
@@ -25,7 +25,7 @@ class Slot(Config):
 
     field: str
     """Field of the format."""
-    first: Number
+    first: CountFromZero
     """The first of its values."""
     size: Count
     """How many of them."""

@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.core.artefact import CHECKPOINT
-from astra_data.core.config import AtOnce, Config, Number, Positive, Share
+from astra_data.core.config import AtOnce, Config, CountFromZero, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part
 from astra_data.core.seeding import derive, generator
@@ -50,13 +50,13 @@ class GroundConfig(DescentConfig):
     """Share by which the slow encoder of "ema" follows the encoder, per update."""
     latent_size: AtOnce = 64
     """Z, also the size of the encoder's hidden state."""
-    position_octaves: Number = 4
+    position_octaves: CountFromZero = 4
     """Number of wavelengths, from 16 m down by halves, of sines and cosines of the position; 0 for none.
     Without effect where a task has no positions."""
     correction_heads: AtOnce = 1
     """Heads that correct the state. Each learns from its own random half of every batch; their mean is the
     correction, and `disagreement_penalty` keeps policies away from where they disagree."""
-    members: Number = Field(default=0, exclude_if=lambda members: not members)
+    members: CountFromZero = Field(default=0, exclude_if=lambda members: not members)
     """Further models, each fitted to a draw of as many training episodes, with replacement (a bootstrap).
     With `keep_member` they correct simulated episodes in place of the model, which is fitted to all."""
     reward: Literal["whole", "correction"] = "whole"
@@ -68,7 +68,7 @@ class GroundConfig(DescentConfig):
     failure_weight: Positive = 1.0
     """Weight of the failures in the loss of the reward. With 1, predicting the average of the failures costs
     as much as predicting the average of all other steps."""
-    failure_members: Number = Field(default=0, exclude_if=lambda members: not members)
+    failure_members: CountFromZero = Field(default=0, exclude_if=lambda members: not members)
     """Networks of a failure model, which foresees failures from how the last second went, and replaces what
     R_pred and the topple head say of them; 0 for none. Without effect where no episode fails."""
     failure_steps: AtOnce = Field(default=RISK_STEPS, exclude_if=lambda steps: steps == RISK_STEPS)

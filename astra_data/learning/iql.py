@@ -19,7 +19,7 @@ import torch
 from pydantic import model_validator
 from torch import Tensor, nn
 
-from astra_data.core.config import AtOnce, Config, Count, NotNegative, Number, Positive, Share
+from astra_data.core.config import AtOnce, Config, Count, CountFromZero, NotNegative, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.generators import seed_generators
@@ -63,7 +63,7 @@ class IqlConfig(Config):
     """Windows per update of the policy."""
     window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
-    burn_in: Number = 20
+    burn_in: CountFromZero = 20
     """Steps at the start of a window that only warm up the memory; none where the episode starts there."""
     learning_rate: Positive = 1e-3
     """Of the policy at the start; falls to zero along a half cosine."""

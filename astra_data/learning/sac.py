@@ -15,7 +15,7 @@ from pydantic import model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from astra_data.core.config import Config, Count, NotNegative, Number, Positive, Share
+from astra_data.core.config import Config, Count, CountFromZero, NotNegative, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
@@ -40,7 +40,7 @@ class SacConfig(Config):
     """Steps per update; where the policy has a memory, in as many windows as they make."""
     window: Count = 32
     """Consecutive steps per window, where the policy has a memory."""
-    burn_in: Number = 8
+    burn_in: CountFromZero = 8
     """Steps at the start of a window that only warm up the memory, until an episode starts."""
     buffer_size: Count = 1_000_000
     """Steps kept for replay, the most recent ones."""

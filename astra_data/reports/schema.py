@@ -13,7 +13,7 @@ def _nan_for_null(value: object) -> object:
     return float("nan") if value is None else value
 
 
-Number = Annotated[float, BeforeValidator(_nan_for_null)]
+NullableFloat = Annotated[float, BeforeValidator(_nan_for_null)]
 """A float whose NaN is null in JSON."""
 
 
@@ -66,16 +66,16 @@ class Learning(Section):
     """One seed's training."""
 
     steps: list[float]
-    score: list[Number] = Field(validation_alias=AliasChoices("score", "success"))
+    score: list[NullableFloat] = Field(validation_alias=AliasChoices("score", "success"))
     """Headline score of the training episodes that ended, from all start states."""
 
 
 class BandMeans(Section):
     """An error at each horizon, averaged over seeds; no interval where a seed has none."""
 
-    mean: list[Number]
-    low: list[Number | None]
-    high: list[Number | None]
+    mean: list[NullableFloat]
+    low: list[NullableFloat | None]
+    high: list[NullableFloat | None]
 
 
 class GapMeans(Section):
@@ -187,7 +187,7 @@ class MethodResults(Section):
     returns: list[float] = Field(
         validation_alias=AliasChoices("return", "returns"), serialization_alias="return"
     )
-    distance: list[Number]
+    distance: list[NullableFloat]
     """Path length of the robot in successful episodes, in m; NaN for a seed without any."""
     simulated_success: list[float] | None
     """Success in the simulator that the policy was trained in; of a hand-written row, in the shared grounded

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.artefact import finished_folder
-from astra_data.core.config import AtOnce, Config, Number
+from astra_data.core.config import AtOnce, Config, CountFromZero
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
@@ -43,7 +43,7 @@ class SelectConfig(Config):
     """Of each policy with each judge, in one batch."""
     judge: str | None = None
     """Row whose groundings judge; by default the reference, NAS."""
-    failure_members: Number = 5
+    failure_members: CountFromZero = 5
     """Networks of the failure model that a judge gets whose history model has none, where some of its
     episodes fail; 0 for none: its states are then scattered as the target's are around the correction."""
     failure_steps: AtOnce = 2

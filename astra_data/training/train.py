@@ -16,7 +16,7 @@ from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
 from astra_data.core.artefact import CHECKPOINT
-from astra_data.core.config import AtOnce, Config, Number, Share, choice
+from astra_data.core.config import AtOnce, Config, CountFromZero, Share, choice
 from astra_data.core.logbook import Logbook
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
@@ -52,7 +52,7 @@ class TrainConfig(EnvConfig):
     """Environments stepped side by side."""
     hidden_sizes: tuple[AtOnce, ...] = (64, 64)
     """Hidden layers of actor and critic."""
-    memory_size: Number = 64
+    memory_size: CountFromZero = 64
     """Size of the policy's own GRU, where no grounding provides a latent."""
     tries: AtOnce = 1
     """Trainings at most: where the policy did not master its own simulator, in 100 episodes from the task's

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from astra_data.core.config import AtOnce, Config, Count, Number
+from astra_data.core.config import AtOnce, Config, Count, CountFromZero
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.running_policy import Observed
 from astra_data.training.target_env import ObservedTargetEnv, TargetStarts
@@ -17,7 +17,7 @@ class TargetConfig(Config):
     """Environment steps in all; by default as in `[train]`."""
     num_envs: AtOnce | None = None
     """Target environments stepped side by side; by default as in `[train]`."""
-    memory_size: Number | None = None
+    memory_size: CountFromZero | None = None
     """Size of the policy's own GRU; by default as in `[train]`. A policy that observes the full state needs
     none."""
 
