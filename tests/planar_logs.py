@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.exchange.logs import Floats
+from astra_data.core.arrays import Floats
 
 
 def poses_of(forward: Floats, left: Floats, turn: Floats, *, in_world: bool = False) -> Floats:

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.worlds.ant.body import (
     CONTROL_SUBSTEPS,
     TIMESTEP_S,
     TOPPLE_COSINE,
-    Floats,
     ant_model,
     canonical_view,
     standing_pose,
@@ -18,7 +18,7 @@ from astra_data.worlds.ant.body import (
     up_cosine,
 )
 from astra_data.worlds.batched import Step
-from astra_data.worlds.batched_mujoco import BatchedPhysics, Bools
+from astra_data.worlds.batched_mujoco import BatchedPhysics
 from astra_data.worlds.rotation import rotation_matrix
 
 

@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.table import Table
 from timing import Candidates, Stretch, measure
 
+from astra_data.core.arrays import Floats
 from astra_data.core.cores import cores
 from astra_data.worlds.ant.body import CONTROL_SUBSTEPS, VelocityController, ant_model
 from astra_data.worlds.ant.target import AntMazeEnv
-from astra_data.worlds.batched_mujoco import Floats
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.registry import TASKS
 

@@ -17,10 +17,10 @@ import numpy as np
 import typer
 from rich.progress import Progress, TaskID
 
+from astra_data.core.arrays import Floats
 from astra_data.reports.formatting import table
 from astra_data.worlds.nao import BatchedNao, WalkLimits
 from astra_data.worlds.nao.robot import CONTROL_STEP_S
-from astra_data.worlds.nao.steps import Floats
 from astra_data.worlds.plane.geometry import wrapped
 
 Tick = Callable[[float], None]

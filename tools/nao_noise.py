@@ -13,8 +13,8 @@ import numpy as np
 import torch
 import typer
 from door import run_tool
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.studies.planar_walker import walk_command
 from astra_data.studies.recordings import Piece, read_recordings
 from astra_data.studies.walking import WalkingConfig
@@ -28,8 +28,6 @@ STILL_M, STILL_RAD = 0.02, 0.05
 LATEST_S = 1.0
 STEP_S = 0.25
 """Length of a motion that is compared with commands: one step of the robot."""
-
-Floats = NDArray[np.float64]
 
 
 def main(data: Annotated[Path, typer.Argument(help="Logs of a physical NAO.", show_default=False)]) -> None:

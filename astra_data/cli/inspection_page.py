@@ -7,8 +7,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from astra_data.core.arrays import Ints
 from astra_data.dataset.checkup.checkup import Checkup
-from astra_data.dataset.inspection import BINS, Inspection, Ints, Map, Spread
+from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
 
 _BARS = " ▁▂▃▄▅▆▇█"
 _SHADES = " ░▒▓█"

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Ints
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
@@ -19,7 +19,6 @@ from astra_data.dataset.parquet import read_blocks, to_numpy
 from astra_data.dataset.plain import data_files, episodes_files, read_footer, read_tasks
 from astra_data.dataset.seal import SEALED, altered_files
 
-Ints = NDArray[np.int64]
 _LOCATION = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
 
 

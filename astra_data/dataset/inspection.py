@@ -3,17 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats, Ints
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.numbers import as_rows
 from astra_data.dataset.columns import STATE, TERMINATED, Array, Column
 from astra_data.dataset.endings import Endings
 from astra_data.dataset.format import STATS_PATH
 from astra_data.dataset.reader import Dataset
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 BINS = 16
 """Bins of a histogram, from the smallest to the largest value."""

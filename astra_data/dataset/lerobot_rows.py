@@ -4,15 +4,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Ints
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.digests import Digests
 from astra_data.dataset.format import reserved_values
 from astra_data.dataset.plain import PlainColumn, Run
 
-Ints = NDArray[np.int64]
 RECORDED_TASK = "recorded.task_index"
 """(T,) int64: LeRobot's task_index, where there are several tasks."""
 ENDS = (names.TERMINATED, names.TRUNCATED)

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset.column_statistics import ranges
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
-from astra_data.dataset.contents import Contents, Ints, read_contents
+from astra_data.dataset.contents import Contents, read_contents
 from astra_data.dataset.description import full_name, identity_of
 from astra_data.dataset.digests import Digests, altered_columns, digests_of, read_digests
 from astra_data.dataset.format import INFO_PATH, OUR_FOLDER

@@ -5,9 +5,10 @@ from itertools import zip_longest
 
 import numpy as np
 
+from astra_data.core.arrays import Ints
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column
-from astra_data.dataset.contents import Contents, Ints
+from astra_data.dataset.contents import Contents
 from astra_data.dataset.description import ContentHash
 from astra_data.dataset.digests import Digests, alteration, digests_of
 from astra_data.dataset.lerobot_rows import RecordedFiles

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from pyarrow import csv
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError, in_short
 from astra_data.exchange.importers.csv import check_separator, delimiter_of, without_blanks
 
-Floats = NDArray[np.float64]
 MOSTLY = 0.9
 """Share of a field's rows with a number above which the others are faults."""
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*|[+-]?(nan|inf)", re.IGNORECASE)

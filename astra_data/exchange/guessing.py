@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.angles import ANGLE, LARGEST
 from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers
@@ -32,7 +33,7 @@ from astra_data.exchange.field_names import (
     Role,
 )
 from astra_data.exchange.log_files import csv_files
-from astra_data.exchange.logs import Field, Floats, Logs
+from astra_data.exchange.logs import Field, Logs
 
 
 def guess(paths: Sequence[Path]) -> Logs:

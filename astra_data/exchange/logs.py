@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.exchange.field_names import HEADING, TURN_RATE, Role
 
-Floats = NDArray[np.float64]
 RATE_HZ = 10
 """Of logs without a time."""
 _EVEN = 0.005

@@ -6,7 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from astra_data.exchange.logs import Field, Floats, Logs
+from astra_data.core.arrays import Floats
+from astra_data.exchange.logs import Field, Logs
 from astra_data.experiments.kind_errors import CLEARLY, JUDGED_STEPS, errors, judged_steps
 from astra_data.experiments.planar_kinds import Planar, are_sides, pose_of
 

@@ -5,7 +5,8 @@ from typing import Protocol
 
 import numpy as np
 
-from astra_data.exchange.logs import Floats, Logs
+from astra_data.core.arrays import Floats
+from astra_data.exchange.logs import Logs
 
 JUDGED_STEPS = 10
 """After so many steps a simulator should be better than nothing."""

@@ -6,8 +6,9 @@ from typing import Self
 
 import numpy as np
 
+from astra_data.core.arrays import Floats
 from astra_data.exchange.field_names import HEADING, QUATERNION
-from astra_data.exchange.logs import Field, Floats
+from astra_data.exchange.logs import Field
 
 
 @dataclass(frozen=True)

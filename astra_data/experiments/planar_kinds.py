@@ -8,8 +8,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from astra_data.core.arrays import Floats
 from astra_data.exchange.field_names import LENGTH
-from astra_data.exchange.logs import Field, Floats, Logs
+from astra_data.exchange.logs import Field, Logs
 from astra_data.experiments.kind_errors import errors
 from astra_data.experiments.planar_heading import Heading
 from astra_data.experiments.written_values import numbers, typical

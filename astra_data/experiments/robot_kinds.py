@@ -9,9 +9,10 @@ from typing import Self
 
 import numpy as np
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.field_names import HEADING, QUATERNION
-from astra_data.exchange.logs import Field, Floats, Logs
+from astra_data.exchange.logs import Field, Logs
 from astra_data.experiments.kind_errors import errors, judged_steps
 from astra_data.experiments.written_values import numbers, texts, typical
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from astra_data.exchange.logs import Floats
+from astra_data.core.arrays import Floats
 
 
 def typical(episodes: Sequence[Floats], failed: Sequence[bool]) -> tuple[Floats, float]:

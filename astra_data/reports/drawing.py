@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artefact_key
 from astra_data.dataset.inspection import Map, visited
@@ -33,8 +34,6 @@ from astra_data.reports.sizes import SizesResults
 from astra_data.reports.tested import where
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.score import SUCCESS, Score
-
-Floats = NDArray[np.float64]
 
 _TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
 """Times at which pictures of an episode are taken, in addition to its end."""

@@ -5,8 +5,8 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.durable import write_file
 from astra_data.core.naming import artefact_key
 from astra_data.grounding.failures import BINS
@@ -15,8 +15,6 @@ from astra_data.reports.artefacts import GAP, METRICS, Foresight, Gap, Metrics, 
 from astra_data.reports.assembly import mean_gap
 from astra_data.reports.formatting import fill, measured
 from astra_data.reports.schema import GapMeans, judged_horizon, shared_horizons
-
-Floats = NDArray[np.float64]
 
 Measured = Mapping[int | None, Mapping[str, Mapping[str, Sequence[Foresight]]]]
 """How failures are foreseen on each seed, by size (the largest last), grounding, and part of it."""

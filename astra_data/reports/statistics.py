@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-
-Floats = NDArray[np.float64]
 
 REPLICATES = 2000
 """Bootstrap resamples per interval."""

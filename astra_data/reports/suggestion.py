@@ -4,15 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import Column
 from astra_data.reports.formatting import fill
 from astra_data.training.proposals import Suggestion
 from astra_data.training.recording_plan import PlannedEpisode
 from astra_data.worlds.task import Task
-
-Floats = NDArray[np.float64]
 
 CELLS = 24
 """Cells of a map along each axis."""

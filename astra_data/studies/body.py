@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.dataset import Dataset
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
 from astra_data.studies.predictors import Predictor
 from astra_data.studies.rollouts import predict
 from astra_data.studies.sequences import Sequences, Stretch
 from astra_data.studies.walking import AXES, BODY_AXES
-
-Floats = NDArray[np.float64]
 
 MOST_STARTS = 4000
 REPLICATES = 1000

@@ -9,11 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, NotNegative, Positive
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE
-from astra_data.studies.body import Body, Floats
+from astra_data.studies.body import Body
 
 ALL = "all_joints"
 """The axis whose squared error is the mean over all joints."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_rows
@@ -21,7 +22,7 @@ from astra_data.dataset.versions import Version, locate
 from astra_data.exchange.importing import import_dataset, log_suffixes
 from astra_data.exchange.mapping import read_mapping
 from astra_data.exchange.recording import find_sources, is_archive
-from astra_data.studies.body import Body, Floats, Reading
+from astra_data.studies.body import Body, Reading
 
 
 @dataclass(frozen=True, eq=False)

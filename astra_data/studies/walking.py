@@ -7,11 +7,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, Positive
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
-from astra_data.studies.body import Body, Floats
+from astra_data.studies.body import Body
 from astra_data.studies.motion import MIRROR, between, chained, composed, seen_after
 from astra_data.studies.planar_walker import PlanarWalker
 from astra_data.worlds.plane.geometry import turned, wrapped

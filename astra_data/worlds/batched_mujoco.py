@@ -12,10 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.core.cores import cores
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)

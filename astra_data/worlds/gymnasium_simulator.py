@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.gymnasium_robot import Env, made
-from astra_data.worlds.numpy_simulator import Floats, NumpySimulator
+from astra_data.worlds.numpy_simulator import NumpySimulator
 from astra_data.worlds.robot import State
 
 _TOLERANCE = 1e-4

@@ -8,9 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.free_states import FreeStates
-
-Floats = NDArray[np.float64]
 
 
 class NumpySimulator(FreeStates):

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.worlds.batched import Step
-from astra_data.worlds.batched_mujoco import Bools, Floats
 from astra_data.worlds.objective import PlanarObjective
 
 

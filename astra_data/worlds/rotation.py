@@ -2,10 +2,9 @@
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Floats = NDArray[np.float64]
+from astra_data.core.arrays import Floats
 
 
 def rotation_matrix(quaternion: Floats) -> Floats:

@@ -11,8 +11,8 @@ from planar_logs import poses_of, write
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
+from astra_data.core.arrays import Floats
 from astra_data.exchange.guessing import guess
-from astra_data.exchange.logs import Floats
 from astra_data.experiments.fitted_kinds import Bicycle, Differential
 from astra_data.experiments.new_robot import write_robot
 from astra_data.worlds.registry import task_named

@@ -15,11 +15,11 @@ from on_meta import places
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import DatasetWriter
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
-from astra_data.exchange.logs import Floats
 from astra_data.experiments.new_robot import write_robot
 from astra_data.experiments.run import check, run
 from astra_data.worlds.registry import task_named

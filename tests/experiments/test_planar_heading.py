@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from astra_data.exchange.logs import Field, Floats
+from astra_data.core.arrays import Floats
+from astra_data.exchange.logs import Field
 from astra_data.experiments.planar_heading import Heading
 
 YAW = np.linspace(-3, 3, 25)

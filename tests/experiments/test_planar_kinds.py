@@ -11,9 +11,9 @@ from planar_logs import poses_of, write
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
+from astra_data.core.arrays import Floats
 from astra_data.exchange.guessing import guess
 from astra_data.exchange.importing import import_dataset
-from astra_data.exchange.logs import Floats
 from astra_data.experiments.fitted_kinds import Bicycle
 from astra_data.experiments.new_robot import write_robot
 from astra_data.experiments.planar_kinds import Holonomic, Planar

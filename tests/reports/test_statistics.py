@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from rliable import metrics  # type: ignore[import-untyped]
 from scipy import stats
 from scipy.stats import pearsonr, rankdata, spearmanr, trim_mean, ttest_rel
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Results
 from astra_data.reports.statistics import (
@@ -21,8 +21,6 @@ from astra_data.reports.statistics import (
     share_interval,
     summarise,
 )
-
-Floats = NDArray[np.float64]
 
 PUBLISHED = Path(__file__).parents[2] / "recipes/results"
 

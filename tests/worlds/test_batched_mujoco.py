@@ -3,8 +3,9 @@ import gymnasium_robotics
 import numpy as np
 import pytest
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.ant.body import ant_model
-from astra_data.worlds.batched_mujoco import BatchedPhysics, Floats, wall_geoms
+from astra_data.worlds.batched_mujoco import BatchedPhysics, wall_geoms
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE
 
 gymnasium.register_envs(gymnasium_robotics)

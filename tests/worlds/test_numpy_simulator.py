@@ -4,7 +4,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from astra_data.worlds.numpy_simulator import Floats, NumpySimulator
+from astra_data.core.arrays import Floats
+from astra_data.worlds.numpy_simulator import NumpySimulator
 
 
 def turn(state: Floats, command: Floats) -> Floats:

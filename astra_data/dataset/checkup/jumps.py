@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.angles import TURNS, is_angle
 from astra_data.dataset.checkup.finding import Finding, channels, deletion, labels
@@ -32,8 +32,6 @@ WHOLE = 0.01
 """Share of a turn by which the step of an angle that wraps may be off ..."""
 USUAL = 3
 """... or so many median steps, if that is more."""
-
-Floats = NDArray[np.float64]
 
 
 class Jumps:

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.numbers import as_rows
 from astra_data.dataset.checkup.finding import SHOWN, Finding, channels, deletion
 from astra_data.dataset.columns import REWARD, STATE, Column, Episode
@@ -19,8 +19,6 @@ INLYING = 0.95
 _TO_STD = 1.4826  # of a normal distribution: 1 / Φ⁻¹(3/4)
 _SMALLEST_SCALE = 0.1
 """Of lengths, as logarithms, and of returns, relative to their median: less than that is no other episode."""
-
-Floats = NDArray[np.float64]
 
 
 class Outliers:

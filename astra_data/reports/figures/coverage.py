@@ -5,11 +5,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Ints
 from astra_data.reports.figures.style import style
-
-Ints = NDArray[np.int64]
 
 
 def coverage(counts: Ints, extent: tuple[float, float, float, float], label: str, unit: str) -> Figure:

@@ -9,13 +9,10 @@ from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.reports.figures.style import DEPLOYED, FAINT, INK, SIMULATED, WALL, method_title, style
 from astra_data.worlds.plane.mazes import Maze
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 COLUMNS = 4
 """Panels side by side, at most."""

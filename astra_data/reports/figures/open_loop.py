@@ -7,12 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
 from astra_data.reports.figures.style import INK, method_colour, method_title, style
-
-Floats = NDArray[np.float64]
 
 SAME = 0.01
 """Ungrounded simulators whose errors differ by less than this share are drawn once."""

@@ -5,12 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
 from astra_data.reports.figures.style import FAINT, method_colour, method_title, style
-
-Floats = NDArray[np.float64]
 
 _TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
 

@@ -9,13 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.naming import base_method, is_plus
 from astra_data.reports.figures.style import FAINT, INK, method_colour, method_title, score_axis, style
 from astra_data.worlds.score import Score
-
-Floats = NDArray[np.float64]
 
 CURVE_POINTS = 200
 """Points at which curves of different seeds are interpolated."""

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
 from astra_data.dataset.inspection import Map
 from astra_data.reports.figures.coverage import draw_visits
 from astra_data.reports.figures.style import method_colour, method_title, score_axis, style
 from astra_data.worlds.score import Score
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

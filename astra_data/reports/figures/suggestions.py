@@ -5,13 +5,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.reports.figures.motion import draw_walls
 from astra_data.reports.figures.style import INK, SIMULATED, style
 from astra_data.worlds.plane.mazes import Maze
-
-Floats = NDArray[np.float64]
 
 
 def information_map(

@@ -3,15 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
 from astra_data.reports.figures.style import FAINT, method_colour, method_title, style
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.reports.figures.style import style
 
-Floats = NDArray[np.float64]
 Bands = Mapping[str, Mapping[str, Floats]]
 """Axis → model → error, low and high, (3, K)."""
 

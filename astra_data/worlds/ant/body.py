@@ -18,11 +18,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.rotation import rotation_matrix
-
-Floats = NDArray[np.float64]
 
 STATE_SIZE = 29
 """qpos (15): x, y, z, quaternion, 8 joint angles; qvel (14): linear, angular, 8 joint rates."""

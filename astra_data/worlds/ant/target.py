@@ -5,6 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.ant.body import (
     CONTROL_SUBSTEPS,
     POSITIONS,
@@ -16,7 +17,7 @@ from astra_data.worlds.ant.body import (
     up_cosine,
 )
 from astra_data.worlds.batched import Step, rows_in
-from astra_data.worlds.batched_mujoco import BatchedPhysics, Floats, wall_geoms
+from astra_data.worlds.batched_mujoco import BatchedPhysics, wall_geoms
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.planar_target import PlanarTarget
 

@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.worlds.batched_mujoco import BatchedPhysics, Bools, Floats
+from astra_data.core.arrays import Bools, Floats
+from astra_data.worlds.batched_mujoco import BatchedPhysics
 from astra_data.worlds.humanoid.locomotion import Locomotion
 from astra_data.worlds.humanoid.model import (
     CONTROL_SUBSTEPS,

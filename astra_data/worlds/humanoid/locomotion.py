@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astra_data.worlds.batched_mujoco import Bools, Floats
+from astra_data.core.arrays import Bools, Floats
 from astra_data.worlds.humanoid.model import STANDING
 
 _QUATERNION = slice(3, 7)

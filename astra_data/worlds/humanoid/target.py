@@ -5,9 +5,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.batched import Step, rows_in
-from astra_data.worlds.batched_mujoco import Floats
 from astra_data.worlds.humanoid import CommandRanges, Humanoids, Locomotion
 from astra_data.worlds.humanoid.model import COMMANDED, JOINTS, STATE_SIZE
 

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from astra_data.worlds.batched_mujoco import Floats, attribute
+from astra_data.core.arrays import Floats
+from astra_data.worlds.batched_mujoco import attribute
 from astra_data.worlds.humanoid.model import (
     COMMANDED,
     DAMPING,

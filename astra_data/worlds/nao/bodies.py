@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.worlds.batched_mujoco import share_out, views, wall_geoms
 from astra_data.worlds.nao.body import STIFFNESS_NM_PER_RAD, SUBSTEPS
 from astra_data.worlds.nao.kinematics import TO_MOTORS
-from astra_data.worlds.nao.steps import Bools, Floats
 from astra_data.worlds.nao.traits import Traits
 from astra_data.worlds.nao.walk import Targets, WalkStyle
 

@@ -8,8 +8,6 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from astra_data.worlds.batched_mujoco import attribute
 from astra_data.worlds.nao.links import (
@@ -27,8 +25,6 @@ from astra_data.worlds.nao.links import (
 )
 from astra_data.worlds.plane.ball import BALL_RADIUS_M, ROLLING_M_S2
 from astra_data.worlds.plane.mazes import Maze
-
-Floats = NDArray[np.float64]
 
 TICK_S = 0.012
 """The robot's own motion cycle (83 Hz), as B-Human's code states it."""

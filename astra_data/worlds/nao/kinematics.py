@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.nao.links import (
     FOOT_HEIGHT_M,
     HIP_OFFSET_Y_M,
@@ -23,8 +24,6 @@ from astra_data.worlds.nao.links import (
     TIBIA_M,
 )
 from astra_data.worlds.plane.geometry import wrapped
-
-Floats = NDArray[np.float64]
 
 JOINTS = ("HipYawPitch", *(f"L{name}" for name in LEG_JOINTS[1:]), *(f"R{name}" for name in LEG_JOINTS[1:]))
 """The eleven angles, in order."""

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.nao.bodies import MOTORS, TICKS, BatchedBodies
 from astra_data.worlds.nao.body import TICK_S, nao_model
 from astra_data.worlds.nao.kinematics import TO_MOTORS, leg_angles
 from astra_data.worlds.nao.links import HIP_OFFSET_Z_M
-from astra_data.worlds.nao.steps import Bools, Floats, Gait, StepPlanner, WalkLimits, put_rows
+from astra_data.worlds.nao.steps import Gait, StepPlanner, WalkLimits, put_rows
 from astra_data.worlds.nao.traits import Traits, TraitSpread
 from astra_data.worlds.nao.walk import WalkEngine, WalkStyle
 from astra_data.worlds.plane.ball import BALL_RADIUS_M

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from astra_data.core.arrays import Bools, Floats
 
 
 def put_rows(robots: object, rows: NDArray[np.intp], others: object) -> None:

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.batched import Step, rows_in
 from astra_data.worlds.nao.abstraction import STATE_SIZE
 from astra_data.worlds.nao.perception import BallSight, Localisation, PerceptionErrors
@@ -15,8 +16,6 @@ from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.planar_target import PlanarTarget
 from astra_data.worlds.plane.ball import asks_to_kick
 from astra_data.worlds.plane.geometry import wrapped
-
-Floats = NDArray[np.float64]
 
 SPEED_M_S = 0.25
 """Of a command of 1, along each axis: the largest forward speed of B-Human's walk."""

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.nao.kinematics import JOINTS
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

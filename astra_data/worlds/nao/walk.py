@@ -11,10 +11,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.worlds.nao.body import GRAVITY, TICK_S
 from astra_data.worlds.nao.kinematics import leg_angles
 from astra_data.worlds.nao.links import HIP_OFFSET_Y_M, HIP_OFFSET_Z_M
-from astra_data.worlds.nao.steps import START, STRIDE, Bools, Floats, Gait, StepPlanner
+from astra_data.worlds.nao.steps import START, STRIDE, Gait, StepPlanner
 
 
 @dataclass(frozen=True)

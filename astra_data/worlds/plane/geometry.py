@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array, Column
-
-Floats = NDArray[np.float64]
 
 
 def wrapped[Angle: (Floats, Tensor)](angle: Angle) -> Angle:

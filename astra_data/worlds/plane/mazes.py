@@ -11,9 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

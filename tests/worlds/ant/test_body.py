@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.ant.body import (
-    Floats,
     VelocityController,
     ant_model,
     canonical_view,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.batched_mujoco import Floats
+from astra_data.core.arrays import Floats
 from astra_data.worlds.humanoid.abstraction import (
     humanoid_to_extended_kinematics,
     humanoid_to_kinematics,

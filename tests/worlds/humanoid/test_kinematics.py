@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.worlds.batched_mujoco import Floats
+from astra_data.core.arrays import Floats
 from astra_data.worlds.humanoid import CommandRanges, Locomotion
 from astra_data.worlds.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
 from astra_data.worlds.humanoid.model import COMMANDED, FEET, JOINTS, TIMESTEP_S, humanoid_model

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.batched_mujoco import Floats
+from astra_data.core.arrays import Floats
 from astra_data.worlds.humanoid.model import FEET, humanoid_model
 from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.batched_mujoco import Floats
+from astra_data.core.arrays import Floats
 from astra_data.worlds.humanoid.model import COMMANDED, CONTACT_M, humanoid_model
 from astra_data.worlds.humanoid.walker import sole_clearance, walker_model
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.nao.bodies import MOTORS, TICKS, BatchedBodies
 from astra_data.worlds.nao.body import STIFFNESS_NM_PER_RAD, SUBSTEPS, nao_model
 from astra_data.worlds.nao.kinematics import TO_MOTORS, leg_angles
 from astra_data.worlds.nao.links import HIP_OFFSET_Z_M
-from astra_data.worlds.nao.steps import Floats, Gait, StepPlanner, WalkLimits
+from astra_data.worlds.nao.steps import Gait, StepPlanner, WalkLimits
 from astra_data.worlds.nao.traits import IDENTICAL, Traits
 from astra_data.worlds.nao.walk import Targets, WalkEngine, WalkStyle
 

@@ -1,8 +1,9 @@
 import mujoco
 import numpy as np
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.nao.body import nao_model
-from astra_data.worlds.nao.kinematics import JOINTS, TO_MOTORS, Floats, foot_poses, leg_angles
+from astra_data.worlds.nao.kinematics import JOINTS, TO_MOTORS, foot_poses, leg_angles
 from astra_data.worlds.nao.links import FOOT_HEIGHT_M, HIP_OFFSET_Y_M, HIP_OFFSET_Z_M, THIGH_M, TIBIA_M
 
 STANDING_Z_M = -0.230 - HIP_OFFSET_Z_M

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from nao_values import TOTAL_MASS_KG
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.nao import IDENTICAL, BatchedNao
 from astra_data.worlds.nao.body import GRAVITY
-from astra_data.worlds.nao.steps import Floats
 from astra_data.worlds.plane.mazes import U_MAZE
 
 EVERYONE = np.arange(3)

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from astra_data.worlds.nao.steps import START, STOP, STRIDE, Floats, Gait, StepPlanner, WalkLimits
+from astra_data.core.arrays import Floats
+from astra_data.worlds.nao.steps import START, STOP, STRIDE, Gait, StepPlanner, WalkLimits
 
 LIMITS = WalkLimits()
 TICK_S = 0.012

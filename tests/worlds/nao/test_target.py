@@ -6,7 +6,8 @@ import pytest
 import torch
 from nao_values import NO_ERRORS
 
-from astra_data.worlds.nao.target import Floats, NaoEnv
+from astra_data.core.arrays import Floats
+from astra_data.worlds.nao.target import NaoEnv
 from astra_data.worlds.registry import TASKS
 
 

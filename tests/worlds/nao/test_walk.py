@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
+from astra_data.core.arrays import Floats
 from astra_data.worlds.nao.body import GRAVITY, TICK_S
 from astra_data.worlds.nao.kinematics import foot_poses
 from astra_data.worlds.nao.links import HIP_OFFSET_Y_M, HIP_OFFSET_Z_M
-from astra_data.worlds.nao.steps import START, STOP, STRIDE, Floats, Gait, StepPlanner, WalkLimits
+from astra_data.worlds.nao.steps import START, STOP, STRIDE, Gait, StepPlanner, WalkLimits
 from astra_data.worlds.nao.walk import WalkEngine, WalkStyle
 
 STYLE = WalkStyle(step_scale=(1.0, 1.0, 1.0))
