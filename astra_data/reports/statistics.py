@@ -6,6 +6,7 @@ of significance and SciPy's checks take most of a report's time. One score per s
 all tasks; resampling is over seeds, within each task.
 """
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -190,7 +191,8 @@ def _student(values: Sequence[float] | Floats) -> float:
     from scipy.stats import t
 
     count = len(values)
-    return float(t.ppf((1 + CONFIDENCE) / 2, count - 1) * np.std(values, ddof=1)) / count**0.5
+    half = float(t.ppf((1 + CONFIDENCE) / 2, count - 1) * np.std(values, ddof=1))
+    return half / math.sqrt(count)
 
 
 def share_interval(count: int, total: int) -> tuple[float, float]:
