@@ -38,11 +38,6 @@ def as_given(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
     return command
 
 
-def if_terminated(state: State, terminated: bool) -> bool:
-    """Return whether the environment terminated."""
-    return terminated
-
-
 def made(env_id: str, **options: Any) -> Env:  # noqa: ANN401 - handed on
     """Return the environment `env_id` with its `options`, without wrappers.
 
@@ -63,6 +58,7 @@ class GymnasiumRobot:
 
     Attributes:
         name: its id. env: the environment.
+        any_end_fails: whether each end of the environment is taken for a failure, as no `failed` is given.
 
     Example:
         >>> from astra_data.worlds.gymnasium_robot import GymnasiumRobot
@@ -77,7 +73,7 @@ class GymnasiumRobot:
         *,
         read_state: Callable[[Env, Any], State] = observed,
         command: Callable[[NDArray[np.float64], State], Any] = as_given,
-        failed: Callable[[State, bool], bool] = if_terminated,
+        failed: Callable[[State, bool], bool] | None = None,
         **options: Any,  # noqa: ANN401 - handed on
     ) -> None:
         """Make the environment.
@@ -87,7 +83,7 @@ class GymnasiumRobot:
             read_state: makes the state (S,) of the environment, without its wrappers, and an observation.
             command: makes an action of the environment of a command (A,) and the state that it is given in.
             failed: whether the robot failed, from the state after a step and whether the environment
-                terminated; by default the latter.
+                terminated; by default the latter, and to terminate at the task's goal is an error.
             options: of the environment.
 
         Raises:
@@ -95,6 +91,7 @@ class GymnasiumRobot:
         """
         self.name, self.env = env_id, made(env_id, **options)
         self._read_state, self._command, self._failed = read_state, command, failed
+        self.any_end_fails = failed is None
         if isinstance(space := self.env.action_space, gymnasium.spaces.Box):
             slack = _SLACK * (space.high - space.low)
             self._least, self._largest = space.low - slack, space.high + slack
@@ -113,7 +110,7 @@ class GymnasiumRobot:
         """
         observation, _, terminated, _, _ = self.env.step(self._action(command))
         self._state = self._read_state(self.env, observation)
-        return self._state, bool(self._failed(self._state, terminated))
+        return self._state, bool(self._failed(self._state, terminated) if self._failed else terminated)
 
     def check_commands(self, limits: Commands) -> None:
         """Reset, and check that the least and the largest commands make actions of the environment.

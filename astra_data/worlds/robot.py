@@ -80,6 +80,7 @@ class RobotEnv:
         self._abstraction = abstraction
         self._robots = [robot() for _ in range(num_envs)]
         takes = inspect.signature(self._robots[0].reset).parameters
+        self._any_end_fails = getattr(self._robots[0], "any_end_fails", False)
         self._takes_seed, self._starts = "seed" in takes, starts if "start" in takes else None
         self.goal = torch.zeros(num_envs, objective.goal_size)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
@@ -129,7 +130,12 @@ class RobotEnv:
         return self._observe()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
-        """Apply `action` (B, A) of ±1; robots outside `active` (B,) stay as they are."""
+        """Apply `action` (B, A) of ±1; robots outside `active` (B,) stay as they are.
+
+        Raises:
+            BadInputError: a robot breaks, or an environment of Gymnasium ends at its goal, and nobody said
+                whether that is a failure.
+        """
         before = self._abstract()
         commands = self._commands.in_units(action).double().numpy()
         rows = range(self.num_envs) if active is None else active.nonzero().squeeze(1).tolist()
@@ -140,7 +146,14 @@ class RobotEnv:
                 raise BadInputError(f"step of the robot: expected (state, whether it failed), got {found!r}")
             self._state[row], self._fell[row] = self._checked(found[0], "step"), bool(found[1])
         after = self._abstract()
-        success = self._objective.reached(after, self.goal) & ~self._fell
+        reached = self._objective.reached(after, self.goal)
+        if self._any_end_fails and (reached & self._fell).any():
+            raise BadInputError(
+                "step of the robot: its environment terminated in a step that reached the goal, and so the "
+                "success counts as a failure: give GymnasiumRobot a failed, a function of the state and of "
+                "whether it terminated that returns whether the robot failed"
+            )
+        success = reached & ~self._fell
         self.failed = (self._fell | self._objective.missed(after, self.goal)) & ~success
         return Step(
             observation=self._observe(),

@@ -1,15 +1,20 @@
 import pickle
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
+from small_cart import TASK, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.gymnasium_robot import Env, GymnasiumRobot, observed
-from astra_data.worlds.robot import State
+from astra_data.worlds.robot import RobotEnv, State
 
 
 def torque(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
@@ -59,6 +64,57 @@ def test_by_default_states_are_observations_and_the_end_is_a_failure() -> None:
         if terminated:
             break
     assert ends[-1] and not ends[0]
+
+
+class Corridor(gymnasium.Env[Any, Any]):
+    """A cart on a rail [x] whose episodes end 0.4 m ahead, where it arrives, and 0.4 m behind, where it falls."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 4.0, (1,))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:  # noqa: ANN401
+        self.x = 0.0
+        return [self.x, 0.0], {}
+
+    def step(self, action: NDArray[np.float64]) -> Any:  # noqa: ANN401
+        self.x += 0.1 * float(action[0])
+        return [self.x, float(action[0])], 0.0, abs(self.x) >= 0.4, False, {}
+
+
+class Near(Reach):
+    """Get 0.3 m ahead."""
+
+    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        return np.full((count, 1), 0.3)
+
+
+def corridor(**functions: Any) -> RobotEnv:  # noqa: ANN401
+    gymnasium.registry.pop("Corridor-v0", None)
+    gymnasium.register("Corridor-v0", Corridor)
+    robot = partial(GymnasiumRobot, "Corridor-v0", **functions)
+    env = replace(TASK, robot=robot, objective=Near(horizon=40)).target(2, seed=0)
+    assert isinstance(env, RobotEnv)
+    env.reset()
+    return env
+
+
+def test_an_end_at_the_goal_is_no_failure_without_a_word() -> None:
+    with pytest.raises(
+        BadInputError, match=r"terminated in a step that reached the goal.*GymnasiumRobot a fai"
+    ):
+        corridor().step(torch.tensor([[0.0], [1.0]]))  # to 0.15 and 0.4 m
+    env = corridor()
+    for _ in range(4):
+        step = env.step(torch.tensor([[-1.0], [-0.6]]))  # by -0.1 and 0 m
+    assert env.failed.tolist() == step.terminated.tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("fails", "success"), [(lambda state, _: state[0] < 0, True), (lambda _, end: end, False)]
+)
+def test_an_end_at_the_goal_is_what_failed_says(fails: Callable[[State, bool], bool], success: bool) -> None:
+    env = corridor(failed=fails)
+    step = env.step(torch.tensor([[0.0], [1.0]]))
+    assert step.success.tolist() == [False, success] and env.failed.tolist() == [False, not success]
 
 
 def test_an_environment_that_cannot_be_made_is_named() -> None:
