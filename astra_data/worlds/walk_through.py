@@ -1,6 +1,7 @@
 """Walk through a task, and name what is wrong with it, before anything long begins."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -141,11 +142,48 @@ def _step(task: Task, simulator: AbstractSimulator, starts: Tensor, device: str)
         return landed.clone()
 
     landed = stepped(slice(None))
-    if torch.equal(landed, stepped(slice(None))):  # otherwise it is noisy, and rows cannot be compared
+    if torch.equal(landed, stepped(slice(None))):
         for row in range(_COUNT):
             alone = stepped(slice(row, row + 1))
             _same(f"{what}: row {row} by itself and", alone, landed[row : row + 1], "in the batch")
-    return landed
+    elif _remembers(lambda: task.own_simulator(_COUNT, device), starts, command):
+        raise BadInputError(
+            f"{what}: expected what follows from the state alone, and it depends on commands before "
+            "reset_to(state): reset all that the simulator remembers there, such as filters and delays"
+        )
+    return landed  # of a noisy one, whose rows cannot be compared, too
+
+
+def _remembers(build: Callable[[], AbstractSimulator], starts: Tensor, command: Tensor) -> bool:
+    """Return whether a step after `reset_to` depends on the command before, with the same noise.
+
+    Noise that no seed repeats hides it: then nothing is said.
+    """
+
+    def landed(earlier: Tensor) -> Tensor:
+        with _seeded(), explained("make_simulator: step(command)"):
+            simulator = build()  # with the same seeds, too, for generators of its own
+            simulator.reset_to(starts.clone())
+            simulator.step(earlier.clone())
+        with _seeded(), explained("make_simulator: step(command)"):
+            simulator.reset_to(starts.clone())
+            return simulator.step(command.clone()).clone()
+
+    plain = landed(command)
+    return torch.equal(plain, landed(command)) and not torch.equal(plain, landed(command.flip(0)))
+
+
+@contextmanager
+def _seeded() -> Iterator[None]:
+    """Let torch's and NumPy's global random numbers begin anew, and go on as before afterwards."""
+    before = np.random.get_state()
+    try:
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            np.random.seed(0)
+            yield
+    finally:
+        np.random.set_state(before)
 
 
 def _same(what: str, shown: Tensor, expected: Tensor, where: str = "") -> None:

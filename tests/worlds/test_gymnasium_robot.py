@@ -67,7 +67,7 @@ def test_by_default_states_are_observations_and_the_end_is_a_failure() -> None:
 
 
 class Corridor(gymnasium.Env[Any, Any]):
-    """A cart on a rail [x] whose episodes end 0.4 m ahead, where it arrives, and 0.4 m behind, where it falls."""
+    """A cart on a rail [x]; episodes end 0.4 m ahead, where it arrives, and 0.4 m behind, where it falls."""
 
     action_space = gymnasium.spaces.Box(-1.0, 4.0, (1,))
 

@@ -190,8 +190,69 @@ def test_every_wrong_piece_is_named() -> None:
     ]
 
 
-def test_noisy_simulators_are_no_fault() -> None:
-    def noisy(self: Rail, command: Tensor) -> Tensor:
-        return Rail.step(self, command + torch.randn_like(command))
+class Noisy(Rail):
+    """Moves at random; the random numbers are those of a task."""
 
-    assert check_task(simulator(step=noisy)) == []
+    random: Any
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        if isinstance(self.random, type):
+            self.random = self.random()
+
+    def step(self, command: Tensor) -> Tensor:
+        return super().step(command + self.random(len(command)))
+
+
+class OwnNoise:
+    """A generator of a simulator's own."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(0)
+
+    def __call__(self, count: int) -> Tensor:
+        return torch.from_numpy(self.rng.normal(size=(count, 1))).float()
+
+
+class UnseededNoise(OwnNoise):
+    """One that begins anywhere."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng()
+
+
+NOISE = [
+    staticmethod(lambda count: torch.randn(count, 1)),
+    staticmethod(lambda count: torch.from_numpy(np.random.normal(size=(count, 1))).float()),
+    OwnNoise,
+    UnseededNoise,
+]
+
+
+@pytest.mark.parametrize("random", NOISE, ids=["torch", "numpy", "own", "unseeded"])
+def test_noisy_simulators_are_no_fault(random: object) -> None:
+    before = torch.get_rng_state(), np.random.get_state()[1].tolist()  # type: ignore[union-attr]
+    assert check_task(replace(TASK, make_simulator=type("Own", (Noisy,), {"random": random}))) == []
+    if random is OwnNoise:
+        assert torch.equal(torch.get_rng_state(), before[0])
+        assert np.random.get_state()[1].tolist() == before[1]  # type: ignore[union-attr]
+
+
+class Lagging(Rail):
+    """Follows commands with a lag that `reset_to` does not know of."""
+
+    lag: Tensor | float = 0.0
+
+    def step(self, command: Tensor) -> Tensor:
+        self.lag = self.lag + 0.5 * (command - self.lag)
+        return super().step(self.lag + self.noise(len(command)))
+
+    def noise(self, count: int) -> Tensor:
+        return torch.zeros(count, 1)
+
+
+@pytest.mark.parametrize("random", [None, *NOISE[:2]], ids=["none", "torch", "numpy"])
+def test_what_a_simulator_remembers_is_no_noise(random: object) -> None:
+    kind = type("Own", (Lagging,), {} if random is None else {"noise": random})
+    (fault,) = check_task(replace(TASK, make_simulator=kind))
+    assert fault.startswith("make_simulator: step(command): expected what follows from the state alone")
