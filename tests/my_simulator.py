@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -88,6 +89,28 @@ class Bare(Glider):
 class Squeezing(Glider):
     def step(self, action: Tensor) -> Tensor:
         return super().step(action)[:, :1]
+
+
+class Numeric(Glider):
+    """Has its states as NumPy arrays."""
+
+    def __init__(self, num_envs: int) -> None:
+        self.state = np.zeros((num_envs, 2), np.float32)  # type: ignore[assignment]
+
+
+class Relapsing(Glider):
+    """Has them so once it is reset."""
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        self.state = state.numpy()  # type: ignore[assignment]
+
+
+class Sliding(Glider):
+    """Moves the states that it handed out."""
+
+    def step(self, action: Tensor) -> Tensor:
+        self.state += 0.05 * action
+        return self.state
 
 
 @dataclass

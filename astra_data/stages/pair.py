@@ -29,6 +29,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.expected_columns import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
+from astra_data.worlds.expecting import expect_tensor, stepped
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.registry import TASKS
@@ -174,7 +175,8 @@ def pair_steps(
         the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
 
     Raises:
-        BadInputError: the difference is larger than `tolerance`, or the simulator's states are not finite.
+        BadInputError: the difference is larger than `tolerance`, the simulator's states are not finite or no
+            tensors, or its step changes those handed out before.
     """
     abstract = checked_abstraction(pairing, state)
     landed = np.empty_like(abstract)
@@ -185,18 +187,18 @@ def pair_steps(
         wanted = torch.from_numpy(abstract[rows])
         with explained(f"reset_to of {pairing.id}"):
             batch.reset_to(wanted)
-        difference = (batch.state - wanted).abs()
+            shown = batch.state
+        difference = (expect_tensor(f"after reset_to, {pairing.id}.state", shown) - wanted).abs()
         if not float(difference.max()) <= tolerance:
             row, entry = divmod(int(difference.argmax()), wanted.shape[1])
             raise BadInputError(
                 f"the simulator, reset to φ(s) of step {first_step + rows[row]}, shows "
                 f"{_name(pairing, entry)} = "
-                f"{float(batch.state[row, entry]):.6g} and not {float(wanted[row, entry]):.6g} "
+                f"{float(shown[row, entry]):.6g} and not {float(wanted[row, entry]):.6g} "
                 f"(tolerance {tolerance:g}): check its reset_to and the abstraction"
             )
         largest = max(largest, float(difference.max()))
-        with explained(f"step of {pairing.id}"):
-            reached = batch.step(torch.from_numpy(as_rows(action[rows]))).numpy()
+        reached = stepped(batch, torch.from_numpy(as_rows(action[rows])), f"step of {pairing.id}").numpy()
         if reached.shape != wanted.shape:
             raise BadInputError(
                 f"step of {pairing.id} returns shape {reached.shape}, expected {tuple(wanted.shape)}"

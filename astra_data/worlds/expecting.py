@@ -1,4 +1,4 @@
-"""Errors of one line about tensors that are not as expected, and about objectives that return them."""
+"""Errors of one line about tensors that are not as expected, and about what returns them."""
 
 import torch
 from torch import Tensor
@@ -6,6 +6,7 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.own_code import explained
+from astra_data.worlds.protocols import AbstractSimulator
 
 
 def expect(
@@ -20,8 +21,7 @@ def expect(
     Raises:
         BadInputError: it is something else.
     """
-    if not isinstance(found, Tensor):
-        raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
+    found = expect_tensor(what, found)
     fits = found.dim() == len(shape) and all(
         size in (-1, length) for size, length in zip(shape, found.shape, strict=True)
     )
@@ -37,6 +37,33 @@ def expect(
     if not found.isfinite().all():
         raise BadInputError(f"{what}: expected finite numbers, got {first(found[~found.isfinite()])}")
     return found
+
+
+def expect_tensor(what: str, found: object) -> Tensor:
+    """Return `found`, a tensor.
+
+    Raises:
+        BadInputError: it is something else.
+    """
+    if not isinstance(found, Tensor):
+        raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
+    return found
+
+
+def stepped(simulator: AbstractSimulator, command: Tensor, what: str) -> Tensor:
+    """Return the states (B, X) that a step with `command` (B, A) leads to; errors begin with `what`.
+
+    Raises:
+        BadInputError: the step fails, returns no tensor, or changes the states that were handed out before.
+    """
+    with explained(what):
+        before = simulator.state
+        kept = before.clone()
+        landed = simulator.step(command)
+    landed = expect_tensor(what, landed)
+    if not torch.equal(before, kept):
+        raise BadInputError(f"{what} changes the states handed out before: expected a new tensor")
+    return landed
 
 
 def first(values: Tensor) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, Array, Column
 from astra_data.worlds.commands import Commands
+from astra_data.worlds.expecting import expect_tensor
 from astra_data.worlds.own_code import explained, file_of, is_own_code, offered, own_object
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import AbstractSimulator
@@ -105,7 +106,9 @@ def built(pairing: Pairing, count: int) -> AbstractSimulator:
     """
     with explained(f"{pairing.id}({count})"):
         batch = pairing.simulator(count)
-        parameters, shape = dict(batch.parameters), tuple(batch.state.shape)
+        parameters, state = dict(batch.parameters), batch.state
+        shape = tuple(state.shape)
+    expect_tensor(f"{pairing.id}({count}).state", state)
     expected = (count, pairing.abstract_state.size)
     if shape != expected:
         raise BadInputError(f"{pairing.id}({count}).state has shape {shape}, expected {expected}")
