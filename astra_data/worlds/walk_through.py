@@ -23,7 +23,7 @@ _TOLERANCE = 1e-4
 def check_task(task: Task, device: str = "cpu") -> list[str]:
     """Return one line for each piece of a task that is not as it should be; none if all is well.
 
-    Three states are drawn, set, stepped and judged. A robot is reset once and is given no command; target
+    Three states are drawn, set, stepped and judged. A robot is reset a few times and is given no command; target
     environments that the task builds itself are left out.
 
     Args:
@@ -99,6 +99,7 @@ def _robot(task: Task) -> None:
         abstract = task.abstraction(env.state)
         if isinstance(env, RobotEnv):
             env.check_commands()
+            env.check_seed()
     expect("abstraction (φ) of the robot's state", abstract, (1, task.abstract_state.size))
 
 

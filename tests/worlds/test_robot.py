@@ -10,6 +10,7 @@ from small_cart import TASK, Cart, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.training.target_episodes import in_target
+from astra_data.worlds.robot import RobotEnv
 
 
 def test_robots_are_stepped_by_commands_in_their_units() -> None:
@@ -105,6 +106,47 @@ def test_the_same_seed_gives_the_same_goals_and_seeds() -> None:
     assert goals[0] == goals[1] == goals[3] != goals[2] and goals[0][0] != goals[0][1]
     assert Noted.seeds[:2] == Noted.seeds[2:4] == Noted.seeds[6:] != Noted.seeds[4:6]
     assert -1 not in Noted.seeds
+
+
+class Scattered(Cart):
+    """A robot that starts at random, by its seed."""
+
+    def reset(self, seed: int = 0) -> list[float]:
+        super().reset()
+        return [self.x, float(np.random.default_rng(seed).normal())]
+
+
+class Careless(Cart):
+    """One that takes a seed and draws from elsewhere."""
+
+    drawn = np.random.default_rng(0)
+
+    def reset(self, seed: int = 0) -> list[float]:
+        super().reset()
+        return [self.x, float(self.drawn.normal())]
+
+
+class Unseeded(Careless):
+    """One that takes none."""
+
+    def reset(self) -> list[float]:  # type: ignore[override]
+        return super().reset()
+
+
+@pytest.mark.parametrize("robot", [Cart, Scattered, Unseeded])
+def test_the_same_seed_gives_the_same_start(robot: type[Cart]) -> None:
+    RobotEnv(**of_robots(robot)).check_seed()
+
+
+def test_a_robot_that_ignores_its_seed_is_told() -> None:
+    with pytest.raises(BadInputError, match=r"same seed must give the same start, and gave speed = .* then "):
+        RobotEnv(**of_robots(Careless)).check_seed()
+
+
+def of_robots(robot: type[Cart]) -> dict[str, Any]:
+    task = replace(TASK, robot=robot)
+    given = {"state": task.state, "commands": task.limits, "abstraction": task.abstraction, "seed": 3}
+    return {"objective": task.objective, "num_envs": 2, "robot": robot, **given}
 
 
 def test_goals_are_not_drawn_as_the_robot_draws_its_start() -> None:

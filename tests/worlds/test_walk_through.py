@@ -152,6 +152,10 @@ WRONG: list[tuple[Task, str]] = [
         "reset of the robot: expected a finite state of 2 numbers, got [0.0, 0.0, 0.0]",
     ),
     (
+        robot(reset=lambda self, seed: [float(torch.rand(())), 0.0]),
+        "reset of the robot: the same seed must give the same start, and gave x = ",
+    ),
+    (
         replace(abstraction(lambda state: state[..., :1] * np.nan), robot=None),
         "abstraction (φ) of states (3, 2): expected finite numbers, got nan",
     ),
