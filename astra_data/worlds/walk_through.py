@@ -1,5 +1,6 @@
 """Walk through a task, and name what is wrong with it, before anything long begins."""
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -16,15 +17,21 @@ from astra_data.worlds.robot import RobotEnv
 from astra_data.worlds.task import Task
 
 _COUNT = 3
+_RESETS = 5
+"""Of a robot, to see where it starts."""
+_DRAWN = 200
+"""Starts, to see in which range the objective draws them."""
 _TOLERANCE = 1e-4
 """Between states, relative to their size: simulators compute in single precision."""
+_log = logging.getLogger(__name__)
 
 
 def check_task(task: Task, device: str = "cpu") -> list[str]:
     """Return one line for each piece of a task that is not as it should be; none if all is well.
 
     Three states are drawn, set, stepped and judged. A robot is reset a few times and is given no command; target
-    environments that the task builds itself are left out.
+    environments that the task builds itself are left out. A warning is logged where robots start far from
+    where the objective draws starts.
 
     Args:
         task: what to walk through.
@@ -47,6 +54,9 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
     starts = starts.to(simulator.state.device)
     if tried(_reset, simulator, starts):
         landed = tried(_step, simulator, starts, device)
+        apart = None if faults else tried(_starts_apart, simulator, starts)
+        if apart:
+            _log.warning(f"task {task.name}: {apart}")
         if landed is not None and goals is not None:
             before, after, goals = (values.to(device) for values in (starts, landed, goals))
             tried(_observation, after, goals)
@@ -126,8 +136,7 @@ def _reset(task: Task, simulator: AbstractSimulator, starts: Tensor) -> bool:
 
 def _step(task: Task, simulator: AbstractSimulator, starts: Tensor, device: str) -> Tensor:
     what = "make_simulator: step(command)"
-    drawn = generator(0, "actions").uniform(-1.0, 1.0, (_COUNT, len(task.limits)))
-    command = task.limits.in_units(torch.from_numpy(drawn).float().to(starts.device))
+    command = _commands(task).to(starts.device)
 
     def landing(rows: slice) -> Tensor:
         count = len(starts[rows])
@@ -181,6 +190,47 @@ def _seeded() -> Iterator[None]:
             yield
     finally:
         np.random.set_state(before)
+
+
+def _starts_apart(task: Task, simulator: AbstractSimulator, starts: Tensor) -> str:
+    """Tell where robots start far from where the objective draws starts; nothing where they do not.
+
+    Far is further outside of the range of the drawn ones, in each of a few resets, than that is wide and the
+    simulator moves in a second, from `starts`.
+    """
+    if task.robot is None:
+        return ""
+    env, resets = task.target(1, seed=0), []
+    for _ in range(_RESETS):
+        env.reset()
+        resets.append(torch.as_tensor(task.abstraction(env.state)))
+    robot = torch.cat(resets)
+    with explained("objective.draw_starts(rng, n)"):
+        drawn = torch.as_tensor(task.objective.draw_starts(generator(0, "starts"), _DRAWN)).float()
+    low, high = drawn.amin(dim=0), drawn.amax(dim=0)
+    command = _commands(task).to(starts.device)
+    with explained("make_simulator: step(command), for a second"):
+        simulator.reset_to(starts.clone())
+        for _ in range(task.fps):
+            simulator.step(command.clone())
+        moved = (simulator.state - starts).abs().amax(dim=0).cpu()
+    outside = torch.maximum(low - robot, robot - high).amin(dim=0)
+    far = (outside > high - low + moved).nonzero().flatten().tolist()
+    if not far:
+        return ""
+    entry = far[0]
+    return (
+        f"the robot starts at {task.abstract_state.labels[entry]} = {robot[:, entry].min():.4g} to "
+        f"{robot[:, entry].max():.4g}, far from where objective.draw_starts puts the simulator, "
+        f"{low[entry]:.4g} to {high[entry]:.4g}: policies are trained from the latter; draw starts as the "
+        "robot has them, or check φ and its units"
+    )
+
+
+def _commands(task: Task) -> Tensor:
+    """Return random commands (3, A), in their units."""
+    drawn = generator(0, "actions").uniform(-1.0, 1.0, (_COUNT, len(task.limits)))
+    return task.limits.in_units(torch.from_numpy(drawn).float())
 
 
 def _same(what: str, shown: Tensor, expected: Tensor, where: str = "") -> None:

@@ -1,5 +1,6 @@
 """Each wrong piece of a task is named by one line, and what is right by none."""
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -260,3 +261,27 @@ def test_what_a_simulator_remembers_is_no_noise(random: object) -> None:
     kind = type("Own", (Lagging,), {} if random is None else {"noise": random})
     (fault,) = check_task(replace(TASK, make_simulator=kind))
     assert fault.startswith("make_simulator: step(command): expected what follows from the state alone")
+
+
+@pytest.mark.parametrize(
+    ("drawn", "started", "told"),
+    [
+        ((0.0, 0.0), [0.0], ""),
+        ((0.0, 0.0), [0.1], ""),  # within what the simulator moves in a second
+        ((4.0, 6.0), [3.5], ""),  # near the range
+        ((50.0, 50.0), [0.0, 50.0], ""),  # there in one reset
+        ((50.0, 50.0), [0.0, 1.0], "starts at x = 0 to 1, far from where objective.draw_starts puts the"),
+        ((-60.0, -50.0), [0.0], "starts at x = 0 to 0, far from where objective.draw_starts puts the"),
+    ],
+)
+def test_a_robot_that_starts_elsewhere_is_told(
+    drawn: tuple[float, float],
+    started: list[float],
+    told: str,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    places = itertools.cycle(started)
+    monkeypatch.setattr(Reach, "draw_starts", lambda self, rng, count: rng.uniform(*drawn, (count, 1)))
+    assert check_task(robot(reset=lambda self: [next(places), 0.0])) == []
+    assert (told in caplog.text and len(caplog.records) == 1) if told else not caplog.records
