@@ -132,7 +132,7 @@ class RobotEnv:
             raise BadInputError(
                 "reset of the robot: the same seed must give the same start, and gave "
                 f"{self._column.labels[entry]} = {found[0][row, entry]:.6g} and then "
-                f"{found[1][row, entry]:.6g}: draw all that is random from the seed that reset is given (in an "
+                f"{found[1][row, entry]:.6g}: draw all that is random from the seed that reset is given (an "
                 "environment of Gymnasium from self.np_random)"
             )
 

@@ -17,6 +17,10 @@ from astra_data.worlds.robot import RobotEnv
 from astra_data.worlds.task import Task
 
 _COUNT = 3
+_EVEN = 0.005
+"""Relative error of a rate that is taken for a whole number, as by `new`."""
+_MOST_UNEVEN = 0.1
+"""Largest one that is not refused, as by imports."""
 _RESETS = 5
 """Of a robot, to see where it starts."""
 _DRAWN = 200
@@ -29,9 +33,9 @@ _log = logging.getLogger(__name__)
 def check_task(task: Task, device: str = "cpu") -> list[str]:
     """Return one line for each piece of a task that is not as it should be; none if all is well.
 
-    Three states are drawn, set, stepped and judged. A robot is reset a few times and is given no command; target
-    environments that the task builds itself are left out. A warning is logged where robots start far from
-    where the objective draws starts.
+    Three states are drawn, set, stepped and judged. A robot is reset a few times and is given no command;
+    target environments that the task builds itself are left out. A warning is logged where robots start far
+    from where the objective draws starts.
 
     Args:
         task: what to walk through.
@@ -46,6 +50,7 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
             faults.append(str(error))
             return None
 
+    tried(_rate)
     starts, goals, simulator = tried(_starts), tried(_goals), tried(_simulator, device)
     tried(_abstraction)
     tried(_robot)
@@ -69,6 +74,21 @@ def _of_numpy(what: str, found: object, shape: tuple[int, ...]) -> Tensor:
     if not isinstance(found, np.ndarray):
         raise BadInputError(f"{what}: expected a NumPy array, got a {type(found).__name__}")
     return expect(what, torch.from_numpy(np.ascontiguousarray(found)), shape).float()
+
+
+def _rate(task: Task) -> None:
+    """Tell that the steps per second are no whole number; refuse it as an import does."""
+    error = 1.0 / (task.timestep_s * task.fps) - 1.0
+    if abs(error) < _EVEN:
+        return
+    line = (
+        f"timestep_s {task.timestep_s:g}: a dataset has a whole number of steps per second, {task.fps}, and "
+        f"so its steps are {abs(error):.1%} too {'long' if error > 0 else 'short'}: take 1 / {task.fps} s, "
+        "or another period that divides a second"
+    )
+    if abs(error) > _MOST_UNEVEN:
+        raise BadInputError(line)
+    _log.warning(f"task {task.name}: {line}")
 
 
 def _starts(task: Task) -> Tensor:

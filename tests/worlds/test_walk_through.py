@@ -40,6 +40,35 @@ def test_nothing_is_wrong_with_them_on_a_gpu(name: str) -> None:
     assert check_task(task_named(name), "cuda") == []
 
 
+@pytest.mark.parametrize(
+    ("timestep_s", "told"),
+    [
+        (0.1, ""),
+        (0.0333, ""),
+        (0.015, ""),  # 66.67, by less than 0.5 %
+        (
+            0.15,
+            "timestep_s 0.15: a dataset has a whole number of steps per second, 7, and so its steps are 4.8%",
+        ),
+        (
+            0.11,
+            "timestep_s 0.11: a dataset has a whole number of steps per second, 9, and so its steps are 1.0%",
+        ),
+    ],
+)
+def test_a_rate_that_is_no_whole_number_is_told(
+    timestep_s: float, told: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert check_task(replace(TASK, timestep_s=timestep_s)) == []
+    assert (f"task rail-cart: {told}" in caplog.text) if told else not caplog.records
+
+
+@pytest.mark.parametrize(("timestep_s", "way"), [(0.4, "25.0% too long"), (0.65, "23.1% too short")])
+def test_a_rate_that_is_far_from_a_whole_number_is_refused(timestep_s: float, way: str) -> None:
+    (fault,) = check_task(replace(TASK, timestep_s=timestep_s))
+    assert fault.startswith(f"timestep_s {timestep_s}: a dataset has a whole number") and way in fault
+
+
 def simulator(**methods: object) -> Task:
     return replace(TASK, make_simulator=type("Own", (Rail,), methods))
 
