@@ -11,12 +11,15 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive, generator
+from astra_data.core.wording import first_few
 from astra_data.dataset.columns import Column
 from astra_data.worlds.batched import Step
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.own_code import explained
 
+_SHOWN = 4
+"""Entries of a state that a line names."""
 State = NDArray[np.floating[Any]] | Sequence[float]
 
 
@@ -86,7 +89,7 @@ class RobotEnv:
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self._fell = self.failed.clone()
         self.wall_contact = torch.zeros(num_envs, dtype=torch.bool)
-        self._state = torch.zeros(num_envs, state.size)
+        self._state, self._steps = torch.zeros(num_envs, state.size), [0] * num_envs
         self.reseed(seed)
         self.observation_size = self._observe().shape[1]
 
@@ -146,7 +149,8 @@ class RobotEnv:
             options |= {} if self._starts is None else {"start": self._starts[row]}
             with explained("reset of the robot"):
                 found = self._robots[row].reset(**options)
-            self._state[row] = self._checked(found, "reset")
+            self._steps[row] = 0
+            self._state[row] = self._checked(found, "reset", row)
             goal = self._objective.draw_goals(generator(self._seed, f"goal of {episode}"), 1)
             self.goal[row] = torch.from_numpy(goal[0]).float()
             self._fell[row] = self.failed[row] = False
@@ -167,7 +171,8 @@ class RobotEnv:
                 found = self._robots[row].step(commands[row])
             if not isinstance(found, tuple) or len(found) != 2:
                 raise BadInputError(f"step of the robot: expected (state, whether it failed), got {found!r}")
-            self._state[row], self._fell[row] = self._checked(found[0], "step"), bool(found[1])
+            self._steps[row] += 1
+            self._state[row], self._fell[row] = self._checked(found[0], "step", row), bool(found[1])
         after = self._abstract()
         reached = self._objective.reached(after, self.goal)
         if self._any_end_fails and (reached & self._fell).any():
@@ -207,11 +212,22 @@ class RobotEnv:
     def _observe(self) -> Tensor:
         return self._objective.observe(self._abstract(), self.goal)
 
-    def _checked(self, state: State, call: str) -> Tensor:
+    def _checked(self, state: State, call: str, row: int) -> Tensor:
+        if isinstance(state, tuple) and len(state) == 2 and isinstance(state[1], dict):
+            raise BadInputError(
+                f"{call} of the robot: expected a state of {self._column.size} numbers, got an observation "
+                f"and a dictionary: {type(self._robots[row]).__name__} is an environment of Gymnasium; "
+                "register it (gymnasium.register) and give robot=partial(GymnasiumRobot, its id)"
+            )
         with explained(f"{call} of the robot: to read its state as numbers"):
             found = torch.as_tensor(np.asarray(state, dtype=np.float32))
-        if found.shape != (self._column.size,) or not found.isfinite().all():
+        expected = f"{call} of the robot: expected a finite state of {self._column.size} numbers"
+        if found.shape != (self._column.size,):
+            raise BadInputError(f"{expected}, got {' '.join(repr(state).split())}")
+        if lost := (~found.isfinite()).nonzero().flatten().tolist():
             raise BadInputError(
-                f"{call} of the robot: expected a finite state of {self._column.size} numbers, got {state!r}"
+                f"{expected}, got {first_few([self._column.labels[entry] for entry in lost], _SHOWN)} = "
+                f"{float(found[lost[0]])} after step {self._steps[row]} of an episode of robot {row + 1} of "
+                f"{self.num_envs}: see what its simulation does there, or let it fail one step before"
             )
         return found

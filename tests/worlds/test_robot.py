@@ -2,6 +2,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -172,6 +173,35 @@ def test_a_state_of_another_kind_is_refused(state: Any) -> None:  # noqa: ANN401
     env.reset()
     with pytest.raises(BadInputError, match="step of the robot: expected a finite state of 2 numbers, got"):
         env.step(torch.zeros(1, 1))
+
+
+def test_the_step_in_which_a_state_is_lost_is_told() -> None:
+    class Lost(Cart):
+        steps = 0
+
+        def step(self, command: np.ndarray[Any, Any]) -> Any:  # noqa: ANN401
+            self.steps += 1
+            (x, speed), tips = super().step(command)
+            return np.array([[x, np.inf if self.steps > 3 and speed > 0 else speed]])[0], tips
+
+    env = replace(TASK, robot=Lost).target(3, seed=0)
+    env.reset()
+    for steps in range(1, 4):
+        env.step(torch.full((3, 1), -0.6))
+        if steps == 1:
+            env.reset(torch.tensor([False, False, True]))
+    told = r"got speed = inf after step 3 of an episode of robot 3 of 3: see what"
+    with pytest.raises(BadInputError, match=told) as caught:
+        env.step(torch.tensor([[-0.6], [-0.6], [0.0]]))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_environment_of_gymnasium_is_called_so() -> None:
+    task = replace(TASK, robot=gymnasium.make("Pendulum-v1").unwrapped.__class__)
+    with pytest.raises(
+        BadInputError, match=r"PendulumEnv is an environment of Gymnasium; register it .*Robot"
+    ):
+        task.target(1, seed=0).reset()
 
 
 @pytest.mark.parametrize("found", [[0.0, 1.0], np.zeros(2), None, ([0.0, 1.0], False, {})])
