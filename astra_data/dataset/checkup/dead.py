@@ -30,9 +30,11 @@ class DeadChannels:
         self._extremes: list[NDArray[np.float64]] = []
         self._others_move: list[bool] = []
         self._uids: list[int] = []
+        self._goes_on = False
 
     def add(self, episode: Episode) -> None:
         """Look at the next episode."""
+        self._goes_on |= len(episode) > 1
         for column in self._columns:
             values = as_rows(episode.columns[column.name])
             first = self._first.setdefault(column.name, values[0].copy())
@@ -45,9 +47,14 @@ class DeadChannels:
                 self._uids.append(episode.uid)
 
     def findings(self, called: str) -> list[Finding]:
-        """Tell which values are constant, and which are stuck in some episodes."""
+        """Tell which values are constant, and which are stuck in some episodes.
+
+        What is the same where episodes begin is not, where none goes on.
+        """
         found = []
         for column in self._columns:
+            if column.name == STATE and not self._goes_on:
+                continue
             constant = np.flatnonzero(~self._changed[column.name]).tolist()
             if constant:
                 advice = (

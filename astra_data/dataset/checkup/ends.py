@@ -58,17 +58,27 @@ class EpisodeEnds:
         return ", ".join(f"{count} {way}" for count, way in counts if count)
 
     def findings(self) -> list[Finding]:
-        """Tell whether there are few failures, where there are any."""
-        failures = self.failures
+        """Tell whether no episode goes on after its first step, and of few failures, where there are any."""
+        failures, found = self.failures, []
+        if max(self._lengths, default=0) == 1:
+            found.append(
+                Finding(
+                    "warning",
+                    "every episode ends after its first step",
+                    "check what ends them: failed of the robot or the log, reached and missed of the "
+                    "objective, or how a mapping splits episodes",
+                )
+            )
         if not 0 < len(failures) < FEW_FAILURES:
-            return []
+            return found
         count = "1 failure" if len(failures) == 1 else f"{len(failures)} failures"
         return [
+            *found,
             Finding(
                 "note",
                 f"{count}, little for a failure model to learn from",
                 f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
                 "ground without failure_members",
                 tuple(failures),
-            )
+            ),
         ]

@@ -44,6 +44,13 @@ def test_a_value_is_constant_only_if_it_is_in_all_episodes() -> None:
     assert not findings(states)
 
 
+def test_where_episodes_begin_alike_and_none_goes_on_no_sensor_is_dead() -> None:
+    states = [held(moving(0), 0, 40) for _ in range(3)]
+    assert not findings([state[:1] for state in states])
+    (found,) = findings([states[0][:1], states[1][:2]])  # y in a second step is that of the first
+    assert found.what == "constant in all steps: y of observation.state"
+
+
 def test_a_command_that_was_never_given_is_told() -> None:
     states = [moving(uid) for uid in range(3)]
     (found,) = findings(states, [np.full(41, 0.5, np.float32)] * 3)

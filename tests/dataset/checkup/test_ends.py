@@ -52,6 +52,14 @@ def test_of_what_was_not_recorded_nothing_is_told() -> None:
     assert not outcomes.findings()
 
 
+@pytest.mark.parametrize(("longest", "found"), [(1, True), (2, False)])
+def test_episodes_that_all_end_in_their_first_step_are_told(longest: int, found: bool) -> None:
+    told = [f"{one}" for one in counted([(1, False), (longest, False)], [None, None]).findings()]
+    assert [line.partition(": check what ends them")[0] for line in told] == (
+        ["warning: every episode ends after its first step"] if found else []
+    )
+
+
 @pytest.mark.parametrize(("failures", "found"), [(0, False), (1, True), (9, True), (10, False)])
 def test_few_failures_are_told(failures: int, found: bool) -> None:
     assert FEW_FAILURES == 10
