@@ -290,6 +290,16 @@ def test_some_seeds_of_a_recipe(recipe: Path, tmp_path: Path) -> None:
         run_stage(recipe, "pair", root=tmp_path)
 
 
+def test_seeds_that_other_machines_ran_are_copied_together(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(recipe.read_text().replace("seeds = [0]", "seeds = [0, 1]"))
+    ours, theirs = (run(recipe, seeds=[seed], root=tmp_path / f"machine{seed}", jobs=1) for seed in (0, 1))
+    shutil.copytree(theirs, ours, dirs_exist_ok=True)
+    run(recipe, root=tmp_path / "machine0", jobs=1)
+    made = [ours / f"train/astra_plus/seed_{seed}/attempts" for seed in (0, 1)]
+    assert [path.read_text() for path in made] == [".", "."]
+    assert asked(ours / "report")["seeds"] == [0, 1]
+
+
 def test_a_recipe_with_data_is_labelled_and_has_nothing_to_collect(recipe: Path, tmp_path: Path) -> None:
     recipe.write_text('data = "me/walks"\n' + recipe.read_text())
     with pytest.raises(BadInputError, match=r"r\.toml has data, me/walks: there is nothing to collect"):
