@@ -7,7 +7,8 @@ from astra_data.core.config import read_written
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.experiments.recipe import Recipe
-from astra_data.worlds.own_code import code_digest
+from astra_data.worlds.code_digest import code_digest
+from astra_data.worlds.registry import place_of
 
 CODE = "code.json"
 """Beside recipe.json: the digests of "task", and of methods by their names, with their settings."""
@@ -37,9 +38,12 @@ def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
 def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
     """Refuse code at a `place` that is not what the folder of a run has recorded of its task, or of a method.
 
+    That of an installed task may be its name.
+
     Raises:
         BadInputError: it is another, or the record is damaged.
     """
+    place = place_of(place) if name == "task" else place
     now = code_digest(place)
     if now and now != _recorded(run / CODE).get(name, now):
         raise BadInputError(
@@ -62,7 +66,7 @@ def _recorded(path: Path) -> dict[str, str]:
 
 
 def _places(recipe: Recipe) -> dict[str, str]:
-    return {"task": recipe.task} | {name: own.method for name, own in recipe.own_methods.items()}
+    return {"task": place_of(recipe.task)} | {name: own.method for name, own in recipe.own_methods.items()}
 
 
 def _digests(recipe: Recipe) -> dict[str, str]:

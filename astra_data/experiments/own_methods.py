@@ -1,6 +1,6 @@
 """Methods of one's own as recipes name them: by a place, or by a table of the place and settings."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,8 @@ from pydantic import ConfigDict, model_validator
 
 from astra_data.core.config import Config, validated
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.methods import METHODS, add_method
+from astra_data.core.naming import base_method
+from astra_data.methods import METHODS, add_method, is_of_package, offered_methods
 from astra_data.worlds.own_code import place_beside
 
 
@@ -71,3 +72,24 @@ def looked_up(own_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:
             table = table | {"method": place_beside(table["method"], folder)}
         found[name] = table
     return found
+
+
+def with_offered(tables: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
+    """Return the `tables` of a recipe with the methods that installed packages offer among `own_methods`.
+
+    Those are its rows, and its tables, by a name that a package offers; the table of one has its settings.
+
+    Args:
+        tables: as a file or a record has them, not checked yet.
+        keys: of recipes, which are no names of methods.
+    """
+    rows, own = tables.get("methods", ()), tables.get("own_methods", {})
+    if not isinstance(rows, list | tuple) or not isinstance(own, Mapping):
+        return dict(tables)
+    names = {base_method(row) for row in rows if isinstance(row, str)} | {*tables}
+    names = {name for name in names - {*keys} - own.keys() if not is_of_package(name)}
+    found = {name: place for name, place in offered_methods().items() if name in names} if names else {}
+    given = {name: table for name in found if isinstance(table := tables.get(name, {}), dict)}
+    taken = {name: table | {"method": found[name]} for name, table in given.items()}
+    rest = {key: value for key, value in tables.items() if key not in taken}
+    return rest | {"own_methods": {**own, **taken}} if taken else rest

@@ -16,7 +16,7 @@ from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
-from astra_data.experiments.own_methods import OwnMethod, add_all
+from astra_data.experiments.own_methods import OwnMethod, add_all, with_offered
 from astra_data.experiments.recipe_tables import method_field, plus_field, stage_field
 from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
@@ -99,7 +99,10 @@ class Recipe(Config):
     @model_validator(mode="before")
     @classmethod
     def _has_data_or_collects(cls, tables: Any) -> Any:  # noqa: ANN401 - checked next
-        if not isinstance(tables, dict) or tables.get("data") is None:
+        if not isinstance(tables, dict):
+            return tables
+        tables = with_offered(tables, cls.model_fields)
+        if tables.get("data") is None:
             return tables
         if tables.get("collect") is not None:
             raise ValueError("data: it takes the place of [collect]: leave out one of them")

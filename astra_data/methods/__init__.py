@@ -72,7 +72,7 @@ def add_method(name: str, place: str) -> None:
         raise BadInputError(f"method '{name}' is {known} already: give {place} another name")
     if not _NAME.fullmatch(name) or is_plus(name):
         raise BadInputError(f"method '{name}': expected a name of a-z, 0-9 and _ that does not end in {PLUS}")
-    if name in METHODS and name not in _PLACES:
+    if is_of_package(name):
         raise BadInputError(f"method '{name}' is one of the package: give {place} another name")
     method = own_object(place)
     if not isinstance(method, Method):
@@ -92,6 +92,16 @@ def add_method(name: str, place: str) -> None:
         add_policy_kind(method.learn.policy)
     METHODS[name] = replace(method, name=name)
     _PLACES[name] = found
+
+
+def is_of_package(name: str) -> bool:
+    """Return whether a method is one of the package, not of the user's."""
+    return name in METHODS and name not in _PLACES
+
+
+def offered_methods() -> dict[str, str]:
+    """Return the places of the methods that installed packages offer, by name."""
+    return offered(ENTRY_POINTS)
 
 
 def tables() -> dict[str, Table]:
@@ -118,8 +128,8 @@ def method_named(row: str) -> Method:
         BadInputError: there is no such method.
     """
     name = base_method(row)
-    if name not in METHODS and (point := offered(ENTRY_POINTS).get(name)):
-        add_method(name, point)
+    if name not in METHODS and (place := offered_methods().get(name)):
+        add_method(name, place)
     if name not in METHODS:
         raise BadInputError(f"unknown method '{row}'; known: {', '.join(METHODS)}, each also with {PLUS}")
     return METHODS[name]

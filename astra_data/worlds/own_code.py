@@ -1,10 +1,8 @@
 """Objects from the user's code: "cart.py:TASK" in a file, "package.module:TASK" in an installed package."""
 
-import ast
 import hashlib
 import importlib
 import importlib.util
-import os
 import sys
 import traceback
 from collections.abc import Iterator
@@ -16,13 +14,10 @@ from typing import Any
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.worlds.code_digest import with_neighbours
 
 _PREFIX = "astra_data_own_"
 """Of the names of modules that are files of the user's."""
-_READ = (".csv", ".json", ".mjcf", ".npy", ".npz", ".obj", ".stl", ".toml", ".txt", ".urdf", ".xml", ".yaml")
-"""Endings of files that code reads."""
-_WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) else {}
-"""What makes `ast.dump` write the same in each version of Python, for digests."""
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -72,83 +67,6 @@ def file_of(name: str) -> dict[str, str]:
     return {"file_sha256": file_digest(place)} if place.suffix == ".py" and place.is_file() else {}
 
 
-def code_digest(name: str) -> str | None:
-    """Return a digest of the code that `name` begins with; None where it is no file.
-
-    The files and packages beside it that it imports count too, and models and data beside these that they
-    name, such as a robot.xml; comments and layout do not.
-
-    Raises:
-        BadInputError: one of these files is no Python.
-    """
-    place = Path(name.rpartition(":")[0])
-    if place.suffix != ".py" or not place.is_file():
-        return None
-    digest = hashlib.sha256()
-    for path, tree in _with_neighbours(place):
-        name = path.relative_to(place.parent).as_posix()
-        digest.update(f"{name}\n{ast.dump(tree, **_WHOLE)}\n".encode())
-        for file in _named_beside(path, tree):
-            digest.update(f"{file.name}\n{file_digest(file)}\n".encode())
-    return digest.hexdigest()
-
-
-def _with_neighbours(place: Path) -> Iterator[tuple[Path, ast.Module]]:
-    """Yield a file and those beside it that it imports, all of a package, each once, and what is in it.
-
-    Raises:
-        BadInputError: one of them is no Python.
-    """
-    todo, seen = [place], set[Path]()
-    while todo:
-        path = todo.pop()
-        seen.add(path)
-        try:
-            tree = ast.parse(path.read_bytes())
-        except SyntaxError as error:
-            if path.parent == place.parent:
-                raise BadInputError(
-                    f"{path}, line {error.lineno}: expected Python, got {error.msg}"
-                ) from None
-            # A package may hold what is never imported, such as a template.
-            tree = ast.Module([ast.Expr(ast.Constant(path.read_bytes()))], [])
-        yield path, tree
-        beside = {file for module in _imported(tree) for file in _files_of(module, place.parent)}
-        todo += sorted(beside - seen - set(todo))
-
-
-def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
-    """Return the models and data in the folder of `place` whose paths within it are texts in it."""
-    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    paths = {Path(text) for text in texts if isinstance(text, str) and text.endswith(_READ)}
-    beside = {place.parent / path for path in paths if not path.is_absolute() and ".." not in path.parts}
-    return sorted(file for file in beside if os.path.isfile(file))  # False of names that no disk takes
-
-
-def _files_of(module: str, folder: Path) -> list[Path]:
-    """Return the file of a top module in `folder`, or all of its package there that is not installed."""
-    file, package = folder / f"{module}.py", folder / module
-    if file.is_file() or not package.is_dir():
-        return [file] if file.is_file() else []
-    spec = None
-    with suppress(ImportError, ValueError):
-        spec = importlib.util.find_spec(module)
-    if spec is not None and spec.origin and not Path(spec.origin).is_relative_to(folder.resolve()):
-        return []
-    return sorted(package.rglob("*.py"))
-
-
-def _imported(tree: ast.Module) -> set[str]:
-    """Return the names of the top modules that a file imports."""
-    names: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module.partition(".")[0])
-    return names
-
-
 def _of_file(path: Path) -> ModuleType:
     if not path.is_file():
         where = "" if path.is_absolute() else f" in {Path.cwd()}"
@@ -185,7 +103,7 @@ def _among_neighbours(path: Path) -> Iterator[None]:
     known = {_folder_of(module) for name, module in loaded.items() if name.startswith(_PREFIX)} - {folder}
     theirs = {}
     with suppress(BadInputError):  # what is no Python is told where it is run
-        for file, _ in _with_neighbours(path):
+        for file, _ in with_neighbours([path], path.parent):
             if file.stem in loaded and _folder_of(loaded[file.stem]) in known:
                 theirs[file.stem] = sys.modules.pop(file.stem)
     ours = [len(places) - 1 - places[::-1].index(place) for place in _APPENDED if place in places]

@@ -44,6 +44,11 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
     )
 
 
+def place_of(name: str) -> str:
+    """Return the place of the code of a task: of one that an installed package offers, where it is there."""
+    return name if name in TASKS or is_own_code(name) else offered(ENTRY_POINTS).get(name, name)
+
+
 def known_tasks() -> dict[str, Task]:
     """Return the tasks of this package and of installed ones, by name.
 

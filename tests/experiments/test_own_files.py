@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments.experiment import Experiment, load_experiment
 from astra_data.experiments.grounded_env import training_of
 from astra_data.experiments.own_files import CODE, check_unchanged, record_code
+from astra_data.experiments.plan import plan
 from astra_data.experiments.trained_policy import load_policy, task_of
+from astra_data.worlds import registry
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
@@ -94,6 +97,52 @@ def test_rows_are_outdated_by_other_settings(made: Path) -> None:
     experiment = load(made)
     assert experiment.outdated("ground/other/seed_0").startswith("the settings of other changed since")
     assert experiment.outdated("ground/nas/seed_0") == ""
+
+
+def test_rows_are_outdated_by_another_method_of_an_installed_package(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its settings, in a table of its name, too."""
+    shutil.copy(ROOT / "recipes/examples/methods/delta_action.py", made / "theirs_of_mine.py")
+    monkeypatch.syspath_prepend(made)
+    monkeypatch.setattr("astra_data.methods.offered", lambda _: {"theirs": "theirs_of_mine:METHOD"})
+    edit(made / "rail.toml", '\n[own_methods]\nmine = "mine.py:METHOD"\n', "\n[theirs]\nmemory = 8\n")
+    edit(made / "rail.toml", '"mine"', '"theirs"')
+    experiment = load(made)
+    settings = experiment.recipe.settings_of("theirs", "ground")
+    assert settings is not None and settings.model_dump() == {"memory": 8, "learning_rate": 0.003}
+    assert [item.key for item in plan(experiment.recipe, experiment.path, experiment.folder)]
+    (experiment.folder / "ground/theirs/seed_0").mkdir(parents=True)
+    record_code(experiment.recipe, experiment.folder)
+    edit(made / "rail.toml", "memory = 8", "memory = 9")
+    assert load(made).outdated("ground/theirs/seed_0").startswith("the settings of theirs changed since")
+    edit(made / "rail.toml", "memory = 9", "memory = 8")
+    assert load(made).outdated("ground/theirs/seed_0") == ""
+    edit(made / "theirs_of_mine.py", "METHOD = ", "EXTRA = METHOD = ")
+    assert load(made).outdated("ground/theirs/seed_0").startswith("theirs_of_mine changed since")
+    assert load(made).outdated("ground/nas/seed_0") == ""
+    edit(made / "rail.toml", "memory", "memroy")
+    with pytest.raises(RecipeError, match=r"theirs: memroy: unknown key: did you mean 'memory'"):
+        load(made)
+
+
+@pytest.mark.parametrize("name", ["rail", "rail_of_mine:TASK"])
+def test_all_is_outdated_by_another_task_of_an_installed_package(
+    made: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (made / "rail.py").rename(made / "rail_of_mine.py")
+    monkeypatch.delitem(sys.modules, "rail_of_mine", raising=False)
+    monkeypatch.syspath_prepend(made)
+    monkeypatch.setattr(registry, "offered", lambda _: {"rail": "rail_of_mine:TASK"})
+    edit(made / "rail.toml", "rail.py:TASK", name)
+    experiment = load(made)
+    (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    record_code(experiment.recipe, experiment.folder)
+    check_unchanged(name, experiment.folder)
+    edit(made / "rail_of_mine.py", "0.1 * command", "0.2 * command")
+    assert load(made).outdated("collect/seed_0").startswith("rail_of_mine changed since")
+    with pytest.raises(BadInputError, match=r"^rail_of_mine changed since .* was made: bring it back"):
+        check_unchanged(name, experiment.folder)
 
 
 def test_a_method_that_the_recipe_has_no_more_outdates_nothing(made: Path) -> None:

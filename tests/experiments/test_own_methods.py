@@ -6,7 +6,7 @@ import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.experiments import run
-from astra_data.experiments.own_methods import OwnMethod, add_all, looked_up
+from astra_data.experiments.own_methods import OwnMethod, add_all, looked_up, with_offered
 from astra_data.methods import METHODS
 
 EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"
@@ -68,3 +68,19 @@ def test_files_are_looked_up_beside_the_recipe() -> None:
         "c": {"method": "package.mod:METHOD"},
         "d": 7,
     }
+
+
+def test_those_that_packages_offer_are_named_as_if_the_recipe_gave_their_places(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    offered = {"theirs": "their.module:METHOD", "unused": "no.module:METHOD", "nas": "no.module:METHOD"}
+    monkeypatch.setattr("astra_data.methods.offered", lambda _: offered)
+    tables = {"methods": ["nas", "theirs_plus"], "theirs": {"memory": 5}, "own_methods": {"mine": DELTA}}
+    assert with_offered(tables, ("methods", "own_methods")) == {
+        "methods": ["nas", "theirs_plus"],
+        "own_methods": {"mine": DELTA, "theirs": {"memory": 5, "method": "their.module:METHOD"}},
+    }
+    for as_it_is in ({"methods": ["nas"], "mine": {}}, {"methods": "theirs"}, {"theirs": 5}):
+        assert with_offered(as_it_is, ("methods", "own_methods")) == as_it_is
+    given = {"methods": ["theirs"], "own_methods": {"theirs": DELTA}}
+    assert with_offered(given, ("methods", "own_methods")) == given

@@ -17,7 +17,7 @@ from astra_data.stages.ground import ground
 from astra_data.stages.pair import PairConfig, pair
 from astra_data.stages.train import train
 from astra_data.training.policy_file import PolicyFile, running
-from astra_data.worlds.own_code import code_digest
+from astra_data.worlds.code_digest import code_digest
 from astra_data.worlds.registry import TASKS
 
 

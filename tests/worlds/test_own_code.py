@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.own_code import code_digest, explained, file_of, found_near, is_own_code, own_object
+from astra_data.worlds.own_code import explained, file_of, found_near, is_own_code, own_object
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -152,50 +152,6 @@ def test_a_file_is_known_by_its_digest() -> None:
     assert file_of("antmaze-umaze") == file_of("package.module:TASK") == {}
 
 
-def test_code_has_one_digest_in_every_version_of_python(tmp_path: Path) -> None:
-    (tmp_path / "cart.py").write_text("TASK = 1\n")
-    assigned = "Assign(targets=[Name(id='TASK', ctx=Store())], value=Constant(value=1))"
-    parsed = f"Module(body=[{assigned}], type_ignores=[])"
-    told = hashlib.sha256(f"cart.py\n{parsed}\n".encode()).hexdigest()
-    assert code_digest(f"{tmp_path}/cart.py:TASK") == told
-
-
-def test_code_is_known_by_what_it_does_and_imports_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "cart.py").write_text("from wheel import R\nimport json\nTASK = R\n")
-    (tmp_path / "wheel.py").write_text("import cart\nR = 1\n")
-    (tmp_path / "json.py").write_text("")
-    first = code_digest(f"{tmp_path}/cart.py:TASK")
-    (tmp_path / "cart.py").write_text("# A cart.\nfrom wheel import R\nimport json\n\nTASK = (R)\n")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") == first
-    (tmp_path / "wheel.py").write_text("import cart\nR = 2\n")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
-    assert code_digest("antmaze-umaze") is code_digest("some.module:TASK") is None
-    (tmp_path / "wheel.py").write_text("R = 1\nR = = 2\n")
-    with pytest.raises(BadInputError, match=r"wheel\.py, line 2: expected Python, got invalid syntax"):
-        code_digest(f"{tmp_path}/cart.py:TASK")
-
-
-def test_the_digest_covers_a_package_beside_the_file(tmp_path: Path) -> None:
-    (tmp_path / "parts/joints").mkdir(parents=True)
-    (tmp_path / "cart.py").write_text("from parts.joints import knee\nTASK = knee.LIMIT\n")
-    (tmp_path / "parts/__init__.py").write_text("import wheel\n")
-    (tmp_path / "wheel.py").write_text("R = 1\n")
-    (tmp_path / "other.py").write_text("R = 1\n")
-    (tmp_path / "parts/joints/knee.py").write_text("LIMIT = 1\n")
-    digests = [code_digest(f"{tmp_path}/cart.py:TASK")]
-    for path, text in (("other.py", "R = 2"), ("parts/joints/knee.py", "LIMIT = 2"), ("wheel.py", "R = 2")):
-        (tmp_path / path).write_text(text)
-        digests.append(code_digest(f"{tmp_path}/cart.py:TASK"))
-    assert digests[0] == digests[1]
-    assert len(set(digests)) == 3
-    (tmp_path / "parts/template.py").write_text("class {{ name }}:\n")
-    (tmp_path / "cart.py").write_text("import numpy\nfrom parts.joints import knee\nTASK = knee.LIMIT\n")
-    assert (with_template := code_digest(f"{tmp_path}/cart.py:TASK")) not in (*digests, None)
-    (tmp_path / "numpy").mkdir()
-    (tmp_path / "numpy/__init__.py").write_text("not the one that is installed\n")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") == with_template
-
-
 def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) -> None:
     file = tmp_path / "wheel.py"
     file.write_text("import numpy as np\n\n\ndef roll():\n    return np.zeros(3).reshape(2, 2)\n")
@@ -224,30 +180,6 @@ def test_a_place_is_named_once_and_only_where_it_is_the_users(tmp_path: Path) ->
 def test_a_file_of_another_kind_is_no_module(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"cart.csv: expected a Python file"):
         own_object(f"{tmp_path / 'cart.csv'}:TASK")
-
-
-def test_the_digest_covers_data_that_the_files_name(tmp_path: Path) -> None:
-    """A model in MuJoCo's XML, say; what is beside it and not named does not count."""
-    (tmp_path / "parts").mkdir()
-    names = ["", "/", "\0.xml", "cart.py", "run.log", "../beside.xml", f"{'轮' * 100}.xml"]
-    (tmp_path / "cart.py").write_text(f'XML = "parts/cart.xml"\nNO = {names}\n')
-    (tmp_path / "run.log").write_text("1")
-    (tmp_path / "parts/cart.xml").write_text("<mujoco/>")
-    (tmp_path / "other.xml").write_text("<mujoco/>")
-    first = code_digest(f"{tmp_path}/cart.py:TASK")
-    (tmp_path / "other.xml").write_text("<mujoco></mujoco>")
-    (tmp_path / "run.log").write_text("2")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") == first
-    (tmp_path / "parts/cart.xml").write_text("<mujoco></mujoco>")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
-
-
-def test_data_outside_of_its_folder_does_not_count(tmp_path: Path) -> None:
-    (tmp_path / "cart").mkdir()
-    (tmp_path / "cart/cart.py").write_text('XML = "../beside.xml"\n')
-    without = code_digest(f"{tmp_path}/cart/cart.py:TASK")
-    (tmp_path / "beside.xml").write_text("<mujoco/>")
-    assert code_digest(f"{tmp_path}/cart/cart.py:TASK") == without
 
 
 def test_a_file_s_neighbours_come_before_those_of_others_whatever_was_appended(
