@@ -9,7 +9,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.files import GROUNDING, save_grounding
+from astra_data.grounding.files import GROUNDING, load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.open_loop_error import gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -69,7 +69,8 @@ def ground(
         grounding, metrics = fit(fitting)
         spent = stopwatch.spent()
         progress(1.0, "gap report")
-        gap = gap_report(world, grounding, held_out, seed=seed)
         save_grounding(folder / GROUNDING, grounding, episodes)
+        # What policies are trained in is what was written.
+        gap = gap_report(world, load_grounding(folder / GROUNDING, device), held_out, seed=seed)
         (folder / METRICS).write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / GAP).write_text(json.dumps(gap, indent=1))

@@ -17,6 +17,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.networks.grounding import LossWeights
+from astra_data.methods import add_method
 from astra_data.methods.compass import CompassConfig
 from astra_data.stages.ground import ground
 from astra_data.stages.train import train
@@ -131,6 +132,17 @@ def test_the_gap_is_measured_on_held_out_episodes(seed: int, task: str, paired: 
     for quantity, entries in (("position_m", [0, 1]), ("velocity_m_s", [2, 3])):
         expected = np.linalg.norm(wrong[:, entries], axis=1).mean()
         assert gap["raw"][quantity]["mean"][0] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("method", "is_raw"), [("METHOD", False), ("LOSSY", True)])
+def test_the_gap_is_that_of_the_grounding_in_the_file(
+    method: str, is_raw: bool, task: str, paired: Path, tmp_path: Path, forgotten_methods: None
+) -> None:
+    add_method("mine", f"shifted_method:{method}")
+    ground(task, "mine", GROUND, dataset=paired, out=tmp_path / "grounded")
+    gap = json.loads((tmp_path / "grounded/gap.json").read_text())
+    raw, grounded = (gap[name]["position_m"]["mean"][0] for name in ("raw", "grounded"))
+    assert (grounded == pytest.approx(raw, rel=1e-4)) == is_raw
 
 
 def test_the_residual_is_the_scatter_on_held_out_episodes(grounded: Path, paired: Path) -> None:
