@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import random
 import sys
 import time
 import traceback
@@ -11,8 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from astra_data.core.disk import disk_error
 from astra_data.core.errors import AstraDataError
+from astra_data.core.seeding import derive
 
 SECONDS_BETWEEN_NOTES = 0.1
 Note = tuple[float, str]
@@ -95,6 +99,8 @@ def pickled(item: Item, prepare: Callable[[], object] | None) -> bytes:
 def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -> float | AstraDataError:
     """Run an item in this process; return its wall-clock time in s, or the error with which it failed.
 
+    The global generators of Python, numpy and torch are seeded by its key: by stage, row and seed.
+
     Args:
         key: of the item.
         work: of `pickled`.
@@ -107,7 +113,9 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
             prepare, call = pickle.loads(work)
             if prepare:
                 prepare()
-            pickle.loads(call)(progress=Reporter(send))
+            made = pickle.loads(call)
+            _seed_global_generators(key)
+            made(progress=Reporter(send))
     except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
         expected = error if isinstance(error, AstraDataError) else disk_error(error)
         if expected:
@@ -115,6 +123,15 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
         last = traceback.format_exception_only(error)[-1].strip()
         return AstraDataError(f"{key} crashed: {last} (traceback: {log})")
     return time.perf_counter() - began
+
+
+def _seed_global_generators(key: str) -> None:
+    """Let an item begin as in a fresh process, whatever ran before it: code of the user's may draw from these."""
+    seed = derive(0, key)
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    if torch := sys.modules.get("torch"):  # its import takes long, and is of no use to what did without
+        torch.manual_seed(seed)
 
 
 class Reporter:

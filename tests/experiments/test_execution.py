@@ -1,10 +1,13 @@
 import os
+import random
 import sys
 from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from fake_items import crash, fail, fill_the_disk, touch
 
 from astra_data.core.errors import DiskError, MissingStageError
@@ -102,6 +105,23 @@ def test_an_item_may_hold_an_object_of_a_file_that_its_preparation_runs(tmp_path
     del sys.modules[type(size).__module__]  # as in a process of its own
     assert isinstance(run_item("a", work, tmp_path / "log", lambda note: None), float)
     assert (tmp_path / "kept").read_text() == "2.5"
+
+
+def draw(path: Path, progress: object) -> None:
+    drawn = random.random(), float(np.random.random()), float(torch.rand(()))
+    path.write_text(f"{drawn}")
+
+
+def test_what_an_item_draws_depends_on_its_key_alone(tmp_path: Path) -> None:
+    """Not on what ran before it in the process, as other rows, or none where a run goes on."""
+    drawn: dict[str, list[str]] = {"ground/mine/seed_0": [], "ground/mine/seed_1": [], "train/mine/seed_0": []}
+    for key in (*drawn, *reversed(drawn)):
+        work = pickled(Item(key, (), partial(draw, tmp_path / "drawn")), None)
+        assert isinstance(run_item(key, work, tmp_path / "log", lambda note: None), float)
+        drawn[key].append((tmp_path / "drawn").read_text())
+    assert all(first == again for first, again in drawn.values())
+    values = [value for first, _ in drawn.values() for value in first.strip("()").split(", ")]
+    assert len(set(values)) == 9
 
 
 def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
