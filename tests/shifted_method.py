@@ -1,7 +1,7 @@
 """Methods of a user's own whose correction is known: each step ends a little further along the first axis."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
@@ -71,4 +71,26 @@ METHOD = Method(
 )
 LOSSY = Method(
     name="lossy", title="Lossy", fit=lambda fitting: (Lossy(shift_of(fitting)), {}), grounding=Lossy
+)
+UNNAMED = replace(LOSSY, grounding=None)
+
+
+class NarrowSimulator(ShiftedSimulator):
+    """Forgets all but the first axis."""
+
+    def step(self, action: Tensor) -> Tensor:
+        return super().step(action)[:, :1]
+
+
+class Narrow(Shifted):
+    """Corrects the first axis only."""
+
+    kind = "shifted, narrow"
+
+    def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> EpisodeSimulator:
+        return NarrowSimulator(simulator, self.shift, scatter)
+
+
+NARROW = Method(
+    name="narrow", title="Narrow", fit=lambda fitting: (Narrow(shift_of(fitting)), {}), grounding=Narrow
 )

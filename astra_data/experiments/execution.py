@@ -126,7 +126,7 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
 
 
 def _seed_global_generators(key: str) -> None:
-    """Let an item begin as in a fresh process, whatever ran before it: code of the user's may draw from these."""
+    """Let an item draw the same whatever ran before it: code of the user's may draw from these."""
     seed = derive(0, key)
     random.seed(seed)
     np.random.seed(seed % 2**32)

@@ -1,12 +1,15 @@
 """All methods by name; each file defines one method, or a family of them. Those of the user's are added."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from astra_data.core.config import Config
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.grounding.files import KINDS
+from astra_data.grounding.own_grounding import missing_parts
 from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
 from astra_data.methods.compass import COMPASS, COMPASS_UNIFORM
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
@@ -20,7 +23,9 @@ from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
 from astra_data.training.own_learner import OwnLearner
 from astra_data.training.policy_file import add_policy_kind
+from astra_data.training.train import InSimulator
 from astra_data.worlds.own_code import offered, own_object
+from astra_data.worlds.variation import Variation
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -62,7 +67,8 @@ def add_method(name: str, place: str) -> None:
         place: "file.py:METHOD" or "package.module:METHOD", whose code is run.
 
     Raises:
-        BadInputError: the name is taken or cannot be that of a folder; or what is there is no method.
+        BadInputError: the name is taken or cannot be that of a folder; or what is there is no method, or
+            lacks a part.
     """
     file, is_file, attribute = place.partition(".py:")
     found = f"{Path(f'{file}.py').resolve()}:{attribute}" if is_file else place
@@ -77,10 +83,8 @@ def add_method(name: str, place: str) -> None:
     method = own_object(place)
     if not isinstance(method, Method):
         raise BadInputError(f"{place} is a {type(method).__name__}, expected a Method")
-    if method.learn is None:
-        raise BadInputError(f"{place} learns no policy: expected learn, an OwnLearner that returns one")
-    if method.table is not None and method.table.ranges:
-        raise BadInputError(f"{place} has a table of ranges, which only methods of the package have")
+    if faults := [*_faults(method)]:
+        raise BadInputError("; ".join(f"{place} {fault}" for fault in faults))
     if kind := method.grounding:
         owner = KINDS.setdefault(kind.kind, kind)
         if owner is not kind:
@@ -92,6 +96,29 @@ def add_method(name: str, place: str) -> None:
         add_policy_kind(method.learn.policy)
     METHODS[name] = replace(method, name=name)
     _PLACES[name] = found
+
+
+def _faults(method: Method) -> Iterator[str]:
+    """Yield what a method of the user's lacks to be a row."""
+    if method.learn is None:
+        yield "learns no policy: expected learn, an OwnLearner that returns one"
+    if method.grounding is not None and (missing := missing_parts(method.grounding)):
+        yield f"has a grounding, {method.grounding.__name__}, without {', '.join(missing)}"
+    if (table := method.table) is None:
+        return
+    if table.ranges:
+        yield "has a table of ranges, which only methods of the package have"
+    if not issubclass(table.model, Config):
+        yield (
+            f"has settings of {table.model.__name__}, which is no astra_data.core.config.Config: expected "
+            f"class {table.model.__name__}(Config)"
+        )
+    elif issubclass(table.model, Variation):
+        return  # ranges, which the environment reads
+    elif method.configures == "ground" and method.fit is None:
+        yield 'has settings that nothing reads: configures="ground" needs fit'
+    elif method.configures == "train" and type(method.learn) is InSimulator:
+        yield 'has settings that nothing reads: expected configures="ground" if they are those of fit'
 
 
 def is_of_package(name: str) -> bool:

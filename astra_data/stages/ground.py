@@ -6,14 +6,16 @@ from pathlib import Path
 from astra_data.core.artefact import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import base_method
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import GROUNDING, load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.open_loop_error import gap_report
+from astra_data.grounding.own_grounding import check_step, fitted
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.methods import method_named
+from astra_data.methods import is_of_package, method_named
 from astra_data.reports.artefacts import GAP, METRICS
 from astra_data.worlds.registry import task_named
 
@@ -44,8 +46,8 @@ def ground(
         progress: called with the fraction done.
 
     Raises:
-        BadInputError: the method does not ground, the dataset is not paired, or `out` was begun
-            with other settings.
+        BadInputError: the method does not ground, the dataset is not paired, `out` was begun with other
+            settings, or a method of the user's makes no grounding that can be used.
 
     Example:
         >>> from pathlib import Path
@@ -66,11 +68,13 @@ def ground(
     with finished_folder(out, config=settings_text, made_from=made_from) as folder:
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
         stopwatch = Stopwatch()
-        grounding, metrics = fit(fitting)
+        grounding, metrics = fitted(fit(fitting))
         spent = stopwatch.spent()
         progress(1.0, "gap report")
         save_grounding(folder / GROUNDING, grounding, episodes)
-        # What policies are trained in is what was written.
-        gap = gap_report(world, load_grounding(folder / GROUNDING, device), held_out, seed=seed)
+        written = load_grounding(folder / GROUNDING, device)  # what policies are trained in
+        if not is_of_package(base_method(method)):
+            check_step(world, written, held_out)
+        gap = gap_report(world, written, held_out, seed=seed)
         (folder / METRICS).write_text(json.dumps(made | spent | metrics, indent=1))
         (folder / GAP).write_text(json.dumps(gap, indent=1))

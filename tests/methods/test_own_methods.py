@@ -238,6 +238,48 @@ def test_what_learns_no_policy_is_no_row_of_the_users(tmp_path: Path) -> None:
     assert "mine" not in METHODS
 
 
+HEAD = """
+from pydantic import BaseModel
+from astra_data.core.config import Config
+from astra_data.methods.direct_transfer import DIRECT_TRANSFER
+from astra_data.methods.method import Method, Table
+from astra_data.grounding.protocols import FittedGrounding
+class Ours(Config):
+    memory: int = 4
+class Theirs(BaseModel):
+    memory: int = 4
+class Half(FittedGrounding):
+    kind = "half"
+def fit(fitting): ...
+METHOD = Method(name="", title="",
+"""
+
+
+@pytest.mark.parametrize(
+    ("rest", "told"),
+    [
+        (
+            "fit=fit, table=Table('mine', Ours)",
+            "has settings that nothing reads: expected configures=.ground",
+        ),
+        ("table=Table('mine', Ours), configures='ground'", "has settings that nothing reads: .* needs fit"),
+        (
+            "fit=fit, table=Table('mine', Theirs), configures='ground'",
+            r"has settings of Theirs, which is no .*Config: expected class Theirs\(Config\)",
+        ),
+        ("fit=fit, grounding=Half", "has a grounding, Half, without scatter, to_file, from_file"),
+        ("learn=None, grounding=Half", "learns no policy.*; .*mine.py:METHOD has a grounding, Half, without"),
+    ],
+)
+def test_what_a_method_lacks_is_told_before_anything_runs(tmp_path: Path, rest: str, told: str) -> None:
+    (tmp_path / "mine.py").write_text(f"{HEAD}{rest})\n")
+    with pytest.raises(RecipeError, match=f"mine.py:METHOD {told}"):
+        load_experiment(
+            recipe(tmp_path, '["mine"]', f'mine = "{tmp_path}/mine.py:METHOD"\n'), tmp_path / "runs"
+        )
+    assert "mine" not in METHODS
+
+
 def test_a_kind_of_the_package_is_not_replaced(tmp_path: Path) -> None:
     text = (EXAMPLES / "delta_action.py").read_text().replace('kind = "delta action"', 'kind = "residual"')
     (tmp_path / "mine.py").write_text(text)

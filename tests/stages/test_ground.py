@@ -145,6 +145,16 @@ def test_the_gap_is_that_of_the_grounding_in_the_file(
     assert (grounded == pytest.approx(raw, rel=1e-4)) == is_raw
 
 
+@pytest.mark.parametrize(("method", "told"), [("UNNAMED", "expected grounding=Lossy"), ("NARROW", "got")])
+def test_a_grounding_that_no_policy_could_be_trained_in_is_not_written(
+    method: str, told: str, task: str, paired: Path, tmp_path: Path, forgotten_methods: None
+) -> None:
+    add_method("mine", f"shifted_method:{method}")
+    with pytest.raises(BadInputError, match=told):
+        ground(task, "mine", GROUND, dataset=paired, out=tmp_path / "grounded")
+    assert not (tmp_path / "grounded").exists()
+
+
 def test_the_residual_is_the_scatter_on_held_out_episodes(grounded: Path, paired: Path) -> None:
     model = load_history_model(grounded / "grounding.safetensors")
     _, held_out = PairedEpisodes.load(paired).split(GROUND.held_out_share, 0)

@@ -1,0 +1,81 @@
+"""What is expected of groundings of the user's, told before anything is made of them."""
+
+import json
+from typing import Any
+
+import torch
+
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.files import KINDS
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import FittedGrounding, Grounding
+from astra_data.worlds.own_code import explained
+from astra_data.worlds.task import Task
+
+_WRITTEN = ("kind", "scatter", "to_file", "from_file")
+"""The parts that a grounding does not inherit."""
+
+
+def missing_parts(grounding: type) -> list[str]:
+    """Return the parts of a `FittedGrounding` that a class has not, and does not inherit."""
+    inherited = [name for name in vars(Grounding) if not name.startswith("_")]
+    has = {name for one in grounding.__mro__ if one not in FittedGrounding.__mro__ for name in vars(one)}
+    if FittedGrounding in grounding.__mro__:
+        has |= {*inherited} - {*_WRITTEN}
+    return [name for name in dict.fromkeys((*_WRITTEN, *inherited)) if name not in has]
+
+
+def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
+    """Return the grounding and the figures that a fit `returned`.
+
+    Raises:
+        BadInputError: they are no such pair, no class of groundings that is known, or no JSON values.
+    """
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        raise BadInputError(
+            f"fit returned a {type(returned).__name__}: expected a pair, the grounding and a dict of figures"
+        )
+    grounding, figures = returned
+    name = type(grounding).__name__
+    if KINDS.get(getattr(grounding, "kind", "")) is not type(grounding):
+        raise BadInputError(
+            f"fit returned a {name}, which cannot be read again: expected grounding={name} of the Method"
+        )
+    if not isinstance(figures, dict):
+        raise BadInputError(f"fit returned a {type(figures).__name__} of figures: expected a dict")
+    if faults := [
+        f"{key!r} is a {type(value).__name__}" for key, value in figures.items() if not _is_json(value)
+    ]:
+        raise BadInputError(
+            f"the figures of fit: {', '.join(faults)}: expected numbers, texts, lists or dicts, such as "
+            "those of value.tolist()"
+        )
+    return grounding, figures
+
+
+@torch.no_grad()
+def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
+    """Step the corrected simulator of `task` once, from where the first of `episodes` begin.
+
+    Raises:
+        BadInputError: it fails, or it returns something else than states (B, X).
+    """
+    windows = episodes.windows
+    state, goal, action = (values[:2, 0] for values in (windows.state, windows.goal, windows.action))
+    with explained(f"a step of {task.name} as corrected by {type(grounding).__name__}"):
+        simulator = grounding.simulator(task, len(state), str(state.device))
+        simulator.start(state, torch.arange(len(state), device=state.device), goal)
+        landed: object = simulator.step(action)
+    got = tuple(landed.shape) if isinstance(landed, torch.Tensor) else f"a {type(landed).__name__}"
+    if got != tuple(state.shape):
+        raise BadInputError(
+            f"{type(simulator).__name__}.step: expected states of shape {tuple(state.shape)}, got {got}"
+        )
+
+
+def _is_json(value: object) -> bool:
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError):
+        return False
+    return True

@@ -1,0 +1,115 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shifted_method
+import torch
+from shifted_method import Lossy, Shifted, ShiftedSimulator
+
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.files import KINDS
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.own_grounding import check_step, fitted, missing_parts
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import FittedGrounding
+from astra_data.worlds.registry import task_named
+
+SHIFTED = Shifted(torch.tensor([0.01]))
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
+
+
+def test_parts_that_a_grounding_does_not_inherit_are_to_be_written() -> None:
+    class Half(FittedGrounding):
+        def scatter(self, episodes: PairedEpisodes) -> torch.Tensor:
+            return torch.eye(1)
+
+    class Alone:
+        kind = "alone"
+
+    assert missing_parts(Shifted) == missing_parts(Lossy) == missing_parts(HistoryGrounding) == []
+    assert missing_parts(Half) == ["kind", "to_file", "from_file"]
+    assert {"scatter", "from_file", "simulator", "for_replay"} <= {*missing_parts(Alone)}
+
+
+def test_a_pair_of_a_grounding_and_figures_is_as_it_was(known: None) -> None:
+    figures = {"loss": 0.5, "epochs": [{"step": 1}], "note": None}
+    assert fitted((SHIFTED, figures)) == (SHIFTED, figures)
+
+
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        (SHIFTED, "fit returned a Shifted: expected a pair, the grounding and a dict of figures"),
+        (None, "fit returned a NoneType: expected a pair"),
+        ((SHIFTED, {}, 1), "fit returned a tuple: expected a pair"),
+        ((SHIFTED, 0.5), "fit returned a float of figures: expected a dict"),
+        (
+            (Lossy(torch.zeros(1)), {}),
+            "fit returned a Lossy, which cannot be read again: expected grounding=Lossy of the Method",
+        ),
+        ((torch.zeros(1), {}), "fit returned a Tensor, which cannot be read again"),
+        (
+            (SHIFTED, {"a": 1, "loss": torch.zeros(()), "n": np.int64(3)}),
+            "the figures of fit: 'loss' is a Tensor, 'n' is a int64: expected numbers, texts, lists or dicts",
+        ),
+    ],
+)
+def test_what_is_no_such_pair_is_refused(returned: object, told: str, known: None) -> None:
+    with pytest.raises(BadInputError, match=f"^{told}"):
+        fitted(returned)
+
+
+def windows_of(count: int) -> Any:  # noqa: ANN401 - what is read of episodes
+    """Return episodes that begin on the rail of small_cart.py."""
+
+    class Windows:
+        state, goal, action = (torch.full((count, 5, 1), value) for value in (0.0, 1.0, 0.5))
+
+    class Episodes:
+        windows = Windows
+
+    return Episodes
+
+
+RAIL = f"{Path(__file__).parents[1] / 'small_cart.py'}:TASK"
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_a_step_that_is_states_passes(count: int) -> None:
+    check_step(task_named(RAIL), SHIFTED, windows_of(count))
+
+
+@pytest.mark.parametrize(
+    ("landed", "told"),
+    [
+        (
+            lambda self, action: self.simulator.step(action)[:, :0],
+            r"expected states of shape \(2, 1\), got \(2, 0\)",
+        ),
+        (
+            lambda self, action: self.simulator.step(action)[:1],
+            r"expected states of shape \(2, 1\), got \(1, 1\)",
+        ),
+        (lambda self, action: None, r"expected states of shape \(2, 1\), got a NoneType"),
+    ],
+)
+def test_a_step_that_is_no_states_is_refused(
+    landed: Callable[..., object], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ShiftedSimulator, "step", landed)
+    with pytest.raises(BadInputError, match=f"^ShiftedSimulator.step: {told}$"):
+        check_step(task_named(RAIL), SHIFTED, windows_of(4))
+
+
+def test_a_step_that_fails_is_told_with_its_place() -> None:
+    file = Path(shifted_method.__file__).name
+    with pytest.raises(
+        BadInputError, match=rf"^a step of rail-cart as corrected by Shifted fails with .*\({file}"
+    ):
+        check_step(task_named(RAIL), Shifted(torch.zeros(3, 4, 7)), windows_of(4))
