@@ -13,8 +13,8 @@ from pathlib import Path
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 
-_READ = (".csv", ".json", ".mjcf", ".npy", ".npz", ".obj", ".stl", ".toml", ".txt", ".urdf", ".xml", ".yaml")
-"""Endings of files that code reads."""
+_NOT_READ = (".log", ".py", ".pyc")
+"""Endings of files that code names and does not read as data: what it writes, and code, which it imports."""
 _WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) else {}
 """What makes `ast.dump` write the same in each version of Python, for digests."""
 _PACKAGE = Path(__file__).parents[1]
@@ -26,8 +26,8 @@ def code_digest(name: str) -> str | None:
     """Return a digest of the code that `name` begins with; None where it is this package's, or not found.
 
     Of a file, the files and packages beside it that it imports count too; of an installed module, all of its
-    package. So do models and data beside these that they name, such as a robot.xml; comments and layout do
-    not.
+    package. So do models and data beside these that they name, such as a robot.xml; what they find without
+    its name, comments and layout do not.
 
     Raises:
         BadInputError: one of these files is no Python.
@@ -92,11 +92,24 @@ def _installed(module: str) -> tuple[list[Path], Path]:
 
 
 def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
-    """Return the models and data in the folder of `place` whose paths within it are texts in it."""
+    """Return the models and data in the folder of `place` whose paths within it are texts in it.
+
+    Or parts of their paths are, as in `folder / "data" / "weights.npz"`.
+    """
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    paths = {Path(text) for text in texts if isinstance(text, str) and text.endswith(_READ)}
-    beside = {place.parent / path for path in paths if not path.is_absolute() and ".." not in path.parts}
-    return sorted(file for file in beside if os.path.isfile(file))  # False of names that no disk takes
+    paths = sorted({Path(text) for text in texts if isinstance(text, str)})
+    paths = [path for path in paths if path.parts and not path.is_absolute() and ".." not in path.parts]
+    found, todo, seen = set[Path](), [place.parent], set[str]()
+    while todo:
+        folder = todo.pop()
+        if (real := os.path.realpath(folder)) in seen or not os.access(folder, os.R_OK):
+            continue
+        seen.add(real)
+        names = {*os.listdir(folder)}
+        beside = [folder / path for path in paths if path.parts[0] in names]
+        found |= {file for file in beside if file.suffix not in _NOT_READ and os.path.isfile(file)}
+        todo += [one for one in beside if os.path.isdir(one)]
+    return sorted(found)
 
 
 def _files_of(module: str, folder: Path) -> list[Path]:

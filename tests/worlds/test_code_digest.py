@@ -68,6 +68,45 @@ def test_the_digest_covers_data_that_the_files_name(tmp_path: Path) -> None:
     assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
 
 
+@pytest.mark.parametrize(
+    ("code", "file"),
+    [
+        ("WEIGHTS = 'w.pt'", "w.pt"),
+        ("WEIGHTS = open('w.pkl')", "w.pkl"),
+        ("WEIGHTS = open('w.safetensors')", "w.safetensors"),
+        ("SETTINGS = open('c.yml')", "c.yml"),
+        ("DATA = 'd.h5'", "d.h5"),
+        ("TABLE = 'table'", "table"),
+        ("DATA = 'data/w.npz'", "data/w.npz"),
+        ("DATA = Path(__file__).parent / 'data' / 'w.npz'", "data/w.npz"),
+        ("DATA = Path(HERE, 'data/deep').joinpath('er', 'w.npz')", "data/deep/er/w.npz"),
+    ],
+)
+def test_data_of_any_kind_count_by_their_names_or_the_parts_of_their_paths(
+    tmp_path: Path, code: str, file: str
+) -> None:
+    place, named = f"{tmp_path}/cart.py:TASK", tmp_path / file
+    named.parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "cart.py").write_text(f"{code}\n")
+    (named.parent / "another.npz").write_text("1")
+    named.write_text("1")
+    first = code_digest(place)
+    (named.parent / "another.npz").write_text("2")
+    assert code_digest(place) == first
+    named.write_text("2")
+    assert code_digest(place) not in (first, None)
+
+
+def test_folders_that_lead_back_are_looked_into_once(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/back").symlink_to(tmp_path)
+    (tmp_path / "data/w.npz").write_text("1")
+    (tmp_path / "cart.py").write_text("NAMES = ['data', 'back', 'w.npz', '.', './data']\n")
+    first = code_digest(f"{tmp_path}/cart.py:TASK")
+    (tmp_path / "data/w.npz").write_text("2")
+    assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
+
+
 def test_data_outside_of_its_folder_does_not_count(tmp_path: Path) -> None:
     (tmp_path / "cart").mkdir()
     (tmp_path / "cart/cart.py").write_text('XML = "../beside.xml"\n')
