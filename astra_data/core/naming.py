@@ -10,6 +10,9 @@ PLUS = "_plus"
 RECORD = "recipe.json"
 """In the folder of a run: the settings that its artefacts were made with."""
 
+CODE = "code.json"
+"""Beside it: the digests of the user's code, "task" and methods by their names, and their settings."""
+
 RUNS = Path("runs")
 """The folder of the folders of runs, unless another is given."""
 

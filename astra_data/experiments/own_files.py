@@ -6,12 +6,11 @@ from pathlib import Path
 from astra_data.core.config import read_written
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import CODE
 from astra_data.experiments.recipe import Recipe
 from astra_data.worlds.code_digest import code_digest
 from astra_data.worlds.registry import place_of
 
-CODE = "code.json"
-"""Beside recipe.json: the digests of "task", and of methods by their names, with their settings."""
 _SETTINGS = ".settings"
 
 

@@ -75,10 +75,12 @@ def dataset_lines(results: Results) -> list[str]:
     return lines
 
 
-def provenance(origins: Sequence[Origin]) -> dict[str, str]:
-    """Return the text on code, machine and versions."""
+def provenance(origins: Sequence[Origin], own_code: Mapping[str, str]) -> dict[str, str]:
+    """Return the text on code, machine and versions, and on the user's code where there is some."""
     texts = {"code": _commit, "machine": machine, "versions": _versions}
-    return {what: _by_stage(origins, text) for what, text in texts.items()}
+    shared = {what: _by_stage(origins, text) for what, text in texts.items()}
+    own = ", ".join(f"{name} `{digest}`" for name, digest in own_code.items())
+    return shared | {"own_code": own} if own else shared
 
 
 def _by_stage(origins: Iterable[Origin], text: Callable[[Origin], str]) -> str:

@@ -95,7 +95,7 @@ def render_html(found: Found, images: Mapping[str, bytes], foresight: Sequence[S
         costed=COSTED,
         stage_costs=stage_costs(results),
         row_costs=row_costs(results),
-        made={what: inline(text) for what, text in provenance(_origins(every)).items()},
+        made={what: inline(text) for what, text in provenance(_origins(every), results.own_code).items()},
         datasets=[
             inline(line) for line in dict.fromkeys(line for one in every for line in dataset_lines(one))
         ],

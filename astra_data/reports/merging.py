@@ -43,6 +43,7 @@ def merge(
     return sources[-1].model_copy(
         update={
             "origins": merged_origins(origin for source in sources for origin in source.origins),
+            "own_code": {name: digest for source in sources for name, digest in source.own_code.items()},
             "wall_seconds": reduce(_sum, (source.wall_seconds for source in sources)),
             "cpu_seconds": reduce(_sum, (source.cpu_seconds for source in sources)),
             "datasets": _datasets(sources),

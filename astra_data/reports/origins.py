@@ -1,7 +1,11 @@
 """Where results come from: each origin and each choice of datasets once."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
+from astra_data.core.config import read_written
+from astra_data.core.naming import CODE, base_method
+from astra_data.methods import grounded_as
 from astra_data.reports.schema import DatasetUse, Origin
 from astra_data.reports.seed_table import Named
 
@@ -15,6 +19,20 @@ def merged_origins(origins: Iterable[Origin]) -> list[Origin]:
         stages = list(dict.fromkeys([*known.stages, *origin.stages]))
         merged[key] = known.model_copy(update={"stages": stages})
     return list(merged.values())
+
+
+def recorded_code(root: Path, rows: Iterable[str]) -> dict[str, str]:
+    """Return the digests that the run at `root` recorded of the code of its task and of methods of `rows`.
+
+    Raises:
+        BadInputError: the record is damaged.
+    """
+    if not (root / CODE).is_file():
+        return {}
+    cure = "restore it from a copy, or remove it if the code is still what the run was made with"
+    recorded = read_written(dict[str, str], root / CODE, by="a run", cure=cure)
+    named = ["task", *(name for row in rows for name in (base_method(row), grounded_as(row)))]
+    return {name: recorded[name] for name in dict.fromkeys(named) if name in recorded}
 
 
 def dataset_uses(named: Mapping[str, Sequence[Named]]) -> list[DatasetUse]:

@@ -82,7 +82,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         costed=COSTED,
         stage_costs=stage_costs(results),
         row_costs=row_costs(results),
-        made=provenance(results.origins),
+        made=provenance(results.origins, results.own_code),
         datasets=dataset_lines(results),
     )
 

@@ -242,6 +242,8 @@ class Results(Section):
     """All settings of the recipe, with defaults filled in."""
     origins: list[Origin]
     """Normally one; more if code or machine changed between stages."""
+    own_code: dict[str, str] = Field(default_factory=dict, exclude_if=lambda digests: not digests)
+    """Digests of the user's code: "task", and methods by their names; empty where all is the package's."""
     wall_seconds: dict[str, float]
     """By stage, summed over all rows and seeds, and "total"; without stages that recorded no time."""
     cpu_seconds: dict[str, float]

@@ -82,7 +82,7 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
         means=means,
         intervals=intervals,
         choices=[_choice(size) for size in found.sizes if size.results.choice],
-        made=provenance([origin for size in found.sizes for origin in size.results.origins]),
+        made=provenance([origin for size in found.sizes for origin in size.results.origins], first.own_code),
     )
 
 

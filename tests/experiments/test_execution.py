@@ -114,7 +114,8 @@ def draw(path: Path, progress: object) -> None:
 
 def test_what_an_item_draws_depends_on_its_key_alone(tmp_path: Path) -> None:
     """Not on what ran before it in the process, as other rows, or none where a run goes on."""
-    drawn: dict[str, list[str]] = {"ground/mine/seed_0": [], "ground/mine/seed_1": [], "train/mine/seed_0": []}
+    keys = ("ground/mine/seed_0", "ground/mine/seed_1", "train/mine/seed_0")
+    drawn: dict[str, list[str]] = {key: [] for key in keys}
     for key in (*drawn, *reversed(drawn)):
         work = pickled(Item(key, (), partial(draw, tmp_path / "drawn")), None)
         assert isinstance(run_item(key, work, tmp_path / "log", lambda note: None), float)

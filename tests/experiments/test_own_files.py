@@ -11,9 +11,10 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.naming import CODE
 from astra_data.experiments.experiment import Experiment, load_experiment
 from astra_data.experiments.grounded_env import training_of
-from astra_data.experiments.own_files import CODE, check_unchanged, record_code
+from astra_data.experiments.own_files import check_unchanged, record_code
 from astra_data.experiments.plan import plan
 from astra_data.experiments.trained_policy import load_policy, task_of
 from astra_data.worlds import registry

@@ -13,11 +13,16 @@ def origin(**changes: object) -> Origin:
 
 
 def test_an_origin_that_all_share_is_named_without_stages() -> None:
-    assert provenance([origin(), origin(stages=["pair"])]) == {
+    assert provenance([origin(), origin(stages=["pair"])], {}) == {
         "code": "commit `abc`",
         "machine": "Fast, 8 cores, 15.5 GiB of memory",
         "versions": "torch 2.0",
     }
+
+
+def test_code_of_ones_own_is_named_by_its_digests() -> None:
+    told = provenance([origin()], {"task": "0a", "mine": "1b"})
+    assert told == provenance([origin()], {}) | {"own_code": "task `0a`, mine `1b`"}
 
 
 def test_origins_that_differ_are_named_with_their_stages_once() -> None:
@@ -26,7 +31,7 @@ def test_origins_that_differ_are_named_with_their_stages_once() -> None:
         origin(commit=None, stages=["pair"], machine=None, packages={}),
         origin(commit="abc-dirty", stages=["train", "align"]),
     ]
-    text = provenance(origins)
+    text = provenance(origins, {})
     assert text["code"] == "commit `abc` with uncommitted changes (train, align); not recorded (pair)"
     assert text["versions"] == "torch 2.0 (train, align); not recorded (pair)"
     assert machine(origins[1]) == "not recorded"

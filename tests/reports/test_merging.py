@@ -46,6 +46,16 @@ def root(tmp_path: Path) -> Path:
     return root
 
 
+def test_the_code_of_published_rows_stays_named(root: Path) -> None:
+    (root / "code.json").write_text('{"task": "0a", "iql": "1b"}')
+    published = assembled(root, methods=("iql",))
+    remove(root, "iql", 0), remove(root, "iql", 1), remove(root, "iql", 2)
+    assert assembled(root, methods=("astra", "iql"), published=published).own_code == {
+        "task": "0a",
+        "iql": "1b",
+    }
+
+
 def test_seeds_found_apart_amount_to_what_they_do_together(root: Path) -> None:
     edit_json(root / "ground/astra/seed_1/gap.json", grounded={"position_m": band(0.7)})
     whole = assembled(root)

@@ -137,6 +137,20 @@ def test_origin_is_what_the_artefacts_recorded(values: Any, folder: Path) -> Non
     assert follower == {"versions": [None] * 3, "hashes": [None] * 3, "methods": ["follower"]}
 
 
+def test_code_of_ones_own_is_named_where_there_is_some(root: Path, folder: Path) -> None:
+    assert "Own code" not in (folder / "results.md").read_text() + (folder / "results.html").read_text()
+    assert "own_code" not in json.loads((folder / "results.json").read_text())
+    digests = {"task": "0a", "astra": "1b", "astra.settings": "{}", "gone": "2c"}
+    write_json(root / "code.json", digests)
+    make(root)
+    assert json.loads((root / "report/results.json").read_text())["own_code"] == {"task": "0a", "astra": "1b"}
+    lines = (root / "report/results.md").read_text().splitlines()
+    line = lines.index("- Own code: task `0a`, astra `1b`.")
+    assert lines[line - 1].startswith("- Code: ") and lines[line + 1].startswith("- Machine: ")
+    page = (root / "report/results.html").read_text()
+    assert "<li>Own code: task <code>0a</code>, astra <code>1b</code>.</li>" in page
+
+
 def test_a_row_that_was_in_no_simulator_is_reported(root: Path) -> None:
     write_elsewhere(root, "iql")
     make(root, recipe=FakeRecipe(methods=("iql", "follower")))
