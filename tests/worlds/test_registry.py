@@ -8,7 +8,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, STATE
 from astra_data.worlds import own_code
 from astra_data.worlds.plane.free_space import FreeSpace
-from astra_data.worlds.registry import ENTRY_POINTS, TASKS, known_names, known_tasks, task_named
+from astra_data.worlds.registry import ENTRY_POINTS, TASKS, known_names, known_tasks, place_of, task_named
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import VariedSimulator
 
@@ -76,6 +76,8 @@ def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(
     monkeypatch.setattr(own_code, "entry_points", lambda group: points)
     assert known_names() == (*TASKS, "rail-cart")
     assert known_tasks()["antmaze-umaze"] is TASKS["antmaze-umaze"]
+    assert place_of("rail-cart") == place_of("small_cart:TASK") == "small_cart:TASK"
+    assert place_of("antmaze-umaze") == "antmaze-umaze" and place_of("unknown") == "unknown"
 
 
 def test_an_unknown_task_answers_with_the_known_ones() -> None:
