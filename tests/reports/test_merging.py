@@ -49,7 +49,8 @@ def root(tmp_path: Path) -> Path:
 def test_the_code_of_published_rows_stays_named(root: Path) -> None:
     (root / "code.json").write_text('{"task": "0a", "iql": "1b"}')
     published = assembled(root, methods=("iql",))
-    remove(root, "iql", 0), remove(root, "iql", 1), remove(root, "iql", 2)
+    for seed in (0, 1, 2):
+        remove(root, "iql", seed)
     assert assembled(root, methods=("astra", "iql"), published=published).own_code == {
         "task": "0a",
         "iql": "1b",

@@ -89,7 +89,7 @@ class Near(Reach):
 
 def corridor(**functions: Any) -> RobotEnv:  # noqa: ANN401
     gymnasium.registry.pop("Corridor-v0", None)
-    gymnasium.register("Corridor-v0", Corridor)
+    gymnasium.register("Corridor-v0", Corridor)  # type: ignore[arg-type]
     robot = partial(GymnasiumRobot, "Corridor-v0", **functions)
     env = replace(TASK, robot=robot, objective=Near(horizon=40)).target(2, seed=0)
     assert isinstance(env, RobotEnv)

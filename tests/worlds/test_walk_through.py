@@ -265,11 +265,11 @@ NOISE = [
 
 @pytest.mark.parametrize("random", NOISE, ids=["torch", "numpy", "own", "unseeded"])
 def test_noisy_simulators_are_no_fault(random: object) -> None:
-    before = torch.get_rng_state(), np.random.get_state()[1].tolist()  # type: ignore[union-attr]
+    before = torch.get_rng_state(), np.random.get_state()[1].tolist()  # type: ignore[index]
     assert check_task(replace(TASK, make_simulator=type("Own", (Noisy,), {"random": random}))) == []
     if random is OwnNoise:
         assert torch.equal(torch.get_rng_state(), before[0])
-        assert np.random.get_state()[1].tolist() == before[1]  # type: ignore[union-attr]
+        assert np.random.get_state()[1].tolist() == before[1]  # type: ignore[index]
 
 
 class Lagging(Rail):
