@@ -11,6 +11,7 @@ from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.experiments.selecting import select
+from astra_data.methods import grounded_as
 from astra_data.training.judging import Judge
 
 pytestmark = pytest.mark.usefixtures("quick_failures")
@@ -133,4 +134,5 @@ def test_rows_are_judged_with_the_groundings_that_they_share(
 ) -> None:
     ensemble = f"{Path(__file__).parents[2]}/recipes/examples/methods/residual_ensemble.py:METHOD"
     changes = {"methods": ["nas_plus", "mine"], "own_methods": {"mine": {"method": ensemble}}}
-    assert asked(folder, monkeypatch, changes).groundings == {"nas_plus": "nas", "mine": "mine"}
+    rows = asked(folder, monkeypatch, changes).methods
+    assert {row: grounded_as(row) for row in rows} == {"nas_plus": "nas", "mine": "mine"}
