@@ -23,15 +23,19 @@ def write_logs(
     *,
     state_size: int = 2,
     held_out: Sequence[bool] = (False,) * 2,
+    ahead: float = 0.0,
     **metadata: int,
 ) -> None:
-    """Write pushes of the small cart, whose bounds are -1 and 4; `metadata` is of each."""
+    """Write pushes of the small cart, whose bounds are -1 and 4; `metadata` is of each.
+
+    Next states are `ahead` of the states of the rows after them.
+    """
     columns = [Column(STATE, size=state_size), Column(NEXT_STATE, size=state_size), Column(ACTION, size=1)]
     states = np.zeros((9, state_size), np.float32)
     actions = np.linspace(least, largest, 9, dtype=np.float32)
     with writer(folder, columns=columns, fps=10) as logs:
         for uid, held in enumerate(held_out):
-            columns_of_one = {STATE: states, NEXT_STATE: states, ACTION: actions}
+            columns_of_one = {STATE: states, NEXT_STATE: states + np.float32(ahead), ACTION: actions}
             logs.add(Episode(uid, columns_of_one, {"held_out": held, **metadata}))
 
 
@@ -68,6 +72,13 @@ def test_bounds_beyond_what_was_recorded_are_told(
     )
     assert bounds.startswith(expected) and bool(bounds) == bool(expected)
     assert goals
+
+
+def test_steps_that_do_not_lead_to_the_row_after_them_are_told(recipe: Path) -> None:
+    write_logs(recipe.parent / "logs", -1.0, 4.0, ahead=0.5)
+    found = check(recipe, root=recipe.parent / "runs")["data"]
+    what = f"steps whose {NEXT_STATE} is not the state of the row after: 16 of 16: rows are missing"
+    assert found.is_finished and found.why.startswith(what)
 
 
 def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
