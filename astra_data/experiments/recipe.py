@@ -36,6 +36,14 @@ class SweepConfig(Config):
     """In per cent of `collect.episodes`, or of those of `data`; smaller ones lie inside larger ones. By
     default the whole."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _sweeps_sizes_alone(cls, table: Any) -> Any:  # noqa: ANN401 - checked next
+        if other := [key for key in table if key != "percent"] if isinstance(table, dict) else []:
+            fault = f"expected percent alone, got {', '.join(other)}"
+            raise ValueError(f"{fault}: for values of another setting write recipes with based_on")
+        return table
+
 
 class Recipe(Config):
     """One experiment: which methods, on which task, with which seeds and settings.

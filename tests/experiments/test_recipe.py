@@ -150,6 +150,10 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ),
         ({"collect": {"start": "task", "episodes": 10**18}}, "collect.episodes: expected less than or equal"),
         ({"collect": {"start": "task", "episodes": 10**10}}, "collect: episodes: 10000000000 of up to 500"),
+        (
+            {"sweep": {"percent": [50], "ground.latent_weight": [0, 1]}},
+            "sweep: expected percent alone, got ground.latent_weight: for values of another setting",
+        ),
         ({"sweep": {"percent": [10**9]}}, "sweep.percent.0: expected less than or equal to 10000"),
         (
             {"task": "antmaze-umaze", "sweep": {"percent": [50]}, "augment": {"copies": 2}},
