@@ -36,7 +36,7 @@ def read_published(path: Path) -> Found:
         return TypeAdapter[Found](Found).validate_json(path.read_bytes())
     except ValidationError as error:
         raise BadInputError(
-            f"{path} does not hold results as they are written now: {faults_of(error)}"
+            f"{path} does not hold results in the current format: {faults_of(error)}"
         ) from None
 
 

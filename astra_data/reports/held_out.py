@@ -189,13 +189,13 @@ def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], hori
     limit, least = errors[largest][2], largest
     where = f"{title}, `{quantity}`, {horizon} steps ahead: "
     if limit is None:
-        return f"{where}withheld, as {largest} % have a seed with a single held-out episode of that length."
+        return f"{where}withheld: at {largest} %, a seed has only one held-out episode of that length."
     for size in reversed(smaller):
         if errors[size][0] > limit:
             break
         least = size
     if least == largest:
-        return f"{where}the error still falls up to {largest} %: more data may help."
+        return f"{where}the error still decreases up to {largest} %: more data may help."
     return f"{where}from {least} % on, the error is within the interval of {largest} %."
 
 

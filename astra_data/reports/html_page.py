@@ -28,7 +28,7 @@ _FORESIGHT = (
     "11\N{EN DASH}30",
     "21\N{EN DASH}40",
     "Brier skill",
-    "sure",
+    "observed of predicted",
 )
 _PIXEL = 2
 """Pixels of a figure for each of the page."""

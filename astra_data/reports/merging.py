@@ -84,7 +84,7 @@ def _check_alike(sources: Sequence[Results]) -> None:
         wrong = [f"{what}: {before} and {now}" for what, (before, now) in compared.items() if before != now]
         if wrong:
             raise BadInputError(
-                f"{first.recipe}: expected results to add that are made alike, got {'; '.join(wrong)}"
+                f"{first.recipe}: expected all merged results to be made alike, got {'; '.join(wrong)}"
             )
 
 
@@ -94,7 +94,7 @@ def _datasets(sources: Sequence[Results]) -> list[DatasetOrigin]:
         known = datasets.setdefault((one.stage, one.seed), one)
         if known.content_hash != one.content_hash:
             raise BadInputError(
-                f"{sources[0].recipe}: expected results to add that are made of the same data, got those of "
+                f"{sources[0].recipe}: expected all merged results to use the same data, got those of "
                 f"{one.stage} seed {one.seed} with content {known.content_hash} and {one.content_hash}"
             )
     return [datasets[key] for key in sorted(datasets)]

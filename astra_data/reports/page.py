@@ -36,11 +36,11 @@ COLUMNS = {
     "failed": ("failed", 2),
     "wall_contact": ("wall contact", 2),
     "steps": ("steps", 0),
-    "distance": ("way to success in m", 1),
+    "distance": ("path length to success (m)", 1),
     "return": ("return", 1),
     "simulated_success": ("success in its simulator", 2),
     "simulated_steps": ("survived steps in its simulator", 0),
-    "tries": ("trainings", 1),
+    "tries": ("training runs", 1),
     "beyond_recorded": ("beyond recorded commands", 2),
 }
 """Column title and digits of such a measure."""
@@ -56,7 +56,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
     rows = results.methods
     seeds = ", ".join(map(str, results.seeds))
     if any(row.seeds != results.seeds for row in rows.values()):
-        seeds += " (rows have as many of them as the table says)"
+        seeds += " (the table has the number of seeds of each row)"
     stages = [made for made in results.origins if made.machine and made.stages != ["report"]]
     reference = reference_of(rows)
     return fill(
@@ -125,7 +125,7 @@ def score_table(results: Results) -> tuple[list[str], list[list[str]]]:
     paper = results.paper_success
     if paper:
         place = head.index(SUCCESS.title) + 1
-        head.insert(place, "the paper's")
+        head.insert(place, "paper")
         for method, cells in zip(rows, lines, strict=True):
             cells.insert(place, f"{paper[method]:.2f}" if method in paper else "-")
     return head, lines

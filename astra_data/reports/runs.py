@@ -136,7 +136,7 @@ class Runs:
         size = "" if self.percent is None else f"percent_{self.percent:03d}/"
         raise MissingStageError(
             f"expected {name} in {self.root / stage}/<method>/{size}seed_<seed>/, found none for {absent}; "
-            f"run the recipe {self.reported.name} again: it goes on with what is missing"
+            f"run the recipe {self.reported.name} again: it continues with what is missing"
         )
 
     def _read[T: Artefact](

@@ -20,14 +20,14 @@ def warning(results: Results) -> str:
     reference = reference_of(results.methods)
     if reference is None:
         place = (
-            "each row in its own grounded simulator, or in the raw one where it grounds none: in the very "
-            "simulator that it was trained in, so the figures say what it learned, not whether it transfers. "
-            "With a row of NAS, all would be tested in one simulator."
+            "Each row was tested in the simulator it was trained in: its own grounded one, or the raw one "
+            "if it has no grounding. So the numbers show what it learned, not whether it transfers. Add a "
+            "row of NAS to test all rows in one simulator."
         )
     else:
         there = [method_title(row) for row in results.methods if grounded_as(row) == reference]
         place = (
-            f"the abstract simulator as {method_title(reference)} grounded it, in which no row was trained "
-            f"but {' and '.join(there)}. What is in no abstract state, it cannot show."
+            f"All rows were tested in the abstract simulator grounded by {method_title(reference)}, in which "
+            f"only {' and '.join(there)} trained. It cannot show what is not in the abstract state."
         )
-    return f"**Nothing was tested on a robot: the task has no target.** Figures were measured in {place}"
+    return f"**Nothing was tested on a robot: the task has no target.** {place}"

@@ -77,12 +77,13 @@ def verdict_of(results: Results, percent: int | None = None) -> Verdict:
     as_good = [floor.title for key, floor in _floors(results) if worth.get(key, -inf) >= worth[name]]
     opening = "Deploy"
     if chosen and chosen.predicted == 0:
-        opening = "Deploy none, for all are predicted to fail: the first in the ranking is"
+        opening = "Deploy none: all are predicted to fail. The first in the ranking is"
     elif row.role:
-        opening = "No gain over the floor: of all policies, the one to deploy is"
+        opening = "No gain over the floor: the policy to deploy is"
     elif as_good:
         opening = (
-            f"No gain over the floor: {' and '.join(as_good)} does as well or better. Of the rest, deploy"
+            f"No gain over the floor: {' and '.join(as_good)} does as well or better. "
+            "Of the other rows, deploy"
         )
     facts = [_of_row(results, row), *references.values()]
     remarks = [*_remarks(results, name, chosen)]
@@ -110,7 +111,7 @@ def _passed_over(results: Results, one: Ranked) -> str:
     row = results.methods.get(one.row)
     if row is None:
         return "has not been tested yet"
-    return f"is of a reference row ({row.role})" if row.role not in (None, "floor") else ""
+    return f"belongs to a reference row ({row.role})" if row.role not in (None, "floor") else ""
 
 
 def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
@@ -123,19 +124,19 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
             yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
         level = sum((one.lower, one.predicted) == (chosen.lower, chosen.predicted) for one in candidates)
         if level > 1:
-            yield f"{level} policies are level with it in the ranking, itself among them."
+            yield f"{level} policies, including this one, tie in the ranking."
         if best is not row:
             score = f"predicted success {worth[ahead]:.2f}" if is_predicted else _score(results, best)
-            yield f"By the mean over seeds {best.title} is ahead: {score}."
+            yield f"By the mean over seeds, {best.title} is ahead: {score}."
         if results.choice.regret and chosen is candidates[0]:
             yield (
-                f"In hindsight another policy is better in the target, by {results.choice.regret:.2f}: "
-                "that is the regret of the choice."
+                "In hindsight, another policy is better in the target by "
+                f"{results.choice.regret:.2f}, the regret of the choice."
             )
         for figure, why in results.choice.withheld.items():
-            yield f"Withheld of the choice: {figure.replace('_', ' ')}, because {why}."
+            yield f"Withheld for the choice: {figure.replace('_', ' ')} ({why})."
         if results.choice.shares_episodes:
-            yield "All seeds have the same episodes, so no judge is independent of what it judges."
+            yield "All seeds have the same episodes, so no judge is independent of the policies it judges."
     else:
         ties = [
             of.title
@@ -143,14 +144,14 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
             if of is not row and not of.role and _mean(results, of) == _mean(results, row)
         ]
         if ties:
-            yield f"As good by the mean: {', '.join(ties)}."
+            yield f"Equal by the mean: {', '.join(ties)}."
     for key, floor in _floors(results):
         if floor is row:
             continue
         if not is_predicted:
             yield from _against(results, row, floor)
         elif key in worth:
-            yield f"{floor.title} is predicted {worth[key]:.2f}, a mean over its seeds."
+            yield f"Predicted success of {floor.title}: {worth[key]:.2f}, the mean over its seeds."
     if unjudged := [
         of.title for key, of in results.methods.items() if of.role != "ceiling" and key not in worth
     ]:
@@ -159,7 +160,7 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
     if failed >= _MOSTLY:
         yield (
             f"{row.title} fails in {100 * failed:.0f}{_PERCENT} of its episodes: "
-            "look at how before a robot depends on it."
+            "look at these failures before you deploy it."
         )
 
 
@@ -169,18 +170,18 @@ def _against(results: Results, row: MethodResults, floor: MethodResults) -> Iter
     ours, its = row.summary[measure], floor.summary[measure]
     if ours.low is None or ours.high is None or its.low is None or its.high is None:
         yield (
-            f"One seed has no interval over seeds, so the difference between {row.title} and {floor.title} "
-            "has none: another seed may come out differently."
+            f"With one seed, there is no interval for the difference between {row.title} and {floor.title}: "
+            "another seed may give a different result."
         )
     elif ours.low <= its.high and its.low <= ours.high:
         yield (
-            f"The {_SURE} intervals of {row.title} and {floor.title} overlap: so few seeds leave open "
-            "whether they differ."
+            f"The {_SURE} intervals of {row.title} and {floor.title} overlap: these seeds do not show "
+            "that they differ."
         )
     elif (seeds := min(len(row.seeds), len(floor.seeds))) < _ENOUGH_SEEDS:
         yield (
-            f"{row.title} and {floor.title} have {seeds} seeds to compare: by chance, equal rows may lie as "
-            "far apart."
+            f"{row.title} and {floor.title} are compared over only {seeds} seeds: equal rows may differ as "
+            "much by chance."
         )
 
 
@@ -210,21 +211,21 @@ def _mean(results: Results, row: MethodResults) -> float:
 
 def _why_chosen(results: Results, chosen: Ranked, percent: int | None) -> str:
     predicted = _with_interval(chosen.predicted, chosen.low, chosen.high)
-    text = f". Its success was predicted, without the target, as {predicted}"
+    text = f". Its success, predicted without the target, is {predicted}"
     if chosen.target is None:
-        text += ", and not measured in the target"
+        text += "; it was not measured in the target"
     else:
         measured = _with_interval(chosen.target, *_ends(results, chosen.target))
-        text += f" and measured in the target as {measured}, over {results.episodes} episodes"
+        text += f"; measured in the target, it is {measured} over {results.episodes} episodes"
     count = len(results.choice.candidates) if results.choice else 0
-    return f"{text}. The stage select chose it from {count} policies{_trained(results, percent)}."
+    return f"{text}. The select stage chose it from {count} policies{_trained(results, percent)}."
 
 
 def _why_best(results: Results, row: MethodResults, percent: int | None) -> str:
     seeds = "best mean over seeds" if len(results.seeds) > 1 else "best result"
     return (
-        f": {_score(results, row)}. It is the row with the {seeds}{_trained(results, percent)}; "
-        "the stage select chose no policy."
+        f": {_score(results, row)}. This row has the {seeds}{_trained(results, percent)}; "
+        "the select stage chose no policy."
     )
 
 

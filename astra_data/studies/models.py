@@ -26,7 +26,7 @@ MODELS = {
     "raw": Model(
         "Raw simulator",
         "#2B2B2B",
-        "a planar body that moves at once as the published code and speed limits say",
+        "a planar body that moves immediately as the published code and speed limits specify",
     ),
     "gains": Model(
         "One gain per axis", "#B58900", "the same with one constant gain per axis, by least squares"
@@ -34,7 +34,7 @@ MODELS = {
     "ridge": Model(
         "Ridge regression",
         "#D33682",
-        "linear on the last H steps, in closed form; its strength chosen on training data",
+        "linear in the last H steps, in closed form; regularization chosen on training data",
     ),
     "mlp": Model(
         "Feed-forward network",
@@ -42,18 +42,18 @@ MODELS = {
         "a feed-forward network on the same H steps, as in the lab's earlier grounding",
     ),
     "nas": _of_method(
-        "nas", "the GRU of the grounding model, with the correction's loss alone, λ = (0, 0, 1)"
+        "nas", "the GRU of the grounding model, with only the correction's loss, λ = (0, 0, 1)"
     ),
     "astra": _of_method(
         "astra",
         "the same with all three losses, λ = (0.1, 1, 1); the logs have no reward, so L_rew predicts "
-        "how much nearer the ball comes",
+        "how much closer the ball gets",
     ),
 }
 """Of a walk, by the names in a study's recipe."""
 
 MODELS_OF_JOINTS = MODELS | {
-    "raw": replace(MODELS["raw"], text="joints that move to their targets as the time constant says"),
+    "raw": replace(MODELS["raw"], text="joints that approach their targets with the time constant"),
     "gains": replace(
         MODELS["gains"],
         title="Second-order response",
@@ -63,7 +63,7 @@ MODELS_OF_JOINTS = MODELS | {
     "astra": replace(
         MODELS["astra"],
         text="the same with all three losses, λ = (0.1, 1, 1); the logs have no reward, so L_rew predicts "
-        "how much nearer the joints come to their targets",
+        "how much closer the joints get to their targets",
     ),
 }
 """Of joints."""

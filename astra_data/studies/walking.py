@@ -110,10 +110,10 @@ def _replayed(state: Tensor, action: Tensor, fps: int) -> Tensor:
 
 
 class WalkingConfig(Config):
-    """When a robot counts as walking: not while it is carried, nor where self-localisation jumps."""
+    """When a robot counts as walking: not while it is carried, nor where self-localization jumps."""
 
     jump_m: Positive = 0.06
-    """A larger displacement between two rows is a jump of self-localisation: at 60 Hz, 3.6 m/s."""
+    """A larger displacement between two rows is a jump of self-localization: at 60 Hz, 3.6 m/s."""
     jump_rad: Positive = 0.1
     """The same for the change of heading."""
     fastest_m_s: Positive = 0.6

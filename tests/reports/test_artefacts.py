@@ -85,7 +85,7 @@ def test_tensors_are_checked_and_become_float64(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected tensors \['start'\], got \['goal'\]"):
         read_tensors(path, ("goal", "start"))
     path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(BadInputError, match="no whole safetensors file"):
+    with pytest.raises(BadInputError, match="not a complete safetensors file"):
         read_tensors(path, ("goal",))
 
 

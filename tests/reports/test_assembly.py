@@ -137,7 +137,7 @@ def test_rows_without_a_finished_seed_are_left_out_and_an_error_if_there_are_no_
         assembled(root, ("astra",))
     message = str(error.value)
     assert "found none for astra seed 0, 1, 2; run" in message
-    assert "run the recipe antmaze_u again: it goes on with what is missing" in message
+    assert "run the recipe antmaze_u again: it continues with what is missing" in message
     with pytest.raises(MissingStageError, match="follower seed 2; run"):
         assembled(root, ("follower",), (2,))
 
@@ -162,7 +162,7 @@ def test_a_hand_written_row_has_the_success_of_the_grounded_simulator(root: Path
     found = assembled(root)
     assert found.methods["follower"].simulated_success == [0.25] * 3
     assert hand_written(found) == "the careful follower"
-    told = "What the careful follower reaches in the grounded simulator tells whether that allows what the"
+    told = "How well the careful follower does in the grounded simulator shows whether that simulator allows"
     assert told in render(found, {}) and "0.25 ± 0.00 |" in render(found, {})
     assert "follower" not in found.probability_of_improvement["astra"]
     write_elsewhere(root, "iql")

@@ -55,5 +55,5 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected published results in .*toy.json, found none"):
         read_published(path)
     path.write_text("{}")
-    with pytest.raises(BadInputError, match=r"toy.json does not hold results as they are written now"):
+    with pytest.raises(BadInputError, match=r"toy.json does not hold results in the current format"):
         read_published(path)

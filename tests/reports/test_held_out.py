@@ -32,9 +32,9 @@ def write(root: Path, percent: int, seed: int, error: float) -> None:
     ("errors", "expected"),
     [
         ((0.3, 0.109, 0.1), "from 50 % on, the error is within the interval of 100 %."),
-        ((0.3, 0.2, 0.1), "the error still falls up to 100 %: more data may help."),
+        ((0.3, 0.2, 0.1), "the error still decreases up to 100 %: more data may help."),
         # A small size that is good by chance is not enough while a larger one is worse.
-        ((0.1, 0.2, 0.1), "the error still falls up to 100 %: more data may help."),
+        ((0.1, 0.2, 0.1), "the error still decreases up to 100 %: more data may help."),
     ],
 )
 def test_enough_is_where_more_makes_no_difference(
@@ -64,7 +64,7 @@ def test_a_single_held_out_episode_settles_nothing(tmp_path: Path) -> None:
     page = write_held_out("r", tmp_path, ("nas",), (0, 1), (50, 100), timestep_s=0.05)
     assert page is not None
     lines = page.read_text().splitlines()
-    told = "withheld, as 100 % have a seed with a single held-out episode of that length."
+    told = "withheld: at 100 %, a seed has only one held-out episode of that length."
     assert f"- NAS, `x`, 10 steps ahead: {told}" in lines
     assert any(line.startswith("| 100 % | NAS | 0.1 [0.09, 0.11] | 1 |") for line in lines)
 
@@ -81,7 +81,7 @@ def test_a_simulator_that_is_no_better_than_standing_still_is_told(
     assert page is not None
     line = f"| 100 % | Standing still | 0.1 [0.1, 0.1] | {still:.3g} [{still:.3g}, {still:.3g}] |"
     assert line in page.read_text()
-    assert ("**In `x` the simulator without grounding is no better" in page.read_text()) == is_astray
+    assert ("**In `x`, the simulator without grounding is no better" in page.read_text()) == is_astray
 
 
 def test_rows_may_have_other_sizes(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_how_well_failures_are_foreseen_is_told_where_it_was_measured(
         write(tmp_path, 100, seed, 0.1)
     given = ("r", tmp_path, ("nas",), (0, 1, 2, 3), (100,))
     page = write_held_out(*given, timestep_s=0.05)
-    assert page is not None and "Failures foreseen" not in page.read_text()
+    assert page is not None and "Predicted failures" not in page.read_text()
     assert not (tmp_path / "gap_reliability.png").exists() and ".png" not in page.read_text()
     write_foresight(tmp_path, 0, 0.8, last=0.65)
     write_foresight(tmp_path, 1, 0.9)  # with episodes too short for the last window
@@ -174,4 +174,4 @@ def test_enough_is_judged_at_ten_steps_though_errors_are_known_further_ahead() -
         return GapMeans(seeds=[0], horizons=[1, 10, 50], grounded={"x": band}, raw={"x": band})
 
     found = enough("NAS", "x", {50: gap(0.4), 100: gap(0.2)}, [1, 10, 50])
-    assert found == "NAS, `x`, 10 steps ahead: the error still falls up to 100 %: more data may help."
+    assert found == "NAS, `x`, 10 steps ahead: the error still decreases up to 100 %: more data may help."

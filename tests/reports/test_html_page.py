@@ -177,10 +177,12 @@ def test_one_seed_has_neither_spread_nor_comparisons_and_few_policies_no_correla
     assert "±" not in "".join(cell for line in page.table(LOSSES)[1:] for cell in line)
     assert {cells[4] for cells in page.table(LOSSES)[1:]} == {"one seed"}
     assert (
-        "intervals over seeds are withheld: they take two seeds or more, and every row has one" in page.text
+        "intervals over seeds are withheld: they need at least two seeds, and every row has one" in page.text
     )
     assert "The probability of improvement is withheld: it compares seeds, and there is one." in page.text
-    assert "in the raw and grounded simulator and in the target is withheld: over 4 policies" in page.text
+    assert (
+        "in the raw and grounded simulator and in the target is withheld: 4 policies are too few" in page.text
+    )
     assert not any(title.startswith(("Probability", "Correlation")) for title in page.tables)
     assert len(page.attributes("img")) == len(images) - 1
 
@@ -285,7 +287,7 @@ def test_sizes_have_a_table_of_interquartile_means_too() -> None:
         ({"unfinished": ["RMA", "NAS"]}, "Not finished yet: RMA, NAS."),
         (
             {"stand_in": "mujoco"},
-            "A simulated stand-in (mujoco) takes the physical robot",
+            "A simulated stand-in (mujoco) replaces the physical robot",
         ),
     ],
 )
@@ -299,5 +301,13 @@ def test_what_is_foreseen_stands_below_its_window(tmp_path: Path) -> None:
     page = read_page(render_html(toy(tmp_path), {}, [["x"] * 7]))
     head = [cell.replace("\N{EN DASH}", " to ") for cell in page.table("On held-out episodes")[0]]
     assert head == [
-        *("simulator", "failures", "AUC 1 to 20 steps", "11 to 30", "21 to 40", "Brier skill", "sure")
+        *(
+            "simulator",
+            "failures",
+            "AUC 1 to 20 steps",
+            "11 to 30",
+            "21 to 40",
+            "Brier skill",
+            "observed of predicted",
+        )
     ]

@@ -56,26 +56,26 @@ def test_the_table_has_a_row_for_each_method_and_the_best_in_bold(page: str) -> 
     assert "| ASTRA | 3 | 0.50 ± 0.25 |" in page
     assert "| ASTRA+ | 3 | **0.92 ± 0.14** |" in page
     assert "| Careful follower (ceiling) | 3 | 1.00 ± 0.00 | 1.00 [1.00, 1.00] |" in page
-    assert "A plus marks the same method trained with the recipe's `[plus]` settings." in page
+    assert "A plus sign marks the same method trained with the recipe's `[plus]` settings." in page
     assert "astra-data run recipes/antmaze_u.toml" in page
     assert "seeds 0, 1, 2, 4 episodes per row and seed. Produced by" in page
-    assert "on Fast, 8 cores, 16 GiB of memory, H200. Wall time of the stages, summed: 3 min.\n" in page
+    assert "on Fast, 8 cores, 16 GiB of memory, H200. Total wall time of the stages: 3 min.\n" in page
 
 
 def test_a_task_without_walls_and_places_has_no_columns_of_them(results: Results, page: str) -> None:
     assert "wall contact | steps |" in page and "Wall contact: share of steps." in page
     bare = rows_of(results, **{row: {"wall_contact": [0.0] * 3, "distance": [0.0] * 3} for row in ROWS})
     changed = page_of(results, methods=bare)
-    assert "wall contact" not in changed.lower() and "way to success" not in changed
+    assert "wall contact" not in changed.lower() and "path length to success" not in changed
     assert "| failed | steps | return |" in changed
 
 
 def test_trainings_are_counted_where_some_were_done_again(results: Results, page: str) -> None:
-    assert "| trainings |" not in page
+    assert "| training runs |" not in page
     once = page_of(results, methods=rows_of(results, astra={"tries": [1.0, 1.0, 1.0]}))
-    assert "| trainings |" not in once
+    assert "| training runs |" not in once
     again = page_of(results, methods=rows_of(results, astra={"tries": [1.0, 3.0, 2.0]}))
-    assert "| success in its simulator | trainings |" in again and "| 2.0 ± 1.0 |" in again
+    assert "| success in its simulator | training runs |" in again and "| 2.0 ± 1.0 |" in again
 
 
 def test_commands_beyond_what_was_recorded_are_told_where_there_are_some(results: Results, page: str) -> None:
@@ -90,12 +90,12 @@ def test_commands_beyond_what_was_recorded_are_told_where_there_are_some(results
 
 
 def test_the_papers_figures_stand_beside_ours(results: Results, page: str) -> None:
-    assert "the paper's" not in page
+    assert "| paper |" not in page
     changed = page_of(results, paper_success={"astra": 0.4})
-    assert "| method | seeds | success | the paper's | IQM [95 %] |" in changed
+    assert "| method | seeds | success | paper | IQM [95 %] |" in changed
     assert "| ASTRA | 3 | 0.50 ± 0.25 | 0.40 | " in changed
     assert "| ASTRA+ | 3 | **0.92 ± 0.14** | - | " in changed
-    assert "their heights cannot" in changed
+    assert "compare their order, not their values" in changed
 
 
 def test_open_loop_errors_have_the_raw_simulator_once_if_all_share_it(results: Results, page: str) -> None:
@@ -130,7 +130,10 @@ def test_validity_is_of_both_simulators_and_names_who_was_not_tested(results: Re
     assert "The grounding is each row's own." in page
     assert "Without" not in page
     untested = rows_of(results, follower={"simulator_returns": {}})
-    assert " Without Careful follower: not tested there" in page_of(results, methods=untested)
+    assert (
+        " Without Careful follower: policies that observe the full state cannot be tested there"
+        in page_of(results, methods=untested)
+    )
     by_nas = {"nas": results.methods["astra"], **results.methods}
     assert "The grounding is NAS's, of the same seed." in page_of(results, methods=by_nas)
     raw = results.predictive_validity["raw"].model_copy(update={"pearson": None})
@@ -150,12 +153,14 @@ def test_rows_that_were_trained_in_the_target_are_set_apart(results: Results, pa
 def test_the_head_names_what_is_special(results: Results) -> None:
     changed = page_of(results, leg_scale=1.25, stand_in="mujoco", unfinished=["RMA", "NAS"])
     assert "4 episodes per row and seed. The target's legs are 1.25 times as long. Produced by" in changed
-    assert "summed: 3 min. Not finished yet: RMA, NAS.\n\n**A simulated stand-in (`mujoco`) takes" in changed
+    assert (
+        "stages: 3 min. Not finished yet: RMA, NAS.\n\n**A simulated stand-in (`mujoco`) replaces" in changed
+    )
     partly = page_of(results, methods=rows_of(results, astra={"seeds": [0, 1], "success": [0.5, 1.0]}))
-    assert "seeds 0, 1, 2 (rows have as many of them as the table says), 4 episodes per row" in partly
+    assert "seeds 0, 1, 2 (the table has the number of seeds of each row), 4 episodes per row" in partly
     assert "| ASTRA | 2 | 0.75 ± 0.35 |" in partly
     unknown = page_of(results, origins=[])
-    assert "on a machine that was not recorded. Wall time" in unknown
+    assert "on a machine that was not recorded. Total wall time" in unknown
 
 
 def test_of_lasting_tasks_the_page_shows_survived_steps_and_return(results: Results) -> None:
@@ -177,7 +182,7 @@ def test_of_lasting_tasks_the_page_shows_survived_steps_and_return(results: Resu
     assert "| ASTRA | Direct transfer | 0.33 [" in page
     assert "| method | encoder | survived steps | return |" in page
     assert "| ASTRA | source | 50 ± 10 | 201.0 ± 1.0 |" in page
-    assert "Survived steps: until an episode fails or its time is up." in page
+    assert "Survived steps: steps until an episode fails or its time is up." in page
     assert "success" not in page
 
 

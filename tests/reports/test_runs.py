@@ -69,7 +69,7 @@ def test_what_is_missing_is_named(root: Path) -> None:
     assert (
         f"expected gap.json in {root}/ground/<method>/seed_<seed>/, found none for astra seed 2;" in message
     )
-    assert message.endswith("run the recipe antmaze_u again: it goes on with what is missing")
+    assert message.endswith("run the recipe antmaze_u again: it continues with what is missing")
     shutil.rmtree(root / "evaluate")
     with pytest.raises(MissingStageError, match=r"direct_transfer seed 0, 1, 2; astra seed 0, 1, 2; .*; run"):
         _ = runs(root).finished

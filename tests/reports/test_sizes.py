@@ -62,15 +62,15 @@ def test_rows_that_are_not_finished_are_left_open() -> None:
 
 def test_stages_that_all_sizes_share_are_timed_once() -> None:
     # Of twice 210 s, the 160 s of collect and pair are counted once.
-    assert "Wall time of the stages, summed: 4 min." in render_sizes(FOUND, {})
+    assert "Total wall time of the stages: 4 min." in render_sizes(FOUND, {})
     alone = FOUND.model_copy(update={"sizes": FOUND.sizes[:1] * 3})
-    assert "summed: 5 min" in render_sizes(alone, {})
+    assert "stages: 5 min" in render_sizes(alone, {})
 
 
 def test_the_figure_is_on_the_page_where_it_was_drawn() -> None:
     page = render_sizes(FOUND, {"data_efficiency": "some.png"})
-    assert "## Data efficiency\n\n![data_efficiency](some.png)\n\nAbove: where the robot was" in page
-    assert "Below: success in the target over the size;" in page
+    assert "## Data efficiency\n\n![data_efficiency](some.png)\n\nTop: positions and velocities" in page
+    assert "Bottom: success in the target by size of the dataset." in page
 
 
 def test_what_was_chosen_is_a_line_for_each_size() -> None:
@@ -113,7 +113,7 @@ def test_a_choice_is_made_once_for_all_sizes() -> None:
     page = render_sizes(
         FOUND.model_copy(update={"sizes": [size, size.model_copy(update={"percent": 100})]}), {}
     )
-    assert "Wall time of the stages, summed: 2 min." in page  # 60 + 20 + 20 s
+    assert "Total wall time of the stages: 2 min." in page  # 60 + 20 + 20 s
 
 
 def test_a_sweep_of_a_stand_in_or_of_other_legs_says_so() -> None:
@@ -121,7 +121,7 @@ def test_a_sweep_of_a_stand_in_or_of_other_legs_says_so() -> None:
     sizes = [SizeResults(percent=50, results=first), FOUND.sizes[1]]
     page = render_sizes(FOUND.model_copy(update={"sizes": sizes}), {})
     assert "size and seed. The target's legs are 1.25 times as long. Produced by" in page
-    assert "**A simulated stand-in (`mujoco`) takes the physical robot's place" in page
+    assert "**A simulated stand-in (`mujoco`) replaces the physical robot" in page
     plain = render_sizes(FOUND, {})
     assert "stand-in" not in plain
     assert "legs" not in plain

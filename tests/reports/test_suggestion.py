@@ -66,7 +66,7 @@ def test_commands_follow_one_another(suggestion: Suggestion) -> None:
     held = ["| 0 | 0.00 | 0.20 | 4.000 |", "|  | 0.20 | 0.10 | -1.000 |", "|  | 0.30 | 0.20 | 4.000 |"]
     assert "\n".join(held) in page
     # Of 1 + 1 + 1 + 4 and 2 + 2 + 2 / 2 + 0 nats the second is taken.
-    assert "6.0 on average, those suggested 5.0." in page
+    assert "6.0 per\nepisode on average, 5.0 in those suggested." in page
 
 
 def test_the_cells_that_teach_most_come_first_unless_hardly_a_step_is_in_them(suggestion: Suggestion) -> None:

@@ -15,9 +15,13 @@ def results(tested_in: str, *rows: str) -> Results:
 @pytest.mark.parametrize(
     ("rows", "words", "told"),
     [
-        (("direct_transfer", "nas"), "in the simulator grounded by NAS", "no row was trained but NAS. "),
-        (("nas", "nas_plus", "astra"), "in the simulator grounded by NAS", "trained but NAS and NAS+. "),
-        (("direct_transfer", "astra"), "in a simulator", "in the very simulator that it was trained in"),
+        (("direct_transfer", "nas"), "in the simulator grounded by NAS", "in which only NAS trained. "),
+        (("nas", "nas_plus", "astra"), "in the simulator grounded by NAS", "only NAS and NAS+ trained. "),
+        (
+            ("direct_transfer", "astra"),
+            "in a simulator",
+            "Each row was tested in the simulator it was trained in",
+        ),
     ],
 )
 def test_results_without_a_target_say_so_first(rows: tuple[str, ...], words: str, told: str) -> None:

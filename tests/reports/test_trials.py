@@ -36,7 +36,9 @@ def test_the_page_says_who_was_tried_how_often_with_what_success() -> None:
     second = TrialRound(trials=2, candidates=[("nas", 1)], tried=[Tried(row="nas", seed=1, success=[1, 1])])
     done = BEGUN.model_copy(update={"rounds": [FIRST, second], "chosen": ("nas", 1), "mean": 0.625})
     page = select_page("cart", JUDGED, done)
-    assert "**NAS, seed 1**: success 0.62 by the prediction and its trials. 6 of 9 episodes" in page
+    assert (
+        "**NAS, seed 1**: success 0.62, estimated from the prediction and the trials. 6 of 9 episodes" in page
+    )
     assert "| 2 | NAS | 1 | 2 | 2 | 0.62 |" in page  # (4 · 0.25 + 4) / (4 + 4)
 
 

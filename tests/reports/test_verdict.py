@@ -48,14 +48,14 @@ def test_without_a_choice_it_is_the_best_mean_of_no_reference(results: Results) 
     assert sentence(verdict).startswith(
         "Deploy ASTRA+: success 0.92 ± 0.14 in the target (3 seeds with 4 episodes each; "
     )
-    assert "It is the row with the best mean over seeds; the stage select chose no policy." in verdict.reason
+    assert "This row has the best mean over seeds; the select stage chose no policy." in verdict.reason
     labels = [(fact.label, fact.value) for fact in verdict.facts]
     assert labels == [
         ("ASTRA+", "0.92 ± 0.14"),
         ("Direct transfer (floor)", "0.17 ± 0.14"),
         ("Careful follower (ceiling)", "1.00 ± 0.00"),
     ]
-    few = "have 3 seeds to compare: by chance, equal rows may lie as far apart."
+    few = "are compared over only 3 seeds: equal rows may differ as much by chance."
     assert verdict.remarks == [f"ASTRA+ and Direct transfer {few}"]
 
 
@@ -64,15 +64,15 @@ def test_the_choice_of_select_comes_before_the_best_mean(tmp_path: Path) -> None
     assert (verdict.row, verdict.title) == ("astra", "ASTRA, seed 2")
     # Wilson's interval of 3 of 4 episodes.
     assert sentence(verdict).startswith(
-        "Deploy ASTRA, seed 2. Its success was predicted, without the target, as 1.00 "
-        "(95 % interval 1.00 to 1.00) and measured in the target as 0.75 (95 % interval 0.30 to 0.95), "
-        "over 4 episodes. The stage select chose it from 6 policies."
+        "Deploy ASTRA, seed 2. Its success, predicted without the target, is 1.00 "
+        "(95 % interval 1.00 to 1.00); measured in the target, it is 0.75 (95 % interval 0.30 to 0.95) "
+        "over 4 episodes. The select stage chose it from 6 policies."
     )
     assert any(
-        remark.startswith("By the mean over seeds ASTRA+ is ahead: success 0.92")
+        remark.startswith("By the mean over seeds, ASTRA+ is ahead: success 0.92")
         for remark in verdict.remarks
     )
-    assert any("better in the target, by 0.25" in remark for remark in verdict.remarks)
+    assert any("better in the target by 0.25" in remark for remark in verdict.remarks)
     assert [fact.value for fact in verdict.facts[:3]] == ["1.00", "0.75", "0.50 ± 0.25"]
 
 
@@ -81,7 +81,7 @@ def test_a_floor_that_is_as_good_is_told_first_and_not_deployed(results: Results
     verdict = verdict_of(with_success(results, direct_transfer=floor))
     assert verdict.row == "astra_plus"
     assert sentence(verdict).startswith(
-        "No gain over the floor: Direct transfer does as well or better. Of the rest, deploy ASTRA+: "
+        "No gain over the floor: Direct transfer does as well or better. Of the other rows, deploy ASTRA+: "
     )
     less = verdict_of(with_success(results, direct_transfer=[0.75, 0.75, 1.0]))
     assert less.opening == "Deploy"
@@ -102,12 +102,12 @@ def test_a_choice_of_a_ceiling_or_of_what_is_untested_is_passed_over(results: Re
     )
     verdict = verdict_of(results.model_copy(update={"choice": choice}))
     assert verdict.title == "ASTRA, seed 2"
-    assert "as 0.70 (interval withheld), and not measured in the target. " in verdict.reason
+    assert "is 0.70 (interval withheld); it was not measured in the target. " in verdict.reason
     assert verdict.remarks[:2] == [
         "select ranks NAS, seed 0 higher, but it has not been tested yet.",
-        "select ranks Careful follower, seed 1 higher, but it is of a reference row (ceiling).",
+        "select ranks Careful follower, seed 1 higher, but it belongs to a reference row (ceiling).",
     ]
-    assert "Withheld of the choice: interval, because fewer than 3 judges." in verdict.remarks
+    assert "Withheld for the choice: interval (fewer than 3 judges)." in verdict.remarks
     assert any("All seeds have the same episodes" in remark for remark in verdict.remarks)
     # The regret is that of the first candidate.
     assert not any("regret" in remark for remark in verdict.remarks)
@@ -121,24 +121,26 @@ def test_a_chosen_policy_of_the_floor_is_the_one_to_deploy(
     choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
     verdict = verdict_of(results.model_copy(update={"choice": choice}))
     assert (verdict.row, verdict.title) == ("direct_transfer", "Direct transfer, seed 1")
-    assert verdict.opening == "No gain over the floor: of all policies, the one to deploy is"
+    assert verdict.opening == "No gain over the floor: the policy to deploy is"
     assert [fact.label for fact in verdict.facts].count("Direct transfer (floor)") == 1
-    assert verdict.remarks[0].startswith("By the mean over seeds ASTRA+ is ahead: success 0.92 ± 0.14 in the")
-    assert not any("overlap" in remark or "seeds to compare" in remark for remark in verdict.remarks)
+    assert verdict.remarks[0].startswith(
+        "By the mean over seeds, ASTRA+ is ahead: success 0.92 ± 0.14 in the"
+    )
+    assert not any("overlap" in remark or "compared over only" in remark for remark in verdict.remarks)
 
 
 def test_where_all_are_predicted_to_fail_none_is_deployed(results: Results) -> None:
     candidates = [candidate("astra", 1, 0.0), candidate("astra", 2, 0.0)]
     choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
     verdict = verdict_of(results.model_copy(update={"choice": choice}))
-    assert verdict.opening == "Deploy none, for all are predicted to fail: the first in the ranking is"
-    assert verdict.remarks[0] == "2 policies are level with it in the ranking, itself among them."
+    assert verdict.opening == "Deploy none: all are predicted to fail. The first in the ranking is"
+    assert verdict.remarks[0] == "2 policies, including this one, tie in the ranking."
     candidates = [candidate("astra", 1, 0.1), candidate("astra", 2, 0.0)]
     verdict = verdict_of(
         results.model_copy(update={"choice": choice.model_copy(update={"candidates": candidates})})
     )
     assert verdict.opening == "Deploy" and not any(
-        "are level with it" in remark for remark in verdict.remarks
+        "tie in the ranking" in remark for remark in verdict.remarks
     )
 
 
@@ -168,8 +170,8 @@ def test_without_a_target_rows_are_compared_by_what_is_predicted(results: Result
     assert (verdict.opening, verdict.title) == ("Deploy", "ASTRA, seed 1")
     unfinished = choice.model_copy(update={"candidates": [candidate("nas", 0, 1.0), *candidates]})
     assert verdict_of(untested.model_copy(update={"choice": unfinished})).title == "ASTRA, seed 1"
-    assert "Direct transfer is predicted 0.10, a mean over its seeds." in verdict.remarks
-    assert "By the mean over seeds ASTRA+ is ahead: predicted success 0.80." in verdict.remarks
+    assert "Predicted success of Direct transfer: 0.10, the mean over its seeds." in verdict.remarks
+    assert "By the mean over seeds, ASTRA+ is ahead: predicted success 0.80." in verdict.remarks
     assert not any("overlap" in remark for remark in verdict.remarks)
     assert next(fact for fact in verdict.facts if fact.label == "ASTRA").note.startswith("success in ")
     as_good = choice.model_copy(
@@ -203,12 +205,12 @@ def test_a_single_seed_has_no_interval(tmp_path: Path) -> None:
         "Deploy ASTRA+: success 0.75 in the target (one seed with 4 episodes). "
     )
     assert "95" not in sentence(verdict) and "±" not in "".join(fact.value for fact in verdict.facts)
-    assert any("One seed has no interval over seeds" in remark for remark in verdict.remarks)
+    assert any("With one seed, there is no interval" in remark for remark in verdict.remarks)
 
 
 def test_ties_and_failures_are_told(results: Results) -> None:
     tied = verdict_of(with_success(results, astra=[1.0, 0.75, 1.0]))
-    assert tied.row == "astra" and "As good by the mean: ASTRA+." in tied.remarks
+    assert tied.row == "astra" and "Equal by the mean: ASTRA+." in tied.remarks
     row = results.methods["astra_plus"].model_copy(update={"failed": [0.75, 0.25, 0.5]})
     failing = results.model_copy(update={"methods": results.methods | {"astra_plus": summarised(row, 100)}})
     assert verdict_of(failing).remarks[-1].startswith("ASTRA+ fails in 50\N{NO-BREAK SPACE}% of its episodes")
@@ -309,11 +311,11 @@ def test_the_row_with_fewer_seeds_decides_whether_there_are_enough(
         for name, (count, share) in seeds.items()
     }
     remarks = verdict_of(results.model_copy(update={"methods": results.methods | rows})).remarks
-    chance = "by chance, equal rows may lie as far apart."
-    assert remarks == [f"ASTRA+ and Direct transfer have {count} seeds to compare: {chance}" for count in few]
+    chance = "seeds: equal rows may differ as much by chance."
+    assert remarks == [f"ASTRA+ and Direct transfer are compared over only {count} {chance}" for count in few]
 
 
 def test_a_reference_is_no_tie(results: Results) -> None:
     # As many as the follower, which is the ceiling.
     verdict = verdict_of(with_success(results, astra_plus=[1.0, 1.0, 1.0]))
-    assert verdict.row == "astra_plus" and not any("As good" in remark for remark in verdict.remarks)
+    assert verdict.row == "astra_plus" and not any("Equal by" in remark for remark in verdict.remarks)

@@ -127,7 +127,7 @@ def test_origin_is_what_the_artefacts_recorded(values: Any, folder: Path) -> Non
     assert drawn["stages"] == ["report"]
     assert drawn["packages"]["numpy"] == np.__version__
     page = (folder / "results.md").read_text()
-    assert "on Fast, 8 cores, 16 GiB of memory, H200. Wall time" in page
+    assert "on Fast, 8 cores, 16 GiB of memory, H200. Total wall time" in page
     assert "- Code: commit `abc` with uncommitted changes (collect, pair, ground, train, evaluate); " in page
     assert "- Versions: torch 2.0.0 (collect, pair, ground, train, evaluate); python " in page
     first = {"name": "antmaze-u-random", "version": "data-1.0.0", "content_hash": "hash0"}
@@ -248,7 +248,7 @@ def test_there_must_be_results_to_add_to(root: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected published results in .*antmaze_u.json, found none"):
         make(root, add_to=tmp_path / "antmaze_u.json")
     (tmp_path / "antmaze_u.json").write_text("{}")
-    with pytest.raises(BadInputError, match=r"antmaze_u.json does not hold results as they are written now"):
+    with pytest.raises(BadInputError, match=r"antmaze_u.json does not hold results in the current format"):
         make(root, add_to=tmp_path / "antmaze_u.json")
 
 
@@ -339,7 +339,7 @@ def test_rows_that_were_tested_in_no_simulator_have_no_predictive_validity(root:
 def test_the_page_says_that_a_robot_is_a_stand_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "task_named", {"antmaze-u": task(facts={"stand_in": "mujoco"})}.__getitem__)
     make(root)
-    text = "**A simulated stand-in (`mujoco`) takes the physical robot's place"
+    text = "**A simulated stand-in (`mujoco`) replaces the physical robot"
     assert text in (root / "report/results.md").read_text()
 
 
@@ -433,10 +433,10 @@ def test_a_choice_without_the_target_is_reported(root: Path, tmp_path: Path) -> 
     assert choice["regret"] == pytest.approx(0.25)
     assert choice["calibration"]["astra"]["signed"] == pytest.approx(0.4)
     page = (tmp_path / "results/antmaze_u.md").read_text()
-    assert "**ASTRA, seed 2**, of 6 policies: predicted success 1.00 [1.00, 1.00]." in page
+    assert "**ASTRA, seed 2**, chosen from 6 policies: predicted success 1.00 [1.00, 1.00]." in page
     assert "| ASTRA | 2 | 1.00 | 1.00 [1.00, 1.00] | 3 | 0.75 |" in page
     assert "| ASTRA | 3 | +0.40 | 0.40 |" in page and "| ASTRA+ | 3 | -0.58 | 0.58 |" in page
-    assert "Regret of the chosen, by success in the target: 0.25; of one drawn at random: 0.29." in page
+    assert "Regret of the chosen policy, in success in the target: 0.25; of a random policy: 0.29." in page
     assert "| select | 8 s | - |  |" in page
     manifest = read_manifest(root / "report")
     assert manifest and manifest.made_from["select"] == file_digest(root / "select/select.json")

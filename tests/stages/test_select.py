@@ -191,7 +191,9 @@ def test_judges_of_the_same_episodes_are_named(root: Path) -> None:
     found = judged(root, reported(root, methods=("nas",), settings={"data": "logs@data-1.0.0"}))
     assert found.shares_episodes
     page = (root / "select/select.md").read_text()
-    assert "fitted to the same episodes" in page and "no judge is independent of what it judges" in page
+    assert (
+        "fitted to the same episodes" in page and "no judge is independent of the policies it judges" in page
+    )
 
 
 def test_what_is_not_there_is_asked_for(root: Path) -> None:

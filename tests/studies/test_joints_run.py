@@ -69,7 +69,7 @@ def test_each_log_is_a_recording_predicted_from_the_other(recipe: Path, tmp_path
     assert cells["mean"]["less_than_raw"] == cells["all_joints"]["less_than_raw"] > 0.9
     text = page.read_text()
     assert "| LF_KFE |" in text and "Second-order response" in text
-    assert "hold no targets" not in text and "walk" not in text
+    assert "have no targets" not in text and "walk" not in text
     assert page.with_suffix(".png").stat().st_size > 1000
 
 
@@ -78,7 +78,7 @@ def test_logs_without_targets_are_predicted_and_never_mixed_with_others(recipe: 
     with_targets = next((tmp_path / "runs/toy/recordings").iterdir())
     (tmp_path / "toy_mapping.toml").write_text(MAPPING)
     page = measure_gap(recipe, tmp_path / "logs/run_1.pt", root=tmp_path / "runs")
-    assert "These recordings hold no targets" in page.read_text()
+    assert "These recordings have no targets" in page.read_text()
     with pytest.raises(BadInputError, match="the same joints, with targets in all or in none"):
         measure_gap(recipe, tmp_path / "logs/run_1.pt", with_targets, root=tmp_path / "runs")
 

@@ -55,8 +55,8 @@ def test_one_folder_is_split_and_each_recording_predicted_from_the_other(
     ridge = held_out["sizes"][-1]["models"]["ridge"]["1"]
     assert ridge["mean"]["less_than_raw"] > 0.5
     text = page.read_text()
-    assert "real robot, and it is prediction, not control" in text
-    assert "self-localisation, not motion capture" in text
+    assert "real robot, and this is prediction, not control" in text
+    assert "self-localization, not motion capture" in text
     assert "--data" in text
     assert (tmp_path / "results/toy.png").read_bytes() == page.with_suffix(".png").read_bytes()
     fits = sorted(path for path in page.parent.rglob("*.safetensors"))

@@ -120,7 +120,7 @@ def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figu
         if any(map(is_plus, curves)):
             handles = [
                 Line2D([], [], color=INK, label="without the [plus] settings"),
-                Line2D([], [], color=INK, ls="--", label="with them"),
+                Line2D([], [], color=INK, ls="--", label="with the [plus] settings"),
             ]
             figure.legend(handles=handles, loc="outside upper center", ncols=2, handlelength=2.4)
         return figure

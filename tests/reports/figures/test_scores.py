@@ -62,7 +62,7 @@ def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
     figure = learning_curves(SUCCESS, curves)
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["NAS", "ASTRA"]
     first, second = figure.axes
-    assert legend(figure) == ["without the [plus] settings", "with them"]
+    assert legend(figure) == ["without the [plus] settings", "with the [plus] settings"]
     assert (len(first.collections), len(second.collections)) == (1, 0)  # a band needs two seeds
     (nas, nas_plus), (astra,) = first.lines, second.lines
     assert nas_plus.get_linestyle() == "--"
