@@ -35,7 +35,7 @@ from astra_data.core.errors import AstraDataError
 from astra_data.core.optional import missing_extra
 
 app = typer.Typer(
-    help="Robot trajectories into datasets, datasets into policies that transfer from an abstract simulator.",
+    help="Turn robot logs into datasets, and datasets into policies trained in a simplified simulator.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -57,7 +57,8 @@ def _options(
     no_fsync: Annotated[
         bool,
         typer.Option(
-            "--no-fsync", help="Faster, but what is written survives only kills, not a power failure."
+            "--no-fsync",
+            help="Do not wait for the disk: faster, but a power failure may lose what was written.",
         ),
     ] = False,
 ) -> None:
@@ -116,7 +117,7 @@ for panel, commands in PANELS.items():
 app.add_typer(
     shipping.app,
     name="recipes",
-    help="List the recipes that come with the package, or copy one.",
+    help="List or copy the package's recipes and mappings.",
     rich_help_panel="Recipes",
 )
 

@@ -9,7 +9,7 @@ DatasetName = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
-        help="A folder, name@data-1.2.0, or name for its highest version.",
+        help="A folder, name@data-1.2.0, or a name (for its highest version).",
         show_default=False,
     ),
 ]
@@ -17,8 +17,8 @@ Source = Annotated[
     str,
     typer.Argument(
         metavar="RECIPE|DATASET",
-        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or name for its highest version. "
-        "Settings below are for a dataset; a recipe has its own.",
+        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or a name (for its highest "
+        "version). The settings below apply to a dataset only; a recipe has its own.",
         show_default=False,
     ),
 ]
@@ -32,6 +32,6 @@ Out = Annotated[
 NewName = Annotated[
     str | None,
     typer.Option(
-        "--name", help="Make it a dataset of its own, from version 1.0.0 on.", show_default="a new version"
+        "--name", help="Start a dataset with this name, at version 1.0.0.", show_default="a new version"
     ),
 ]

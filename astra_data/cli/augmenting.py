@@ -12,8 +12,8 @@ def augment(
     task: Annotated[
         str | None,
         typer.Option(
-            help="Task that computes rewards and ends of the copies.",
-            show_default="the one the dataset was collected for",
+            help="Task that computes the rewards and endings of the copies.",
+            show_default="the dataset's own task",
         ),
     ] = None,
     name: NewName = None,
@@ -22,22 +22,22 @@ def augment(
         int | None, typer.Option(help="Copies of each training episode.", show_default="3")
     ] = None,
     episodes: Annotated[
-        int | None, typer.Option(help="Episodes in all, instead of --copies.", show_default=False)
+        int | None, typer.Option(help="Total number of episodes, instead of --copies.", show_default=False)
     ] = None,
     rotations: Annotated[
-        str | None, typer.Option(help="any (angle), quarter (turns) or none.", show_default="any")
+        str | None, typer.Option(help="any (angle), quarter (turns), or none.", show_default="any")
     ] = None,
     translations: Annotated[
         bool | None,
         typer.Option(
             "--translations/--no-translations",
-            help="Place copies anywhere in the maze, or where the original started.",
+            help="Start copies anywhere in the maze, or where the original started.",
             show_default="translations",
         ),
     ] = None,
     held_out_share: Annotated[
         float | None,
-        typer.Option(help="Share of episodes that are held out and never copied.", show_default="0.1"),
+        typer.Option(help="Fraction of episodes to hold out; they are never copied.", show_default="0.1"),
     ] = None,
     keep_originals: Annotated[
         bool | None,
@@ -48,15 +48,15 @@ def augment(
         ),
     ] = None,
     margin_m: Annotated[
-        float | None, typer.Option(help="Clearance from the walls, in m.", show_default="the robot's reach")
+        float | None, typer.Option(help="Minimum distance to walls, in m.", show_default="the robot's reach")
     ] = None,
-    min_steps: Annotated[int | None, typer.Option(help="Fewest steps of a copy.", show_default="20")] = None,
+    min_steps: Annotated[int | None, typer.Option(help="Minimum steps of a copy.", show_default="20")] = None,
     tries: Annotated[
-        int | None, typer.Option(help="Rotations tried per copy before it is given up.", show_default="100")
+        int | None, typer.Option(help="Rotations to try per copy before giving up.", show_default="100")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of all randomness.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
 ) -> None:
-    """Make more episodes by rotating and translating them; the dataset must not be paired yet."""
+    """Add rotated and shifted copies of episodes; the dataset must not be paired yet."""
     from astra_data.core.config import only_given, validated
     from astra_data.dataset.versions import locate
     from astra_data.experiments.display import shown

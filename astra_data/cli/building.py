@@ -15,7 +15,7 @@ Task = Annotated[
     typer.Argument(
         metavar="RECIPE|TASK",
         help="A recipe (.toml), or a task such as antmaze-umaze. "
-        "Settings below are for a task; a recipe has its own.",
+        "The settings below apply to a task only; a recipe has its own.",
         show_default=False,
     ),
 ]
@@ -23,8 +23,8 @@ SeedOrSeeds = Annotated[
     list[int] | None,
     typer.Option(
         "--seed",
-        help="Seed of all randomness; of a recipe, only these of its seeds.",
-        show_default="0; all of a recipe",
+        help="Random seed; with a recipe, run only this one of its seeds (may be repeated).",
+        show_default="0; all seeds of a recipe",
     ),
 ]
 Behavior = Annotated[
@@ -33,44 +33,48 @@ Behavior = Annotated[
         help="random, stress, policy, suboptimal_ppo, suboptimal_sac or planned.", show_default="random"
     ),
 ]
-Episodes = Annotated[int | None, typer.Option(help="Episodes in all.", show_default="200")]
+Episodes = Annotated[int | None, typer.Option(help="Number of episodes.", show_default="200")]
 LeastSteps = Annotated[
     int | None,
-    typer.Option(help="Only as many episodes as have these steps together.", show_default="all episodes"),
+    typer.Option(help="Stop once the episodes have this many steps in total.", show_default="all episodes"),
 ]
-MaxSteps = Annotated[int | None, typer.Option(help="Longest episode, in steps.", show_default="500")]
+MaxSteps = Annotated[int | None, typer.Option(help="Maximum steps per episode.", show_default="500")]
 Start = Annotated[
     str | None, typer.Option(help="Where episodes start: anywhere or task.", show_default="anywhere")
 ]
 Hold = Annotated[
     tuple[float, float] | None,
     typer.Option(
-        metavar="LEAST LARGEST", help="How long random commands are held, in s.", show_default="0.5 3"
+        metavar="LEAST LARGEST", help="How long each random command is held, in s.", show_default="0.5 3"
     ),
 ]
 PpoSteps = Annotated[
-    int | None, typer.Option(help="Steps after which suboptimal_ppo stops learning.", show_default="300000")
+    int | None, typer.Option(help="Environment steps that suboptimal_ppo learns for.", show_default="300000")
 ]
 SacSteps = Annotated[
     int | None,
-    typer.Option(help="Steps after which suboptimal_sac stops at the latest.", show_default="300000"),
+    typer.Option(help="Maximum environment steps that suboptimal_sac learns for.", show_default="300000"),
 ]
 SacEpisodeSteps = Annotated[
     int | None,
-    typer.Option(help="Mean episode length at which suboptimal_sac stops learning.", show_default="500"),
+    typer.Option(
+        help="Stop suboptimal_sac once its mean episode length, in steps, reaches this.", show_default="500"
+    ),
 ]
 RandomShare = Annotated[
     float | None,
-    typer.Option(help="Share of the episodes of a policy that are random instead.", show_default="0"),
+    typer.Option(help="With a policy: fraction of episodes with random commands instead.", show_default="0"),
 ]
 Clearance = Annotated[
     float | None,
-    typer.Option(help="Replace random commands that lead closer to walls, in m.", show_default="0"),
+    typer.Option(
+        help="Replace random commands that would lead closer to walls than this, in m.", show_default="0"
+    ),
 ]
 Policy = Annotated[
     str | None,
     typer.Option(
-        help="Folder of the policy: made by a training, or meta/astra of a dataset.", show_default=False
+        help="Folder of the policy: written by train, or meta/astra of a dataset.", show_default=False
     ),
 ]
 Grounding = Annotated[
@@ -81,12 +85,14 @@ Encoder = Annotated[
 ]
 Plan = Annotated[
     str | None,
-    typer.Option(help="Planned episodes to record: plan.json of `astra-data suggest`.", show_default=False),
+    typer.Option(
+        help="Record these planned episodes: plan.json written by `astra-data suggest`.", show_default=False
+    ),
 ]
 Name = Annotated[
     str | None, typer.Option(help="Name of the dataset.", show_default="task, behavior and seed")
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted call of the same command.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue the same command after an interruption.")]
 
 
 def collect(
@@ -113,7 +119,7 @@ def collect(
     out: Out = None,
     resume: Resume = False,
 ) -> None:
-    """Collect a dataset in the target environment."""
+    """Record episodes in the target environment."""
     from astra_data.core.config import only_given, validated
 
     given = only_given(
@@ -138,7 +144,9 @@ def collect(
         run_stage(Path(task), "collect", seeds=seeds or (), jobs=jobs, root=root)
         return
     if len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError("collect: a task takes one --seed and no --jobs, which are for recipes")
+        raise BadInputError(
+            "collect: with a task, give at most one --seed and no --jobs (these are for recipes)"
+        )
     import torch
 
     from astra_data.experiments.display import shown
@@ -166,21 +174,22 @@ def pair(
     simulator: Annotated[
         str | None,
         typer.Option(
-            help="A task, for its abstract simulator, one of an installed package, or your own class: "
-            "path.py:MySimulator, whose code is run.",
+            help="A task (to use its abstract simulator), a simulator of an installed package, or your own "
+            "class: path.py:MySimulator. Its code is run.",
             show_default=False,
         ),
     ] = None,
     reset_tolerance: Annotated[
         float | None,
         typer.Option(
-            help="Largest difference between a reset simulator's state and φ(s).", show_default="1e-6"
+            help="Maximum difference between φ(s) and the simulator's state after a reset.",
+            show_default="1e-6",
         ),
     ] = None,
     name: NewName = None,
     out: Out = None,
 ) -> None:
-    """Add to every transition the abstract simulator's next state from the same state and action."""
+    """Add the abstract simulator's next state, from the same state and action, to every step."""
     from astra_data.core.config import only_given, validated
 
     given = only_given(reset_tolerance=reset_tolerance)
@@ -189,7 +198,7 @@ def pair(
         run_stage(Path(dataset), "pair", seeds=seeds or (), jobs=jobs, root=root)
         return
     if seeds or jobs is not None:
-        raise BadInputError("pair: a dataset takes neither --seed nor --jobs, which are for recipes")
+        raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
     from astra_data.dataset.versions import locate
     from astra_data.experiments.display import shown
     from astra_data.stages.pair import PairConfig
@@ -197,7 +206,7 @@ def pair(
 
     config = validated(given, PairConfig, "pair")
     if simulator is None:
-        raise BadInputError("pair: expected --simulator, a task or path.py:MySimulator")
+        raise BadInputError("pair: expected --simulator: a task or path.py:MySimulator")
     with shown("pair") as progress:
         folder = pair_dataset(
             simulator, config, dataset=locate(dataset), name=name, out=out, progress=progress

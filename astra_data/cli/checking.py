@@ -11,10 +11,10 @@ from astra_data.cli.arguments import DatasetName
 def validate(
     dataset: DatasetName,
     with_lerobot: Annotated[
-        bool, typer.Option("--with-lerobot", help="Also compare windows with lerobot's own loader; slow.")
+        bool, typer.Option("--with-lerobot", help="Also compare with what lerobot's own loader reads (slow).")
     ] = False,
 ) -> None:
-    """Check every file and value of a LeRobot dataset, and list all faults."""
+    """Check every file and value of a LeRobot dataset and list all errors."""
     from astra_data.core.errors import BadInputError, CorruptDatasetError
     from astra_data.dataset.columns import TERMINATED
     from astra_data.dataset.doctor.check import check
@@ -31,15 +31,15 @@ def validate(
     for note in report.notes:
         typer.echo(f"note: {note}")
     if report.faults:
-        count = "1 fault" if report.fault_count == 1 else f"{report.fault_count} faults"
+        count = "1 error" if report.fault_count == 1 else f"{report.fault_count} errors"
         message = "\n  ".join([f"{root} has {count}:", *report.faults])
         if can_be_repaired(root):
-            message += f"\nTo save its whole episodes: astra-data repair {root} --out DIR"
+            message += f"\nTo recover its intact episodes: astra-data repair {root} --out DIR"
         raise CorruptDatasetError(message)
-    typer.echo(f"{root} is whole: {report.episodes} episodes, {report.frames} steps")
+    typer.echo(f"{root} is intact: {report.episodes} episodes, {report.frames} steps")
     try:
         whole = Dataset.open(root)
-    except BadInputError as error:  # whole, but no robot's trajectories
+    except BadInputError as error:  # intact, but no robot's trajectories
         typer.echo(f"note: {error}")
         return
     if TERMINATED in whole.features:
@@ -58,16 +58,16 @@ def repair(
         list[str] | None,
         typer.Option(
             metavar="DATASET",
-            help="The dataset from which FOLDER was made by LeRobot's tools: its origin and its episodes' "
-            "metadata are copied, matched by uid and values. After a merge, once for each dataset merged.",
+            help="The dataset that LeRobot's tools made FOLDER from. Its origin and its episodes' metadata "
+            "are copied to episodes with the same uid and values. After a merge, give each dataset merged.",
             show_default=False,
         ),
     ] = None,
     new_uids: Annotated[
-        bool, typer.Option("--new-uids", help="Keep episodes whose uid is taken, under new ones.")
+        bool, typer.Option("--new-uids", help="Keep episodes whose uid is already taken, under new uids.")
     ] = False,
 ) -> None:
-    """Save the intact episodes of a broken dataset, of astra-data or LeRobot, to a new one."""
+    """Recover the intact episodes of a damaged dataset, of astra-data or LeRobot, into a new one."""
     from astra_data.dataset.doctor.repair import repair as save
     from astra_data.dataset.versions import open_dataset
 

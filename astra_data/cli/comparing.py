@@ -12,7 +12,7 @@ _SHOWN = 5
 
 
 def log(dataset: DatasetName) -> None:
-    """Show the datasets that one was made from, as a tree with versions, hashes, stages and settings."""
+    """Show what a dataset was made from: a tree of datasets with versions, hashes, stages and settings."""
     from astra_data.dataset.lineage import lineage, tree_lines
     from astra_data.dataset.versions import open_dataset
 

@@ -14,30 +14,32 @@ from astra_data.core.naming import RUNS
 def subset(
     dataset: Source,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="How many episodes.", show_default=False)
+        int | None, typer.Option(min=1, help="Number of episodes to keep.", show_default=False)
     ] = None,
     percent: Annotated[
         int | None,
-        typer.Option(min=1, help="Or how many, in per cent of --of; may exceed 100.", show_default=False),
+        typer.Option(min=1, help="The same as a percentage of --of; may exceed 100.", show_default=False),
     ] = None,
     of: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Number of episodes that is 100 per cent.", show_default="all episodes of DATASET"
+            min=1,
+            help="Number of episodes that counts as 100 percent.",
+            show_default="all episodes of DATASET",
         ),
     ] = None,
     seeds: Annotated[
         list[int] | None,
         typer.Option(
             "--seed",
-            help="Seed of the permutation; of a recipe, only these of its seeds.",
-            show_default="the one stored in DATASET; all of a recipe",
+            help="Seed of the random choice; with a recipe, run only this of its seeds (may be repeated).",
+            show_default="the one stored in DATASET; all seeds of a recipe",
         ),
     ] = None,
     stratify: Annotated[
         str | None,
         typer.Option(
-            help="Key of the episodes' metadata, such as success: each value keeps its share.",
+            help="Key of the episodes' metadata, such as success, whose values keep their proportions.",
             show_default=False,
         ),
     ] = None,
@@ -46,14 +48,16 @@ def subset(
     jobs: Jobs = None,
     root: Root = RUNS,
 ) -> None:
-    """Write a random subset; with the same seed, larger subsets contain smaller ones."""
+    """Write a random subset; with the same seed, smaller subsets are contained in larger ones."""
     if dataset.endswith(".toml"):
         options = {"episodes": episodes, "percent": percent, "of": of, "stratify": stratify}
         refuse(options | {"name": name, "out": out}, "subset", "sweep")
         run_stage(Path(dataset), "subset", seeds=seeds or (), jobs=jobs, root=root)
         return
     if len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError("subset: a dataset takes one --seed and no --jobs, which are for recipes")
+        raise BadInputError(
+            "subset: with a dataset, give at most one --seed and no --jobs (these are for recipes)"
+        )
     from astra_data.dataset.edit import subset as write
     from astra_data.dataset.versions import open_dataset
 
@@ -77,11 +81,11 @@ def merge(
         list[str],
         typer.Argument(
             metavar="DATASET",
-            help="Two or more, with equal columns, fps, task, environment and simulator.",
+            help="Two or more datasets with the same columns, fps, task, environment and simulator.",
         ),
     ],
     new_uids: Annotated[
-        bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is taken.")
+        bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is already taken.")
     ] = False,
     name: NewName = None,
     out: Out = None,
@@ -115,16 +119,18 @@ def filter_(
     dataset: DatasetName,
     success: Annotated[
         bool | None,
-        typer.Option("--success/--no-success", help="Only successes, or only failures.", show_default=False),
+        typer.Option(
+            "--success/--no-success", help="Keep only successes, or only failures.", show_default=False
+        ),
     ] = None,
-    min_return: Annotated[float | None, typer.Option(help="Smallest return.", show_default=False)] = None,
-    max_return: Annotated[float | None, typer.Option(help="Largest return.", show_default=False)] = None,
-    min_length: Annotated[int | None, typer.Option(help="Fewest steps.", show_default=False)] = None,
-    max_length: Annotated[int | None, typer.Option(help="Most steps.", show_default=False)] = None,
+    min_return: Annotated[float | None, typer.Option(help="Minimum return.", show_default=False)] = None,
+    max_return: Annotated[float | None, typer.Option(help="Maximum return.", show_default=False)] = None,
+    min_length: Annotated[int | None, typer.Option(help="Minimum steps.", show_default=False)] = None,
+    max_length: Annotated[int | None, typer.Option(help="Maximum steps.", show_default=False)] = None,
     name: NewName = None,
     out: Out = None,
 ) -> None:
-    """Write the episodes that meet every given condition."""
+    """Write a dataset of the episodes that meet every given condition."""
     from astra_data.dataset.edit import filter_episodes
     from astra_data.dataset.versions import open_dataset
 

@@ -12,10 +12,11 @@ def export(
     dataset: DatasetName,
     format: Annotated[str, typer.Option(help="minari, d4rl, robomimic or d3rlpy.", show_default=False)],
     out: Annotated[
-        Path, typer.Option(help="The new file; for minari a folder, maze/random-v0.", show_default=False)
+        Path,
+        typer.Option(help="The new file; for minari a folder, such as maze/random-v0.", show_default=False),
     ],
 ) -> None:
-    """Write a dataset in the format of another library."""
+    """Convert a dataset to the format of another library."""
     from astra_data.dataset.versions import open_dataset
     from astra_data.exchange.exporters import export as write
 

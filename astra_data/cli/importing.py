@@ -15,8 +15,8 @@ MappingFile = Annotated[
     Path | None,
     typer.Option(
         "--mapping",
-        help="TOML file: which fields become which columns. D4RL, robomimic, d3rlpy, Minari and PACE "
-        "need none.",
+        help="TOML file that says which fields become which columns. D4RL, robomimic, d3rlpy, Minari and "
+        "PACE need none.",
         show_default=False,
     ),
 ]
@@ -30,12 +30,14 @@ FileFormat = Annotated[
 ]
 Name = Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")]
 Fps = Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")]
-Task = Annotated[str | None, typer.Option(help="What the episodes do.", show_default="the mapping's")]
+Task = Annotated[
+    str | None, typer.Option(help="What the robot does in the episodes.", show_default="the mapping's")
+]
 MaxBytes = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="Refuse recordings that unpack to more values, of 8 bytes each.",
+        help="Refuse recordings that unpack to more bytes (8 per value).",
         show_default="100 times their size, or 256 MB",
     ),
 ]
@@ -43,7 +45,7 @@ SkipBad = Annotated[
     bool,
     typer.Option(
         "--skip-bad",
-        help="Leave out files that cannot be imported, and tell them at the end; each file is read twice.",
+        help="Skip files that cannot be imported and list them at the end; reads each file twice.",
     ),
 ]
 

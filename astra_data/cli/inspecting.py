@@ -21,10 +21,12 @@ def inspect(
     ] = None,
     json: Annotated[
         Path | None,
-        typer.Option(help="File for the findings, with all episodes of each.", show_default="no file"),
+        typer.Option(
+            help="File for the check-up's findings, each with all its episodes.", show_default="no file"
+        ),
     ] = None,
 ) -> None:
-    """Show the contents of a dataset: its values, its episodes, where the robot was, what is odd."""
+    """Show a dataset's values, episodes, a map of visited positions, and what looks wrong."""
     from rich.console import Console
 
     from astra_data.cli.inspection_page import inspection_page
@@ -46,8 +48,8 @@ def inspect(
     drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
     if not drawn:
         raise BadInputError(
-            f"{inspection.reference}: expected a state with the role position or vector, got none: give "
-            "its columns a role in the mapping, or leave --plot out"
+            f"{inspection.reference}: expected a state with the role position or vector, found none: "
+            "give its columns a role in the mapping, or leave out --plot"
         )
     for planar, label, unit in drawn:
         path = plot / f"{label}_coverage.png"
@@ -58,21 +60,23 @@ def inspect(
 def list_(
     folders: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="FOLDER", help="Further folders to --clean, such as runs.", show_default=False
-        ),
+        typer.Argument(metavar="FOLDER", help="More folders for --clean, such as runs.", show_default=False),
     ] = None,
     clean: Annotated[
         bool,
-        typer.Option("--clean", help="Remove instead what killed commands left at home and in FOLDER."),
+        typer.Option(
+            "--clean", help="Instead, remove leftovers of killed commands from the home folder and FOLDER."
+        ),
     ] = False,
 ) -> None:
-    """List the datasets at home and their versions."""
+    """List the datasets in the home folder, and their versions."""
     if clean:
         _clean(folders or [])
         return
     if folders:
-        raise BadInputError("list: folders are for --clean; the datasets that are listed are those at home")
+        raise BadInputError(
+            "list: folders are for --clean; without it, list shows the datasets in the home folder"
+        )
     from rich.table import Table
 
     from astra_data.core.errors import AstraDataError, CorruptDatasetError
@@ -105,7 +109,7 @@ def _clean(folders: list[Path]) -> None:
     notes = {
         "removed": "",
         "in use": ": another command is writing it",
-        "kept": ": the command that was interrupted goes on with it, or delete it",
+        "kept": ": the interrupted command can continue from it; otherwise delete it",
     }
     if missing := [str(folder) for folder in folders if not folder.is_dir()]:
         raise BadInputError(f"list --clean: expected folders, got {', '.join(missing)}")
@@ -113,4 +117,4 @@ def _clean(folders: list[Path]) -> None:
     for path, state in found.items():
         typer.echo(f"{state}: {path}{notes[state]}")
     if not found:
-        typer.echo("nothing was left by killed commands")
+        typer.echo("found no leftovers of killed commands")

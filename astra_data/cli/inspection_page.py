@@ -27,7 +27,7 @@ def inspection_page(inspection: Inspection, checkup: Checkup) -> RenderableType:
     parts += [Text(line) for line in checkup.summary]
     parts += [Text(str(finding), style=_STYLES[finding.severity]) for finding in checkup.findings]
     if not checkup.findings:
-        parts.append(Text("no findings in the values; `astra-data validate` reads all files"))
+        parts.append(Text("nothing looks wrong in the values; `astra-data validate` also checks all files"))
     return Group(*parts)
 
 

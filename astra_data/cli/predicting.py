@@ -11,16 +11,16 @@ from astra_data.core.naming import RUNS
 Data = Annotated[
     Path,
     typer.Option(
-        help="Recordings to predict: a dataset or its name, or a log, an archive or a folder of them as the "
-        "recipe's mapping describes them.",
+        help="Recordings to predict: a dataset or its name; or a log, an archive or a folder of logs that "
+        "the recipe's mapping describes.",
         show_default=False,
     ),
 ]
 Train = Annotated[
     Path | None,
     typer.Option(
-        help="Recordings to learn from, in the same form.",
-        show_default="a part of --data, of which the rest is predicted",
+        help="Recordings to fit the models to, in the same form.",
+        show_default="part of --data; the rest is predicted",
     ),
 ]
 

@@ -11,30 +11,30 @@ from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS
 
 RecipePath = Annotated[
-    Path, typer.Argument(metavar="RECIPE", help="A recipe, a TOML file.", show_default=False)
+    Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).", show_default=False)
 ]
-RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE", help="Recipes, TOML files.")]
-Method = Annotated[str | None, typer.Option(help="Only this row of the recipe.", show_default=False)]
+RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE", help="Recipes (TOML files).")]
+Method = Annotated[str | None, typer.Option(help="Run only this row of the recipe.", show_default=False)]
 Seeds = Annotated[
     list[int] | None,
-    typer.Option("--seed", help="Only this seed of the recipe; may be repeated.", show_default=False),
+    typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.", show_default=False),
 ]
-Device = Annotated[str, typer.Option(help="Torch device of the networks: cpu, cuda, cuda:1, …")]
+Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …")]
 Jobs = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="Items at a time, each in its own process; on a CUDA device, each with its own CUDA context.",
+        help="Number of parallel processes; on a CUDA device, each has its own CUDA context.",
         show_default="one per core; 2 with --device cuda",
     ),
 ]
-Root = Annotated[Path, typer.Option(help="Folder of all runs.")]
-Until = Annotated[str | None, typer.Option(help="The last stage to run.", show_default="all")]
+Root = Annotated[Path, typer.Option(help="Folder that contains the runs.")]
+Until = Annotated[str | None, typer.Option(help="Stop after this stage.", show_default="all")]
 Publish = Annotated[
-    bool, typer.Option("--publish", help="Also copy the results to results/ beside the recipe.")
+    bool, typer.Option("--publish", help="Also copy the results to the folder results/ next to the recipe.")
 ]
 Add = Annotated[
-    bool, typer.Option("--add", help="Add to the published results: those that are not in --root are kept.")
+    bool, typer.Option("--add", help="Add to the published results; keep those that are not in --root.")
 ]
 
 
@@ -46,7 +46,7 @@ def run(
     until: Until = None,
     root: Root = RUNS,
 ) -> None:
-    """Run all stages of a recipe; run it again to continue."""
+    """Run all stages of a recipe; after an interruption, run it again to continue."""
     from astra_data.experiments.run import run as run_recipe
 
     with resumable():
@@ -58,7 +58,10 @@ def check(
     recipes: RecipePaths,
     root: Root = RUNS,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Read every byte of the artefacts, not only their sizes.")
+        bool,
+        typer.Option(
+            "--verify", help="Read every byte of the artefacts instead of comparing only their sizes."
+        ),
     ] = False,
 ) -> None:
     """Check recipes without running them, and list which artefacts are finished, damaged or stale."""
@@ -72,7 +75,7 @@ def check(
                 from astra_data.studies.run import load_gap_recipe
 
                 load_gap_recipe(recipe)
-                typer.echo(f"{recipe}: for `astra-data gap`, without faults")
+                typer.echo(f"{recipe}: no errors; a recipe for `astra-data gap`")
                 continue
             conditions = check_recipe(recipe, root=root, verify=verify)
         except AstraDataError as error:
@@ -85,7 +88,9 @@ def check(
             typer.echo(f"  {'to do' if found.state == 'missing' else found.state:8}  {key}{why}")
         spoilt = [f"{states.count(state)} {state}" for state in ("damaged", "stale") if state in states]
         if spoilt:
-            again = f"`astra-data run {recipe}` makes again what the list does not ask you to remove"
+            again = (
+                f"`astra-data run {recipe}` recreates these, except those that the list asks you to remove"
+            )
             faults.append(f"{recipe}: {' and '.join(spoilt)}: {again}")
     if faults:
         raise AstraDataError("\n".join(faults))
@@ -108,9 +113,11 @@ def _of_networks(stage: str, summary: str) -> Callable[..., None]:
     return command
 
 
-ground = _of_networks("ground", "Learn from the pairs to correct the abstract simulator.")
-train = _of_networks("train", "Train policies in the abstract simulator, grounded if the method grounds it.")
-align = _of_networks("align", "Fit the encoder of target histories to that of simulated ones.")
+ground = _of_networks("ground", "Fit each method's correction of the abstract simulator to the pairs.")
+train = _of_networks(
+    "train", "Train policies where each method trains them, for most in the (corrected) abstract simulator."
+)
+align = _of_networks("align", "Fit the target encoder so that its latents match those of the grounding.")
 
 
 def evaluate(
@@ -122,22 +129,24 @@ def evaluate(
     policy: Annotated[
         str | None,
         typer.Option(
-            help="Test this policy of your own in place of the row's: path.py:POLICY, whose code is run.",
+            help="Test this policy of yours instead of the row's: path.py:POLICY. Its code is run.",
             show_default=False,
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="With --policy, the folder to write.", show_default=False)
+        Path | None, typer.Option(help="With --policy: the folder to write.", show_default=False)
     ] = None,
 ) -> None:
-    """Run the policies in the target environment, or where it has none in simulators."""
+    """Run the policies in the target environment (if the task has one) and in simulators."""
     if policy is None:
         if out is not None:
-            raise BadInputError("evaluate: --out is for --policy: a recipe's evaluations have their places")
+            raise BadInputError("evaluate: --out goes with --policy; without it, leave out --out")
         run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)
         return
     if method is None or out is None or len(seeds or ()) != 1 or jobs is not None:
-        raise BadInputError("evaluate: --policy expects --method, one --seed and --out, and no --jobs")
+        raise BadInputError(
+            "evaluate: with --policy, give --method, one --seed and --out, and leave out --jobs"
+        )
     from astra_data.experiments.display import shown
     from astra_data.experiments.grounded_env import evaluate_policy
     from astra_data.worlds.own_code import own_object
@@ -202,7 +211,7 @@ def show_made(folder: Path, until: str | None, *others: Path) -> None:
     written = [str(file) for file in (*pages, *others) if file.is_file()]
     if until == "ground" and pages[0].is_file():
         typer.echo(pages[0].read_text())
-    typer.echo(f"finished: {folder}" + (f" (look at {', '.join(written)})" if written else ""))
+    typer.echo(f"finished: {folder}" + (f" (see {', '.join(written)})" if written else ""))
 
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
@@ -214,7 +223,7 @@ def refuse(options: Mapping[str, object], stage: str, table: str | None = None) 
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
         raise BadInputError(
-            f"{stage}: a recipe sets this itself, in [{table or stage}]: leave out {', '.join(given)}"
+            f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}"
         )
 
 

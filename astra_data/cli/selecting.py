@@ -10,32 +10,44 @@ from astra_data.core.errors import BadInputError
 
 def select(
     run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="The folder of a run, runs/cart.", show_default=False)
+        Path,
+        typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.", show_default=False),
     ],
     row: Annotated[
-        list[str] | None, typer.Option(help="Only policies of this row; may be repeated.", show_default="all")
+        list[str] | None,
+        typer.Option(help="Rank only policies of this row; may be repeated.", show_default="all"),
     ] = None,
     judge: Annotated[
-        str | None, typer.Option(help="The row whose groundings judge.", show_default="the reference")
+        str | None,
+        typer.Option(help="The row whose groundings serve as judges.", show_default="the reference"),
     ] = None,
     episodes: Annotated[
         int | None,
-        typer.Option(help="Of each policy with each judge.", min=1, show_default="the recipe's, or 100"),
+        typer.Option(
+            help="Episodes of each policy with each judge.", min=1, show_default="the recipe's, or 100"
+        ),
     ] = None,
     trials: Annotated[
         int | None,
-        typer.Option(help="Episodes in the target to spend on the candidates.", min=1, show_default="none"),
+        typer.Option(
+            help="Make the final choice with this many episodes in the target.", min=1, show_default="none"
+        ),
     ] = None,
     field: Annotated[
         int | None,
-        typer.Option(help="Candidates that are tried at all.", show_default="as many as the trials allow"),
+        typer.Option(
+            help="With --trials: number of candidates to try.", show_default="as many as the trials allow"
+        ),
     ] = None,
     percent: Annotated[
         int | None,
-        typer.Option(help="Size of the dataset whose policies are tried, of a sweep.", show_default=False),
+        typer.Option(
+            help="With --trials, after a sweep: the dataset size whose policies are tried.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
-    """Rank the trained policies of a run without the target, or with few trials there."""
+    """Rank the trained policies of a run without the target, or with a few trials in it."""
     from astra_data.experiments.display import shown
     from astra_data.experiments.selecting import select as rank
     from astra_data.experiments.trials import choose_by_trials
@@ -43,13 +55,13 @@ def select(
 
     given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
     if trials is None and (field is not None or percent is not None):
-        raise BadInputError("--field and --percent are of --trials: give that too, or leave them out")
+        raise BadInputError("--field and --percent need --trials: add --trials, or leave them out")
     if trials is not None:
         with shown("select") as progress:
             made = choose_by_trials(run, trials, field=field, percent=percent, progress=progress, **given)
         assert made.chosen is not None
         best, seed = made.chosen
-        typer.echo(f"chosen by {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}")
+        typer.echo(f"chosen with {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}")
         typer.echo(f"written: {run / FOLDER / 'select.md'}")
         return
     with shown("select") as progress:

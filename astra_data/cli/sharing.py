@@ -19,11 +19,13 @@ def card(
     dataset: DatasetName,
     out: Annotated[
         Path | None,
-        typer.Option(help="The Markdown file; a figure goes beside it.", show_default="<name>.md here"),
+        typer.Option(
+            help="The Markdown file; a figure is written next to it.", show_default="<name>.md here"
+        ),
     ] = None,
     notes: NotesPath = None,
 ) -> None:
-    """Write a dataset's card: its contents, its origin, how to load it."""
+    """Write a dataset card: contents, origin, and how to load it."""
     from astra_data.core.config import load_recipe
     from astra_data.dataset.versions import open_dataset
     from astra_data.exchange.sharing.card import write_card
@@ -51,7 +53,7 @@ def push(
         bool, typer.Option("--private", help="Create the repository on the Hub as private.")
     ] = False,
 ) -> None:
-    """Share a version of a dataset with its card; a shared version never changes."""
+    """Share a version of a dataset, with its card; a shared version never changes."""
     from astra_data.exchange.sharing.push import push as send
     from astra_data.experiments.display import shown
 
@@ -65,18 +67,20 @@ def pull(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help="user/name on the Hugging Face Hub, or URL or path of the dataset's folder.",
+            help="user/name on the Hugging Face Hub, or the URL or path of the dataset's folder.",
             show_default=False,
         ),
     ],
     out: Out = None,
-    version: Annotated[str | None, typer.Option(help="Such as 1.2.0.", show_default="the newest")] = None,
+    version: Annotated[
+        str | None, typer.Option(help="Version to download, such as 1.2.0.", show_default="the newest")
+    ] = None,
     max_bytes: Annotated[
         int | None,
-        typer.Option(min=1, help="Refuse a dataset with larger files in all.", show_default="100 GB"),
+        typer.Option(min=1, help="Refuse a dataset whose files are larger in total.", show_default="100 GB"),
     ] = None,
 ) -> None:
-    """Download a shared dataset and verify it; run it again to continue, or to verify the copy."""
+    """Download and verify a shared dataset; run again to continue, or to verify the copy."""
     from astra_data.exchange.sharing.pull import MOST_BYTES
     from astra_data.exchange.sharing.pull import pull as fetch
     from astra_data.experiments.display import shown

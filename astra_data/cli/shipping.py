@@ -12,7 +12,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.command("list")
 def list_() -> None:
-    """List the recipes, and the mappings of `import`, that come with the package."""
+    """List the package's recipes, and its mappings for `import`."""
     from rich.table import Table
 
     from astra_data.experiments.shipped import shipped_mappings, shipped_recipes
@@ -28,11 +28,11 @@ def list_() -> None:
 @app.command()
 def copy(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Of a recipe that `recipes list` shows.", show_default=False)
+        str, typer.Argument(metavar="NAME", help="A name shown by `recipes list`.", show_default=False)
     ],
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to.")] = Path("recipes"),
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to copy to.")] = Path("recipes"),
 ) -> None:
-    """Copy a recipe or mapping, with the recipe that it is based on and the code that it needs."""
+    """Copy a recipe or mapping, with the recipe it is based on and the code it needs."""
     from astra_data.experiments.shipped import IMPORTS, copy_recipe, shipped
 
     new = copy_recipe(name, folder)

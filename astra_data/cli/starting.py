@@ -10,25 +10,25 @@ from astra_data.cli.showing import show_table
 
 def new(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Of the robot: a-z, 0-9 and _.", show_default=False)
+        str, typer.Argument(metavar="NAME", help="Name of the robot: a-z, 0-9 and _.", show_default=False)
     ],
     logs: Annotated[
         list[Path] | None,
         typer.Option(
             "--from",
-            help="Its logs: CSV files, or folders of them; or a dataset.",
-            show_default="those of a made-up cart",
+            help="The robot's logs: CSV files, folders of them, or a dataset.",
+            show_default="logs of a made-up cart",
         ),
     ] = None,
     more: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[LOG]...", help="More logs, as a shell writes --from logs/*.csv out.", show_default=False
+            metavar="[LOG]...", help="More logs, so that --from logs/*.csv works.", show_default=False
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
 ) -> None:
-    """Begin with a robot of your own: a task, a recipe, a mapping of its logs, a test and a page."""
+    """Start a project for your own robot: a task, a recipe, a mapping of its logs, a test and a page."""
     from rich.table import Table
 
     from astra_data.experiments.kind_errors import JUDGED_STEPS, badly_predicted
@@ -37,7 +37,7 @@ def new(
     folder = out or Path(name)
     kind = write_robot(name, folder, [*(logs or ()), *(more or ())])
     found = kind.logs
-    table = Table("field", "taken for", "unit", "factor", "why")
+    table = Table("field", "used as", "unit", "factor", "why")
     for field in found.fields:
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
     show_table(table)
@@ -45,15 +45,15 @@ def new(
     if worse := badly_predicted(kind):
         which = "each state" if len(worse) == len(kind.names) else " and ".join(worse)
         typer.echo(
-            f"after {JUDGED_STEPS} steps it predicts {which} of the logs worse than standing still does: "
+            f"after {JUDGED_STEPS} steps it predicts {which} of the logs worse than standing still would: "
             f"edit `step` in {folder}/{name}.py"
         )
     if not found.of("time"):
-        typer.echo(f"none of them is a time: {found.rate} rows a second were taken; set fps and TIMESTEP_S")
+        typer.echo(f"found no time field, so assumed {found.rate} rows per second: set fps and TIMESTEP_S")
     if found.uneven:
         typer.echo(f"{found.uneven} (CHECK)")
     if found.still:
         typer.echo(f"{found.still} (CHECK)")
     for name, count in found.left_out.items():
-        typer.echo(f"{name} has no number in {count} rows, which are left out: logs.toml says how (CHECK)")
-    typer.echo(f"finished: {folder}; {folder}/README.md says how to go on, and CHECK marks what was guessed")
+        typer.echo(f"{name} is not a number in {count} rows, which are left out: see logs.toml (CHECK)")
+    typer.echo(f"finished: {folder}; see {folder}/README.md for the next steps; CHECK marks guesses")

@@ -14,21 +14,21 @@ def suggest(
         Path,
         typer.Argument(metavar="RUN|RECIPE", help="The folder of a run, or its recipe.", show_default=False),
     ],
-    episodes: Annotated[int, typer.Option(help="Episodes to suggest.", min=1)] = 20,
-    seed: Annotated[int, typer.Option(help="Of the episodes to choose from.")] = 0,
+    episodes: Annotated[int, typer.Option(help="Number of episodes to suggest.", min=1)] = 20,
+    seed: Annotated[int, typer.Option(help="Random seed of the episodes to choose from.")] = 0,
     row: Annotated[
-        str | None, typer.Option(help="The row whose groundings are asked.", show_default="the reference")
+        str | None, typer.Option(help="The row whose groundings are used.", show_default="the reference")
     ] = None,
     max_steps: Annotated[
-        int | None, typer.Option(help="Length of an episode, in steps.", min=1, show_default="the recipe's")
+        int | None, typer.Option(help="Length of each episode, in steps.", min=1, show_default="the recipe's")
     ] = None,
-    proposals: Annotated[int, typer.Option(help="Episodes to choose from.", min=2)] = 2000,
+    proposals: Annotated[int, typer.Option(help="Number of random episodes to choose from.", min=2)] = 2000,
     out: Annotated[
-        Path | None, typer.Option(help="A new folder.", show_default="suggest in that of the run")
+        Path | None, typer.Option(help="A new folder.", show_default="suggest in the run's folder")
     ] = None,
     root: Root = RUNS,
 ) -> None:
-    """Suggest which episodes to record next: where the corrections of a run's groundings disagree."""
+    """Say which episodes to record next: those where the corrections of a run's groundings disagree."""
     import torch
 
     from astra_data.experiments.display import shown
@@ -43,7 +43,9 @@ def suggest(
     expected = found.rollouts.expected.sum(0)
     nats, average = expected[found.taken].mean(), expected.mean()
     number = f"{len(found.taken)} of {len(expected)}"
-    typer.echo(f"suggested: {number} episodes, with {nats:.1f} nats each, on average of all {average:.1f}")
+    typer.echo(
+        f"suggested: {number} episodes, {nats:.1f} nats each on average (all proposals: {average:.1f})"
+    )
     typer.echo(f"written: {folder / 'suggest.md'}, {folder / 'plan.json'}, {folder / 'map.png'}")
     if task_named(task).has_target:
         typer.echo(f"record them: astra-data collect {task} --plan {folder / 'plan.json'}")

@@ -21,39 +21,43 @@ def sweep(
     recipe: RecipePath,
     methods: Annotated[
         list[str] | None,
-        typer.Option("--method", help="Only this row of the recipe; may be repeated.", show_default=False),
+        typer.Option(
+            "--method", help="Run only this row of the recipe; may be repeated.", show_default=False
+        ),
     ] = None,
     seeds: Seeds = None,
     percents: Annotated[
         list[int] | None,
-        typer.Option("--percent", help="Only this size; may be repeated.", show_default=False),
+        typer.Option("--percent", help="Run only this dataset size; may be repeated.", show_default=False),
     ] = None,
     unpublished: Annotated[
         bool,
-        typer.Option("--unpublished", help="Only the points that are not in results/ beside the recipe."),
+        typer.Option(
+            "--unpublished", help="Run only points that are not yet in results/ next to the recipe."
+        ),
     ] = False,
     jobs: Jobs = None,
     device: Device = "cpu",
     until: Until = None,
     root: Root = RUNS,
     engine: Annotated[
-        Engine, typer.Option(help="Processes of this machine, or tasks of a Ray cluster.")
+        Engine, typer.Option(help="Run as processes on this machine, or as tasks of a Ray cluster.")
     ] = Engine.processes,
     address: Annotated[
         str | None,
         typer.Option(
-            help="Address of a Ray cluster whose machines share this folder and installation.",
+            help="Address of a Ray cluster; its machines must share this folder and installation.",
             show_default="a cluster on this machine",
         ),
     ] = None,
     trackio: Annotated[
         str | None,
         typer.Option(
-            metavar="PROJECT", help="Log each finished point to this project of trackio.", show_default=False
+            metavar="PROJECT", help="Log each finished point to this trackio project.", show_default=False
         ),
     ] = None,
 ) -> None:
-    """Run a recipe on every seed and size, with a table of its points; run it again to continue."""
+    """Run a recipe over rows, seeds and dataset sizes, with a live table; run it again to continue."""
     if address is not None and engine is not Engine.ray:
         raise BadInputError("sweep: --address is for --engine ray")
     from astra_data.experiments.sweep import sweep as sweep_recipe

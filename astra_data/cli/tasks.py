@@ -21,12 +21,12 @@ def tasks(
         str | None,
         typer.Argument(
             metavar="TASK",
-            help="Walk through this one, by name or place, cart.py:TASK, and name what is wrong with it.",
+            help="Test this task and list its errors: a name, or a place such as cart.py:TASK.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
-    """List the tasks that can be named, and what they have; or walk through one."""
+    """List the named tasks and their parts; or test one task."""
     from rich.table import Table
 
     from astra_data.core.errors import BadInputError
@@ -40,7 +40,7 @@ def tasks(
             raise BadInputError("\n".join(f"task {task}: {fault}" for fault in faults))
         bounds = ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in named.limits.items())
         typer.echo(f"commands: {bounds}\nabstract states: {', '.join(_names(named))}")
-        typer.echo(f"{task}: nothing is wrong with its states, simulator, objective and robot")
+        typer.echo(f"{task}: found no errors in its states, simulator, objective and robot")
         return
     table = Table("task", "commands", "abstract states", "target", "steps/s")
     table.columns[0].no_wrap = True
@@ -54,8 +54,8 @@ def tasks(
         )
     show_table(table)
     typer.echo(
-        "`astra-data tasks TASK` tells all of one. A task of your own is named by its place, cart.py:TASK or "
-        "package.module:TASK; it is run."
+        "`astra-data tasks TASK` tests one and shows all its values. Name your own task by its place: "
+        "cart.py:TASK or package.module:TASK. Its code is run."
     )
 
 
@@ -68,9 +68,11 @@ def label(
     dataset: DatasetName,
     task: Annotated[
         str,
-        typer.Option(help="A task, by name or place: cart.py:TASK. The file is run.", show_default=False),
+        typer.Option(
+            help="A task: a name, or a place such as cart.py:TASK. Its code is run.", show_default=False
+        ),
     ],
-    seed: Annotated[int, typer.Option(help="Of the goals.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of the goals.")] = 0,
     name: NewName = None,
     out: Out = None,
 ) -> None:

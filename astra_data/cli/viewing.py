@@ -11,14 +11,16 @@ def view(
         str,
         typer.Argument(
             metavar="DATASET|RUN",
-            help="A dataset: a folder, name@data-1.2.0, or name for its highest version; or the folder of a "
-            "run, runs/cart.",
+            help="A dataset: a folder, name@data-1.2.0, or a name (for its highest version); or the folder "
+            "of a run, such as runs/cart.",
             show_default=False,
         ),
     ],
     save: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.rrd", help="Write a recording.", show_default="open the viewer"),
+        typer.Option(
+            metavar="FILE.rrd", help="Write a recording to this file.", show_default="open the viewer"
+        ),
     ] = None,
     uids: Annotated[
         list[int] | None,
@@ -26,14 +28,14 @@ def view(
             "--episode",
             metavar="UID",
             help="Uid of an episode; may be repeated.",
-            show_default="all; of a run 5 that were held out",
+            show_default="all; for a run, 5 held-out episodes",
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Of a run: a seed of its recipe.", show_default="the first")
+        int | None, typer.Option(help="For a run: a seed of its recipe.", show_default="the first")
     ] = None,
 ) -> None:
-    """Show paths, commands and rewards of a dataset in Rerun; of a run, also its simulators."""
+    """Show a dataset's paths, commands and rewards in Rerun; for a run, also replays in its simulators."""
     from astra_data.core.errors import BadInputError
     from astra_data.core.naming import RECORD
     from astra_data.dataset.format import INFO_PATH
@@ -49,11 +51,11 @@ def view(
     else:
         if folder.is_dir() and not (folder / INFO_PATH).is_file():
             raise BadInputError(
-                f"{source}: expected a dataset, which holds {INFO_PATH}, or the folder of a run, which holds "
-                f"{RECORD}; got neither: name the folder that import, collect or run wrote"
+                f"{source}: expected a dataset (a folder with {INFO_PATH}) or the folder of a run (with "
+                f"{RECORD}), got neither: name the folder that import, collect or run wrote"
             )
         if seed is not None:
-            raise BadInputError(f"{source} is a dataset: --seed is for the folder of a run")
+            raise BadInputError(f"{source} is a dataset, but --seed is for the folder of a run: leave it out")
         show(open_dataset(source), uids or (), save=save)
     if save is not None:
         typer.echo(f"written: {save}")

@@ -34,7 +34,7 @@ def refuse_finished(out: Path) -> None:
         BadInputError: it exists.
     """
     if out.exists():
-        raise BadInputError(f"{out} is finished already: remove it to run the stage again")
+        raise BadInputError(f"{out} is already finished: remove it to run the stage again")
 
 
 @contextmanager
@@ -67,7 +67,7 @@ def finished_folder(
     with writing(out), ExitStack() as stack:
         made = make_folder(partial)
         if not stack.enter_context(held(partial)):
-            raise BadInputError(f"{out} is being made right now: wait until it is, or choose another folder")
+            raise BadInputError(f"{out} is being written right now: wait, or choose another folder")
         try:
             sweep(out)
             if old.exists() and not out.exists():  # a kill came between the two renames below
@@ -127,5 +127,5 @@ def _begin(partial: Path, config: str) -> None:
         write_file(settings, config)
     elif not (settings.exists() and settings.read_text() == config):
         raise BadInputError(
-            f"{partial} was begun with other settings, see its config.json if it has one: remove it"
+            f"{partial} was started with other settings (see its config.json if it has one): remove it"
         )

@@ -57,7 +57,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
             metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
     except SafetensorError as error:
-        raise BadInputError(f"{path} is not a whole safetensors file: {error}") from None
+        raise BadInputError(f"{path} is not a complete safetensors file: {error}") from None
     except json.JSONDecodeError:
         raise BadInputError(f"{path} was not written by astra-data: its metadata is not JSON") from None
     return tensors, metadata

@@ -130,7 +130,7 @@ def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: s
         faults = [_fault(details, model) for details in error.errors(include_url=False)]
     if len(faults) == 1:
         raise RecipeError(f"{origin}: {faults[0]}")
-    raise RecipeError("\n  ".join([f"{origin} has {len(faults)} faults:", *faults]))
+    raise RecipeError("\n  ".join([f"{origin} has {len(faults)} errors:", *faults]))
 
 
 def faults_of(error: ValidationError) -> str:

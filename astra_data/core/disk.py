@@ -11,10 +11,10 @@ from astra_data.core.errors import AstraDataError, DiskError
 
 _OF_THE_DISK = {
     errno.ENOSPC: ("the disk is full", "free space"),
-    errno.EDQUOT: ("the quota is used up", "free space"),
+    errno.EDQUOT: ("the quota is exceeded", "free space"),
     errno.EFBIG: ("a file would be larger than is allowed", "raise the limit (ulimit -f)"),
     errno.EROFS: ("the disk is read-only", "make it writable or choose another folder"),
-    errno.EIO: ("the disk reports a fault", "check it"),
+    errno.EIO: ("the disk reports an error", "check it"),
     errno.ENODEV: ("the disk is gone", "connect it again"),
     errno.ENXIO: ("the disk is gone", "connect it again"),
     errno.ESTALE: ("the disk is gone", "connect it again"),

@@ -57,4 +57,4 @@ def cure(extra: str) -> str:
 
 
 def _not_installed(package: str) -> BadInputError:
-    return BadInputError(f"{package} is needed and not installed: {cure(EXTRAS[package])}")
+    return BadInputError(f"{package} is needed but not installed: {cure(EXTRAS[package])}")

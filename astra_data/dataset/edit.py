@@ -57,14 +57,16 @@ def subset(
         6
     """
     if (episodes is None) == (percent is None) or (of is not None and percent is None):
-        raise BadInputError("a subset takes either a number of episodes, or a percentage (and of how many)")
+        raise BadInputError(
+            "a subset needs either a number of episodes or a percentage (optionally with --of)"
+        )
     count = episodes if percent is None else share(percent, of or len(source))
     assert count is not None
     if not 1 <= count <= len(source):
         wanted = f"{count} episodes" if percent is None else f"{percent} % of {of or len(source)} = {count}"
         raise BadInputError(
-            f"{source.reference} has {len(source)} episodes, a subset of {wanted} was asked for: expected 1 "
-            f"to {len(source)}. Episodes are never repeated: collect or augment more, or name a smaller --of."
+            f"{source.reference} has {len(source)} episodes, but the subset has {wanted}: expected 1 "
+            f"to {len(source)}. Episodes are never repeated: collect or augment more, or give a smaller --of."
         )
     chosen = source.subset_seed if seed is None else seed
     strata = _strata(source, stratify, chosen) if stratify else {}
@@ -188,7 +190,7 @@ def merge(
     ]
     if faults:
         raise BadInputError(
-            f"the datasets do not fit together: expected the columns, fps, task, environment and simulator "
+            f"the datasets do not match: expected the columns, fps, task, environment and simulator "
             f"of {first.reference} in all of them; merge only those that share them:\n  "
             + "\n  ".join(faults)
         )
@@ -215,7 +217,7 @@ def _write(
     seed: int | None = None,
 ) -> Path:
     if not kept:
-        raise BadInputError(f"{source.reference}: no episode would be left of its {len(source)}")
+        raise BadInputError(f"{source.reference}: none of its {len(source)} episodes would be left")
     with next_version(
         source, "episodes", stage=stage, config=config, name=name, out=out, subset_seed=seed
     ) as writer:
@@ -239,7 +241,7 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
     if key not in source.metadata:
         if key in ("success", "return"):
             raise BadInputError(
-                f"the episodes of {source.reference} have no {key!r}: compute it by `astra-data label --task`"
+                f"the episodes of {source.reference} have no {key!r}: run `astra-data label --task`"
             )
         known = ["length", *source.metadata]
         raise BadInputError(f"the episodes of {source.reference} have no {key!r}{did_you_mean(key, known)}")

@@ -40,8 +40,7 @@ class Endings:
     def __str__(self) -> str:
         """Summarise them in a line."""
         return f"{self.terminated} terminated, {self.cut_off} cut off" + (
-            f"; {self.made_up} next states were made up, where an episode is terminated: the state stands "
-            "for its own"
+            f"; {self.made_up} next states of terminated episodes were made up: the state itself is used"
             if self.made_up
             else ""
         )

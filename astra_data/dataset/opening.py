@@ -22,11 +22,11 @@ def refuse_others(root: Path) -> None:
         refuse_run(root)
         if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
             raise BadInputError(
-                f"{root} holds logs, {logs[0]} and so on: make a dataset of them by `astra-data import` with "
-                "a mapping, which `astra-data new` writes"
+                f"{root} contains logs ({logs[0]} and so on): make them a dataset with `astra-data import` "
+                "and a mapping, which `astra-data new` writes"
             )
         raise BadInputError(
-            f"{root}: no dataset there; check the path (`astra-data list` says where names are) "
+            f"{root}: found no dataset; check the path (`astra-data list` shows where names are) "
             "or run the stage that writes it."
         )
 
@@ -35,7 +35,7 @@ def refuse_versions(root: Path) -> None:
     """Raise BadInputError where `root` holds versions of a dataset; name them."""
     versions = sorted(path.name for path in root.glob("data-*.*.*") if (path / INFO_PATH).is_file())
     if versions:
-        raise BadInputError(f"{root} holds versions of a dataset: name one of {', '.join(versions)}.")
+        raise BadInputError(f"{root} contains versions of a dataset: name one of {', '.join(versions)}.")
 
 
 def refuse_run(root: Path) -> None:
@@ -58,7 +58,7 @@ def explained(root: Path) -> Iterator[None]:
         others = " or run the stage that wrote it again"
         if can_be_repaired(root):
             others = (
-                ", run the stage that wrote it again, or save what is whole of it: "
+                ", run the stage that wrote it again, or recover its intact episodes: "
                 f"`astra-data repair {root} --out FOLDER`"
             )
         raise CorruptDatasetError(

@@ -20,7 +20,7 @@ _LARGE = 2**16
 """From here on float32 tells apart steps of 1/128 or more, which positions of an offset fall below."""
 _ENOUGH = 10
 """Changes of a value, in rows that come together, of which one can say that most are lost."""
-_KINDS = {"U": "text", "S": "text", "O": "what no number can hold, such as nothing"}
+_KINDS = {"U": "text", "S": "text", "O": "values that are not numbers, such as missing ones"}
 
 
 class Converter:
@@ -164,7 +164,7 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
         if (abs(sound.astype(float)) >= EXACT).any():
             raise BadInputError(
                 "numbers of 2^53 or more came as floats, which cannot represent them; "
-                "expected integers: no fractions or empty cells among them, no field of floats beside them, "
+                "expected integers: no fractions or empty cells among them, no float fields in the column, "
                 "no scale, offset or clip"
             )
     elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():

@@ -42,7 +42,7 @@ def uneven_steps(topic: str, rate: float, fps: int) -> str:
     return (
         f"{comes} no fps nearby is a whole fraction: at {fps}, {share_long:.0%} of the steps are of "
         f"{long} ms, the others of {short}; at {best} only {_share_odd(rate / best):.0%} are odd, "
-        "or let it be sent a whole number of times a second"
+        "or publish it a whole number of times a second"
     )
 
 
@@ -80,18 +80,18 @@ def ended(topic: str, times: int, gap_s: float, column: str, commanded: str | No
     key = f'gap_s in [columns."{column}"]' if column else "split.gap_s"
     often = "once" if times == 1 else f"{times} times"
     silence = (
-        f"{topic} is silent for over {gap_s:g} s ({key}) {often} while others are not, and episodes end there"
+        f"{topic} is silent for over {gap_s:g} s ({key}) {often} while others are not; episodes end there"
     )
     # A column with a gap of its own cannot be latched.
     if commanded:
         latched = "" if column else f'latched = true in [columns."{commanded}"], or '
         return (
-            f"{silence}, as is right where the robot stops by itself without commands; where it goes on with "
+            f"{silence}. That is right if the robot stops by itself without commands; if it continues with "
             f"the last one, set {latched}a longer gap_s"
         )
     if column:
-        return f"{silence}; where values may be held for longer, set a longer one"
-    return f"{silence}: set latched = true where it is sent on change, or a longer gap_s"
+        return f"{silence}; if values may be held for longer, set a longer one"
+    return f"{silence}: set latched = true if it is sent on change, or a longer gap_s"
 
 
 def _share_odd(messages_per_row: float) -> float:

@@ -85,9 +85,9 @@ def guess(paths: Sequence[Path]) -> Logs:
     if abs(found.rate_error) > RATE_TOLERANCE:
         (time, *_) = found.of("time")
         raise BadInputError(
-            f"{files[0]}: {time.name}: expected rows a second within {RATE_TOLERANCE:.0%} of a whole number, "
-            f"as fps is one, got {found.recorded_rate:.4g}: correct its unit, or resample the logs to "
-            f"{found.rate} rows a second"
+            f"{files[0]}: {time.name}: expected rows per second within {RATE_TOLERANCE:.0%} of a "
+            f"whole number, as fps is one, got {found.recorded_rate:.4g}: correct its unit, or resample the "
+            f"logs to {found.rate} rows per second"
         )
     return found
 
@@ -114,7 +114,7 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
     for number, field in sorted(enumerate(fields), key=lambda numbered: weak[numbered[0]]):
         if field.role in ("failure", "success", "reward"):
             if field.role in ends:
-                why = f"a second {field.role}: make one field of both"
+                why = f"a second {field.role}: combine both into one field"
                 fields[number] = replace(field, role="left out", why=why)
             ends.add(field.role)
     seen: dict[str, str] = {}
@@ -123,7 +123,7 @@ def _distinct(fields: list[Field]) -> tuple[Field, ...]:
             continue
         if (other := seen.setdefault(field.taken_for, field.name)) != field.name:
             raise BadInputError(
-                f"{other} and {field.name} are both taken for {field.taken_for}: rename one, or leave it out"
+                f"{other} and {field.name} would both become {field.taken_for}: rename one, or leave it out"
             )
     return tuple(fields)
 
@@ -149,7 +149,7 @@ def _places_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) 
     if not any(field.role == "command" or _may_command(field) for field in fields if field.name not in stay):
         return list(fields)
     return [
-        replace(field, role="goal", why="one place in each episode") if field.name in stay else field
+        replace(field, role="goal", why="constant in each episode") if field.name in stay else field
         for field in fields
     ]
 
@@ -173,7 +173,7 @@ def _times_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -
             found.append(replace(field, role="left out", why="a second time"))
         else:
             has_time = True
-            why = "its ending, and it rises in every row"
+            why = "its ending, and it increases in every row"
             found.append(Field(field.name, "time", "time", ending, TIMES[ending], why))
     return found
 

@@ -106,13 +106,13 @@ def import_dataset(
     left_out: tuple[str, ...] = ()
     if skip_bad:
         if settings is None:
-            raise BadInputError("--skip-bad needs a --mapping, which tells what is missing")
+            raise BadInputError("--skip-bad needs a --mapping, which says what is missing")
         sources, left_out = importable(sources, format_, settings)
     records = _records(sources, format_)
     if records and settings is None:
         if len(sources) > 1:
             raise BadInputError(
-                f"{next(iter(records))} is an export of astra-data: import each on its own, then merge"
+                f"{next(iter(records))} is an export of astra-data: import each export separately, then merge"
             )
         return _restored_export(sources[0], format_, records[sources[0]], options, out, began)
     for source, record in records.items():
@@ -165,8 +165,8 @@ def _refuse_parts(sources: Sequence[Source]) -> None:
         if files > 1:
             raise BadInputError(
                 f"{recording}: split.files = false cannot join its {files} MCAP files, each of which is "
-                "resampled by itself: make one of them, by `ros2 bag convert` or `mcap merge`, or leave the "
-                "key out, and an episode ends with each"
+                "resampled separately: join them with `ros2 bag convert` or `mcap merge`, or leave out the "
+                "key, so that an episode ends with each file"
             )
 
 
@@ -243,7 +243,7 @@ def _sources(recording: Path, file_format: str) -> list[Source]:
             raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
         return [Source(recording, None, recording)]
     if is_archive(recording) and file_format not in IN_ARCHIVES:
-        raise BadInputError(f"{recording}: {file_format} cannot be read from an archive, unpack it")
+        raise BadInputError(f"{recording}: {file_format} cannot be read from an archive: unpack it")
     return find_sources(recording, _suffixes(FORMATS[file_format]))
 
 
@@ -275,4 +275,4 @@ def _why_none(tally: Tally, settings: ImportMapping) -> str:
     for reason, why in reasons.items():
         if 2 * cuts[reason] > tally.rows:
             return why
-    return "each of which needs two rows where logs have no next states"
+    return "and each needs two rows if logs have no next states"

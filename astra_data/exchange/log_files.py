@@ -17,7 +17,7 @@ def csv_files(place: Path) -> list[Path]:
         BadInputError: there is none; says what is there instead, and what to do.
     """
     if not place.exists():
-        raise BadInputError(f"{place}: there is no such file, folder or dataset")
+        raise BadInputError(f"{place}: no such file, folder or dataset")
     inside = sorted(place.iterdir()) if place.is_dir() else [place]
     if found := [path for path in inside if path.suffix.lower() in SUFFIXES]:
         return found
@@ -27,12 +27,12 @@ def csv_files(place: Path) -> list[Path]:
     files = [*inside, *sorted(place.glob("*/*"))]  # a bag is a folder itself
     if bags := [path.name for path in files if path.name.lower().endswith(BAGS)]:
         raise BadInputError(
-            f"{place}: expected CSV logs or a dataset, got a recording of ROS, {bags[0]}: make a dataset of "
-            f"it, `astra-data import {shlex.quote(str(place))} --mapping recipes/imports/ros2_base.toml` "
-            "with that mapping or one like it (`astra-data recipes copy ros2_base`), and then name that "
+            f"{place}: expected CSV logs or a dataset, got a ROS recording, {bags[0]}: make it a dataset "
+            f"(`astra-data import {shlex.quote(str(place))} --mapping recipes/imports/ros2_base.toml`, "
+            "with that mapping or one like it: `astra-data recipes copy ros2_base`), then name the "
             "dataset: --from NAME"
         )
     raise BadInputError(
-        f"{place}: expected files that end in {' or '.join(SUFFIXES)}, found none: `import` takes others, by "
-        "a mapping, and `new` then the dataset that it makes"
+        f"{place}: expected files that end in {' or '.join(SUFFIXES)}, found none: convert other formats "
+        "with `import` and a mapping, then give `new` the dataset"
     )

@@ -86,8 +86,8 @@ class Logs:
             return ""
         off = f"{abs(self.rate_error):.1%} too {'long' if self.rate_error > 0 else 'short'}"
         return (
-            f"the logs have {self.recorded_rate:.4g} rows a second, no whole number: TIMESTEP_S is {off}; "
-            f"resample them, to {self.rate} rows a second"
+            f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is "
+            f"{off}; resample them to {self.rate} rows per second"
         )
 
     @cached_property
@@ -117,7 +117,7 @@ class Logs:
             if not np.ptp(values)
         ]
         what = "it does" if len(named) == 1 else "they do"
-        return f"{' and '.join(named)} in all rows: no simulator learns what {what}" if named else ""
+        return f"{' and '.join(named)} in all rows: no simulator can learn what {what}" if named else ""
 
     def of(self, role: Role) -> tuple[Field, ...]:
         """Return the fields with a role."""

@@ -44,32 +44,32 @@ class ColumnMapping(Config):
     """
 
     fields: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Fields of the source; of MCAP, "/topic:path.in.message", and "/topic:list[name]" of named values."""
+    """Fields of the source; for MCAP "/topic:path.in.message", or "/topic:list[name]" for named values."""
     take: tuple[Index, ...] = ()
-    """Which of their values, from 0; by default all."""
+    """Indices of the values to use, from 0; by default all."""
     scale: tuple[Factor, ...] = ()
     """Factors other than 0, such as 0.001 for mm."""
     offset: tuple[float, ...] = ()
     """Added after scaling."""
     clip: tuple[float, float] | None = None
-    """Range to which values are clipped; values that are not finite are rejected, not clipped."""
+    """Range to clip values to; values that are not finite are rejected, not clipped."""
     names: tuple[str, ...] = ()
-    """A name for each value; by default those of the fields, where each has one value."""
+    """A name for each value; by default the fields' names, if each field has one value."""
     unit: tuple[str, ...] = ()
     """Units after scaling."""
     frame: tuple[str, ...] = ()
     """Frames of reference."""
     role: tuple[str, ...] = ()
-    """What a planar rotation does to each value: see `columns.ROLES`."""
+    """How a planar rotation transforms each value: see `columns.ROLES`."""
     meaning: str = ""
-    """One sentence."""
+    """One sentence that describes the column."""
     dtype: Literal["float32", "int64", "bool"] | None = None
-    """By default bool for flags and float32 for all else."""
+    """By default bool for flags and float32 for everything else."""
     latched: bool = False
-    """MCAP: sent once or on change, so that the last value holds without limit."""
+    """MCAP: published once or on change, so that the last value holds without limit."""
     gap_s: Positive | None = None
-    """MCAP: the longest time for which the last value of this column's topics is held, by default that of
-    `split`."""
+    """MCAP: the longest time that the last value of this column's topics is held; by default that of `split`.
+    """
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -89,27 +89,27 @@ class Jump(Config):
     """Where a jump begins a new episode."""
 
     column: str
-    """Which column jumps."""
+    """Column that jumps."""
     values: Annotated[tuple[Index, ...], Field(min_length=1)]
     """Which of its values, such as x and y."""
     above: Positive
-    """The Euclidean distance between rows, in the column's unit, above which it is a jump; whole turns of an
-    angle do not count."""
+    """Euclidean distance between rows, in the column's unit, above which it is a jump; full turns of an angle
+    do not count."""
 
 
 class Split(Config):
     """Conditions that begin a new episode, in addition to the episodes that a format itself has."""
 
     files: bool = True
-    """Each file; if false, the files of a folder or archive continue one another (not those of MCAP)."""
+    """Each file. If false, the files of a folder or archive continue one another (not for MCAP)."""
     field: str | None = None
-    """A field of the source whose value changes."""
+    """A field of the source: a new value begins an episode."""
     ends: tuple[str, ...] = ()
-    """Fields of the source that are true in the last row of an episode, besides those of next.terminated and
-    next.truncated."""
+    """Fields of the source that are true in the last row of an episode, in addition to those of
+    next.terminated and next.truncated."""
     gap_s: Positive | None = None
-    """A step in `time` that is longer; of MCAP, the longest time for which a topic's last value is held. Time
-    that goes back within a file begins a new episode in any case; of MCAP, if a topic goes back by more."""
+    """A longer step in `time`; for MCAP, the longest time that a topic's last value is held. Time that goes
+    back within a file always begins a new episode; for MCAP, if a topic goes back by more than this."""
     jump: Jump | None = None
     """A jump between rows."""
 
@@ -120,14 +120,14 @@ class ImportMapping(Config):
     name: str
     """The dataset's name."""
     task: str
-    """What the episodes do, a sentence or a name."""
+    """What the robot does in the episodes: a sentence or a name."""
     fps: Count
-    """Steps per second. MCAP is resampled to it, by holding each value until the next; of other formats, each
+    """Steps per second. MCAP is resampled to it by holding each value until the next; in other formats, each
     row is a step."""
     columns: Annotated[dict[str, ColumnMapping], Field(min_length=1)]
-    """By name. next.observation.state is derived where it is left out: an episode then loses its last row,
-    whose next state was not recorded (see `terminal`). A row with next.terminated or next.truncated ends its
-    episode, even if the flag stays set row after row. next.done is always derived."""
+    """Columns by name. If next.observation.state is left out, it is derived: an episode then loses its last
+    row, whose next state was not recorded (see `terminal`). A row with next.terminated or next.truncated ends
+    its episode, even if the flag stays set in later rows. next.done is always derived."""
     version: str = "1.0.0"
     """The dataset's version."""
     format: str | None = None
@@ -135,22 +135,22 @@ class ImportMapping(Config):
     split: Split = Split()
     """What begins a new episode."""
     time: str | None = None
-    """A field with the time of each row; the rate measured from it must be `fps`."""
+    """Field with the time of each row; the rate measured from it must equal `fps`."""
     time_scale: Positive = 1.0
     """Seconds per unit of `time`."""
     not_finite: Literal["refuse", "drop", "split"] = "refuse"
-    """Handling of rows with values that are not finite. "refuse": nothing is imported. "drop": they are left
-    out and their neighbours become consecutive. "split": they are left out and begin new episodes."""
+    """What to do with rows whose values are not finite. "refuse": nothing is imported. "drop": they are left
+    out, and their neighbors become consecutive. "split": they are left out and begin new episodes."""
     terminal: Literal["drop", "stand_still"] = "drop"
-    """Handling of a terminated last row whose next state was not recorded. "drop": it is left out, and its
-    next.terminated and next.success become those of the step before, which led to it. "stand_still": it is
-    kept, and its state stands for the next state, which is made up."""
+    """What to do with a terminated last row whose next state was not recorded. "drop": it is left out, and
+    its next.terminated and next.success move to the step before, which led to it. "stand_still": it is kept,
+    with its own state as the (made-up) next state."""
     min_steps: Count = 1
     """Episodes with fewer steps are left out."""
     episodes: str | None = None
     """HDF5: groups that are episodes, such as "data/demo_*"; fields are then relative to the group. Or
-    "{field}_{number}", where the number of the episode ends the names of its fields, as d3rlpy writes them; a
-    single value is then that of the last row."""
+    "{field}_{number}", if the names of fields end with the number of the episode, as in d3rlpy's files; a
+    single value then belongs to the last row."""
     transposed: bool = False
     """HDF5: rows lie along the last dimension, as in MATLAB's files."""
 

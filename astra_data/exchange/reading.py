@@ -87,7 +87,7 @@ def refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
     not_finite = tally.rejected_rows - tally.torn_rows
     if not_finite and mapping.not_finite == "refuse":
         raise BadInputError(
-            f"{not_finite} of {tally.rows} rows have values that are not finite, the first is "
+            f"{not_finite} of {tally.rows} rows have values that are not finite; the first is "
             f'{tally.rejected_first}; set not_finite in the mapping to leave them out: "split" ends '
             'the episode there, "drop" goes on with the next row as if one step had passed'
         )

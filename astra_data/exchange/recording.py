@@ -56,8 +56,8 @@ class Source:
         """
         if size > self.most_bytes:
             raise BadInputError(
-                f"{self} holds values of {size} bytes or more, of which at most {self.most_bytes} are taken: "
-                "more than a robot's logs are packed by. If you trust it, pass a larger --max-bytes."
+                f"{self} holds values of {size} bytes or more, but at most {self.most_bytes} are accepted: "
+                "robot logs do not compress that much. If you trust it, pass a larger --max-bytes."
             )
 
     def __str__(self) -> str:
@@ -177,7 +177,7 @@ def refuse_dataset(place: Path) -> None:
     info = read_object(place / INFO_PATH)
     if isinstance(info, dict) and "codebase_version" in info:
         raise BadInputError(
-            f"{place} is a LeRobot dataset, no logs, and needs no import: name it as it is, as in "
+            f"{place} is a LeRobot dataset, not logs, and needs no import: use it directly, as in "
             f"`astra-data inspect {shlex.quote(str(place))}`, or as `data` in a recipe"
         )
 

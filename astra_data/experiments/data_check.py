@@ -40,8 +40,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
         raise BadInputError(f"data: {str(error).rstrip('.')}: import or pull it first") from None
     if ABSTRACT_STATE in source.features:
         raise BadInputError(
-            f"data: {source.reference} has been paired, and a recipe pairs by itself: give it the dataset "
-            "that this one was made from, as `astra-data log` tells"
+            f"data: {source.reference} is paired already, but a recipe pairs its data itself: name the "
+            "dataset that this one was made from (see `astra-data log`)"
         )
     task = task_named(recipe.task)
     check_fits(source, task)

@@ -172,7 +172,7 @@ class Experiment:
             if changed:
                 raise RecipeError(
                     f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "
-                    f"{self.results} were made: make all rows again and publish them in their place"
+                    f"{self.results} were made: run all rows again and publish the new results instead"
                 )
             rows = found.methods.items()
             points |= {RunPoint(method, seed, percent) for method, row in rows for seed in row.seeds}
@@ -210,7 +210,7 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     base_path = path.with_name(f"{name}.toml")
     base_tables = read_tables(base_path)
     if "based_on" in base_tables:
-        raise RecipeError(f"{path}: based_on: expected a recipe that is based on none itself, got '{name}'")
+        raise RecipeError(f"{path}: based_on: expected a recipe that is not based on another, got '{name}'")
     base = Experiment(validated(base_tables, Recipe, str(base_path)), base_path, root / base_path.stem)
     recipe = validated(_laid_over(base_tables, tables), Recipe, str(path))
     _check_fit(recipe, base, path)

@@ -166,7 +166,7 @@ def _training(
 ) -> Training:
     table = "plus" if is_plus(row) else "train"
     if _method_of(settings, row).learn is None:
-        raise BadInputError(f"{row} trains nothing: expected a row that is trained")
+        raise BadInputError(f"{row} has no training: expected a row that is trained")
     changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | dict(changes)}
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     _check_made(of_train, ("dataset", "grounding"))

@@ -58,7 +58,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart")
     if name in _TAKEN or keyword.iskeyword(name) or _is_installed(name):
-        raise BadInputError(f"'{name}': expected a name that nothing else in Python has, such as my_{name}")
+        raise BadInputError(f"'{name}': expected a name that Python does not use, such as my_{name}")
     with atomic_folder(out) as folder:
         places = [path.resolve() for path in logs]
         if not places:
@@ -111,7 +111,7 @@ def _folder(place: Path) -> Path | None:
         if "@" in place.name:
             raise
         close = did_you_mean(str(place), names_at_home())
-        raise BadInputError(f"{place}: there is no such file, folder or dataset{close}") from None
+        raise BadInputError(f"{place}: no such file, folder or dataset{close}") from None
     return folder if folder != place or (folder / INFO_PATH).is_file() else None
 
 
@@ -161,8 +161,8 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
     split = [f"field = {_toml(field.name)}\n" for field in logs.of("episode")[:1]]
     if time:
         split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
-    check = logs.uneven if logs.of("time") else "the logs have no time"
-    lines = ["| field | taken for | unit | factor | why |", "|---|---|---|---|---|"]
+    check = logs.uneven if logs.of("time") else "the logs have no time field"
+    lines = ["| field | used as | unit | factor | why |", "|---|---|---|---|---|"]
     for field in logs.fields:
         called = field.name.replace("|", r"\|")
         taken = f"`{called}` | {field.taken_for} | {field.unit} | {field.scale:.4g}"
@@ -172,7 +172,7 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
         "timestep_s": repr(1 / logs.rate),
         "rate_hz": f"{logs.rate}" + (f"  # CHECK: {check}" if check else ""),
         "time": "".join(time),
-        "not_finite": 'not_finite = "split"  # CHECK: rows without a number end the episode\n'
+        "not_finite": 'not_finite = "split"  # CHECK: rows with a missing number end the episode\n'
         if logs.left_out
         else "",
         "split": "".join(["\n[split]\n", *split]) if split else "",
@@ -213,8 +213,8 @@ def _goals(logs: Logs) -> str:
     if not (goals := logs.of("goal")):
         return ""
     return (
-        "\n# CHECK: the logs have goals, and the task drives to one place. Give its objective goal_size and\n"
-        "# draw_goals, so that it takes them:\n"
+        "\n# CHECK: the logs have goals, but the task drives to one place. To use the goals, give the\n"
+        "# objective goal_size and draw_goals:\n"
         f'# [columns."{GOAL}"]\n# fields = {_toml([field.name for field in goals])}\n'
         f"# scale = {_toml([field.scale for field in goals])}\n"
     )
@@ -226,7 +226,7 @@ def _toml(value: str | Sequence[str] | Sequence[float]) -> str:
 
 
 def _drive(folder: Path) -> None:
-    """Record a made-up cart that lags behind its commands and tips over in fast curves."""
+    """Record a made-up cart that lags behind its commands and tips over in fast turns."""
     folder.mkdir()
     rng = np.random.default_rng(0)
     header = "t_s,x_m,y_m,heading_x,heading_y,v_m_s,w_rad_s,cmd_v_m_s,cmd_w_rad_s,tipped"

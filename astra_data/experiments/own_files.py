@@ -47,7 +47,7 @@ def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
     if now and now != _recorded(run / CODE).get(name, now):
         raise BadInputError(
             f"{place.rpartition(':')[0]} changed since {run} was made: "
-            "bring it back as it was then, or run the recipe under another name"
+            "restore that version, or run the recipe under another name"
         )
 
 

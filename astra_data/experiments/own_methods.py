@@ -14,12 +14,12 @@ from astra_data.worlds.own_code import place_beside
 
 
 class OwnMethod(Config):
-    """A method of one's own; further keys are its settings, which the model of its `table` reads."""
+    """A method of your own; further keys are its settings, which the model of its `table` reads."""
 
     model_config = ConfigDict(extra="allow")
 
     method: str
-    """A file beside the recipe, "delta.py:METHOD", or "package.module:METHOD"; its code is run."""
+    """A file next to the recipe, "delta.py:METHOD", or "package.module:METHOD"; its code is run."""
 
     @model_validator(mode="before")
     @classmethod

@@ -75,7 +75,7 @@ class Planar:
         """What was taken for what without a reason; nothing where there was one."""
         if self._known_turn:
             return ""
-        return f"took {self.logs.of('command')[1].short} for a turn rate: nothing says so"
+        return f"{self.logs.of('command')[1].short} is used as a turn rate, although nothing says so"
 
     @classmethod
     def of(cls, logs: Logs) -> Self | None:

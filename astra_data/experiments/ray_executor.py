@@ -122,7 +122,7 @@ def _connect(address: str, jobs: int | None) -> Any:  # noqa: ANN401 - the modul
         ray.init(address, log_to_driver=False, logging_level="ERROR", **local)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise BadInputError(
-            f"no Ray cluster can be used at {address}: {_first_line(error)}; `ray status` lists clusters, "
+            f"found no usable Ray cluster at {address}: {_first_line(error)}; `ray status` lists clusters, "
             "`ray start --head` starts one"
         ) from None
     return ray
@@ -172,7 +172,7 @@ def _work(
         os.chdir(folder)
     except OSError as error:
         return AstraDataError(
-            f"{key}: {platform.node()} cannot work in {folder}, which the machines of a cluster must share: "
+            f"{key}: {platform.node()} cannot use {folder}, which all machines of the cluster must share: "
             f"{error.strerror}"
         )
     # A worker runs one task after another, so some may be in its search path already.

@@ -33,8 +33,8 @@ class SweepConfig(Config):
     """The sizes of the dataset on which the rows are repeated."""
 
     percent: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
-    """In per cent of `collect.episodes`, or of those of `data`; smaller ones lie inside larger ones. By
-    default the whole."""
+    """Percentages of `collect.episodes`, or of the episodes of `data`; smaller sets are contained in larger
+    ones. By default the whole dataset."""
 
     @model_validator(mode="before")
     @classmethod
@@ -53,16 +53,16 @@ class Recipe(Config):
     """
 
     task: str
-    """A task of the package or of an installed one, or of a file beside the recipe: "cart.py:TASK"."""
+    """A task of this package or of an installed one, or in a file next to the recipe: "cart.py:TASK"."""
     data: str | None = Field(default=None, exclude_if=lambda data: data is None)
-    """A dataset in place of `[collect]`: a folder beside the recipe, what the commands on datasets take (a
-    folder, a name at home, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
+    """A dataset instead of `[collect]`: a folder next to the recipe, what dataset commands take (a folder, a
+    name in the home folder, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
     own_methods: dict[str, OwnMethod] = Field(default_factory=dict, exclude_if=lambda methods: not methods)
-    """Methods of one's own by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
+    """Your own methods, by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
     methods: tuple[str, ...] = Field(min_length=1)
-    """Rows of the results: a name in `astra_data.methods.METHODS`, by itself or followed by `_plus`."""
+    """Rows of the results: a name in `astra_data.methods.METHODS`, alone or followed by `_plus`."""
     seeds: tuple[int, ...] = Field(min_length=1)
-    """Each seed repeats everything, from the collected dataset on."""
+    """For each seed everything is repeated, starting with collecting the dataset."""
 
     if TYPE_CHECKING:
 
@@ -113,7 +113,7 @@ class Recipe(Config):
         if tables.get("data") is None:
             return tables
         if tables.get("collect") is not None:
-            raise ValueError("data: it takes the place of [collect]: leave out one of them")
+            raise ValueError("data replaces [collect]: leave out one of them")
         return tables | {"collect": None}
 
     @field_validator("task")
@@ -147,7 +147,7 @@ class Recipe(Config):
                 raise ValueError(unknown) from None
             if is_plus(row) and not method_named(row).in_simulator:
                 raise ValueError(
-                    f"'{row}' trains nothing in a simulator, so the [plus] settings are without effect: "
+                    f"'{row}' trains nothing in a simulator, so [plus] settings have no effect: "
                     f"leave out {PLUS}"
                 )
         return rows
@@ -158,7 +158,7 @@ class Recipe(Config):
             raise ValueError(f"methods: rma: expected train.learner 'ppo', got '{self.train.learner}'")
         collects_by = self.collect and self.collect.behavior
         if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
-            raise ValueError(f"collect: good episodes of {self.task} are short: take 'suboptimal_ppo'")
+            raise ValueError(f"collect: good episodes of {self.task} are short: use 'suboptimal_ppo'")
         eases = any(table.ramp_while for table in (self.train, self.plus))
         if eases and task_named(self.task).objective.is_lasting:
             raise ValueError(f"ramp_while: no episode of {self.task} succeeds before its end: expected 0")
@@ -183,7 +183,8 @@ class Recipe(Config):
             table = "plus" if is_plus(row) else "train"
             if not method_named(row).accepts(getattr(self, table).reward):
                 raise ValueError(
-                    f"{table}.reward: {row} predicts none: expected 'abstract' or 'blend', got 'predicted'"
+                    f"{table}.reward: {row} predicts no reward: expected 'abstract' or "
+                    "'blend', got 'predicted'"
                 )
         return self
 
@@ -197,7 +198,7 @@ class Recipe(Config):
             raise ValueError(f"select.judge: {error}") from None
         if len(self.seeds) < 2:
             raise ValueError(
-                "select: expected two seeds or more, got 1: judges are of other seeds: "
+                "select: expected two seeds or more, got 1 (judges are of other seeds): "
                 "remove [select], or add a seed"
             )
         if not any(method_named(row).trains_without_target for row in self.methods):
@@ -210,8 +211,8 @@ class Recipe(Config):
         elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]
         if self.train.limits_commands and elsewhere:
             raise ValueError(
-                f"train.command_limit: it does not reach {', '.join(elsewhere)}, which no simulator "
-                "trains: leave these rows out, or give it in [plus]"
+                f"train.command_limit: has no effect on {', '.join(elsewhere)}, which no simulator "
+                "trains: leave these rows out, or set it in [plus]"
             )
         return self
 
@@ -249,8 +250,8 @@ class Recipe(Config):
     def _counts_recorded_episodes(self) -> Self:
         if self.augment and self.sweep.percent:
             raise ValueError(
-                "sweep.percent: sizes are of recorded episodes, and [augment] adds copies of these: leave "
-                "one of both out"
+                "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one "
+                "of the two"
             )
         return self
 
@@ -271,7 +272,8 @@ class Recipe(Config):
         for percent in self.sweep.percent:
             if not share(percent, self.collect.episodes):
                 raise ValueError(
-                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes are none: expected more"
+                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes is below one: "
+                    "expected more"
                 )
         return self
 

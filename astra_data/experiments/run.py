@@ -107,16 +107,16 @@ def run_stage(
     """
     check_stage(stage)
     if add and seeds:
-        raise BadInputError("--add keeps what is published of all seeds: leave out --seed")
+        raise BadInputError("--add keeps the published results of all seeds: leave out --seed")
     experiment = load_experiment(recipe_path, root)
     maker = experiment.maker(stage)
     if maker is not experiment:
         raise BadInputError(
-            f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` for that"
+            f"{recipe_path} uses the {stage} of {maker.path}: run `astra-data {stage} {maker.path}` instead"
         )
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
-        raise BadInputError(f"{recipe_path} has data, {recipe.data}: there is nothing to collect")
+        raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
     part = Selection.of(recipe, () if method is None else (method,), seeds)
     if add:
         experiment.published()
@@ -203,7 +203,7 @@ def make(
             if not can_be_made_again(key, experiment):
                 raise BadInputError(
                     f"{experiment.place(key)} is {reason}, and was not made by this recipe: restore it from "
-                    "a copy, save its whole episodes with `astra-data repair`, or remove it"
+                    "a copy, recover its intact episodes with `astra-data repair`, or remove it"
                 )
         items = [item for item in items if item.key in again or not finished(item, experiment)]
         if any(stage_of(item) == "label" for item in items):
@@ -212,7 +212,7 @@ def make(
         experiment.link_borrowed()
         console = Console()
         for key, reason in again.items():
-            line = f"{key} is made again: {reason}; the old one is in {set_aside(folder, key)}"
+            line = f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
         record_code(recipe, folder)

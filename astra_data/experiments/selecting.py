@@ -71,7 +71,7 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
     out = folder / FOLDER
     if out.is_symlink():
         raise BadInputError(
-            f"{out} is that of {out.resolve().parent}, which this run is based on: select there"
+            f"{out} belongs to {out.resolve().parent}, which this run is based on: run select there"
         )
     if not out.is_dir():
         return False
@@ -83,5 +83,5 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
         return True
     aside = set_aside(folder, FOLDER)
     if (aside / TRIALS).is_file():
-        _log.warning("the choice is made anew; the old one, with its trials in the target, is in %s", aside)
+        _log.warning("choosing again; the old choice, with its trials in the target, is in %s", aside)
     return False

@@ -32,11 +32,11 @@ class Asked(Config):
 
     task: str
     row: str
-    """Whose groundings are asked."""
+    """Row whose groundings are used."""
     groundings: tuple[str, ...]
-    """Their places in the run."""
+    """Paths of the groundings in the run."""
     seed: int
-    """Of the proposals."""
+    """Random seed of the proposals."""
     suggest: SuggestConfig
 
 

@@ -99,7 +99,7 @@ def _left(
     """Return the unpublished points, and the items that they and the report need."""
     left = tuple(point for point in points if point not in published)
     if not left:
-        raise BadInputError("all of these points are published: leave out --unpublished to make them again")
+        raise BadInputError("all of these points are published: leave out --unpublished to run them again")
     inputs = {item.key: item.inputs for item in items}
     needs, to_look_at = {"report"}, [point.key for point in left]
     while to_look_at:

@@ -97,7 +97,7 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     folder = Path(run)
     if not (folder / RECORD).is_file():
         raise BadInputError(
-            f"{run}: expected the folder of a run, which holds {RECORD}: make it with astra-data run"
+            f"{run}: expected the folder of a run (with {RECORD}): make it with astra-data run"
         )
     settings = recorded_settings(folder)
     settings["task"] = found_near(settings["task"], folder)
@@ -117,7 +117,7 @@ def _files(
         _check_asked(settings, row, seed)
     method = method_named(row)
     if not method.trains:
-        raise BadInputError(f"{row} trains no policy: it is written by hand")
+        raise BadInputError(f"{row} has no trained policy: it is written by hand")
     sizes = settings.get("sweep", {}).get("percent", ())
     if (percent is None) == bool(sizes) or (sizes and percent not in sizes):
         wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"

@@ -95,7 +95,7 @@ def _begun(folder: Path, trials: int, field: int, percent: int | None) -> Trials
         if was != now:
             raise BadInputError(
                 f"{path}: expected trials with {name} = {now}, found {there.spent} made with {was}: "
-                f"give the same again, or move {path.parent} away"
+                f"use the same settings, or move {path.parent} away"
             )
     return there
 

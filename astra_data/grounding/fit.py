@@ -40,48 +40,52 @@ class GroundConfig(DescentConfig):
     window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
     latent_weight: Positive = 0.1
-    """λ1, of the loss of the next latent; at 1 it crowds out the correction."""
+    """λ1, weight of the loss of the next latent; at 1 it crowds out the correction."""
     reward_weight: Positive = 1.0
-    """λ2, of the loss of the reward; λ3, of the correction, is 1."""
+    """λ2, weight of the loss of the reward; λ3, the weight of the correction, is 1."""
     target: TargetKind = "ema"
-    """The target of the latent loss: a slow copy of the encoder ("ema"), or the encoder itself without its
-    gradient ("detach") or with it ("online", the printed loss, which is unbounded below)."""
+    """Target of the latent loss: a slowly updated copy of the encoder ("ema"), or the encoder itself without
+    its gradient ("detach") or with it ("online": the loss as printed, which is unbounded below)."""
     ema_rate: Share = 0.01
-    """Share by which the slow encoder of "ema" follows the encoder, per update."""
+    """Fraction by which the slow copy of "ema" follows the encoder in each update."""
     latent_size: AtOnce = 64
     """Z, also the size of the encoder's hidden state."""
     position_octaves: CountFromZero = 4
-    """Number of wavelengths, from 16 m down by halves, of sines and cosines of the position; 0 for none.
-    Without effect where a task has no positions."""
+    """Number of wavelengths of sines and cosines of the position, from 16 m down, each half the previous; 0
+    for none. No effect if a task has no positions."""
     correction_heads: AtOnce = 1
-    """Heads that correct the state. Each learns from its own random half of every batch; their mean is the
-    correction, and `disagreement_penalty` keeps policies away from where they disagree."""
+    """Number of heads that predict the correction. Each learns from its own random half of every batch; the
+    correction is their mean, and `disagreement_penalty` keeps policies away from states where they disagree.
+    """
     members: CountFromZero = Field(default=0, exclude_if=lambda members: not members)
-    """Further models, each fitted to a draw of as many training episodes, with replacement (a bootstrap).
-    With `keep_member` they correct simulated episodes in place of the model, which is fitted to all."""
+    """Number of further models, each fitted to a bootstrap sample of the training episodes. With
+    `keep_member` they correct simulated episodes instead of the model that is fitted to all episodes."""
     reward: Literal["whole", "correction"] = "whole"
-    """What R_pred learns: "whole", the target's reward, as in the paper; "correction", the residual reward:
-    the target's less the task's own on the recorded abstract states. It matters only to policies that learn
-    from the predicted reward. Augmented copies are rewarded on abstract states: their residual is zero."""
+    """What R_pred learns. "whole": the target's reward, as in the paper. "correction": the residual reward,
+    the target's minus the task's own on the recorded abstract states. Matters only to policies that learn
+    from the predicted reward. Augmented copies are rewarded on abstract states, so their residual is zero."""
     reward_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Dropout rate of the latent that R_pred is given in training, so that it memorises no failure."""
+    """Dropout rate on R_pred's input latent in training, so that it does not memorize failures."""
     failure_weight: Positive = 1.0
-    """Weight of the failures in the loss of the reward. With 1, predicting the average of the failures costs
-    as much as predicting the average of all other steps."""
+    """Weight of failures in the loss of the reward. With 1, predicting the average of the failures costs as
+    much as predicting the average of all other steps."""
     failure_members: CountFromZero = Field(default=0, exclude_if=lambda members: not members)
-    """Networks of a failure model, which foresees failures from how the last second went, and replaces what
-    R_pred and the topple head say of them; 0 for none. Without effect where no episode fails."""
+    """Number of networks in the failure model, which predicts failures from the last second of motion and
+    replaces the failure predictions of R_pred and the topple head; 0 for none. No effect if no episode fails.
+    """
     failure_steps: AtOnce = Field(default=RISK_STEPS, exclude_if=lambda steps: steps == RISK_STEPS)
-    """Within how many steps the failure model foresees failures: fewer tell when they come, more warn."""
+    """Number of steps within which the failure model predicts failures: with fewer it knows better when they
+    come, with more it warns earlier."""
     recorded_clearance: bool = Field(default=False, exclude_if=lambda used: not used)
-    """Let corrected states come no closer to walls than the robot did in 98 of 100 recorded steps: a body
-    slimmer than the robot's slides where nothing was recorded. Without effect where a task has no walls."""
+    """Keep corrected states as far from walls as the robot was in 98 of 100 recorded steps: a body slimmer
+    than the robot's slides along walls where nothing was recorded. No effect if a task has no walls."""
     scatter: bool = Field(default=False, exclude_if=lambda used: not used)
-    """Scatter corrected states as held-out episodes do around the correction: by how much depends on the
-    moment. Without it a simulator moves more smoothly than any robot, and policies are never disturbed."""
+    """Add noise to corrected states, distributed as held-out episodes are around the correction; its size
+    depends on the moment. Without it a simulator moves more smoothly than any robot and never disturbs
+    policies."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Share of the episodes that are held out, to measure and to fit the scatter around the correction,
-    unless the dataset holds some out itself."""
+    """Fraction of the episodes to hold out, for measuring the error and for fitting the scatter around the
+    correction, unless the dataset holds some out itself."""
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from astra_data.core.logbook import Logbook
 
 
 class DescentConfig(Config):
-    """How a model is fitted by gradient descent. The paper prints none of the settings."""
+    """How a model is fitted by gradient descent. The paper gives none of these settings."""
 
     updates: Count = 1500
-    """Gradient updates in all."""
+    """Number of gradient updates."""
     learning_rate: Positive = 1e-3
-    """At the start; falls to zero along a half cosine."""
+    """Learning rate at the start; decays to zero along a half cosine."""
     gradient_norm: Positive = 1.0
     """Gradients are clipped to this norm."""
 

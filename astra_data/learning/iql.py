@@ -32,31 +32,31 @@ _ROWS_AT_ONCE = 8192
 
 
 class IqlConfig(Config):
-    """How a policy is learned from recorded episodes. The paper prints none of these."""
+    """How a policy is learned from recorded episodes. The paper gives none of these settings."""
 
     critic_updates: Count = 5_000
-    """Gradient updates of the critics, before the first of the policy."""
+    """Gradient updates of the critics, all before the policy's first update."""
     critic_batch: AtOnce = 256
     """Transitions per update of the critics."""
     critic_sizes: tuple[AtOnce, ...] = (128, 128)
     """Hidden layers of each critic."""
     critic_learning_rate: Positive = 1e-3
-    """Of the critics."""
+    """Learning rate of the critics."""
     target_rate: Share = 0.005
     """Polyak rate of the target action values, per update."""
     expectile: Share = 0.9
-    """Expectile of action values that the state value estimates; that of the method's authors for AntMaze."""
+    """Expectile of the action values that the state value estimates; the authors' value for AntMaze."""
     discount: Share = 0.99
     """Discount factor per step."""
     return_steps: Count = 10
-    """Length of n-step returns, which sum recorded rewards and the state value after them. 1 is the method as
-    printed: at 20 steps/s a single command hardly moves the robot, and its advantage is lost in the critics'
-    errors."""
+    """Length of n-step returns, which sum recorded rewards and add the state value after them. 1 is the
+    published method: at 20 steps/s a single command hardly moves the robot, and its advantage drowns in the
+    critics' errors."""
     reward_scale: Positive = 1.0
-    """Factor on the recorded reward, before the shift."""
+    """Factor on the recorded reward, applied before the shift."""
     reward_shift: float = 0.0
-    """Added to each step's reward; 0 by default, as progress is rewarded in every step. The -1 that is usual
-    for sparse rewards rewards falling over where that ends the task."""
+    """Added to each step's reward; 0 by default because progress is rewarded in every step. The usual -1 for
+    sparse rewards would reward falling over in tasks that a fall ends."""
     policy_updates: Count = 600
     """Gradient updates of the policy."""
     batch_windows: AtOnce = 24
@@ -64,12 +64,12 @@ class IqlConfig(Config):
     window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
     burn_in: CountFromZero = 20
-    """Steps at the start of a window that only warm up the memory; none where the episode starts there."""
+    """Steps at the start of a window that only warm up the memory; none where an episode starts."""
     learning_rate: Positive = 1e-3
-    """Of the policy at the start; falls to zero along a half cosine."""
+    """Learning rate of the policy at the start; decays to zero along a half cosine."""
     temperature: NotNegative = 10.0
-    """Inverse temperature of the advantage weights, which are clipped at 100; that of the method's
-    authors for AntMaze."""
+    """Inverse temperature of the advantage weights, which are clipped at 100; the authors' value for AntMaze.
+    """
     gradient_norm: Positive = 1.0
     """The policy's gradients are clipped to this norm."""
 

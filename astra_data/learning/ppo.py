@@ -26,24 +26,24 @@ _LEARNED = ("action", "action_log_prob", "advantage", "value_target")
 
 
 class PpoConfig(Config):
-    """Settings of proximal policy optimisation."""
+    """Settings of proximal policy optimization."""
 
     total_steps: Count = 4_000_000
-    """Environment steps in all."""
+    """Total number of environment steps."""
     rollout_steps: Count = 64
-    """Steps of every environment per iteration."""
+    """Steps of each environment per iteration."""
     epochs: Count = 5
     """Passes over the collected steps per iteration."""
     minibatches: Count = 4
-    """Updates per pass; each takes the whole rollouts of a share of the environments."""
+    """Updates per pass; each uses the complete rollouts of part of the environments."""
     learning_rate: Positive = 5e-4
-    """Learning rate at the start; falls linearly to zero."""
+    """Learning rate at the start; decays linearly to zero."""
     discount: Share = 0.99
     """Discount factor per step."""
     gae_lambda: Share = 0.95
-    """λ of generalised advantage estimation."""
+    """λ of generalized advantage estimation."""
     clip: Positive = 0.2
-    """Range of an action's probability ratio around 1 within which the objective is not clipped."""
+    """Range around 1 of an action's probability ratio within which the objective is not clipped."""
     entropy_weight: NotNegative = 0.003
     """Weight of the policy's entropy in the loss."""
     value_weight: NotNegative = 0.5
@@ -53,20 +53,21 @@ class PpoConfig(Config):
     reward_scale: Positive = 0.1
     """Factor on the reward that the critic learns from."""
     normalize_returns: bool = False
-    """Divide rewards by the running deviation of the discounted return; `reward_scale` has no effect then."""
+    """Divide rewards by the running standard deviation of the discounted return; `reward_scale` then has no
+    effect."""
     critic_gain: Positive = 1.0
-    """Of the critic's last layer at the start. With 1, its values are larger than returns that are small, and
-    the first advantages tell of the untrained critic rather than of the rewards."""
+    """Initial gain of the critic's last layer. With 1, its values exceed small returns, so the first
+    advantages reflect the untrained critic instead of the rewards."""
     clipped_mean: bool = False
-    """Clip the mean of the actions to ±1, in place of a tanh, which is flat where it pushes at full speed."""
+    """Clip the mean of the actions to ±1 instead of using a tanh, which is flat near full speed."""
     most_kl: Positive | None = None
-    """Largest KL divergence of a minibatch's policy from the one that collected it, after which an iteration
-    learns no more from its rollout; by default all passes are made."""
+    """Stop an iteration's passes once a minibatch's policy has diverged this far (KL) from the one that
+    collected the rollout; by default all passes are made."""
     final_std: Positive | None = None
-    """Largest deviation of the actions at the end, to which it falls by equal factors, so that the policy is
-    trained as it is tested; by default the policy keeps what it has learned."""
+    """Maximum standard deviation of the actions at the end; the limit falls to it by equal factors, so that
+    the policy is trained as it is tested. By default the policy keeps the deviation it has learned."""
     std_fade: Share = 1.0
-    """Share of the training over which the deviation falls to `final_std`."""
+    """Fraction of the training over which the deviation falls to `final_std`."""
 
 
 class Ppo(Learner):

@@ -21,16 +21,16 @@ from astra_data.worlds.batched import BatchedEnv
 
 
 class RmaConfig(Config):
-    """Settings of rapid motor adaptation. The paper prints none; sizes are those of Kumar et al. 2021."""
+    """Settings of rapid motor adaptation. The paper gives none; sizes are those of Kumar et al. 2021."""
 
     extrinsics_size: Count = 8
     """Size of the encoding of the simulator's parameters."""
     history_length: Annotated[int, Field(ge=SHORTEST_HISTORY)] = 50
-    """Steps from which the extrinsics are estimated."""
+    """Number of past steps from which the extrinsics are estimated."""
     adaptation_steps: Count = 500_000
-    """Environment steps of phase 2 in all."""
+    """Number of environment steps in phase 2."""
     adaptation_learning_rate: Positive = 1e-3
-    """Learning rate of phase 2 at the start; falls linearly to zero."""
+    """Learning rate of phase 2 at the start; decays linearly to zero."""
 
 
 class Adaptation(Learner):

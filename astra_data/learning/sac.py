@@ -31,34 +31,34 @@ class SacConfig(Config):
     """Settings of soft actor-critic."""
 
     total_steps: Count = 1_000_000
-    """Environment steps in all."""
+    """Total number of environment steps."""
     rollout_steps: Count = 64
     """Batched steps per iteration."""
     updates_per_step: Count = 8
     """Gradient updates per batched step."""
     batch_size: Count = 256
-    """Steps per update; where the policy has a memory, in as many windows as they make."""
+    """Steps per update; if the policy has a memory, split into windows."""
     window: Count = 32
-    """Consecutive steps per window, where the policy has a memory."""
+    """Consecutive steps per window, if the policy has a memory."""
     burn_in: CountFromZero = 8
     """Steps at the start of a window that only warm up the memory, until an episode starts."""
     buffer_size: Count = 1_000_000
-    """Steps kept for replay, the most recent ones."""
+    """Number of most recent steps kept for replay."""
     learning_rate: Positive = 1e-3
-    """Learning rate of actor, critics and temperature; falls to zero over the second half of the training.
-    Without that, the quality of the final policy is left to chance."""
+    """Learning rate of actor, critics and temperature; decays to zero over the second half of the training.
+    Otherwise the quality of the final policy is left to chance."""
     discount: Share = 0.97
     """Discount factor per step."""
     reward_scale: Positive = 1.0
     """Factor on the reward that the critics learn from."""
     initial_temperature: Positive = 0.2
-    """Weight of the entropy in the reward, at the start."""
+    """Weight of the entropy in the reward at the start."""
     target_rate: Share = 0.005
     """Polyak rate of the target critics, per update."""
     imitation_weight: NotNegative = 0.0
-    """Weight of the mean squared distance from recorded actions in the actor's loss, relative to the size of
-    the mean action value, entropy included. 0.4 is that of Fujimoto and Gu (2021), who take the mean of
-    sizes. Without effect in the target: upper bounds use no recorded data."""
+    """Weight of the mean squared distance to recorded actions in the actor's loss, relative to the magnitude
+    of the mean action value, including entropy. 0.4 is the value of Fujimoto and Gu (2021), who use the mean
+    magnitude. No effect in the target: upper bounds use no recorded data."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:

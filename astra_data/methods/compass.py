@@ -40,20 +40,20 @@ class CompassConfig(AnyVariation, CausalConfig):
     """
 
     iterations: Count = 5
-    """Replays, each followed by a fit of the causal model and a step of the parameters."""
+    """Number of iterations; each replays windows, fits the causal model and updates the parameters."""
     contexts: Annotated[int, Field(ge=2)] = 128
-    """Parameter sets with which every window is replayed, per iteration."""
+    """Parameter sets per iteration; every window is replayed with each."""
     windows: Annotated[int, Field(ge=10)] = 500
     """Windows per iteration."""
     window: AtOnce = 25
     """Steps per window."""
     outlier_share: Annotated[float, Field(ge=0, le=0.5)] = 0.05
-    """Share of the windows left out, those with the largest gaps; as in the authors' code."""
+    """Fraction of the windows to leave out, those with the largest gaps; as in the authors' code."""
     shrink: Annotated[float, Field(gt=0, lt=1)] = 0.6
-    """Factor on the ranges of the parameters that moved, after each iteration."""
+    """Factor on the ranges of the parameters that moved, applied after each iteration."""
     policy_at: Literal["point", "around"] = "point"
-    """"point": train the policy at the identified parameters, as the authors do. "around": draw them
-    from the last, narrowed ranges, which are still the whole ranges of those that were not identified."""
+    """"point": train the policy at the identified parameters, as the authors do. "around": draw parameters
+    from the final, narrowed ranges; parameters that were not identified keep their full ranges."""
 
 
 def parameters_at(point: Mapping[str, float], kind: type[Variation]) -> Tensor:

@@ -24,13 +24,13 @@ class GolemoConfig(Config):
     """How the residual model is fitted; the defaults are the authors'."""
 
     epochs: Count = 5
-    """Passes over the training episodes; each update takes one whole episode."""
+    """Passes over the training episodes; each update uses one whole episode."""
     hidden_size: AtOnce = 128
-    """Of each layer of the LSTM."""
+    """Size of each LSTM layer."""
     layers: AtOnce = 3
-    """Of the LSTM."""
+    """Number of LSTM layers."""
     learning_rate: Positive = 1e-3
-    """Of Adam, constant."""
+    """Learning rate of Adam, constant."""
 
 
 def fit_residual(fitting: Fitting) -> tuple[ResidualGrounding, dict[str, Any]]:

@@ -29,18 +29,18 @@ class AlignConfig(DescentConfig):
     """How the target encoder is fitted."""
 
     updates: Count = 600
-    """Gradient updates in all."""
+    """Number of gradient updates."""
     batch_windows: AtOnce = 32
     """Windows per update."""
     window: AtOnce = 100
     """Steps per window, in backpropagation through time."""
     bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)
-    """Of the MMD's kernels, in units of the square root of the latent's size."""
+    """Bandwidths of the MMD's kernels, in units of the square root of the latent's size."""
     paired_weight: NotNegative = 0.0
-    """Weight of the direct distance between paired latents; 0 is the paper's loss."""
+    """Weight of the direct distance between paired latents; 0 gives the paper's loss."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Share of the episodes that are held out to measure the agreement, unless the dataset sets some aside
-    itself. In a recipe that of `[ground]`, for these were not trained on there."""
+    """Fraction of the episodes to hold out for measuring the agreement, unless the dataset holds some out
+    itself. In a recipe this is that of `[ground]`, whose training leaves these episodes out."""
 
 
 def align(

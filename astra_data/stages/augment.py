@@ -47,31 +47,32 @@ _OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
 
 
 class AugmentConfig(Config):
-    """How many copies, and how they may differ; the paper makes 200 episodes of 50 by turning and moving."""
+    """How many copies, and how they may differ; the paper makes 200 episodes of 50 by rotating and moving."""
 
     copies: AtOnce | None = None
-    """Copies of each training episode; by default 3, or as many as `episodes` needs."""
+    """Copies of each training episode; by default 3, or as many as `episodes` requires."""
     episodes: Count | None = None
-    """Episodes in all, originals and held-out ones included; instead of `copies`."""
+    """Total number of episodes, including originals and held-out ones; instead of `copies`."""
     rotations: Rotations = "any"
-    """"any": by any angle that leaves the commands within their limit, the rarer the longer they are.
-    "quarter": by multiples of 90 degrees, each as often, for every command stays within its limit."""
+    """"any": by any angle that keeps the commands within their limits, which is rarer for longer commands.
+    "quarter": by multiples of 90 degrees, each equally often, since these always keep commands within limits.
+    """
     translations: bool = True
-    """To anywhere in the maze; otherwise the copy starts where the original did."""
+    """Move copies anywhere in the maze; otherwise a copy starts where the original did."""
     reflections: bool = Field(default=False, deprecated="copies are not mirrored")
-    """Always false; kept because the seeds of copies depend on it."""
+    """Always false; kept because the random seeds of copies depend on it."""
     held_out_share: Annotated[float, Field(ge=0, lt=1)] = 0.1
-    """Share of the episodes that is set aside before, at least one unless it is 0."""
+    """Fraction of the episodes to hold out first, at least one episode unless it is 0."""
     keep_originals: bool = True
-    """Whether the training episodes themselves are part of the new dataset; held-out ones always are."""
+    """Whether the new dataset includes the training episodes themselves; it always includes held-out ones."""
     margin_m: NotNegative | None = None
-    """Clearance from the walls kept by copies and their originals; by default the robot's reach. With less,
-    copies are longer and some of their steps false: stopped by walls that are not there, or walking through
-    walls that are (with 0.6 m 8 % of the steps on the U-Maze, with the ant's reach none)."""
+    """Minimum distance to walls of copies and their originals; by default the robot's reach. With less,
+    copies are longer but some of their steps are wrong: the robot stops at walls that are not there, or walks
+    through walls that are (8 % of the steps on the U-Maze with 0.6 m, none with the ant's reach)."""
     min_steps: Count = 20
-    """Shortest stretch that is copied."""
+    """Length of the shortest stretch that is copied."""
     tries: Count = 100
-    """Turns that are drawn for a copy before it is given up, with 64 places for each."""
+    """Rotations to draw for a copy before giving up, with 64 places for each."""
 
     @field_validator("episodes")
     @classmethod
@@ -91,7 +92,7 @@ class AugmentConfig(Config):
     @classmethod
     def _is_no_longer_offered(cls, reflections: bool) -> bool:
         if reflections:
-            raise ValueError("expected false, for copies are not mirrored any more: leave the key out")
+            raise ValueError("expected false, since copies are no longer mirrored: leave the key out")
         return reflections
 
 
@@ -174,7 +175,7 @@ def augment(
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
         if copies.any() and not placed:
             raise BadInputError(
-                f"{source.reference}: no place was found for any of {lost} copies: lower --margin-m "
+                f"{source.reference}: found no place for any of {lost} copies: lower --margin-m "
                 f"({relocation.margin_m:g} m) or --min-steps, or raise --tries"
             )
         skipped = int((~held_out & (copies == 0)).sum())
@@ -185,10 +186,10 @@ def augment(
 def _task_of(source: Dataset, task: str | None) -> Task:
     called, collected_for = source.reference, source.description["environment"].get("id")
     if task is None and collected_for is None:
-        raise BadInputError(f"{called} does not name the task that it was collected for: give --task")
+        raise BadInputError(f"{called} does not name its task: give --task")
     if task is None and is_own_code(str(collected_for)):
         raise BadInputError(
-            f"{called} was collected for {collected_for}, which is code that would be run: read it, and give "
+            f"{called} was collected for {collected_for}, whose code would be run: read it, then give "
             f"--task {collected_for}"
         )
     if task is not None and collected_for in TASKS and task != collected_for:
@@ -244,7 +245,9 @@ def _shares(
     if config.episodes is not None:
         kept = count if config.keep_originals else len(held)
         if config.episodes < kept:
-            raise BadInputError(f"--episodes {config.episodes}: expected at least the {kept} that are kept")
+            raise BadInputError(
+                f"--episodes {config.episodes}: expected at least {kept}, the number of episodes kept"
+            )
         each, more = divmod(config.episodes - kept, int(usable.sum()))
         copies[usable] = each
         copies[training[usable[training]][:more]] += 1

@@ -46,41 +46,43 @@ class CollectConfig(Config):
     """What to collect; the paper uses 200 episodes of random behavior of up to 500 steps."""
 
     behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac", "planned"] = "random"
-    """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": at the bounds, often
-    reversed, to see failures. "policy": a saved policy; "suboptimal_ppo" and "suboptimal_sac": one trained in
-    the target and stopped early. Policies draw actions as in training. "planned": what a `plan` says."""
+    """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": commands at the
+    bounds that often reverse, to provoke failures. "policy": a saved policy. "suboptimal_ppo",
+    "suboptimal_sac": a policy trained in the target and stopped early. Policies sample their actions, as in
+    training. "planned": the episodes of a `plan`."""
     episodes: Count = 200
-    """Episodes in all; with `least_steps` at most; of a plan at most as many as it has, its first ones."""
+    """Number of episodes: with `least_steps` the maximum; with a plan at most as many as it has, the first
+    ones."""
     least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
-    """Only as many episodes as have these steps together, so that datasets of different behaviors are of one
-    size."""
+    """Record only as many episodes as it takes to reach this many steps in total, so that datasets of
+    different behaviors have the same size."""
     max_steps: Count = 500
-    """Longest episode, in control steps; longer ones are truncated. A plan has its own."""
+    """Maximum steps per episode; longer episodes are truncated. A plan has its own lengths."""
     num_envs: AtOnce = 200
-    """Episodes recorded in one batch; also decides which random numbers each episode gets."""
+    """Episodes recorded in one batch; also affects which random numbers each episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
     """Where episodes start: anywhere in the free space (with a ball, near it), or where the task does."""
     hold_s: HoldTimes = (0.5, 3.0)
-    """How long a random command is held; not in the paper."""
+    """Range of the time that a random command is held; not in the paper."""
     clearance_m: NotNegative = 0.0
-    """A random command is replaced once it would lead closer to a wall than this within a second, as
-    somebody steering the robot by hand would do; 0: never."""
+    """Replace a random command when it would lead closer to a wall than this within a second, as a person
+    steering the robot would; 0: never."""
     ppo_steps: Count = 300_000
-    """Environment steps after which the suboptimal policy's training by PPO is stopped."""
+    """Environment steps after which the PPO training of the suboptimal policy stops."""
     sac_steps: Count = 300_000
-    """Environment steps after which its training by SAC is stopped at the latest."""
+    """Environment steps after which the SAC training of the suboptimal policy stops at the latest."""
     sac_episode_steps: Count = 500
-    """Training by SAC is stopped as soon as trials of the policy last this many steps on average."""
+    """The SAC training stops as soon as test episodes of its policy last this many steps on average."""
     random_share: Share = Field(default=0.0, exclude_if=lambda share: not share)
-    """Share of a policy's episodes whose commands are random in place, spread evenly over the dataset."""
+    """Fraction of a policy's episodes that get random commands instead, spread evenly over the dataset."""
     policy: str | None = None
-    """Folder of the saved policy, as the stage `train` writes it."""
+    """Folder of the saved policy, as written by the stage `train`."""
     grounding: str | None = None
-    """Folder of the grounding that the saved policy's latent comes from, if it has one."""
+    """Folder of the grounding that computes the latent for the saved policy, if it has one."""
     target_encoder: str | None = None
     """Folder of the aligned target encoder; by default the grounding's own encoder is used."""
     plan: str | None = Field(default=None, exclude_if=lambda plan: plan is None)
-    """File of planned episodes, as `astra-data suggest` writes it: where each starts and what it commands."""
+    """File of planned episodes, as written by `astra-data suggest`: starts and commands."""
 
     @model_validator(mode="after")
     def _fits_the_behavior(self) -> Self:
@@ -98,8 +100,8 @@ class CollectConfig(Config):
             raise ValueError(f'random_share: expected the behavior of a policy, got "{self.behavior}"')
         if self.episodes * self.max_steps > MOST_STEPS:
             raise ValueError(
-                f"episodes: {self.episodes} of up to {self.max_steps} steps take terabytes, expected at most "
-                f"{MOST_STEPS} steps in all"
+                f"episodes: {self.episodes} of up to {self.max_steps} steps take terabytes: expected at most "
+                f"{MOST_STEPS} steps in total"
             )
         return self
 
@@ -245,7 +247,7 @@ def _keep(least_steps: int, writer: StagedWriter) -> None:
     if kept < least_steps:
         raise BadInputError(
             f"least_steps: expected {least_steps}, got {kept} in {len(writer.staged)} episodes: "
-            f"take more episodes, and delete {writer.folder}"
+            f"raise episodes, and delete {writer.folder}"
         )
     for position, steps in sorted(writer.lengths.items(), reverse=True):
         kept -= steps

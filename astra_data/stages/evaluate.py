@@ -52,11 +52,11 @@ class EvaluateConfig(Config):
     """How policies are tested; the paper uses 100 episodes."""
 
     episodes: AtOnce = 100
-    """Run in one batch, in the target and in each simulator."""
+    """Episodes in the target and in each simulator, run in one batch."""
     encoder: EncoderKind = "target"
-    """Encoder with which an aligned policy is deployed for the headline figures; both are reported."""
+    """Encoder that an aligned policy uses for the headline numbers; results with both are reported."""
     leg_scale: Positive = 1.0
-    """Of the ant in the target environment; 1.25 is the paper's morphology test."""
+    """Scale of the ant's legs in the target environment; 1.25 is the paper's morphology test."""
 
 
 def evaluate(
@@ -158,7 +158,9 @@ def _check(task: Task, method: str, policy: Path | PolicyFile | None, grounding:
     if row.trains and policy is None:
         raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
     if not row.trains and policy is not None:
-        raise BadInputError(f"method '{method}' has no policy: leave it out, or name the row of it")
+        raise BadInputError(
+            f"method '{method}' has no policy: leave out the policy, or name the policy's row"
+        )
     if not (row.trains or task.has_target):
         raise BadInputError(f"method '{method}' acts in a target, and {task.name} has none")
     if row.grounds and grounding is None:

@@ -85,7 +85,7 @@ def label(
         out.symlink_to(source.root.resolve())
         return out
     if not more:
-        raise BadInputError(f"{source.reference} has goals and outcomes already: there is nothing to label")
+        raise BadInputError(f"{source.reference} already has goals and outcomes: there is nothing to label")
     for warning in remarks(source, world):
         _log.warning(warning)
     steps = successes = failures = at_goal = 0
@@ -111,7 +111,7 @@ def label(
         _log.warning(
             "%s",
             f"{source.reference}: {at_goal} episodes terminate at their goal and are labelled as failures, "
-            f"for {TERMINATED} does not say why: import {SUCCESS} as well if they ended because they arrived",
+            f"because {TERMINATED} does not say why: also import {SUCCESS} if they ended on arrival",
         )
     return writer.root
 

@@ -46,7 +46,7 @@ class PairConfig(Config):
     """Tolerance of the check that the simulator was reset to φ(s)."""
 
     reset_tolerance: NotNegative = 1e-6
-    """Largest difference between φ(s) and the simulator's state after being reset to it."""
+    """Maximum difference between φ(s) and the simulator's state after a reset to it."""
 
 
 def pair(
@@ -192,9 +192,9 @@ def pair_steps(
         if not float(difference.max()) <= tolerance:
             row, entry = divmod(int(difference.argmax()), wanted.shape[1])
             raise BadInputError(
-                f"the simulator, reset to φ(s) of step {first_step + rows[row]}, shows "
+                f"the simulator, reset to φ(s) of step {first_step + rows[row]}, has "
                 f"{_name(pairing, entry)} = "
-                f"{float(shown[row, entry]):.6g} and not {float(wanted[row, entry]):.6g} "
+                f"{float(shown[row, entry]):.6g}, expected {float(wanted[row, entry]):.6g} "
                 f"(tolerance {tolerance:g}): check its reset_to and the abstraction"
             )
         largest = max(largest, float(difference.max()))
@@ -234,7 +234,7 @@ def _check(source: Dataset, pairing: Pairing) -> None:
         )
     faults = [f"no column {name}" for name in (STATE, ACTION, NEXT_STATE) if name not in source.features]
     if ABSTRACT_STATE in source.features:
-        faults.append(f"{ABSTRACT_STATE} already: it has been paired")
+        faults.append(f"{ABSTRACT_STATE} already: it is paired")
     if pairing.fps not in (None, source.info["fps"]):
         faults.append(f"{source.info['fps']} steps per second, where {pairing.id} makes {pairing.fps}")
     if faults:

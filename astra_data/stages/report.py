@@ -53,16 +53,16 @@ class ReportConfig(Config):
     """Rows whose trajectories are drawn; all rows if none of these is reported."""
 
     trajectory_episodes: int = Field(default=12, ge=1)
-    """Episodes drawn per row and world, the first ones of the row's first seed."""
+    """Episodes to draw per row and world: the first ones of the row's first seed."""
 
     paper_success: dict[str, Share] = Field(default_factory=dict)
-    """Row → the success rate that the paper prints for it, shown beside ours."""
+    """Row → the paper's success rate, shown next to ours."""
 
     compare: tuple[str, ...] = ("astra",)
-    """Methods that are compared with every row that is trained alike, each with and without [plus]."""
+    """Methods to compare with every row trained the same way, each with and without [plus]."""
 
     bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
-    """Bootstrap resamples per interval."""
+    """Bootstrap resamples per confidence interval."""
 
 
 def report(

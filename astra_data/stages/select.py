@@ -40,14 +40,15 @@ class SelectConfig(Config):
     """How policies are chosen without the target."""
 
     episodes: AtOnce = 100
-    """Of each policy with each judge, in one batch."""
+    """Episodes of each policy with each judge, run in one batch."""
     judge: str | None = None
-    """Row whose groundings judge; by default the reference, NAS."""
+    """Row whose groundings serve as judges; by default the reference, NAS."""
     failure_members: CountFromZero = 5
-    """Networks of the failure model that a judge gets whose history model has none, where some of its
-    episodes fail; 0 for none: its states are then scattered as the target's are around the correction."""
+    """Number of networks in the failure model fitted for a history model that serves as judge and has none,
+    if some of the judge's episodes fail. 0: no failure model; the judge's states are then scattered around
+    the correction as the target's are."""
     failure_steps: AtOnce = 2
-    """Within how many steps that failure model foresees failures."""
+    """Number of steps within which that failure model predicts failures."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
     if len(bench.judges) < 2:
         raise BadInputError(
             f"{root}: expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}: "
-            "a policy is judged by those of other episodes; add seeds to the recipe and run it"
+            "groundings of other episodes judge a policy: add seeds to the recipe and run it"
         )
 
 

@@ -79,7 +79,7 @@ def train(
     sees_data = base.grounds or base.learns_from == "episodes" or config.data_start_share > 0
     if sees_data and world.goal and not episodes.windows.goal.shape[-1]:
         raise BadInputError(
-            f"{episodes.reference} has no goals, those of {world.name}: run `astra-data label` first"
+            f"{episodes.reference} lacks the goals of {world.name}: run `astra-data label` first"
         )
     grounding_file = grounding and grounding / GROUNDING
     initial_file = initial and initial / POLICY
@@ -87,7 +87,7 @@ def train(
     beginning = PolicyFile.load(initial_file, device) if initial_file else None
     if beginning and beginning.simulation and beginning.simulation.world.limits_commands:
         raise BadInputError(
-            f"{initial} was trained with command_limit, which does not reach '{method}': train it without"
+            f"{initial} was trained with command_limit, which has no effect on '{method}': train it without"
         )
     grounding_digest = file_digest(grounding_file) if grounding_file else None
     initial_digest = file_digest(initial_file) if initial_file else None

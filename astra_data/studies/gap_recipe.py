@@ -15,21 +15,22 @@ class GapRecipe(Config):
     """How well models of a robot's walk, or of its joints, predict recordings of it."""
 
     mapping: str
-    """How logs become columns: a file of `astra-data import`, relative to the recipe."""
+    """How logs become columns: a mapping of `astra-data import`, relative to the recipe."""
     models: Annotated[tuple[str, ...], Field(min_length=1)]
     """Names in `rollouts.FITS`; the raw simulator is always added."""
     seeds: Annotated[tuple[int, ...], Field(min_length=1)]
-    """Seeds of the smaller data sizes' choice of pieces, and of the networks."""
+    """Seeds of the networks, and of the choice of pieces for smaller data sizes."""
     minutes: tuple[Positive, ...] = ()
-    """Sizes of the training data, besides all of it; each is a subset of the larger ones."""
+    """Sizes of the training data, in addition to all of it; each is a subset of the larger ones."""
     horizons_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.5, 1.0, 2.0, 3.0)
-    """Prediction horizons, besides one step; rounded to control steps, at least one."""
+    """Prediction horizons, in addition to one step; rounded to control steps, at least one."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
-    """Share of each recording's pieces held out for testing, if no other recordings are given."""
+    """Fraction of each recording's pieces to hold out for testing, if no other recordings are given."""
     notes: tuple[str, ...] = ()
     """Paragraphs for the page, such as which data was used for tuning."""
     simulator: Literal["planar_walker", "joints"] = "planar_walker"
-    """The abstract simulator, and so what is predicted: a walk in the plane, or joints sent to targets."""
+    """The abstract simulator, which decides what is predicted: a walk in the plane, or joints that follow
+    targets."""
     walking: WalkingConfig = WalkingConfig()
     """When a robot counts as walking."""
     joints: JointsConfig = JointsConfig()

@@ -111,12 +111,13 @@ class Joints(Body):
 
 
 class JointsConfig(Config):
-    """How the joints' simulator responds, and how their recordings are cut."""
+    """How the joints' simulator responds, and how recordings of joints are cut."""
 
     time_constant_s: NotNegative = 0.0
-    """Of the simulator's first-order response to targets; 0 for joints that are where they should be."""
+    """Time constant of the simulator's first-order response to targets; 0 for joints that reach targets at
+    once."""
     piece_s: Positive = 30.0
-    """Longer episodes are cut into pieces of this length, the unit of hold-out and of resampling."""
+    """Longer episodes are cut into pieces of this length, the unit of hold-out and resampling."""
 
     def body(self, dataset: Dataset) -> Body:
         """Return the joints of observation.state; those of action are their targets, in the same order.

@@ -43,7 +43,7 @@ class FitConfig(DescentConfig):
     noise: NotNegative = 1.0
     """Standard deviation of noise on the history, in units of `Body.noise`, against overfitting."""
     start: Literal["simulator", "ridge"] = "simulator"
-    """What networks correct: the motion of the raw simulator, or that of ridge regression."""
+    """What networks correct: the motion predicted by the raw simulator, or by ridge regression."""
     latent_size: AtOnce = 64
     """Z of ASTRA and NAS."""
     head_sizes: tuple[AtOnce, ...] = (64, 64)

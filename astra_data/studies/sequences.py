@@ -23,7 +23,7 @@ class StepsConfig(Config):
     rows: Count = 10
     """Rows per control step: at 60 Hz a sixth of a second, so that half a second is three steps."""
     history: Count = 20
-    """H, the past control steps in the models' input."""
+    """H, the number of past control steps in the models' input."""
 
 
 @dataclass(frozen=True)

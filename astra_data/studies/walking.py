@@ -117,10 +117,10 @@ class WalkingConfig(Config):
     jump_rad: Positive = 0.1
     """The same for the change of heading."""
     fastest_m_s: Positive = 0.6
-    """A robot that is faster over half a second is carried or corrects its position. Twice the maximum speed
-    of the robot's walk engine."""
+    """A robot that is faster than this over half a second is being carried or corrects its position. Twice
+    the maximum speed of the robot's walk engine."""
     piece_s: Positive = 30.0
-    """Longer episodes are cut into pieces of this length, the unit of hold-out and of resampling."""
+    """Longer episodes are cut into pieces of this length, the unit of hold-out and resampling."""
 
     def body(self, dataset: Dataset) -> Body:
         """Return the walking body.

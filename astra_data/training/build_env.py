@@ -30,48 +30,49 @@ _KERNEL_M = 0.25
 class EnvConfig(Config):
     """Switches of the environment that a policy is trained in; all off is the method as published.
 
-    Each may be given to any method, but the raw simulator has no model to predict from: there `topple` and
-    `disagreement_penalty` are without effect, the reward "blend" is the abstract one, and "predicted" is
-    refused. Of them all, only `data_start_share` reaches policies that are trained in the target.
+    Any method accepts them, but the raw simulator has no model to predict from: there `topple` and
+    `disagreement_penalty` have no effect, the reward "blend" is the abstract one, and "predicted" is
+    refused. For policies trained in the target, only `data_start_share` has an effect.
     """
 
     model_config = ConfigDict(serialize_by_alias=True)
 
     reward: RewardSource | None = None
-    """Where the reward comes from: "abstract", "predicted" or "blend"; by default that of the method."""
+    """Source of the reward: "abstract", "predicted" or "blend"; by default that of the method."""
     topple: bool = False
-    """Draw topples from the topple head: they end the episode, and cost what a failure costs."""
+    """Sample topples from the topple head: they end the episode and cost as much as a failure."""
     risk_weight: NotNegative = 1.0
-    """How many topples a predicted one counts for in "blend": it costs the rest of the episode as well."""
+    """How many topples a predicted one counts as in "blend": a topple also costs the rest of the episode."""
     residual_noise: NotNegative = 0.0
-    """Scatter the state after each step; in units of the target's scatter around the simulator."""
+    """Noise added to the state after each step, in units of the target's scatter around the simulator."""
     support_penalty: NotNegative = 0.0
-    """Subtracted from the reward of a step to where there is no data; less of it where there is little."""
+    """Subtracted from the reward of a step to a place without data; less is subtracted where data is thin."""
     support_density: Positive = 0.3
-    """Data is thin where its density is below this share of the median density of the free space."""
+    """Data is thin where its density is below this fraction of the free space's median density."""
     disagreement_penalty: NotNegative = Field(default=0.0, serialization_alias="doubt_penalty")
-    """Subtracted from the reward of a step, times the disagreement beyond the usual of the correction's heads
-    (`[ground] correction_heads`), or with `keep_member` of a row's member with the model."""
+    """Subtracted from the reward of a step, multiplied by how much the correction's heads (`[ground]
+    correction_heads`) disagree beyond the usual; with `keep_member`, by how much a row's member disagrees
+    with the model."""
     keep_member: bool = Field(default=False, exclude_if=lambda keeps: not keeps)
-    """Correct each row, and predict its reward, by one of the `[ground] members`, in equal shares: simulators
-    that differ are harder to exploit."""
+    """Use one of the `[ground] members` to correct each row and predict its reward, in equal shares:
+    simulators that differ are harder to exploit."""
     change_penalty: NotNegative = Field(default=0.0, exclude_if=lambda weight: not weight)
-    """Subtracted from the reward of a step, times the squared change of the command, from the start: robots
-    fall and lose time where commands jump about."""
+    """Subtracted from the reward of a step, multiplied by the squared change of the command; not ramped up.
+    Robots fall and lose time when commands jump."""
     command_limit: Positive = Field(default=NO_LIMIT, serialization_alias="command_limit_m_s")
-    """Shorten longer commands to this, in training and in the target, as a multiple of the largest along an
-    axis, which is 1 m/s for the ant; by default longer than any command."""
+    """Shorten commands longer than this, in training and in the target, as a multiple of the largest along an
+    axis (1 m/s for the ant); by default no command is shortened."""
     ramp: Share = 0.0
-    """Share of the training over which the penalties grow from zero: at full size from the start, they teach
-    the robot to stand still."""
+    """Fraction of the training over which the penalties grow from zero: at full size from the start, they
+    teach the robot to stand still."""
     ramp_while: Share = Field(default=0.0, exclude_if=lambda share: not share)
-    """Success of training episodes with which the penalties grow; with less they shrink, as fast, so that
-    care does not cost the way. 0: they grow whatever there is."""
+    """Success of training episodes at or above which the penalties grow; below it they shrink at the same
+    speed, so that caution does not cost progress. 0: they always grow."""
     data_start_share: Share = 0.0
-    """Share of the episodes that start from the middle of a recorded one."""
+    """Fraction of the episodes that start from the middle of a recorded one."""
     episode_steps: Count | None = None
-    """Steps after which simulated episodes are truncated, bootstrapping their values; by default the task's
-    horizon. Short ones from recorded moments leave errors no time to grow (Janner et al. 2019)."""
+    """Steps after which simulated episodes are truncated and their values bootstrapped; by default the task's
+    horizon. In short episodes from recorded states, errors have no time to grow (Janner et al. 2019)."""
 
     @model_validator(mode="before")
     @classmethod

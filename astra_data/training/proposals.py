@@ -33,17 +33,17 @@ class SuggestConfig(Config):
     """Which episodes are proposed, and how many of them are suggested."""
 
     episodes: AtOnce = 20
-    """Episodes to suggest."""
+    """Number of episodes to suggest."""
     max_steps: AtOnce = 500
-    """Length of an episode, in control steps."""
+    """Length of each episode, in control steps."""
     start: Literal["anywhere", "task"] = "anywhere"
-    """Where episodes may start: anywhere in the free space, or where the task does."""
+    """Where episodes may start: anywhere in the free space, or where the task starts."""
     hold_s: HoldTimes = (0.5, 3.0)
-    """How long a command is held."""
+    """Range of the time that a command is held."""
     proposals: AtOnce = Field(default=2000, ge=2)
-    """Episodes to choose from."""
+    """Number of episodes to choose from."""
     reach: Positive = 0.5
-    """How near a step has to come to one of an episode that was taken, to teach much less: in standard
+    """Distance within which a step close to one of an episode already chosen teaches much less, in standard
     deviations of all proposals' states and commands."""
 
 

@@ -16,29 +16,29 @@ from astra_data.worlds.task import Task
 
 
 class PlannedEpisode(Config):
-    """One episode: its start, and its commands, which need no look at the robot."""
+    """One episode: its start and its commands, which do not depend on the robot's state."""
 
     start: tuple[float, ...]
-    """Abstract state, (X,), at rest."""
+    """Abstract state (X,), at rest."""
     commands: tuple[tuple[float, ...], ...] = Field(min_length=1)
-    """One after another, in the units of the robot, (K, A)."""
+    """Successive commands (K, A), in the robot's units."""
     hold_steps: tuple[AtOnce, ...] = Field(min_length=1)
-    """For how many steps each is held, (K,)."""
+    """Number of steps that each command is held, (K,)."""
     information: float = 0.0
-    """What it is expected to teach, in nats, given those before it in the plan."""
+    """How much it is expected to teach, in nats, given the episodes before it in the plan."""
 
 
 class RecordingPlan(Config):
-    """Episodes to record, those that teach most first."""
+    """Episodes to record, the most informative first."""
 
     task: str
-    """Its name."""
+    """Name of the task."""
     timestep_s: float
-    """Its control period."""
+    """Control period."""
     start_names: tuple[str, ...]
-    """The entries of a start."""
+    """Names of a start's values."""
     command_names: tuple[str, ...]
-    """The axes of a command."""
+    """Names of a command's axes."""
     episodes: tuple[PlannedEpisode, ...] = Field(min_length=1)
 
     @classmethod

@@ -83,7 +83,7 @@ def suboptimal_by_sac(
         BadInputError: the task's episodes end in success, so that lasting long is not good.
     """
     if not task.objective.is_lasting:
-        raise BadInputError(f"in {task.name} good episodes are short: take 'suboptimal_ppo'")
+        raise BadInputError(f"in {task.name} good episodes are short: use 'suboptimal_ppo'")
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = ObservedTargetEnv(task, _SAC_ENVS, observed="full", num_threads=num_threads)
     actor = SoftActor(PolicyShape(world.observation_size, world.action_size, hidden_sizes=_SAC_SIZES))

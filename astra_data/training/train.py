@@ -46,28 +46,30 @@ from astra_data.worlds.variation import Variation
 
 
 class TrainConfig(EnvConfig):
-    """How policies are trained, but for the learner's own settings."""
+    """How policies are trained, except for the learner's own settings."""
 
     num_envs: AtOnce = 256
-    """Environments stepped side by side."""
+    """Environments stepped in parallel."""
     hidden_sizes: tuple[AtOnce, ...] = (64, 64)
     """Hidden layers of actor and critic."""
     memory_size: CountFromZero = 64
-    """Size of the policy's own GRU, where no grounding provides a latent."""
+    """Size of the policy's own GRU, used if no grounding provides a latent."""
     tries: AtOnce = 1
-    """Trainings at most: where the policy did not master its own simulator, in 100 episodes from the task's
-    starts and by the mean of its actions, it is trained again from another seed."""
+    """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
+    the task's starts, acting by the mean of its actions) is trained again with another seed."""
     least_success: Share = 0.9
-    """Success in these with which a simulator is mastered; the best try is kept where none has it."""
+    """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept.
+    """
     most_of_horizon: Share = 0.85
-    """Share of the horizon that those which succeed may take; later they hardly arrive in time."""
+    """Maximum fraction of the horizon that successful episodes may take; slower policies hardly arrive in
+    time."""
 
 
 class PpoTrainConfig(TrainConfig, PpoConfig):
     """Training by PPO."""
 
     learner: Literal["ppo"] = "ppo"
-    """Proximal policy optimisation."""
+    """Proximal policy optimization."""
 
 
 class SacTrainConfig(TrainConfig, SacConfig):
@@ -76,7 +78,7 @@ class SacTrainConfig(TrainConfig, SacConfig):
     learner: Literal["sac"]
     """Soft actor-critic."""
     num_envs: AtOnce = 32
-    """Environments stepped side by side."""
+    """Environments stepped in parallel."""
 
     @model_validator(mode="after")
     def _learns_from_one_reward(self) -> Self:

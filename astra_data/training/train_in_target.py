@@ -14,9 +14,9 @@ class TargetConfig(Config):
     """Settings that may differ from `[train]` in the target, whose steps are slow; not in the paper."""
 
     total_steps: Count | None = None
-    """Environment steps in all; by default as in `[train]`."""
+    """Number of environment steps; by default as in `[train]`."""
     num_envs: AtOnce | None = None
-    """Target environments stepped side by side; by default as in `[train]`."""
+    """Target environments stepped in parallel; by default as in `[train]`."""
     memory_size: CountFromZero | None = None
     """Size of the policy's own GRU; by default as in `[train]`. A policy that observes the full state needs
     none."""

@@ -40,7 +40,7 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
         return _a_task(name, own_object(installed[name]))
     known = (*known_names(), *besides)
     raise BadInputError(
-        f"unknown task '{name}'{did_you_mean(name, known)}; a task of your own is named as cart.py:TASK"
+        f"unknown task '{name}'{did_you_mean(name, known)}; name your own task like cart.py:TASK"
     )
 
 

@@ -147,10 +147,14 @@ class Task:
         if (horizon := self.objective.horizon) < 1:
             faults.append(f"objective: horizon {horizon}, expected 1 step or more")
         if not 0 < self.timestep_s < 2:
-            expected = "expected above 0 and below 2 s, for datasets have a whole number of steps per second"
+            expected = (
+                "expected above 0 and below 2 s, since datasets have a whole number of steps per second"
+            )
             faults.append(f"timestep_s: {expected}: got {self.timestep_s}")
         if not NAME.fullmatch(self.name):
-            faults.append("name: expected letters, digits, '.', '_' and '-': datasets are named after it")
+            faults.append(
+                "name: expected letters, digits, '.', '_' and '-', since datasets are named after it"
+            )
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
         abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]
@@ -216,7 +220,7 @@ class Task:
     def without_maze(self) -> BadInputError:
         """Return the error for settings that need a maze."""
         return BadInputError(
-            f"expected a task in a maze, got '{self.name}', which has none: leave out what needs one "
+            f"expected a task in a maze, got '{self.name}', which has none: leave out what needs a maze "
             "(augment, follower, support_penalty, command_limit, clearance_m, start 'anywhere')"
         )
 
@@ -242,7 +246,7 @@ class Task:
         if self.robot is None:
             raise BadInputError(
                 f"task '{self.name}' has no target: give it a `robot`, or leave out what needs one (collect, "
-                "the rows that are trained in the target)"
+                "rows trained in the target)"
             )
         return RobotEnv(
             self.objective,

@@ -174,8 +174,8 @@ def _step(task: Task, simulator: AbstractSimulator, starts: Tensor, device: str)
             _same(f"{what}: row {row} by itself and", alone, landed[row : row + 1], "in the batch")
     elif _remembers(lambda: task.own_simulator(_COUNT, device), starts, command):
         raise BadInputError(
-            f"{what}: expected what follows from the state alone, and it depends on commands before "
-            "reset_to(state): reset all that the simulator remembers there, such as filters and delays"
+            f"{what}: expected a result that depends on the state alone, but it depends on commands before "
+            "reset_to(state): reset all memory there, such as filters and delays"
         )
     return landed  # of a noisy one, whose rows cannot be compared, too
 
@@ -242,8 +242,8 @@ def _starts_apart(task: Task, simulator: AbstractSimulator, starts: Tensor) -> s
     return (
         f"the robot starts at {task.abstract_state.labels[entry]} = {robot[:, entry].min():.4g} to "
         f"{robot[:, entry].max():.4g}, far from where objective.draw_starts puts the simulator, "
-        f"{low[entry]:.4g} to {high[entry]:.4g}: policies are trained from the latter; draw starts as the "
-        "robot has them, or check φ and its units"
+        f"{low[entry]:.4g} to {high[entry]:.4g}: policies start training from the latter: draw starts like "
+        "the robot's, or check φ and its units"
     )
 
 

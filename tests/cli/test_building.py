@@ -53,9 +53,9 @@ def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["collect", "recipe.toml", "--episodes", "3"], r"in \[collect\]: leave out --episodes"),
+        (["collect", "recipe.toml", "--episodes", "3"], r"\[collect\] sets this: leave out --episodes"),
         (["collect", "recipe.toml", "--resume"], r"leave out --resume"),
-        (["collect", "antmaze-umaze", "--seed", "1", "--seed", "2"], r"takes one --seed"),
+        (["collect", "antmaze-umaze", "--seed", "1", "--seed", "2"], r"give at most one --seed"),
         (["collect", "antmaze-umaze", "--behavior", "wild"], r"behavior: expected 'random', .*got 'wild'"),
         (
             ["collect", "antmaze-umaze", "--random-share", "0.5"],
@@ -68,8 +68,11 @@ def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
         ),
         (["collect", "antmaze-umaze", "--plan", "none.json"], r"none.json cannot be read as a plan: No such"),
         (["collect", "antmaze-umase"], r"did you mean 'antmaze-umaze'"),
-        (["pair", "recipe.toml", "--simulator", "antmaze-umaze"], r"in \[pair\]: leave out --simulator"),
-        (["pair", "walks", "--jobs", "2", "--simulator", "antmaze-umaze"], r"neither --seed nor --jobs"),
+        (
+            ["pair", "recipe.toml", "--simulator", "antmaze-umaze"],
+            r"\[pair\] sets this: leave out --simulator",
+        ),
+        (["pair", "walks", "--jobs", "2", "--simulator", "antmaze-umaze"], r"leave out --seed and --jobs"),
         (["pair", "walks"], r"expected --simulator"),
         (["pair", "walks", "--simulator", "antmaze-umaze"], r"no dataset 'walks'"),
     ],

@@ -20,7 +20,7 @@ def test_validate_and_repair(
     root = write_fake(tmp_path / "set").root
     assert run(monkeypatch, "validate", root) == 0
     told = capsys.readouterr().out
-    assert told.startswith(f"{root} is whole: 5 episodes, 55 steps\nepisodes end: ")
+    assert told.startswith(f"{root} is intact: 5 episodes, 55 steps\nepisodes end: ")
     (root / "meta/tasks.parquet").unlink()
     (root / "meta/stats.json").write_text("{}")
     assert run(monkeypatch, "validate", root) == 1
@@ -65,8 +65,8 @@ def test_validate_counts_all_faults(
     root = write_fake(tmp_path / "set").root
     (root / "data/0.txt").touch()
     run(monkeypatch, "validate", root)
-    assert "has 1 fault:" in capsys.readouterr().err
+    assert "has 1 error:" in capsys.readouterr().err
     for number in range(30):
         (root / f"data/{number}.txt").touch()
     run(monkeypatch, "validate", root)
-    assert "has 30 faults:" in capsys.readouterr().err
+    assert "has 30 errors:" in capsys.readouterr().err

@@ -53,6 +53,6 @@ def test_a_refused_edit_writes_nothing(fake: str) -> None:
 
 def test_a_recipe_says_its_sizes_itself() -> None:
     result = call("subset", "r.toml", "--percent", "50")
-    assert str(result.exception) == "subset: a recipe sets this itself, in [sweep]: leave out --percent"
+    assert str(result.exception) == "subset: the recipe's [sweep] sets this: leave out --percent"
     result = call("subset", "fake", "--percent", "50", "--seed", "0", "--seed", "1")
     assert isinstance(result.exception, BadInputError)

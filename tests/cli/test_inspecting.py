@@ -65,13 +65,13 @@ def test_what_killed_commands_left_is_removed_on_request(
     for folder in (dead, other, staged):
         folder.mkdir(parents=True)
     assert call("list", "--clean").output.splitlines() == [
-        f"kept: {staged}: the command that was interrupted goes on with it, or delete it",
+        f"kept: {staged}: the interrupted command can continue from it; otherwise delete it",
         f"removed: {dead}",
     ]
     assert not dead.exists() and other.exists()
     assert f"removed: {other}" in call("list", "--clean", str(tmp_path / "runs")).output
     staged.rmdir()
-    assert call("list", "--clean").output == "nothing was left by killed commands\n"
+    assert call("list", "--clean").output == "found no leftovers of killed commands\n"
     assert "folders are for --clean" in str(call("list", str(tmp_path / "runs")).exception)
 
 

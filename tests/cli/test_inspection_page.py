@@ -81,7 +81,7 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     assert lines[0] == "fake@data-1.0.0: 3 episodes, 3,600 steps, 3.0 min"
     assert lines[1].startswith("lengths 600 to 1800, median 1200  ")
     assert ("success 1 of 3 episodes (0.33)" in lines) == (success is not None)
-    assert any(line.startswith("episodes end: 2 terminated, 1 cut off; 1 next states were") for line in lines)
+    assert any(line.startswith("episodes end: 2 terminated, 1 cut off; 1 next states of") for line in lines)
     table = lines[lines.index("action (2) float32") + 1 :]
     assert table[0].split() == ["value", "unit", "min", "mean", "max", "spread"]
     assert table[1].split() == ["vx", "m/s", "-1", "0", "1"]
@@ -89,4 +89,4 @@ def test_a_page_sums_up_the_dataset(success: int | None) -> None:
     assert table[3] == "positions, x -1.0 to 0.0 m, y 2.0 to 3.0 m"
     assert table[4] == "█"
     assert table[5:8] == ["check-up", "endings: 3 cut", "rate: 20 Hz declared"]
-    assert table[8:] == ["no findings in the values; `astra-data validate` reads all files"]
+    assert table[8:] == ["nothing looks wrong in the values; `astra-data validate` also checks all files"]

@@ -52,7 +52,7 @@ def test_a_run_ends_with_the_pages_to_look_at(
         page.touch()
     show_made(tmp_path, until, *others)
     listed = ", ".join(str(tmp_path / page) for page in looked_at)
-    assert capsys.readouterr().out == f"{shown}finished: {tmp_path} (look at {listed})\n"
+    assert capsys.readouterr().out == f"{shown}finished: {tmp_path} (see {listed})\n"
 
 
 @pytest.mark.parametrize(
@@ -116,5 +116,5 @@ def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_options_that_a_recipe_sets_itself_are_refused() -> None:
     refuse({"episodes": None}, "collect")
-    with pytest.raises(BadInputError, match=r"in \[sweep\]: leave out --of, --min-steps$"):
+    with pytest.raises(BadInputError, match=r"\[sweep\] sets this: leave out --of, --min-steps$"):
         refuse({"of": 3, "min_steps": 0, "name": None}, "subset", "sweep")

@@ -30,7 +30,7 @@ def asked_of(recipe: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> di
     monkeypatch.setattr("astra_data.experiments.sweep.sweep", sweep)
     result = CliRunner().invoke(cli.app, ["sweep", str(recipe), *options])
     folder = recipe.parent / "r"
-    assert result.output == f"finished: {folder} (look at {folder / 'sweep.csv'})\n"
+    assert result.output == f"finished: {folder} (see {folder / 'sweep.csv'})\n"
     return asked[0]
 
 

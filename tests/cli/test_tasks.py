@@ -57,7 +57,7 @@ TASK = replace(RIGHT, objective=Wrong(horizon=40))
 
 def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = CliRunner().invoke(app, ["tasks", f"{CART}:TASK"])
-    assert result.exit_code == 0 and "small_cart.py:TASK: nothing is wrong" in result.output
+    assert result.exit_code == 0 and "small_cart.py:TASK: found no errors" in result.output
     assert result.output.startswith("commands: v -1…4\nabstract states: x\n")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "wrong.py").write_text(WRONG)

@@ -50,7 +50,7 @@ def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
         (folder / "checkpoint").touch()
         raise KeyboardInterrupt
     with (
-        pytest.raises(BadInputError, match=f"{folder} was begun with other settings"),
+        pytest.raises(BadInputError, match=f"{folder} was started with other settings"),
         finished_folder(out, config="2"),
     ):
         pass
@@ -88,7 +88,7 @@ def test_what_another_is_making_is_left_to_it(tmp_path: Path, replace: bool) -> 
     with finished_folder(out, config="1") as folder:
         (folder / "model").touch()
         with (
-            pytest.raises(BadInputError, match="out is being made right now: wait"),
+            pytest.raises(BadInputError, match="out is being written right now: wait"),
             finished_folder(out, replace=replace, config="1"),
         ):
             pytest.fail("it was yielded twice")
@@ -108,14 +108,14 @@ def test_what_another_finished_while_the_lock_was_awaited_is_not_replaced(
         yield True
 
     monkeypatch.setattr("astra_data.core.artefact.held", late)
-    with pytest.raises(BadInputError, match="finished already"), finished_folder(out):
+    with pytest.raises(BadInputError, match="already finished"), finished_folder(out):
         pytest.fail("it was made again")
     assert [path.name for path in out.iterdir()] == ["model"]
 
 
 def test_a_folder_without_a_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(BadInputError, match="finished already"), finished_folder(Path(".")):
+    with pytest.raises(BadInputError, match="already finished"), finished_folder(Path(".")):
         pass
     assert not list(tmp_path.iterdir())
 
@@ -131,7 +131,7 @@ def test_a_folder_begun_without_a_config_is_refused(tmp_path: Path) -> None:
         (folder / "checkpoint").touch()
         raise KeyboardInterrupt
     with (
-        pytest.raises(BadInputError, match="begun with other"),
+        pytest.raises(BadInputError, match="started with other"),
         finished_folder(tmp_path / "out", config="1"),
     ):
         pass
@@ -141,7 +141,7 @@ def test_a_folder_begun_without_a_config_is_refused(tmp_path: Path) -> None:
 def test_a_finished_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").touch()
-    with pytest.raises(BadInputError, match="finished already"), finished_folder(tmp_path / "out"):
+    with pytest.raises(BadInputError, match="already finished"), finished_folder(tmp_path / "out"):
         pass
     with finished_folder(tmp_path / "out", replace=True) as folder:
         (folder / "new").touch()
@@ -184,7 +184,7 @@ def test_a_kill_while_replacing_loses_nothing(
         patched.setattr("shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt), finished_folder(out, replace=True) as folder:
             (folder / "new").touch()
-    with pytest.raises(BadInputError, match="finished already"), finished_folder(out):
+    with pytest.raises(BadInputError, match="already finished"), finished_folder(out):
         pass
     assert [path.name for path in out.iterdir()] == ["new" if renames == 2 else "old"]
     with finished_folder(out, replace=True) as folder:

@@ -68,7 +68,7 @@ def test_files_that_are_missing_damaged_or_foreign_are_refused(tmp_path: Path) -
         load_tensors(path)
     save_tensors(path, {"a": torch.ones(100)}, {})
     path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(BadInputError, match="not a whole safetensors file"):
+    with pytest.raises(BadInputError, match="not a complete safetensors file"):
         load_tensors(path)
     save_file({"a": torch.ones(1)}, path, {"format": "pt"})
     with pytest.raises(BadInputError, match="not written by astra-data"):

@@ -64,7 +64,7 @@ def test_configs_are_frozen_and_described_by_the_strings_under_their_fields() ->
 def test_all_faults_come_in_one_message(tmp_path: Path) -> None:
     text = 'seeds = [0, "one"]\n[train]\nlearning_rate = true\nlearner = "dqn"\nenvsteps = 1\n'
     assert fault(tmp_path, text).splitlines() == [
-        "FILE has 5 faults:",
+        "FILE has 5 errors:",
         "  task: expected a value, but the key is missing",
         "  seeds.1: expected a whole number, got 'one'",
         "  train.learning_rate: expected a number, got True",

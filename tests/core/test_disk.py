@@ -12,10 +12,10 @@ from astra_data.core.errors import BadInputError, DiskError
     ("code", "why", "cure"),
     [
         (errno.ENOSPC, "the disk is full", "free space"),
-        (errno.EDQUOT, "the quota is used up", "free space"),
+        (errno.EDQUOT, "the quota is exceeded", "free space"),
         (errno.EFBIG, "a file would be larger than is allowed", "ulimit -f"),
         (errno.EROFS, "the disk is read-only", "make it writable"),
-        (errno.EIO, "the disk reports a fault", "check it"),
+        (errno.EIO, "the disk reports an error", "check it"),
         (errno.ESTALE, "the disk is gone", "connect it again"),
     ],
 )

@@ -35,7 +35,7 @@ def test_what_does_not_fit_is_refused_with_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=f"remove {tmp_path}"):
         Logbook(checkpoint, lambda state: state["bias"])
     checkpoint.write_bytes(checkpoint.read_bytes()[:-4])
-    with pytest.raises(BadInputError, match=f"not a whole safetensors file: .*: remove {tmp_path}"):
+    with pytest.raises(BadInputError, match=f"not a complete safetensors file: .*: remove {tmp_path}"):
         Logbook(checkpoint, never)
 
 

@@ -108,7 +108,7 @@ def test_a_disk_that_fails_at_any_operation_leaves_all_or_nothing(
                 with atomic_folder(target) as folder:
                     (folder / "file").write_text("whole")
             except DiskError as error:
-                assert str(error).startswith(f"{target} cannot be written: the disk reports a fault.")
+                assert str(error).startswith(f"{target} cannot be written: the disk reports an error.")
         if target.exists():
             assert (target / "file").read_text() == "whole"
         if len(calls) <= at:

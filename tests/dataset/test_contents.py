@@ -56,7 +56,7 @@ def repeat_the_last_row(root: Path) -> None:
         ),
         (
             lambda root: (root / "meta/info.json").write_text('{"codebase_version": "v3.0"}'),
-            ["has 5 faults: fps: expected a value", "; features: expected a value"],
+            ["has 5 errors: fps: expected a value", "; features: expected a value"],
         ),
     ],
 )
@@ -69,7 +69,7 @@ def test_damage_is_told_in_one_line(
         Dataset.open(root)
     message = str(caught.value)
     assert message.startswith(f"{root} is incomplete or was altered: ")
-    repair = f"or save what is whole of it: `astra-data repair {root} --out FOLDER`."
+    repair = f"or recover its intact episodes: `astra-data repair {root} --out FOLDER`."
     # Without these, columns and rate are unknown.
     lost = "info.json is no JSON" in message or "features: expected a value" in message
     assert message.endswith("wrote it again." if lost else repair)

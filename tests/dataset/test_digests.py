@@ -54,8 +54,8 @@ def test_an_altered_value_is_refused_before_it_is_seen(
     assert len(seen) <= 3
     assert str(caught.value) == (
         f"{root} is incomplete or was altered: next.reward: other values than were written in {DATA} rows "
-        "20 to 49 (episode 3). Restore it from a copy, run the stage that wrote it again, or save what is "
-        f"whole of it: `astra-data repair {root} --out FOLDER`."
+        "20 to 49 (episode 3). Restore it from a copy, run the stage that wrote it again, or recover its "
+        f"intact episodes: `astra-data repair {root} --out FOLDER`."
     )
     with pytest.raises(CorruptDatasetError, match=r"next\.reward"):
         dataset.columns([REWARD])

@@ -21,7 +21,7 @@ def test_only_a_terminated_last_step_that_stands_still_was_made_up(tmp_path: Pat
 
     found = endings_of(Dataset.open(tmp_path / "d"))
     assert found == Endings(terminated=2, cut_off=2, made_up=1)
-    assert str(found).startswith("2 terminated, 2 cut off; 1 next states were made up")
+    assert str(found).startswith("2 terminated, 2 cut off; 1 next states of terminated episodes were made up")
     assert str(Endings(3, 1)) == "3 terminated, 1 cut off"
 
 

@@ -101,7 +101,7 @@ def test_every_fault_of_a_description_is_told_at_once(made: Path) -> None:
     parent = {"name": "../x", "version": "1", "hash": "0"}
     changed = description | {"name": "a/b", "parents": [parent], "more": 1}
     (made / DATASET_PATH).write_text(json.dumps(changed))
-    with pytest.raises(CorruptDatasetError, match=r"dataset\.json has 4 faults: name: ") as caught:
+    with pytest.raises(CorruptDatasetError, match=r"dataset\.json has 4 errors: name: ") as caught:
         read_description(made)
     for key in ("parents.0.name", "parents.0.version", "config: expected a value"):
         assert key in str(caught.value)

@@ -134,7 +134,7 @@ def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
 
 
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="no dataset there"):
+    with pytest.raises(BadInputError, match="found no dataset"):
         Dataset.open(tmp_path / "typo")
 
 
@@ -160,7 +160,7 @@ def test_a_run_names_its_datasets(tmp_path: Path) -> None:
 def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:
     for version in ("1.0.0", "1.1.0"):
         write_fake(tmp_path / f"fake/data-{version}")
-    with pytest.raises(BadInputError, match=r"holds versions .*: name one of data-1.0.0, data-1.1.0"):
+    with pytest.raises(BadInputError, match=r"contains versions .*: name one of data-1.0.0, data-1.1.0"):
         Dataset.open(tmp_path / "fake")
 
 
@@ -217,5 +217,5 @@ def test_a_folder_of_logs_is_no_dataset_yet(tmp_path: Path) -> None:
     written = write_fake(tmp_path / "set").root
     (written / "notes.csv").write_text("")
     assert len(Dataset.open(written)) > 0
-    with pytest.raises(BadInputError, match=r"holds logs, Drive\.CSV and so on: .*`astra-data import`"):
+    with pytest.raises(BadInputError, match=r"contains logs \(Drive\.CSV and so on\): .*`astra-data import`"):
         Dataset.open(tmp_path)

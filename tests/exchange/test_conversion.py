@@ -83,7 +83,7 @@ def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
         (
             {},
             np.array([1, None]),
-            "field 'f': expected numbers, got what no number can hold, such as nothing",
+            "field 'f': expected numbers, got values that are not numbers, such as missing ones",
         ),
         ({}, np.zeros((2, 0)), r"field 'f' has no values, its shape is \(2, 0\)"),
     ],

@@ -81,8 +81,8 @@ def test_a_silence_that_ends_episodes_is_told_with_its_key_and_what_it_may_mean(
     """A column with a gap of its own cannot be latched; a base's watchdog stops it without commands."""
     told = ended("/cmd_vel", 2, 0.5, column, commanded)
     key = f'gap_s in [columns."{column}"]' if column else "split.gap_s"
-    assert told.startswith(f"/cmd_vel is silent for over 0.5 s ({key}) 2 times while others are not, and ")
-    assert ("is right where the robot stops by itself" in told) is (commanded is not None)
+    assert told.startswith(f"/cmd_vel is silent for over 0.5 s ({key}) 2 times while others are not; ")
+    assert ("is right if the robot stops by itself" in told) is (commanded is not None)
     assert ("latched = true" in told) is (not column)
     assert "set a longer" in told or "or a longer gap_s" in told
 

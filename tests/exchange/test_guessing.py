@@ -130,7 +130,7 @@ def test_a_rate_that_no_import_takes_is_refused(
     log = write(tmp_path / "log.csv", {"t_s": step * RAMP, "x": RAMP, "cmd": RAMP})
     with pytest.raises(
         BadInputError,
-        match=rf"t_s: expected rows a second .*, got {measured}: .* logs to {rate} rows a second",
+        match=rf"t_s: expected rows per second .*, got {measured}: .* logs to {rate} rows per second",
     ):
         guess([log])
 
@@ -185,7 +185,7 @@ def test_what_rises_in_a_unit_of_time_is_a_time(tmp_path: Path) -> None:
     restarts = 50 * (RAMP % 3)
     logs = guess([write(tmp_path / "a.csv", {"zeit_ms": restarts} | rest)])
     assert (logs.fields[0].role, logs.fields[0].unit, logs.rate) == ("time", "ms", 20)
-    assert logs.fields[0].why == "its ending, and it rises in every row"
+    assert logs.fields[0].why == "its ending, and it increases in every row"
     np.testing.assert_allclose(logs.episodes[1]["zeit_ms"], [0, 0.05, 0.1])
     times: dict[str, object] = {"uptime_s": RAMP, "t": RAMP / 10, "age_us": 7 * RAMP}
     logs = guess([write(tmp_path / "b.csv", times | rest)])
@@ -264,8 +264,8 @@ def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
             "t: expected a number in each row of a time, got none in 1 of 3: leave",
         ),
         ("x,cmd\n0,0\n1,nan\n2,inf\n", "cmd: expected a number in each row of a command, got none in 2 of 3"),
-        ("x_mm,x_cm,cmd\n0,0,0\n1,1,1\n2,2,2\n", "x_mm and x_cm are both taken for state x: rename one"),
-        ("x,cmd_v,u_v\n0,0,0\n1,1,1\n", "cmd_v and u_v are both taken for command v: rename one"),
+        ("x_mm,x_cm,cmd\n0,0,0\n1,1,1\n2,2,2\n", "x_mm and x_cm would both become state x: rename one"),
+        ("x,cmd_v,u_v\n0,0,0\n1,1,1\n", "cmd_v and u_v would both become command v: rename one"),
         (
             "x;cmd\n0,5;1\n1;2\n",
             "expected fields parted by commas, got semicolons in its header: write it with commas, or with",
@@ -289,9 +289,9 @@ def test_files_have_to_be_there_and_alike(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected files that end in \.csv or \.tsv, found none"):
         guess([tmp_path])
     (tmp_path / "log.h5").write_bytes(b"\x89HDF")
-    with pytest.raises(BadInputError, match=r"log\.h5: expected files that end in .*: `import` takes others"):
+    with pytest.raises(BadInputError, match=r"log\.h5: expected files that end in .*: convert other formats"):
         guess([tmp_path / "log.h5"])
-    with pytest.raises(BadInputError, match="there is no such file"):
+    with pytest.raises(BadInputError, match="no such file"):
         guess([tmp_path / "log.csv"])
     one = write(tmp_path / "one.csv", {"x": RAMP, "cmd": RAMP})
     two = write(tmp_path / "two.csv", {"y": RAMP, "cmd": RAMP})
@@ -439,7 +439,7 @@ def test_goals_are_told_from_states_and_commands(tmp_path: Path) -> None:
     assert found == {
         "goal_x": ("goal", "m", "its name"),
         "goal_yaw_deg": ("goal", "rad", "its ending"),
-        "target_x": ("goal", "1", "one place in each episode"),
+        "target_x": ("goal", "1", "constant in each episode"),
         "target_y": ("command", "1", "no unit in its name"),
         "target_q1": ("command", "1", "no unit in its name"),
         "dist_to_goal": ("state", "1", "no unit in its name"),

@@ -153,7 +153,7 @@ def test_a_format_that_does_not_exist_is_told(tmp_path: Path) -> None:
 
 def test_a_dataset_needs_no_import(tmp_path: Path) -> None:
     dataset, _ = imported(tmp_path / "my own", write_table(tmp_path / "a.csv", rows()))
-    told = f"is a LeRobot dataset, no logs, and needs no import: .*`astra-data inspect '{dataset.root}'`, or"
+    told = f"is a LeRobot dataset, not logs, and needs no import: .*`astra-data inspect '{dataset.root}'`, or"
     for mapping in (None, MAPPING):
         with pytest.raises(BadInputError, match=told):
             imported(tmp_path / "again", dataset.root, mapping)
@@ -179,7 +179,7 @@ def test_formats_that_need_seeking_are_not_read_from_archives(tmp_path: Path) ->
     path = write_table(tmp_path / "a.npz", rows())
     with tarfile.open(tmp_path / "a.tar", "w") as archive:
         archive.add(path, "a.npz")
-    with pytest.raises(BadInputError, match="npz cannot be read from an archive, unpack it"):
+    with pytest.raises(BadInputError, match="npz cannot be read from an archive: unpack it"):
         imported(tmp_path, tmp_path / "a.tar")
 
 
@@ -332,7 +332,7 @@ def test_files_that_go_on_are_not_said_to_be_without_an_episode(tmp_path: Path) 
 
 def test_short_logs_with_a_few_gaps_are_not_said_to_be_in_another_unit(tmp_path: Path) -> None:
     mapping = csv_logs(tmp_path, "t,x,a\n0,0,0\n9,1,1\n", "t,x,a\n0,0,0\n", "t,x,a\n0,0,0\n")
-    with pytest.raises(BadInputError, match="no episodes, each of which needs two rows"):
+    with pytest.raises(BadInputError, match="no episodes, and each needs two rows"):
         import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
 
 

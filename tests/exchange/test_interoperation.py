@@ -159,7 +159,7 @@ def test_lerobot_trains_act_on_it(runs: Runs) -> None:
 
 
 def test_lerobots_loader_cuts_the_same_windows(runs: Runs) -> None:
-    assert "is whole: 5 episodes, 55 steps" in assert_succeeded(runs, "validate")
+    assert "is intact: 5 episodes, 55 steps" in assert_succeeded(runs, "validate")
 
 
 def test_hf_datasets_reads_the_parquet_files(runs: Runs) -> None:

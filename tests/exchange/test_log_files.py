@@ -21,7 +21,7 @@ def test_bags_are_to_be_imported_first(tmp_path: Path, name: str) -> None:
     (bags / name).parent.mkdir(parents=True)
     (bags / name).touch()
     for place in {bags, (bags / name).parent, bags / name}:
-        told = f"got a recording of ROS, {Path(name).name}: "
+        told = f"got a ROS recording, {Path(name).name}: "
         expected = rf"{told}.*import '{place}' --mapping recipes/imports/ros2_base\.toml"
         with pytest.raises(BadInputError, match=expected) as raised:
             csv_files(place)
@@ -30,11 +30,13 @@ def test_bags_are_to_be_imported_first(tmp_path: Path, name: str) -> None:
 
 def test_what_is_there_in_place_of_logs_is_told(tmp_path: Path) -> None:
     write_fake(tmp_path / "walks/data-1.0.0")
-    with pytest.raises(BadInputError, match=r"walks holds versions of a dataset: name one of data-1\.0\.0"):
+    with pytest.raises(
+        BadInputError, match=r"walks contains versions of a dataset: name one of data-1\.0\.0"
+    ):
         csv_files(tmp_path / "walks")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / RECORD).touch()
     with pytest.raises(BadInputError, match="run is a run; it has no datasets yet"):
         csv_files(tmp_path / "run")
-    with pytest.raises(BadInputError, match="nothing: there is no such file, folder or dataset"):
+    with pytest.raises(BadInputError, match="nothing: no such file, folder or dataset"):
         csv_files(tmp_path / "nothing")

@@ -66,7 +66,7 @@ def test_a_file_that_is_bad_in_its_midst_is_left_out_as_a_whole(tmp_path: Path) 
     write_table(paths[0], damaged)
     dataset, report = imported(tmp_path, paths, skip_bad=True)
     assert set(dataset.metadata["source"]) == {"1.csv"}
-    assert "1 of 20 rows have values that are not finite, the first is 0.csv line 21" in report.left_out[0]
+    assert "1 of 20 rows have values that are not finite; the first is 0.csv line 21" in report.left_out[0]
 
 
 def test_nothing_is_imported_where_all_files_are_bad(tmp_path: Path) -> None:

@@ -85,8 +85,8 @@ def test_an_emptied_file_is_found_and_made_again(
     lines = capsys.readouterr().out.splitlines()[:2]
     aside = folder / "set_aside/1"
     assert lines == [
-        f"{TRAIN} is made again: damaged ({why}); the old one is in {aside / TRAIN}",
-        f"{EVALUATE} is made again: made from {TRAIN}; the old one is in {aside / EVALUATE}",
+        f"{TRAIN} is recreated: damaged ({why}); the old one is in {aside / TRAIN}",
+        f"{EVALUATE} is recreated: made from {TRAIN}; the old one is in {aside / EVALUATE}",
     ]
     assert (aside / TRAIN / "policy.safetensors").read_bytes() == b""
     assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}"]
@@ -101,7 +101,7 @@ def test_each_artefact_is_made_again_for_its_own_damage_first(
             (folder / key / file).unlink()
     capsys.readouterr()
     run(recipe, root=recipe.parent, jobs=1)
-    told = dict(re.findall(r"(\S+) is made again: (.*);", capsys.readouterr().out))
+    told = dict(re.findall(r"(\S+) is recreated: (.*);", capsys.readouterr().out))
     assert told[GROUND] == told[ALIGN] == "damaged (asked.json is missing; metrics.json is missing)"
     assert told[TRAIN] == f"made from {GROUND}"
 
@@ -275,7 +275,7 @@ def test_a_choice_is_made_again_once_there_are_more_policies(
     assert states(recipe)["select"] == ("stale", "made without train/nas/seed_2")
     capsys.readouterr()
     run(recipe, root=tmp_path, jobs=1)
-    why = "select is made again: stale (made without train/nas/seed_2)"
+    why = "select is recreated: stale (made without train/nas/seed_2)"
     assert why in capsys.readouterr().out and states(recipe) == {}
     # Of fewer policies it need not be made again.
     run(recipe, root=tmp_path, jobs=1, seeds=[0, 1])

@@ -108,7 +108,9 @@ def test_data_that_were_paired_are_refused(recipe: Path) -> None:
         out=recipe.parent / "logs",
         progress=silent,
     )
-    with pytest.raises(BadInputError, match=r"data: fake@.* has been paired, and a recipe pairs by itself"):
+    with pytest.raises(
+        BadInputError, match=r"data: fake@.* is paired already, but a recipe pairs its data itself"
+    ):
         check(recipe, root=recipe.parent / "runs")
 
 

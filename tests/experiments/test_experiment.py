@@ -19,7 +19,7 @@ from astra_data.worlds.registry import TASKS
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
 
-KNOWN = f"{', '.join([*TASKS, 'maze'])}; a task of your own is named as cart.py:TASK"
+KNOWN = f"{', '.join([*TASKS, 'maze'])}; name your own task like cart.py:TASK"
 BASE = 'task = "maze"\nmethods = ["astra", "astra_plus", "follower"]\nseeds = [0, 1]\n[evaluate]\nsteps = 3\n'
 LONGER = 'based_on = "base"\n[evaluate]\nrate = 2.0\n'
 
@@ -191,7 +191,7 @@ def test_a_run_reads_what_the_base_made_and_makes_only_the_rest(
 def test_a_stage_of_the_base_is_not_run_here(base: Path, longer: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as caught:
         run_stage(longer, "train", root=tmp_path)
-    assert str(caught.value) == (f"{longer} uses the train of {base}: run `astra-data train {base}` for that")
+    assert str(caught.value) == (f"{longer} uses the train of {base}: run `astra-data train {base}` instead")
     with pytest.raises(
         MissingStageError, match=r"base/train/astra/seed_0 is missing: run `astra-data run .*base"
     ):
@@ -282,7 +282,7 @@ def test_faults_are_told(longer: Path, text: str, expected: str) -> None:
 def test_there_is_no_chain(longer: Path) -> None:
     third = longer.with_name("third.toml")
     third.write_text('based_on = "longer"')
-    with pytest.raises(RecipeError, match=r"expected a recipe that is based on none itself, got 'longer'$"):
+    with pytest.raises(RecipeError, match=r"expected a recipe that is not based on another, got 'longer'$"):
         load_experiment(third, longer.parent)
 
 

@@ -227,7 +227,7 @@ def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> N
     refused("the recipe has no size 50", percent=50)
     refused("unknown option 'rewards': did you mean 'reward'", rewards="abstract")
     refused("unknown option 'ramp'", ramp=0.5)
-    refused("nas predicts none", reward="predicted")
+    refused("nas predicts no reward", reward="predicted")
     refused("reward: expected 'abstract', 'predicted' or 'blend', got 'none'", reward="none")
     refused("has no maze, which these need: train.support_penalty", support_penalty=1.0)
     settings = json.loads((run / "recipe.json").read_text())
@@ -323,9 +323,9 @@ def test_the_command_says_what_a_policy_of_ones_own_is_given_with(tmp_path: Path
         [*policy, *out, "--seed", "0"],
         [*policy, *out, *one, "--seed", "1"],
     ):
-        with pytest.raises(BadInputError, match="--policy expects --method, one --seed and --out"):
+        with pytest.raises(BadInputError, match="with --policy, give --method, one --seed and --out"):
             app(["evaluate", "cart.toml", *given], standalone_mode=False)
-    with pytest.raises(BadInputError, match="--out is for --policy"):
+    with pytest.raises(BadInputError, match="--out goes with --policy"):
         app(["evaluate", "cart.toml", *one, *out], standalone_mode=False)
 
 

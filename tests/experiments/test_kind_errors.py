@@ -50,7 +50,7 @@ def test_a_simulator_of_no_use_is_told(tmp_path: Path) -> None:
         out = tmp_path / name
         shown = CliRunner().invoke(app, ["new", name, "--from", str(log), "--out", str(out)])
         line = (
-            "after 10 steps it predicts each state of the logs worse than standing still does: "
+            "after 10 steps it predicts each state of the logs worse than standing still would: "
             f"edit `step` in {out}/{name}.py\n"
         )
         assert shown.exit_code == 0 and (line in shown.output) is (name == "back"), shown.output
@@ -68,7 +68,7 @@ def test_a_state_that_is_predicted_worse_is_named_though_others_are_better(tmp_p
         kind = Planar.of(guess([log]))
         assert kind is not None and badly_predicted(kind) == ["yaw"]
     shown = CliRunner().invoke(app, ["new", "left", "--from", str(log), "--out", str(tmp_path / "left")])
-    assert "after 10 steps it predicts yaw of the logs worse than standing still does: edit" in shown.output
+    assert "after 10 steps it predicts yaw of the logs worse than standing still would: edit" in shown.output
 
 
 @pytest.mark.parametrize(("factor", "is_told"), [(1.02, False), (1.1, True)])

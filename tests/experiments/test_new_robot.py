@@ -209,12 +209,12 @@ def test_what_is_guessed_is_marked(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("x,cmd_x,won,reward\n" + "".join(f"{row},{row % 3},0,{row}\n" for row in range(9)))
     write_robot("slide", Path("slide"), [log])
-    assert "fps = 10  # CHECK: the logs have no time" in Path("slide/logs.toml").read_text()
+    assert "fps = 10  # CHECK: the logs have no time field" in Path("slide/logs.toml").read_text()
     assert "[split]" not in Path("slide/logs.toml").read_text()
     assert '[columns."next.reward"]\nfields = ["reward"]' in Path("slide/logs.toml").read_text()
     assert Path("slide/slide.py").read_text().count("CHECK") == 7
     shown = CliRunner().invoke(app, ["new", "other", "--from", str(log)])
-    assert "none of them is a time: 10 rows a second were taken" in shown.output
+    assert "found no time field, so assumed 10 rows per second" in shown.output
 
 
 def test_a_rate_that_is_no_whole_number_is_marked_and_imported(tmp_path: Path) -> None:
@@ -223,8 +223,8 @@ def test_a_rate_that_is_no_whole_number_is_marked_and_imported(tmp_path: Path) -
     np.savetxt("log.csv", table, "%.3f", ",", header="time,x,cmd_vx", comments="")
     shown = CliRunner().invoke(app, ["new", "slide", "--from", "log.csv"])
     why = (
-        "the logs have 12.5 rows a second, no whole number: TIMESTEP_S is 3.8% too short; "
-        "resample them, to 13 rows a second"
+        "the logs have 12.5 rows per second, not a whole number: TIMESTEP_S is 3.8% too short; "
+        "resample them to 13 rows per second"
     )
     assert f"{why} (CHECK)" in shown.output
     assert f"fps = 13  # CHECK: {why}\n" in Path("slide/logs.toml").read_text()
@@ -241,7 +241,7 @@ def test_a_name_is_one_of_a_file_and_a_task(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["class", "random", "torch", "logs", "mujoco", "rich"])
 def test_a_name_is_taken_from_nothing_else(name: str) -> None:
-    with pytest.raises(BadInputError, match=f"that nothing else in Python has, such as my_{name}"):
+    with pytest.raises(BadInputError, match=f"that Python does not use, such as my_{name}"):
         write_robot(name, Path("out"))
     assert not Path("out").exists()
 
@@ -250,7 +250,7 @@ def test_nothing_is_written_over_or_left_half_done(tmp_path: Path) -> None:
     (tmp_path / "cart").mkdir()
     with pytest.raises(BadInputError, match="cart exists already"):
         write_robot("cart", Path("cart"))
-    with pytest.raises(BadInputError, match="there is no such file"):
+    with pytest.raises(BadInputError, match="no such file"):
         write_robot("other", Path("other"), [Path("nothing.csv")])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cart"]
 
@@ -270,7 +270,7 @@ def test_a_hole_in_the_logs_is_marked_and_imported(tmp_path: Path) -> None:
     lines[20] = ",".join([*cells[:3], "nan", *cells[4:]])
     log.write_text("\n".join(lines) + "\n")
     shown = CliRunner().invoke(app, ["new", "arm", "--from", str(log)])
-    assert "q2_deg has no number in 1 rows, which are left out: logs.toml says how (CHECK)" in shown.output
+    assert "q2_deg is not a number in 1 rows, which are left out: see logs.toml (CHECK)" in shown.output
     assert 'not_finite = "split"  # CHECK' in Path("arm/logs.toml").read_text()
     command("import log.csv --mapping arm/logs.toml --out imported")
     assert len(Dataset.open("imported")) == 3  # two trials, one of them in two
@@ -303,7 +303,9 @@ def test_of_two_fields_that_end_episodes_one_is_left_out_aloud(tmp_path: Path) -
     Path("log.csv").write_text("x,cmd_x,fell,collision,|v|\n" + rows)
     shown = CliRunner().invoke(app, ["new", "slide", "--from", "log.csv"])
     page = Path("slide/README.md").read_text()
-    assert "| left out | 1 | 1 | a second failure: make one field of both |" in page and not shown.exit_code
+    assert (
+        "| left out | 1 | 1 | a second failure: combine both into one field |" in page and not shown.exit_code
+    )
     assert '[columns."next.terminated"]\nfields = ["fell"]' in Path("slide/logs.toml").read_text()
     assert "| `\\|v\\|` | state v |" in page
 
@@ -362,11 +364,11 @@ def test_a_dataset_is_begun_with_as_it_is(tmp_path: Path, place: str) -> None:
             "walks and home/walks/data-1.1.0: expected .* `astra-data merge`",
         ),
         (["log.csv", "walks"], "log.csv and walks: expected logs, or one dataset"),
-        (["home/walks"], "walks holds versions of a dataset: name one of data-1.0.0, data-1.1.0"),
+        (["home/walks"], "walks contains versions of a dataset: name one of data-1.0.0, data-1.1.0"),
         (["walks@data-3.0.0"], "walks has no version data-3.0.0 in .*home; it has data-1.0.0, data-1.1.0"),
-        (["walsk"], "walsk: there is no such file, folder or dataset: did you mean 'walks'"),
-        (["a/b"], "a/b: there is no such file, folder or dataset"),
-        (["bags"], "bags: expected CSV logs or a dataset, got a recording of ROS, drive.mcap"),
+        (["walsk"], "walsk: no such file, folder or dataset: did you mean 'walks'"),
+        (["a/b"], "a/b: no such file, folder or dataset"),
+        (["bags"], "bags: expected CSV logs or a dataset, got a ROS recording, drive.mcap"),
     ],
 )
 def test_what_is_no_data_to_begin_with_is_told(tmp_path: Path, places: list[str], expected: str) -> None:
@@ -392,7 +394,7 @@ def test_a_command_that_never_changes_is_told(tmp_path: Path) -> None:
     given = np.column_stack([np.sin(np.arange(40)), np.zeros(40), np.cos(np.arange(40))])
     driven(Path("ros"), ROS[0], ("linear.x", "linear.y", "angular.z"), given)
     shown = CliRunner().invoke(app, ["new", "base", "--from", "ros"])
-    still = "linear.y is 0 in all rows: no simulator learns what it does"
+    still = "linear.y is 0 in all rows: no simulator can learn what it does"
     assert f"{still} (CHECK)\n" in shown.output
     assert f"# CHECK: what was recorded; {still}\n" in Path("base/base.py").read_text()
     assert check_task(task_named("base/base.py:TASK")) == []

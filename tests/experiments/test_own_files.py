@@ -142,7 +142,7 @@ def test_all_is_outdated_by_another_task_of_an_installed_package(
     check_unchanged(name, experiment.folder)
     edit(made / "rail_of_mine.py", "0.1 * command", "0.2 * command")
     assert load(made).outdated("collect/seed_0").startswith("rail_of_mine changed since")
-    with pytest.raises(BadInputError, match=r"^rail_of_mine changed since .* was made: bring it back"):
+    with pytest.raises(BadInputError, match=r"^rail_of_mine changed since .* was made: restore that version"):
         check_unchanged(name, experiment.folder)
 
 
@@ -214,7 +214,7 @@ def test_no_command_takes_a_run_of_another_task(
     assert shown.exit_code == 1 and isinstance(shown.exception, BadInputError)
     assert str(shown.exception) == (
         f"{made}/rail.py changed since runs/rail was made: "
-        "bring it back as it was then, or run the recipe under another name"
+        "restore that version, or run the recipe under another name"
     )
     assert sorted(made.rglob("*")) == before
 
@@ -223,7 +223,9 @@ def test_no_policy_and_no_environment_is_of_another_task(made: Path) -> None:
     edit(made / "rail.py", "0.1 * command", "0.2 * command")
     run = made / "runs/rail"
     for load in (load_policy, partial(training_of, seed=0)):
-        with pytest.raises(BadInputError, match=f"^{made}/rail.py changed since {run} was made: bring it"):
+        with pytest.raises(
+            BadInputError, match=f"^{made}/rail.py changed since {run} was made: restore that"
+        ):
             load(run, "nas")
 
 
@@ -241,7 +243,7 @@ def test_no_policy_is_of_another_method(made: Path, row: str, monkeypatch: pytes
 
     assert refused(row).endswith("run the recipe first")
     edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
-    told = f"{made}/mine.py changed since {run} was made: bring it back"
+    told = f"{made}/mine.py changed since {run} was made: restore that version"
     assert refused(row).startswith(told)
     assert refused("nas").endswith("run the recipe first")
     monkeypatch.setattr("astra_data.experiments.trained_policy.grounded_as", lambda _: "mine")

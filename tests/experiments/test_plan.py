@@ -14,7 +14,7 @@ from astra_data.experiments.recipe import Recipe
 from astra_data.stages.registry import Stage
 from astra_data.worlds.registry import TASKS
 
-KNOWN = f"{', '.join([*TASKS, 'maze'])}; a task of your own is named as cart.py:TASK"
+KNOWN = f"{', '.join([*TASKS, 'maze'])}; name your own task like cart.py:TASK"
 HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
 
 
@@ -201,7 +201,7 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
         (HEAD.replace("maze", "moon"), "task: unknown task 'moon'; known: " + KNOWN),
         (
             HEAD.replace("astra_plus", "fine_tuned_plus"),
-            "methods: 'fine_tuned_plus' trains nothing in a simulator, so the [plus] settings are without "
+            "methods: 'fine_tuned_plus' trains nothing in a simulator, so [plus] settings have no "
             "effect: leave out _plus",
         ),
         (HEAD.replace("7", "0"), "expected each of seeds once, got [0, 0]"),
@@ -212,7 +212,7 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
         (HEAD + "[sweep]\npercent = [5, 5]", "expected each of sweep.percent once, got [5, 5]"),
         (
             HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",
-            "sweep.percent: 5 % of 9 episodes are none: expected more",
+            "sweep.percent: 5 % of 9 episodes is below one: expected more",
         ),
         (HEAD.replace("[0, 7]", "[]"), "seeds: expected 1 or more, got none"),
     ],
@@ -235,7 +235,7 @@ def test_a_recipe_with_data_labels_that_and_collects_nothing(
     assert items["pair/seed_7"].inputs == ("label/seed_7",)
     assert subset["of"] is None and "data" not in load(tmp_path, fake_recipe, HEAD).settings
     for more, expected in (
-        ("[collect]\nepisodes = 9\n", r"data: it takes the place of \[collect\]: leave out one of them"),
+        ("[collect]\nepisodes = 9\n", r"data replaces \[collect\]: leave out one of them"),
         ("[sweep]\npercent = [150]\n", "sweep.percent: expected at most 100 % of data, got 150"),
     ):
         with pytest.raises(RecipeError, match=expected):
@@ -300,7 +300,7 @@ def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path, fake_recipe:
     [
         (
             SELECT.replace("[0, 7]", "[0]"),
-            "select: expected two seeds or more, got 1: judges are of other seeds: remove .select., or add",
+            "select: expected two seeds or more, got 1 .judges are of other seeds.: remove .select., or add",
         ),
         (SELECT.replace(', "nas"]', "]"), "select.judge: expected a row that grounds its simulator"),
         (SELECT + 'judge = "target"\n', "expected a row that grounds its simulator as judge, got target"),

@@ -155,8 +155,12 @@ def test_a_unicycle_has_a_speed_and_a_turn_rate(
 @pytest.mark.parametrize(
     ("names", "meanings", "doubt"),
     [
-        (("cmd_a", "cmd_b"), ["speed", "turn"], "took b for a turn rate: nothing says so"),
-        (("cmd_a_rad_s", "cmd_b_rad_s"), ["speed", "turn"], "took b for a turn rate: nothing says so"),
+        (("cmd_a", "cmd_b"), ["speed", "turn"], "b is used as a turn rate, although nothing says so"),
+        (
+            ("cmd_a_rad_s", "cmd_b_rad_s"),
+            ["speed", "turn"],
+            "b is used as a turn rate, although nothing says so",
+        ),
         (("cmd_a_rad_s", "cmd_b_m_s"), ["turn", "speed"], ""),
         (("cmd_a_m_s", "cmd_b_rad_s"), ["speed", "turn"], ""),
         (("cmd_a_rad_s", "cmd_turn"), ["speed", "turn"], ""),

@@ -99,7 +99,7 @@ def test_a_cluster_that_does_not_answer_is_told(tmp_path: Path, monkeypatch: pyt
         raise ConnectionError("nobody there\nat all")
 
     monkeypatch.setattr("ray.init", refuse)
-    with pytest.raises(BadInputError, match=r"^no Ray cluster can be used at head:1: nobody there; `ray"):
+    with pytest.raises(BadInputError, match=r"^found no usable Ray cluster at head:1: nobody there; `ray"):
         execute_on_cluster([], address="head:1", jobs=None, logs=tmp_path, watch=Record())
 
 
@@ -112,7 +112,7 @@ def test_a_worker_that_does_not_share_the_folder_is_told(
     items = [Item("a", (), partial(touch, tmp_path / "a", ()))]
     with pytest.raises(
         AstraDataError,
-        match=r"^a: .* cannot work in .*elsewhere, which .* must share: No such file or directory$",
+        match=r"^a: .* cannot use .*elsewhere, which .* must share: No such file or directory$",
     ):
         execute_on_cluster(items, address=address, jobs=None, logs=tmp_path / "logs", watch=record)
     assert record.events == [("failed", "a")]

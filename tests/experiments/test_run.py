@@ -228,7 +228,9 @@ def test_a_report_is_published_beside_the_recipe_and_added_to_what_is_there(
     run_stage(recipe, "report", root=tmp_path, jobs=1, add=True)
     told = asked(tmp_path / "r/report")
     assert (told["publish"], told["add_to"]) == (None, str(results / "r.json"))
-    with pytest.raises(BadInputError, match="--add keeps what is published of all seeds: leave out --seed"):
+    with pytest.raises(
+        BadInputError, match="--add keeps the published results of all seeds: leave out --seed"
+    ):
         run_stage(recipe, "report", root=tmp_path, add=True, seeds=[1])
     recipe.write_text(recipe.read_text() + "[evaluate]\nsteps = 7\n")
     with pytest.raises(RecipeError, match=r"^evaluate changed in .* since its results in"):
@@ -302,7 +304,7 @@ def test_seeds_that_other_machines_ran_are_copied_together(recipe: Path, tmp_pat
 
 def test_a_recipe_with_data_is_labelled_and_has_nothing_to_collect(recipe: Path, tmp_path: Path) -> None:
     recipe.write_text('data = "me/walks"\n' + recipe.read_text())
-    with pytest.raises(BadInputError, match=r"r\.toml has data, me/walks: there is nothing to collect"):
+    with pytest.raises(BadInputError, match=r"r\.toml uses the data me/walks: there is nothing to collect"):
         run_stage(recipe, "collect", root=tmp_path)
     folder = run(recipe, root=tmp_path, jobs=1, until="pair")
     assert asked(folder / "label/seed_0")["data"] == "me/walks"

@@ -225,11 +225,13 @@ def test_what_is_neither_and_what_is_not_there_is_told(run: Path, tmp_path: Path
         return str(error.value)
 
     assert told(str(tmp_path)).startswith(
-        f"{tmp_path}: expected a dataset, which holds meta/info.json, or the folder of a run, which holds "
-        "recipe.json; got neither"
+        f"{tmp_path}: expected a dataset (a folder with meta/info.json) or the folder of a run (with "
+        "recipe.json), got neither"
     )
     assert "has no episode 99" in told(str(run), "--episode", "99")
     assert told(str(run), "--seed", "7") == "the recipe has no seed 7; its seeds: 3, 4"
     assert "no dataset of seed 4 yet" in told(str(run), "--seed", "4")
-    assert told(str(run / "pair/seed_3"), "--seed", "3").endswith("--seed is for the folder of a run")
+    assert told(str(run / "pair/seed_3"), "--seed", "3").endswith(
+        "--seed is for the folder of a run: leave it out"
+    )
     assert not (tmp_path / "x.rrd").exists()

@@ -104,7 +104,7 @@ def test_what_is_not_there_is_asked_for(folder: Path) -> None:
         select(folder, rows=["astra"])
     (folder.parent / "base").mkdir()
     (folder / "select").symlink_to(folder.parent / "base")
-    with pytest.raises(BadInputError, match="which this run is based on: select there"):
+    with pytest.raises(BadInputError, match="which this run is based on: run select there"):
         select(folder)
 
 

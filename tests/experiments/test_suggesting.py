@@ -69,7 +69,7 @@ def test_the_same_seed_gives_the_same_bytes_and_replaces_what_was_there(folder: 
             first = contents(place)
     assert contents(tmp_path / "again") == first
     assert contents(folder / "suggest")["plan.json"] != first["plan.json"]
-    with pytest.raises(BadInputError, match="again is finished already"):
+    with pytest.raises(BadInputError, match="again is already finished"):
         suggest(folder, seed=1, out=tmp_path / "again", **FEW)
 
 

@@ -120,7 +120,7 @@ def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> No
         ("astra", 7, "the run has no seed 7; its seeds: 0, 1"),
         ("astr", 0, "the run has no row 'astr': did you mean 'astra'?"),
         ("iql", 0, "the run has no row 'iql'; known: astra, follower"),
-        ("follower", 0, "follower trains no policy: it is written by hand"),
+        ("follower", 0, "follower has no trained policy: it is written by hand"),
     ],
 )
 def test_a_row_or_seed_that_the_recipe_lacks_is_told(row: str, seed: int, told: str, tmp_path: Path) -> None:
@@ -153,10 +153,10 @@ def test_a_run_of_several_sizes_is_asked_for_one(run: Path, tmp_path: Path) -> N
 
 
 def test_no_run_and_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"expected the folder of a run, which holds recipe\.json"):
+    with pytest.raises(BadInputError, match=r"expected the folder of a run \(with recipe\.json"):
         load_policy(tmp_path, "astra")
     (tmp_path / "recipe.json").write_text("{")
     with pytest.raises(BadInputError, match=r"recipe\.json is not what a run writes"):
         load_policy(tmp_path, "astra")
-    with pytest.raises(BadInputError, match="follower trains no policy"):
+    with pytest.raises(BadInputError, match="follower has no trained policy"):
         load_policy(run, "follower")

@@ -71,7 +71,7 @@ def test_trials_are_made_in_the_target(folder: Path) -> None:
     assert [(of.trials, len(of.tried)) for of in record.rounds] == [(2, 4), (2, 2)]
     assert record.chosen is not None and record.chosen in record.rounds[-1].candidates
     row, seed = record.chosen
-    assert f"chosen by 12 trials: {row}, seed {seed}: success {record.mean:.2f}" in shown.output
+    assert f"chosen with 12 trials: {row}, seed {seed}: success {record.mean:.2f}" in shown.output
     assert "## Trials in the target" in (folder / "select/select.md").read_text()
     manifest = read_manifest(folder / "select")
     assert manifest is not None and "trials.json" in manifest.files
@@ -171,10 +171,12 @@ def test_what_trials_cannot_be_made_of_is_refused(folder: Path, tries: Tries) ->
         choose_by_trials(folder, 30, rows=["nothing"])
     assert not tries.made
     choose_by_trials(folder, 12)
-    with pytest.raises(BadInputError, match=r"with trials = 13, found 12 made with 12: give the same again"):
+    with pytest.raises(
+        BadInputError, match=r"with trials = 13, found 12 made with 12: use the same settings"
+    ):
         choose_by_trials(folder, 13)
     shown = CliRunner().invoke(app, ["select", str(folder), "--field", "3"])
-    assert isinstance(shown.exception, BadInputError) and "give that too" in str(shown.exception)
+    assert isinstance(shown.exception, BadInputError) and "add --trials" in str(shown.exception)
 
 
 def test_trials_keep_others_out_and_go_on_only_as_they_began(folder: Path, tries: Tries) -> None:
@@ -190,7 +192,7 @@ def test_trials_keep_others_out_and_go_on_only_as_they_began(folder: Path, tries
     assert held_once and not any(held_once), "nobody else may work there"
     first = found.rounds[0].tried[0]
     assert f"{first.row}, seed {first.seed}: 2 of 2" in notes
-    with pytest.raises(BadInputError, match=r"with field = 3, found 20 made with 4: give the same again"):
+    with pytest.raises(BadInputError, match=r"with field = 3, found 20 made with 4: use the same settings"):
         choose_by_trials(folder, 20, field=3)
 
 
@@ -220,7 +222,9 @@ def test_trials_are_of_the_size_that_is_asked_for(
     found = choose_by_trials(folder, 20, field=4, percent=50)
     assert found.percent == 50 and loaded == [50] * 6
     assert found.rounds[0].candidates == [(one.row, one.seed) for one in both.ranked(50)[:4]]
-    with pytest.raises(BadInputError, match=r"with percent = 100, found 20 made with 50: give the same"):
+    with pytest.raises(
+        BadInputError, match=r"with percent = 100, found 20 made with 50: use the same settings"
+    ):
         choose_by_trials(folder, 20, field=4, percent=100)
     alone = judged.model_copy(update={"candidates": judged.candidates[:1]})
     monkeypatch.setattr(module, "select", lambda *_, **__: alone)

@@ -146,7 +146,7 @@ def test_what_was_begun_with_another_grounding_is_refused(
 
     with pytest.raises(Stopped):
         begin(grounded, stop)
-    with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
+    with pytest.raises(BadInputError, match=r"partial was started with other settings .*: remove it"):
         begin(grounded_anew, silent)
 
 

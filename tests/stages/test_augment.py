@@ -260,7 +260,7 @@ def test_copies_without_a_place_are_counted_and_none_at_all_is_an_error(
     assert told["copies_without_place"] == 2 * told["copies"] > 0
     assert told["copies"] + told["episodes_not_copied"] == 7  # all of the eight but the one held out
     monkeypatch.setattr(Relocation, "copied", lambda *given: None)
-    with pytest.raises(BadInputError, match=r"no place was found for any of \d+ copies: lower --margin-m"):
+    with pytest.raises(BadInputError, match=r"found no place for any of \d+ copies: lower --margin-m"):
         augment(None, config, out=tmp_path / "none", **given)
     assert [path.name for path in tmp_path.iterdir()] == ["some"]
 
@@ -311,7 +311,9 @@ def test_copies_differ_from_what_they_are_of() -> None:
 
 def test_mirror_images_are_no_longer_made() -> None:
     assert validated({"reflections": False}, AugmentConfig, "[augment]") == AugmentConfig()
-    with pytest.raises(RecipeError, match=r"augment\]: reflections: expected false, for copies are not"):
+    with pytest.raises(
+        RecipeError, match=r"augment\]: reflections: expected false, since copies are no longer mirrored"
+    ):
         validated({"reflections": True}, AugmentConfig, "[augment]")
 
 
@@ -320,7 +322,7 @@ def test_mirror_images_are_no_longer_made() -> None:
     [
         ({"margin_m": 9.0}, r"none of 7 training episodes keeps 9 m from the walls for 20 steps"),
         ({"margin_m": 0.0, "min_steps": 99}, r"none of 7 training episodes keeps 0 m from .* for 99 steps"),
-        ({"episodes": 7}, r"--episodes 7: expected at least the 8 that are kept"),
+        ({"episodes": 7}, r"--episodes 7: expected at least 8, the number of episodes kept"),
     ],
 )
 def test_what_cannot_be_done_is_told(
@@ -365,7 +367,7 @@ def test_code_that_a_dataset_names_is_not_run(collected: Path, tmp_path: Path) -
     description = {"name": "foreign", "stage": "import", "environment": {"id": f"{code}:TASK"}}
     with DatasetWriter(foreign, source.schema, fps=20, task="run", description=description) as writer:
         writer.add(next(source.episodes()))
-    with pytest.raises(BadInputError, match=r"task\.py:TASK, which is code that would be run: read it"):
+    with pytest.raises(BadInputError, match=r"task\.py:TASK, whose code would be run: read it"):
         augment(None, CONFIG, dataset=foreign, seed=0, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "ran").exists()
 

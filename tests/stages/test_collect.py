@@ -249,7 +249,9 @@ def test_an_episode_that_an_interruption_cut_off_counts_before_later_ones(
 
 def test_too_few_episodes_for_the_steps_are_told(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"episodes": 2, "max_steps": 5, "least_steps": 11})
-    with pytest.raises(BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: take more"):
+    with pytest.raises(
+        BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: raise episodes"
+    ):
         collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()
 
@@ -347,7 +349,7 @@ def test_by_sac_it_stops_when_episodes_last_long_enough_or_at_the_end(
 
 def test_where_good_episodes_are_short_sac_is_not_stopped_by_their_length(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"behavior": "suboptimal_sac"})
-    with pytest.raises(BadInputError, match="good episodes are short: take 'suboptimal_ppo'"):
+    with pytest.raises(BadInputError, match="good episodes are short: use 'suboptimal_ppo'"):
         collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
 
 
@@ -387,7 +389,7 @@ def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Pa
 
 def test_steps_that_take_terabytes_are_refused() -> None:
     assert CollectConfig(episodes=10**8, max_steps=100).episodes == 10**8
-    with pytest.raises(ValueError, match=r"episodes: 100000001 of .*, expected at most 10000000000 steps"):
+    with pytest.raises(ValueError, match=r"episodes: 100000001 of .*: expected at most 10000000000 steps"):
         CollectConfig(episodes=10**8 + 1, max_steps=100)
 
 

@@ -286,7 +286,9 @@ def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> No
     with pytest.raises(BadInputError, match=r"policy.safetensors does not exist") as caught:
         make(task, "direct_transfer", tmp_path / "out", {"policy": tmp_path})
     assert "\n" not in str(caught.value)
-    with pytest.raises(BadInputError, match="'follower' has no policy: leave it out, or name the row"):
+    with pytest.raises(
+        BadInputError, match="'follower' has no policy: leave out the policy, or name the policy's row"
+    ):
         make(task, "follower", tmp_path / "out", {"policy": trained})
 
 
@@ -299,7 +301,7 @@ def test_what_does_not_fit_is_refused_before_any_episode(
         make(task, "direct_transfer", tmp_path / "out", {"policy": trained})
     (tmp_path / "out").mkdir()
     monkeypatch.setattr("astra_data.stages.evaluate.task_named", lambda name: pytest.fail("work was begun"))
-    with pytest.raises(BadInputError, match=r"out is finished already: remove it"):
+    with pytest.raises(BadInputError, match=r"out is already finished: remove it"):
         make(task, "follower", tmp_path / "out")
 
 

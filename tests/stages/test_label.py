@@ -220,7 +220,7 @@ def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
     ):
         label("antmaze-umaze", data=logs, out=tmp_path / "out")
     labelled = label(CART, data=logs, out=tmp_path / "labelled")
-    with pytest.raises(BadInputError, match="has goals and outcomes already: there is nothing to label"):
+    with pytest.raises(BadInputError, match="already has goals and outcomes: there is nothing to label"):
         label(CART, data=labelled)
     assert not (tmp_path / "out").exists()
 

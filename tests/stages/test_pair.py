@@ -145,7 +145,7 @@ def test_the_largest_reset_error_of_all_blocks_is_recorded(
 @pytest.mark.parametrize(
     ("simulator", "told"),
     [
-        (f"{MINE}:Forgetful", r"reset to φ\(s\) of step \d+, shows [xy] = .* and not .*: check its reset_to"),
+        (f"{MINE}:Forgetful", r"reset to φ\(s\) of step \d+, has [xy] = .*, expected .*: check its reset_to"),
         (f"{MINE}:Exploding", r"stepped from φ\(s\) of step 0, gives x = .*: expected finite states"),
         (f"{MINE}:Greedy", r"abstraction of Greedy, given states \(\d+, 29\), fails with IndexError"),
         (f"{MINE}:Clumsy", r"Clumsy\(4096\) fails with TypeError"),
@@ -252,7 +252,7 @@ def test_data_of_another_robot_are_refused(
 
 
 def test_a_paired_dataset_is_not_paired_again(paired: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"has abstract.state already: it has been paired"):
+    with pytest.raises(BadInputError, match=r"has abstract.state already: it is paired"):
         pair("antmaze-umaze", PairConfig(), dataset=paired, out=tmp_path / "out", progress=silent)
 
 
@@ -275,7 +275,7 @@ def test_the_step_that_is_told_is_that_of_the_dataset(
     simulator, out = glider_that_is_off(tmp_path, 0.0, "0.5"), tmp_path / "out"
     with pytest.raises(BadInputError) as caught:
         pair(simulator, PairConfig(), dataset=collected, out=out, progress=silent)
-    told = re.search(r"of step (\d+), shows ([xy]) = .* and not (\S+) \(", str(caught.value))
+    told = re.search(r"of step (\d+), has ([xy]) = .*, expected (\S+) \(", str(caught.value))
     assert told is not None
     source, step, entry = Dataset.open(collected), int(told[1]), "xy".index(told[2])
     assert source.lengths[0] <= step < source.lengths[:2].sum()

@@ -91,7 +91,7 @@ def test_the_artefact_names_all_that_it_was_made_from(root: Path) -> None:
     assert manifest.made_from["pair/seed_2"] == read_description(root / "pair/seed_2")["content_hash"]
     keys = benches(reported(root), "nas")[0].keys
     assert set(keys) == set(manifest.made_from) and len(keys) == len(set(keys))
-    with pytest.raises(BadInputError, match="is finished already"):
+    with pytest.raises(BadInputError, match="is already finished"):
         judged(root)
 
 

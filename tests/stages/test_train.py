@@ -193,7 +193,7 @@ def test_what_was_begun_with_other_settings_is_left_alone(
         make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop_past(0.7))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
     longer = TRAIN.model_copy(update={"total_steps": 2 * TRAIN.total_steps})
-    with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
+    with pytest.raises(BadInputError, match=r"partial was started with other settings .*: remove it"):
         make(task, "direct_transfer", paired, None, tmp_path / "out", longer)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
 
@@ -209,7 +209,7 @@ def test_what_was_begun_with_another_grounding_is_refused(
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Stopped):
         make(task, "nas", paired, grounded, tmp_path / "out", TRAIN, stop_past(0.7))
-    with pytest.raises(BadInputError, match=r"partial was begun with other settings, .* remove it"):
+    with pytest.raises(BadInputError, match=r"partial was started with other settings .*: remove it"):
         make(task, "nas", paired, grounded_anew, tmp_path / "out")
     make(task, "nas", paired, grounded, tmp_path / "out")
 
@@ -289,7 +289,7 @@ def test_data_without_goals_are_refused_where_policies_meet_them(
         ("nas", grounded, from_the_start),
         ("direct_transfer", None, from_data),
     ):
-        with pytest.raises(BadInputError, match=r"has no goals, those of .*: run `astra-data label` first"):
+        with pytest.raises(BadInputError, match=r"lacks the goals of .*: run `astra-data label` first"):
             make(task, method, paired, grounding, tmp_path / "out", config)
     assert make(task, "direct_transfer", paired, None, tmp_path / "out", from_the_start)
 
@@ -333,7 +333,7 @@ def test_a_policy_of_short_commands_is_no_start_of_fine_tuning(
 ) -> None:
     limited = TRAIN.model_copy(update={"command_limit": 0.5})
     make(task, "direct_transfer", paired, None, tmp_path / "limited", limited)
-    with pytest.raises(BadInputError, match="command_limit, which does not reach 'direct_transfer_iql'"):
+    with pytest.raises(BadInputError, match="command_limit, which has no effect on 'direct_transfer_iql'"):
         train(
             task,
             "direct_transfer_iql",

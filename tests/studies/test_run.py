@@ -98,7 +98,7 @@ def test_a_gap_recipe_is_checked(recipe: Path) -> None:
         result = CliRunner().invoke(cli.app, ["check", str(recipe)])
         return result.exit_code, f"{result.output}{result.exception or ''}"
 
-    assert call() == (0, f"{recipe}: for `astra-data gap`, without faults\n")
+    assert call() == (0, f"{recipe}: no errors; a recipe for `astra-data gap`\n")
     recipe.write_text(recipe.read_text().replace("updates", "update"))
     assert call()[0] == 1 and "fit.update: unknown key: did you mean 'updates'?" in call()[1]
     recipe.write_text(RECIPE.replace("nao_guda.toml", "nowhere.toml"))

@@ -54,7 +54,7 @@ def test_without_gymnasium_one_line_says_how_to_install_it() -> None:
     ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
     assert ran.returncode == 1
     last = ran.stderr.splitlines()[-1]
-    assert "BadInputError: gymnasium is needed and not installed: " in last and "astra-data[sim]" in last
+    assert "BadInputError: gymnasium is needed but not installed: " in last and "astra-data[sim]" in last
 
 
 def test_failures_are_told_apart_from_successes() -> None:

@@ -133,7 +133,7 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
 
 
 def test_where_good_episodes_are_short_sac_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="good episodes are short: take 'suboptimal_ppo'"):
+    with pytest.raises(BadInputError, match="good episodes are short: use 'suboptimal_ppo'"):
         suboptimal_by_sac(
             MAZE, steps=1, episode_steps=1, seed=0, folder=tmp_path, num_threads=1, progress=silent
         )

@@ -289,7 +289,9 @@ class Lagging(Rail):
 def test_what_a_simulator_remembers_is_no_noise(random: object) -> None:
     kind = type("Own", (Lagging,), {} if random is None else {"noise": random})
     (fault,) = check_task(replace(TASK, make_simulator=kind))
-    assert fault.startswith("make_simulator: step(command): expected what follows from the state alone")
+    assert fault.startswith(
+        "make_simulator: step(command): expected a result that depends on the state alone"
+    )
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,6 @@ class Angles:
         if not found:
             return []
         named = channels(self._column, [self._angles[index] for index in found])
-        what = f"{named}: up to {self._farthest[found].max():.4g} rad, which is more than two turns"
+        what = f"{named}: up to {self._farthest[found].max():.4g} rad, which is more than two full turns"
         advice = "if these are degrees, set `scale` to 0.0174533 in the mapping and import again"
         return [Finding("warning", what, advice)]

@@ -89,7 +89,7 @@ class Clock:
     def __str__(self) -> str:
         """Compare the rates."""
         if not self._has_rate:
-            return f"{self._fps} Hz declared; {self._name} does not go on in most steps"
+            return f"{self._fps} Hz declared; {self._name} does not increase in most steps"
         if self._is_off:
             return f"{self._fps} Hz declared, and {self._off} by {self._name}"
         share, rate = self.gaps / int(self._bins.sum()), f"{1 / self.period_s:.4g} Hz by {self._name}"
@@ -120,7 +120,7 @@ class Clock:
             found.append(
                 Finding(
                     "warning",
-                    f"{self._name} goes on at {1 / period_s:.4g} Hz, but {self._fps} Hz is declared",
+                    f"{self._name} runs at {1 / period_s:.4g} Hz, but {self._fps} Hz is declared",
                     "correct `fps` in the mapping, or resample, and import again",
                 )
             )
@@ -143,7 +143,7 @@ class Clock:
         if mcap:
             own = f'[columns."{self._name}"]'
             return f"rows repeat a message: lower `fps`, or set `gap_s` in {own} where the topic drops out"
-        return "look for rows that the log has twice, or a clock that was set back"
+        return "look for duplicate rows in the log, or a clock that was set back"
 
     def _gap_remedy(self, mcap: bool | None) -> str:
         split = f"`time`, and `gap_s = {GAP * self.period_s:.3g}` in [split], of the mapping"

@@ -76,8 +76,8 @@ class GivenCommands:
             Finding(
                 "note",
                 f"commands at the edge of their range in up to {100 * worst:.0f} % of steps, {names}",
-                "what lies between is seen less often: compare the range with what the robot obeys (`clip` "
-                "of a mapping), or record gentler commands",
+                "values in between are rarer in the data: compare the range with what the robot follows "
+                "(`clip` in the mapping), or record gentler commands",
             )
         ]
 

@@ -27,9 +27,9 @@ class Continuity:
         """Tell how many steps do not lead to the row after them."""
         if not self._broken:
             return []
-        what = f"steps whose {NEXT_STATE} is not the state of the row after: {self._broken} of {self._steps}"
+        what = f"steps whose {NEXT_STATE} is not the state of the next row: {self._broken} of {self._steps}"
         advice = (
-            "rows are missing, or the columns are not of one log: import again, without "
+            "rows are missing, or the columns come from different logs: import again, without "
             f"{NEXT_STATE} in the mapping if each row is the state after the one before"
         )
         return [Finding("warning", what, advice, tuple(self._uids))]

@@ -28,8 +28,6 @@ class Duplicates:
             return []
         uids = tuple(self._copies)
         first = self._copies[uids[0]]
-        what = (
-            f"copies of other episodes, {len(uids)} in all; {uids[0]} has the states and actions of {first}"
-        )
-        advice = f"they count twice, and may be in training and held out at once: {deletion(called, uids)}"
+        what = f"copies of other episodes: {len(uids)}; {uids[0]} has the states and actions of {first}"
+        advice = f"they count twice, and may be both in training and held out: {deletion(called, uids)}"
         return [Finding("warning", what, advice, uids)]

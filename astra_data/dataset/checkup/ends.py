@@ -65,8 +65,8 @@ class EpisodeEnds:
                 Finding(
                     "warning",
                     "every episode ends after its first step",
-                    "check what ends them: failed of the robot or the log, reached and missed of the "
-                    "objective, or how a mapping splits episodes",
+                    "check what ends them: failed of the robot or log, reached and missed of the objective, "
+                    "or how a mapping splits episodes",
                 )
             )
         if not 0 < len(failures) < FEW_FAILURES:
@@ -76,7 +76,7 @@ class EpisodeEnds:
             *found,
             Finding(
                 "note",
-                f"{count}, little for a failure model to learn from",
+                f"{count}, which is little for a failure model to learn from",
                 f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
                 "ground without failure_members",
                 tuple(failures),

@@ -117,7 +117,7 @@ class Jumps:
         usual = np.quantile(np.concatenate(self._samples)[:, worst], 1 - RARE)
         above, most = max(float(usual), 0.9 * min(sizes[worst])), max(sizes[worst])
         what = (
-            f"{count} single-step jump{'s' if count > 1 else ''} in {where}; the farthest is {most:.3g} in "
+            f"{count} single-step jump{'s' if count > 1 else ''} in {where}; the largest is {most:.3g} in "
             f"{labels(self._column)[worst]}, whose median step is {limits[worst] / LARGE:.2g}"
         )
         advice = (
@@ -137,7 +137,7 @@ class Jumps:
 
     def _wrapping(self, unit: str, found: Mapping[int, set[int]]) -> Finding:
         what = f"{channels(self._column, sorted(found))} jumps by a full turn, like an angle that wraps"
-        advice = f'store its cosine and sine in its place, or say that it is an angle by unit = "{unit}"'
+        advice = f'store its cosine and sine instead, or declare it an angle with unit = "{unit}"'
         return Finding("warning", what, advice, tuple(sorted(set().union(*found.values()))))
 
 

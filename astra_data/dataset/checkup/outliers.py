@@ -60,7 +60,7 @@ class Outliers:
         uids = {self._uids[position]: reasons[position][0] for position in sorted(reasons)}
         shown = [f"{uid} by {reason}" for uid, reason in list(uids.items())[:SHOWN]]
         what = f"{len(uids)} far from the others: {'; '.join(shown)}"
-        advice = f"look at them, and leave out what is no episode of the task: {deletion(called, list(uids))}"
+        advice = f"look at them, and leave out those that do not belong: {deletion(called, list(uids))}"
         return [Finding("note", what, advice, tuple(uids))]
 
     def _figures(self) -> list[tuple[Floats, str, str, bool]]:

@@ -52,7 +52,7 @@ def check(root: Path) -> Report:
     """
     if not (root / "meta").is_dir() and not (root / "data").is_dir():
         refuse_run(root)
-        raise BadInputError(f"{root}: no dataset there; expected a folder with meta/ and data/")
+        raise BadInputError(f"{root}: found no dataset; expected a folder with meta/ and data/")
     report = Report()
     info = read_object(root / INFO_PATH)
     if isinstance(info, str):

@@ -30,7 +30,7 @@ class CausalConfig(Config):
     sparsity: NotNegative = 0.01
     """Weight of the mean probability of the masks."""
     mask_threshold: Share = 0.3
-    """A cause counts where the probability of its mask is above this."""
+    """A cause counts if the probability of its mask is above this."""
 
 
 class CausalModel(nn.Module):

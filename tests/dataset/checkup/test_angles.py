@@ -19,7 +19,7 @@ def findings(*largest: float) -> list[Finding]:
 def test_an_angle_of_many_turns_is_taken_for_degrees() -> None:
     (found,) = findings(500.0, 179.9, 500.0, 3.0)
     assert found.severity == "warning"
-    assert found.what == f"heading of {STATE}: up to 179.9 rad, which is more than two turns"
+    assert found.what == f"heading of {STATE}: up to 179.9 rad, which is more than two full turns"
     assert "degrees, set `scale` to 0.0174533" in found.advice
     (both,) = findings(0.0, 179.9, 0.0, 90.0)
     assert both.what.startswith("heading, arm of")

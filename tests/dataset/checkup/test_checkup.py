@@ -108,11 +108,11 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
         carried,
         "warning",
         (7,),
-        "1 single-step jump in x of observation.state; the farthest is 1",
+        "1 single-step jump in x of observation.state; the largest is 1",
         "[split.jump]",
     ),
     (missed, "warning", (3, 4), "steps of over 1.5 periods: 2, the longest 0.15 s", "gap_s = 0.075"),
-    (slow, "warning", (), "time goes on at 10 Hz, but 20 Hz is declared", "correct `fps`"),
+    (slow, "warning", (), "time runs at 10 Hz, but 20 Hz is declared", "correct `fps`"),
     (jittery, "note", (), "5 % of the steps are off by 24 %", "resample the recording to 20 Hz"),
     (standing, "warning", (9,), "time stands still or goes back", "delete walks --episode 9"),
     (dead, "note", (), "constant in all steps: y of observation.state", "check the log"),
@@ -120,12 +120,12 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
     (unused, "note", (), "constant in all steps: w of action", "its effect cannot be learned"),
     (copied, "warning", (11, 12), "11 has the states and actions of 2", "--episode 11 --episode 12"),
     (short, "note", (6,), "6 by length 12 steps, median 100", "delete walks --episode 6"),
-    (torn, "warning", (2,), "not the state of the row after: 1 of 2970", "rows are missing"),
+    (torn, "warning", (2,), "not the state of the next row: 1 of 2970", "rows are missing"),
     (rewarded, "note", (8,), "8 by return 59", "delete walks --episode 8"),
     (far, "note", (1,), "1 by y of observation.state, which reaches -4", "delete walks --episode 1"),
     (in_degrees, "warning", (), "yaw of observation.state: up to", "degrees, set `scale` to 0.0174533"),
     (saturated, "note", (), "at the edge of their range in up to", "record gentler commands"),
-    (failing, "note", tuple(range(9)), "9 failures, little", "--behavior stress"),
+    (failing, "note", tuple(range(9)), "9 failures, which is little", "--behavior stress"),
 ]
 
 

@@ -132,7 +132,7 @@ def test_time_that_stands_in_half_of_the_steps_has_no_rate(still: int, told: boo
 
 def test_time_that_never_goes_on_has_no_rate() -> None:
     timed = clock([0.0] * 20)
-    assert str(timed) == "10 Hz declared; time does not go on in most steps"
+    assert str(timed) == "10 Hz declared; time does not increase in most steps"
     (finding,) = timed.findings("walks")
     assert "set back" in finding.advice and "int64" not in finding.advice
     floats = Clock.of(SECONDS, 10)

@@ -25,7 +25,7 @@ def test_a_step_leads_to_the_row_after_it(shape: tuple[int, ...]) -> None:
     continuity.add(episode(5, state, arrived))
     (found,) = continuity.findings()
     assert found.severity == "warning" and found.episodes == (4,)
-    assert found.what == "steps whose next.observation.state is not the state of the row after: 2 of 15"
+    assert found.what == "steps whose next.observation.state is not the state of the next row: 2 of 15"
 
 
 @pytest.mark.parametrize("missing", [STATE, NEXT_STATE])

@@ -22,7 +22,7 @@ def test_the_same_states_and_actions_are_a_copy() -> None:
     duplicates.add(episode(9, other, action))
     (found,) = duplicates.findings("walks")
     assert found.episodes == (8, 9)
-    assert found.what == "copies of other episodes, 2 in all; 8 has the states and actions of 0"
+    assert found.what == "copies of other episodes: 2; 8 has the states and actions of 0"
     assert found.advice.endswith("astra-data delete walks --episode 8 --episode 9")
 
 

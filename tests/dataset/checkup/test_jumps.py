@@ -144,7 +144,7 @@ def test_jumps_are_found_in_the_episodes_that_have_them(tmp_path: Path) -> None:
         found.add(episode)
     (finding,) = found.findings(dataset, "walks")
     assert finding.episodes == (3, 8)
-    assert finding.what.startswith("3 single-step jumps in y of observation.state; the farthest is 1.98 in y")
+    assert finding.what.startswith("3 single-step jumps in y of observation.state; the largest is 1.98 in y")
     assert 'column = "observation.state", values = [1], above = 0.6' in finding.advice
 
 

@@ -129,9 +129,9 @@ def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
         ),
         (
             edit("meta/astra/dataset.json", parents=[{"name": "x"}], stage=""),
-            ["dataset.json has 3 faults: parents.0.version: expected a value", "parents.0.hash", "stage: "],
+            ["dataset.json has 3 errors: parents.0.version: expected a value", "parents.0.hash", "stage: "],
         ),
-        (write("meta/astra/dataset.json", b"{}"), ["dataset.json has 11 faults: name: expected a value"]),
+        (write("meta/astra/dataset.json", b"{}"), ["dataset.json has 11 errors: name: expected a value"]),
         (edit("meta/astra/subsets.json", seed="0"), ["subsets.json: seed: expected a whole number"]),
         (edit("meta/info.json", data_path="/etc/file.parquet"), ["expected a path inside the folder"]),
         (edit("meta/info.json", data_path="../file.parquet"), ["expected a path inside the folder"]),
@@ -297,5 +297,5 @@ def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> No
 
 
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="no dataset there"):
+    with pytest.raises(BadInputError, match="found no dataset"):
         check(tmp_path)

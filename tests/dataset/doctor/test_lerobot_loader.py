@@ -66,5 +66,5 @@ def test_what_lerobot_cannot_open_is_a_fault(tmp_path: Path) -> None:
 
 def test_without_lerobot_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lerobot", None)
-    with pytest.raises(BadInputError, match=r"lerobot is needed and not installed: uv sync --extra lerobot"):
+    with pytest.raises(BadInputError, match=r"lerobot is needed but not installed: uv sync --extra lerobot"):
         compared(write_fake(tmp_path / "set").root)

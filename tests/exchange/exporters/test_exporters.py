@@ -146,7 +146,7 @@ def test_exports_are_imported_one_by_one(dataset: Dataset, tmp_path: Path) -> No
     paths = [tmp_path / "one.hdf5", tmp_path / "two.hdf5"]
     for path in paths:
         export(dataset, path, format="d4rl")
-    with pytest.raises(BadInputError, match="import each on its own, then merge"):
+    with pytest.raises(BadInputError, match="import each export separately, then merge"):
         import_dataset(paths, out=tmp_path / "back")
     (tmp_path / "a").mkdir()
     foreign = tmp_path / "a" / "foreign.hdf5"
@@ -227,7 +227,7 @@ def test_what_is_missing_is_told(dataset: Dataset, tmp_path: Path, monkeypatch: 
         export(write_fake(tmp_path / "bare"), tmp_path / "a", format="d4rl")
     monkeypatch.setitem(sys.modules, "h5py", None)
     told = (
-        r'h5py is needed and not installed: uv sync --extra hdf5 in .*, else pip install "astra-data\[hdf5\]"'
+        r'h5py is needed but not installed: uv sync --extra hdf5 in .*, else pip install "astra-data\[hdf5\]"'
     )
     with pytest.raises(BadInputError, match=told):
         export(dataset, tmp_path / "a", format="d4rl")

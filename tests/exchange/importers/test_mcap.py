@@ -191,7 +191,7 @@ def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
         "log.mcap: /command is silent for over 0.35 s (split.gap_s) 3 times while others are not" in warning
     )
     assert "latched = true" in warning
-    assert "as is right where the robot stops by itself" in warning
+    assert "That is right if the robot stops by itself" in warning
 
 
 def test_a_topic_that_is_silent_for_longer_than_its_column_allows_is_named_with_that_key(

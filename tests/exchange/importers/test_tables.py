@@ -77,7 +77,7 @@ def test_text_for_numbers_is_told(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_no_rows_are_told(tmp_path: Path, name: str) -> None:
     path = write_table(tmp_path / name, {field: values[:0] for field, values in rows().items()})
-    with pytest.raises(BadInputError, match="no episodes, each of which needs two rows where"):
+    with pytest.raises(BadInputError, match="no episodes, and each needs two rows if"):
         imported(tmp_path, path)
     assert not (tmp_path / "out").exists()
 
