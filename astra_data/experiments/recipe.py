@@ -182,10 +182,7 @@ class Recipe(Config):
         for row in (*self.methods, *filter(None, initial)):
             table = "plus" if is_plus(row) else "train"
             if not method_named(row).accepts(getattr(self, table).reward):
-                raise ValueError(
-                    f"{table}.reward: {row} predicts no reward: expected 'abstract' or "
-                    "'blend', got 'predicted'"
-                )
+                raise ValueError(f"{table}.reward: {row} predicts no reward: expected 'abstract' or 'blend'")
         return self
 
     @model_validator(mode="after")
@@ -272,8 +269,7 @@ class Recipe(Config):
         for percent in self.sweep.percent:
             if not share(percent, self.collect.episodes):
                 raise ValueError(
-                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes is below one: "
-                    "expected more"
+                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes are none: expected more"
                 )
         return self
 

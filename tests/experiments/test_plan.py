@@ -212,7 +212,7 @@ def test_plus_lies_over_train(tmp_path: Path, fake_recipe: type[Recipe]) -> None
         (HEAD + "[sweep]\npercent = [5, 5]", "expected each of sweep.percent once, got [5, 5]"),
         (
             HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",
-            "sweep.percent: 5 % of 9 episodes is below one: expected more",
+            "sweep.percent: 5 % of 9 episodes are none: expected more",
         ),
         (HEAD.replace("[0, 7]", "[]"), "seeds: expected 1 or more, got none"),
     ],
