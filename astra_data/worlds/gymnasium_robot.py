@@ -1,4 +1,4 @@
-"""A robot that is an environment of Gymnasium, named by its id."""
+"""A robot that is an environment of Gymnasium, given by its id or its class."""
 
 from collections.abc import Callable
 from typing import Any
@@ -38,16 +38,23 @@ def as_given(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
     return command
 
 
-def made(env_id: str, **options: Any) -> Env:  # noqa: ANN401 - handed on
-    """Return the environment `env_id` with its `options`, without wrappers.
+def made(env_id: str | Callable[..., Env], **options: Any) -> Env:  # noqa: ANN401 - handed on
+    """Return the environment `env_id`, or of that class, with its `options`, without wrappers.
 
     Raises:
         BadInputError: it cannot be made.
     """
+    if callable(env_id):
+        with explained(f"making {_name(env_id)}"):
+            return env_id(**options).unwrapped
     with explained(f"gymnasium.make({env_id!r})"):
         # The horizon is the task's, and what is wrong with states is told by the task.
         env: Env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **options)
     return env.unwrapped
+
+
+def _name(env_id: str | Callable[..., Env]) -> str:
+    return env_id if isinstance(env_id, str) else getattr(env_id, "__name__", repr(env_id))
 
 
 class GymnasiumRobot:
@@ -57,7 +64,7 @@ class GymnasiumRobot:
     where the three functions can.
 
     Attributes:
-        name: its id. env: the environment.
+        name: its id, or the name of its class. env: the environment.
         any_end_fails: whether each end of the environment is taken for a failure, as no `failed` is given.
 
     Example:
@@ -69,7 +76,7 @@ class GymnasiumRobot:
 
     def __init__(
         self,
-        env_id: str,
+        env_id: str | Callable[..., Env],
         *,
         read_state: Callable[[Env, Any], State] = observed,
         command: Callable[[NDArray[np.float64], State], Any] = as_given,
@@ -79,7 +86,8 @@ class GymnasiumRobot:
         """Make the environment.
 
         Args:
-            env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0".
+            env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0"; or the
+                class itself, or a function that makes the environment.
             read_state: makes the state (S,) of the environment, without its wrappers, and an observation.
             command: makes an action of the environment of a command (A,) and the state that it is given in.
             failed: whether the robot failed, from the state after a step and whether the environment
@@ -89,7 +97,7 @@ class GymnasiumRobot:
         Raises:
             BadInputError: the environment cannot be made.
         """
-        self.name, self.env = env_id, made(env_id, **options)
+        self.name, self.env = _name(env_id), made(env_id, **options)
         self._read_state, self._command, self._failed = read_state, command, failed
         self.any_end_fails = failed is None
         if isinstance(space := self.env.action_space, gymnasium.spaces.Box):

@@ -214,10 +214,11 @@ class RobotEnv:
 
     def _checked(self, state: State, call: str, row: int) -> Tensor:
         if isinstance(state, tuple) and len(state) == 2 and isinstance(state[1], dict):
+            name = type(self._robots[row]).__name__
             raise BadInputError(
                 f"{call} of the robot: expected a state of {self._column.size} numbers, got an observation "
-                f"and a dictionary: {type(self._robots[row]).__name__} is an environment of Gymnasium; "
-                "register it (gymnasium.register) and give robot=partial(GymnasiumRobot, its id)"
+                f"and a dictionary: {name} is an environment of Gymnasium; give "
+                f"robot=partial(GymnasiumRobot, {name})"
             )
         with explained(f"{call} of the robot: to read its state as numbers"):
             found = torch.as_tensor(np.asarray(state, dtype=np.float32))

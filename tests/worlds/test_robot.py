@@ -199,7 +199,7 @@ def test_the_step_in_which_a_state_is_lost_is_told() -> None:
 def test_an_environment_of_gymnasium_is_called_so() -> None:
     task = replace(TASK, robot=cast("Any", gymnasium.make("Pendulum-v1").unwrapped.__class__))
     with pytest.raises(
-        BadInputError, match=r"PendulumEnv is an environment of Gymnasium; register it .*Robot"
+        BadInputError, match=r"PendulumEnv is an environment of Gymnasium; give .*Robot, PendulumEnv\)"
     ):
         task.target(1, seed=0).reset()
 
