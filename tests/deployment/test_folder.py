@@ -116,7 +116,7 @@ def alone(folder: Path, code: str) -> str:
 
 
 def test_what_is_no_policy_and_a_folder_that_exists_are_refused(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="follower trains no policy"):
+    with pytest.raises(BadInputError, match="follower has no trained policy"):
         deploy(run, "follower", tmp_path / "a/policy")
     with pytest.raises(BadInputError, match=r"nas, seed 1: expected .*\(astra-data train\).*run the recipe"):
         deploy(run, "nas", tmp_path / "a/policy", seed=1)

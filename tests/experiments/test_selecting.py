@@ -74,7 +74,7 @@ def test_trials_that_are_set_aside_are_told(
         if trials:
             (folder / "select/trials.json").write_text("{}")
     (told,) = [record.getMessage() for record in caplog.records]
-    assert told.endswith(f"the old one, with its trials in the target, is in {folder}/set_aside/2/select")
+    assert told.endswith(f"the old choice, with its trials in the target, is in {folder}/set_aside/2/select")
     assert (folder / "set_aside/2/select/trials.json").is_file()
 
 

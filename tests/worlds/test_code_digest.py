@@ -119,33 +119,29 @@ def test_data_outside_of_its_folder_does_not_count(tmp_path: Path) -> None:
 def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of installed packages."""
     folder = tmp_path / "site-packages"
-    (folder / "gears_of_mine/parts").mkdir(parents=True)
-    for name in ("gears_of_mine/__init__.py", "gears_of_mine/parts/knee.py", "others.py"):
+    (folder / "levers_of_mine/parts").mkdir(parents=True)
+    for name in ("levers_of_mine/__init__.py", "levers_of_mine/parts/knee.py", "others.py"):
         (folder / name).write_text("import others\nLIMIT = 1\n")
     monkeypatch.syspath_prepend(folder)
     return folder
 
 
-@pytest.mark.parametrize("place", ["gears_of_mine:TASK", "gears_of_mine.parts.knee:TASK"])
+@pytest.mark.parametrize("place", ["levers_of_mine:TASK", "levers_of_mine.parts.knee:TASK"])
 def test_installed_code_is_known_by_all_of_its_package(library: Path, place: str) -> None:
     first = code_digest(place)
     (library / "others.py").write_text("LIMIT = 2\n")
-    (library / "gears_of_mine/__init__.py").write_text("import others  # Another.\nLIMIT = 1\n")
+    (library / "levers_of_mine/__init__.py").write_text("import others  # Another.\nLIMIT = 1\n")
     assert code_digest(place) == first
-    (library / "gears_of_mine/parts/knee.py").write_text("import others\nLIMIT = 2\n")
-    assert (
-        (code_digest(place) is first is None)
-        if "here" in place
-        else (code_digest(place) not in (first, None))
-    )
-    assert "gears_of_mine" not in sys.modules
+    (library / "levers_of_mine/parts/knee.py").write_text("import others\nLIMIT = 2\n")
+    assert code_digest(place) not in (first, None)
+    assert "levers_of_mine" not in sys.modules
 
 
 def test_a_module_in_no_package_is_known_by_its_file(library: Path) -> None:
     first = code_digest("others:TASK")
-    (library / "gears_of_mine/__init__.py").write_text("")
+    (library / "levers_of_mine/__init__.py").write_text("")
     assert code_digest("others:TASK") == first
-    (library / "others.py").write_text("import gears_of_mine\nLIMIT = 2\n")
+    (library / "others.py").write_text("import levers_of_mine\nLIMIT = 2\n")
     assert code_digest("others:TASK") not in (first, None)
 
 

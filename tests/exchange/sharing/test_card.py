@@ -139,7 +139,7 @@ def test_without_positions_there_is_no_figure(tmp_path: Path) -> None:
 
 def test_notes_with_faults_are_told(tmp_path: Path) -> None:
     (tmp_path / "notes.toml").write_text('limit = "none"\nlicense = 3\n')
-    with pytest.raises(RecipeError, match=r"(?s)2 faults.*did you mean 'limits'"):
+    with pytest.raises(RecipeError, match=r"(?s)2 errors.*did you mean 'limits'"):
         load_recipe(tmp_path / "notes.toml", Notes)
 
 
