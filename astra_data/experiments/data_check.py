@@ -3,8 +3,7 @@
 import numpy as np
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.checkup.continuity import Continuity
-from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, NEXT_STATE, STATE
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
 from astra_data.dataset.edit import share
 from astra_data.dataset.lineage import recordings_of
 from astra_data.dataset.reader import Dataset
@@ -47,8 +46,7 @@ def data_condition(recipe: Recipe) -> Condition | None:
     check_fits(source, task)
     if any(method_named(row).grounds for row in recipe.methods):
         _check_division(recipe, source)
-    notes = [*_broken_steps(source), *differing_bounds(task.limits, source), *remarks(source, task)]
-    return Condition("finished", "; ".join(notes))
+    return Condition("finished", "; ".join([*differing_bounds(task.limits, source), *remarks(source, task)]))
 
 
 def _check_division(recipe: Recipe, source: Dataset) -> None:
@@ -60,14 +58,6 @@ def _check_division(recipe: Recipe, source: Dataset) -> None:
         smallest = min(recipe.sweep.percent)
         name, recordings = f"{smallest} % of {name}", min(recordings, share(smallest, len(source)))
     divided(name, recordings, recipe.ground.held_out_share, seed=0)
-
-
-def _broken_steps(source: Dataset) -> list[str]:
-    """Return a line where steps do not lead to the row after them, which a correction would be fitted to."""
-    continuity = Continuity()
-    for episode in source.episodes([STATE, NEXT_STATE]):
-        continuity.add(episode)
-    return [f"{finding.what}: {finding.advice}" for finding in continuity.findings()]
 
 
 def differing_bounds(limits: Commands, source: Dataset) -> list[str]:

@@ -3,11 +3,11 @@
 import json
 from pathlib import Path
 
-from astra_data.core.config import read_written
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import CODE
 from astra_data.experiments.recipe import Recipe
+from astra_data.reports.origins import recorded_code
 from astra_data.worlds.code_digest import code_digest
 from astra_data.worlds.registry import place_of
 
@@ -23,7 +23,7 @@ def changed_code(recipe: Recipe, folder: Path) -> dict[str, str]:
     Raises:
         BadInputError: the record is damaged.
     """
-    before = _recorded(folder / CODE)
+    before = recorded_code(folder)
     now = _digests(recipe)
     changed = [name for name, digest in before.items() if now.get(name, digest) != digest]
     return {
@@ -44,7 +44,7 @@ def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
     """
     place = place_of(place) if name == "task" else place
     now = code_digest(place)
-    if now and now != _recorded(run / CODE).get(name, now):
+    if now and now != recorded_code(run).get(name, now):
         raise BadInputError(
             f"{place.rpartition(':')[0]} changed since {run} was made: "
             "restore that version, or run the recipe under another name"
@@ -54,14 +54,7 @@ def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
 def record_code(recipe: Recipe, folder: Path) -> None:
     """Write down in `folder` what the code is now, if there is any; that of other methods stays written."""
     if digests := _digests(recipe):
-        write_file(folder / CODE, json.dumps(_recorded(folder / CODE) | digests, indent=1) + "\n")
-
-
-def _recorded(path: Path) -> dict[str, str]:
-    if not path.is_file():
-        return {}
-    cure = "restore it from a copy, or remove it if the code is still what the run was made with"
-    return read_written(dict[str, str], path, by="a run", cure=cure)
+        write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
 
 
 def _places(recipe: Recipe) -> dict[str, str]:

@@ -206,11 +206,12 @@ def make(
                     "a copy, recover its intact episodes with `astra-data repair`, or remove it"
                 )
         items = [item for item in items if item.key in again or not finished(item, experiment)]
-        if any(stage_of(item) == "label" for item in items):
-            data_condition(recipe)
+        data = data_condition(recipe) if any(stage_of(item) == "label" for item in items) else None
         _check_inputs(experiment, items)
         experiment.link_borrowed()
         console = Console()
+        if data and data.why:
+            console.print(f"data: {data.why}", markup=False, highlight=False, soft_wrap=True)
         for key, reason in again.items():
             line = f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -27,7 +27,7 @@ from astra_data.reports.comparing import SHARED_WORLDS
 from astra_data.reports.costs import DATASET_STAGES, Files, seconds, seed_cost, throughput, with_first
 from astra_data.reports.mean_bands import mean_band
 from astra_data.reports.merging import merge
-from astra_data.reports.origins import dataset_uses, merged_origins, recorded_code
+from astra_data.reports.origins import code_of_rows, dataset_uses, merged_origins
 from astra_data.reports.runs import Reported, Runs
 from astra_data.reports.schema import (
     BandMeans,
@@ -172,7 +172,7 @@ def _read(read: Runs, command: str, scores: tuple[Score, ...], judged: Judged | 
         scores=scores,
         settings=dict(read.reported.settings),
         origins=_origins({**files, "report": {"all": [Artefact.model_validate(origin())]}}),
-        own_code=recorded_code(read.root, rows),
+        own_code=code_of_rows(read.root, rows),
         wall_seconds=seconds(timed, "wall_seconds"),
         cpu_seconds=seconds(timed, "cpu_seconds"),
         datasets=[

@@ -21,8 +21,8 @@ def merged_origins(origins: Iterable[Origin]) -> list[Origin]:
     return list(merged.values())
 
 
-def recorded_code(root: Path, rows: Iterable[str]) -> dict[str, str]:
-    """Return the digests that the run at `root` recorded of the code of its task and of methods of `rows`.
+def recorded_code(root: Path) -> dict[str, str]:
+    """Return what the run at `root` recorded of the user's code and its settings; empty where it has none.
 
     Raises:
         BadInputError: the record is damaged.
@@ -30,7 +30,16 @@ def recorded_code(root: Path, rows: Iterable[str]) -> dict[str, str]:
     if not (root / CODE).is_file():
         return {}
     cure = "restore it from a copy, or remove it if the code is still what the run was made with"
-    recorded = read_written(dict[str, str], root / CODE, by="a run", cure=cure)
+    return read_written(dict[str, str], root / CODE, by="a run", cure=cure)
+
+
+def code_of_rows(root: Path, rows: Iterable[str]) -> dict[str, str]:
+    """Return the digests that the run at `root` recorded of the code of its task and of methods of `rows`.
+
+    Raises:
+        BadInputError: the record is damaged.
+    """
+    recorded = recorded_code(root)
     named = ["task", *(name for row in rows for name in (base_method(row), grounded_as(row)))]
     return {name: recorded[name] for name in dict.fromkeys(named) if name in recorded}
 

@@ -13,6 +13,7 @@ from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
 from astra_data.dataset.atomic import refuse_existing
+from astra_data.dataset.checkup.continuity import Continuity
 from astra_data.dataset.columns import (
     DONE,
     GOAL,
@@ -79,6 +80,8 @@ def label(
         for column in ((world.goal,) if world.goal else ()) + OUTCOME_COLUMNS
         if column.name not in source.features
     ]
+    for warning in remarks(source, world):
+        _log.warning(warning)
     if not more and out is not None:
         refuse_existing(out)
         make_folder(out.parent)
@@ -86,8 +89,6 @@ def label(
         return out
     if not more:
         raise BadInputError(f"{source.reference} already has goals and outcomes: there is nothing to label")
-    for warning in remarks(source, world):
-        _log.warning(warning)
     steps = successes = failures = at_goal = 0
     with next_version(
         source,
@@ -119,7 +120,15 @@ def label(
 def remarks(source: Dataset, task: Task) -> list[str]:
     """Say what is to be checked of a dataset that fits a task."""
     named = names_apart(source, (task.state, task.action), task.name)
-    return [remark for remark in (named, _drawn_goals(source, task)) if remark]
+    return [*_broken_steps(source), *filter(None, (named, _drawn_goals(source, task)))]
+
+
+def _broken_steps(source: Dataset) -> list[str]:
+    """Say that steps do not lead to the row after them, which a correction would be fitted to."""
+    continuity = Continuity()
+    for episode in source.episodes([STATE, NEXT_STATE]):
+        continuity.add(episode)
+    return [f"{finding.what}: {finding.advice}" for finding in continuity.findings()]
 
 
 def _drawn_goals(source: Dataset, task: Task) -> str:

@@ -74,11 +74,15 @@ def test_bounds_beyond_what_was_recorded_are_told(
     assert goals
 
 
-def test_steps_that_do_not_lead_to_the_row_after_them_are_told(recipe: Path) -> None:
+def test_steps_that_do_not_lead_to_the_row_after_them_are_told(
+    recipe: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_logs(recipe.parent / "logs", -1.0, 4.0, ahead=0.5)
     found = check(recipe, root=recipe.parent / "runs")["data"]
     what = f"steps whose {NEXT_STATE} is not the state of the next row: 16 of 16: rows are missing"
     assert found.is_finished and found.why.startswith(what)
+    run(recipe, root=recipe.parent / "runs", until="label", jobs=1)
+    assert f"data: {found.why}\n" in capsys.readouterr().out
 
 
 def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:

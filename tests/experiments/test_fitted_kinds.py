@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from planar_logs import poses_of, write
+from planar_logs import poses_of, step_as_logged, wrapped, write
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
@@ -16,7 +15,6 @@ from astra_data.exchange.guessing import guess
 from astra_data.experiments.fitted_kinds import Bicycle, Differential
 from astra_data.experiments.new_robot import write_robot
 from astra_data.worlds.registry import task_named
-from astra_data.worlds.walk_through import check_task
 
 
 def steer(wheelbase_m: float, rows: int = 120) -> tuple[Floats, Floats]:
@@ -25,8 +23,7 @@ def steer(wheelbase_m: float, rows: int = 120) -> tuple[Floats, Floats]:
     speed, angle = commands.T
     turn = speed * np.tan(angle) / wheelbase_m
     poses = poses_of(speed, np.zeros(rows), turn)
-    poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
-    return poses, commands
+    return wrapped(poses), commands
 
 
 @pytest.mark.parametrize("wheelbase_m", [0.26, -0.26])
@@ -43,13 +40,8 @@ def test_a_car_is_steered_by_an_angle(tmp_path: Path, wheelbase_m: float, order:
     assert line in shown.output and "standing still" not in shown.output
     assert "WHEELBASE_M = 0.26  # CHECK" in (tmp_path / "racer/racer.py").read_text()
     task = task_named(f"{tmp_path}/racer/racer.py:TASK")
-    assert check_task(task) == []
-    simulator = task.make_simulator(len(poses) - 1)
+    simulator = step_as_logged(task, poses, commands[:, order])
     assert simulator.parameters == {"timestep_s": 0.1, "wheelbase_m": 0.26}
-    states = torch.from_numpy(poses).float()
-    simulator.reset_to(task.abstraction(states[:-1]))
-    landed = simulator.step(torch.from_numpy(commands[:-1, order]).float())
-    torch.testing.assert_close(landed, task.abstraction(states[1:]), atol=1e-4, rtol=0)
     runpy.run_path(f"{tmp_path}/racer/test_racer.py")["test_a_step_of_the_simulator"]()
 
 
@@ -89,8 +81,7 @@ def roll(track_m: float = TRACK_M, rows: int = 200, lag: float = 0.0) -> tuple[F
         turned[row] = lag * turned[row - 1] + (1 - lag) * commands[row]
     left, right = RADIUS_M * turned.T
     poses = poses_of((left + right) / 2, np.zeros(rows), (right - left) / track_m)
-    poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
-    return poses, commands
+    return wrapped(poses), commands
 
 
 @pytest.mark.parametrize("track_m", [TRACK_M, -TRACK_M])
@@ -109,17 +100,12 @@ def test_two_wheels_are_a_differential_drive(tmp_path: Path, track_m: float, ord
     )
     assert line in shown.output and "standing still" not in shown.output
     task = task_named(f"{tmp_path}/burger/burger.py:TASK")
-    assert check_task(task) == []
-    simulator = task.make_simulator(len(poses) - 1)
+    simulator = step_as_logged(task, poses, commands[:, order])
     assert simulator.parameters == {
         "timestep_s": 0.1,
         "speed_per_command": RADIUS_M,
         "track_m": track_m,
     }
-    states = torch.from_numpy(poses).float()
-    simulator.reset_to(task.abstraction(states[:-1]))
-    landed = simulator.step(torch.from_numpy(commands[:-1, order]).float())
-    torch.testing.assert_close(landed, task.abstraction(states[1:]), atol=1e-4, rtol=0)
     runpy.run_path(f"{tmp_path}/burger/test_burger.py")["test_a_step_of_the_simulator"]()
 
 

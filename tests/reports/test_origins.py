@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.origins import merged_origins, recorded_code
+from astra_data.reports.origins import code_of_rows, merged_origins
 from astra_data.reports.schema import Machine, Origin
 
 USUAL = Origin(
@@ -28,11 +28,11 @@ def test_other_code_another_machine_and_other_packages_are_other_origins() -> No
 
 
 def test_the_code_of_ones_own_is_that_of_the_task_and_the_rows(tmp_path: Path) -> None:
-    assert recorded_code(tmp_path, ["nas"]) == {}
+    assert code_of_rows(tmp_path, ["nas"]) == {}
     recorded = '{"task": "0a", "nas": "1b", "nas.settings": "{}", "compass": "2c"}'
     (tmp_path / "code.json").write_text(recorded)
-    assert recorded_code(tmp_path, ["nas_plus", "nas", "direct_transfer"]) == {"task": "0a", "nas": "1b"}
-    assert recorded_code(tmp_path, []) == {"task": "0a"}
+    assert code_of_rows(tmp_path, ["nas_plus", "nas", "direct_transfer"]) == {"task": "0a", "nas": "1b"}
+    assert code_of_rows(tmp_path, []) == {"task": "0a"}
     (tmp_path / "code.json").write_text("[]")
     with pytest.raises(BadInputError, match=r"code\.json is not what a run writes: .*; restore it"):
-        recorded_code(tmp_path, ["nas"])
+        code_of_rows(tmp_path, ["nas"])

@@ -84,6 +84,19 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     assert notes[-1] == f"1 successes, 0 failures in {10 + len(fast)} steps"
 
 
+def test_steps_that_do_not_lead_to_the_next_row_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    ahead = drive(0.5, 10)
+    ahead[NEXT_STATE] = ahead[NEXT_STATE] + np.float32(0.01)
+    told = f"steps whose {NEXT_STATE} is not the state of the next row: 9 of 9"
+    labelled = label(CART, data=write(tmp_path / "logs", [ahead]), out=tmp_path / "out")
+    assert told in caplog.text
+    caplog.clear()
+    label(CART, data=labelled, out=tmp_path / "linked")  # has all that a task asks for
+    assert told in caplog.text
+
+
 def test_goals_that_are_drawn_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     mistaken = Column("observation.goal")
     goals = {"observation.goal": np.ones(10, np.float32)}
