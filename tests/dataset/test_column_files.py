@@ -67,6 +67,19 @@ def test_a_full_disk_ends_with_an_error_and_no_raw_file(fake: Dataset, tmp_path:
     assert not list(tmp_path.rglob("*.npy"))
 
 
+def test_a_disk_without_room_for_the_last_byte_is_a_full_one(fake: Dataset, tmp_path: Path) -> None:
+    Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path / "roomy")
+    [path] = tmp_path.rglob("values.npy")
+    size = path.stat().st_size
+    with small_files(size - 1), pytest.raises(DiskError, match=f"{STATE} cannot be written: a file would be"):
+        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path / "tight")
+    assert not list((tmp_path / "tight").rglob("*.npy"))
+    with small_files(size):
+        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path / "tight")
+    [again] = (tmp_path / "tight").rglob("values.npy")
+    assert again.read_bytes() == path.read_bytes()
+
+
 def test_a_failure_leaves_no_raw_file(
     fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -90,6 +90,21 @@ def test_the_longer_side_of_the_map_has_as_many_cells_as_a_side_may_have(tmp_pat
     assert places.cell * CELLS == pytest.approx(6.4)
 
 
+def test_a_side_that_is_longer_by_rounding_alone_gets_no_row_of_its_own(tmp_path: Path) -> None:
+    """Of 1 m by 0.5 m, and 2^-37 m more: less than a billionth of a cell."""
+    source = write_fake(tmp_path / "fake")
+    description = {"name": "edge", "stage": "x"}
+    with DatasetWriter(
+        tmp_path / "edge", source.schema, fps=20, task="go", description=description
+    ) as writer:
+        for episode in source.episodes():
+            episode.columns[STATE][:, :2] = np.linspace([0, -(2.0**-37)], [1.0, 0.5], len(episode))
+            writer.add(episode)
+    places = inspect_dataset(Dataset.open(tmp_path / "edge")).positions
+    assert places is not None
+    assert places.counts.shape == (CELLS // 2, CELLS) and places.counts.sum() == sum(LENGTHS)
+
+
 def test_bars_and_shades_follow_the_counts() -> None:
     assert sparkline(np.array([0, 1, 4, 8])) == " ▁▄█"
     assert sparkline(np.zeros(3, dtype=np.int64)) == "   "

@@ -87,6 +87,20 @@ def test_a_terminated_row_that_is_left_out_hands_its_flags_to_the_step_before() 
     assert values(names.SUCCESS, "bool", more=with_next).tolist() == [False, False, False, True]
 
 
+def test_an_episode_that_ends_at_its_time_limit_too_keeps_both_flags() -> None:
+    last = np.arange(STEPS) == STEPS - 1
+    both: dict[str, Array] = {names.TERMINATED: last, names.TRUNCATED: last}
+    with_next = both | {names.NEXT_STATE: np.ones((STEPS, 2), np.float32)}
+    for name in (names.TERMINATED, names.TRUNCATED, names.DONE):
+        np.testing.assert_array_equal(values(name, "bool", more=with_next), last)
+    # The step before a row that is left out is terminated, and no longer cut off by the end of the rows.
+    assert values(names.TERMINATED, "bool", more=both).tolist() == [False, False, True]
+    assert values(names.TRUNCATED, "bool", more=both).tolist() == [False, False, False]
+    earlier: dict[str, Array] = {names.TERMINATED: last, names.TRUNCATED: np.arange(STEPS) == STEPS - 2}
+    assert values(names.TERMINATED, "bool", more=earlier).tolist() == [False, False, True]
+    assert values(names.TRUNCATED, "bool", more=earlier).tolist() == [False, False, True]
+
+
 def test_only_the_columns_that_are_needed_are_read() -> None:
     rows, _ = rows_and_run({names.FRAME_INDEX: np.arange(STEPS), "force": np.ones(STEPS)})
 

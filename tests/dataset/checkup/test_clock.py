@@ -156,6 +156,14 @@ def test_a_recording_with_many_gaps_is_to_be_resampled(count: int, is_many: bool
     assert finding.advice.startswith("resample") is is_many
 
 
+@pytest.mark.parametrize(("regular", "is_many"), [(198, True), (199, False)])
+def test_two_gaps_in_two_hundred_steps_are_many(regular: int, is_many: bool) -> None:
+    timed = clock([0.1] * regular + [0.3] * 2)
+    (finding,) = timed.findings("walks")
+    assert finding.advice.startswith("resample") is is_many
+    assert ("2 (1 % of the steps: rows are missing)" in str(timed)) is is_many
+
+
 def test_episodes_of_one_step_have_no_times_between() -> None:
     timed = clock([], REGULAR)
     assert not timed.findings("walks")
