@@ -1,11 +1,18 @@
+from pathlib import Path
+from typing import Any
+
 import gymnasium
 import gymnasium_robotics
 import mujoco
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from astra_data.core.arrays import Floats
 from astra_data.worlds.ant.body import (
+    CONTROL_SUBSTEPS,
+    TIMESTEP_S,
     VelocityController,
     ant_model,
     canonical_view,
@@ -69,6 +76,15 @@ def test_walls_are_gymnasium_robotics_own() -> None:
             np.testing.assert_array_equal(getattr(ours.geom(name), field), getattr(theirs.geom(name), field))
 
 
+def test_the_ant_is_integrated_as_gymnasiums() -> None:
+    theirs: Any = gymnasium.make("Ant-v5").unwrapped
+    ours = ant_model()
+    for name in ("integrator", "timestep", "solver", "iterations", "gravity", "cone"):
+        np.testing.assert_array_equal(getattr(ours.opt, name), getattr(theirs.model.opt, name))
+    assert theirs.frame_skip == CONTROL_SUBSTEPS
+    assert theirs.dt == pytest.approx(TIMESTEP_S)
+
+
 def test_longer_legs_are_longer_and_nothing_else() -> None:
     plain, longer = ant_model(U_MAZE), ant_model(U_MAZE, leg_scale=1.25)
     # Legs are the capsules; a capsule's size is its radius, then half of its length.
@@ -117,6 +133,26 @@ def test_commands_point_forward_in_the_canonical_view() -> None:
     assert (observation[:, 14:18] > 0).all()
 
 
+def test_the_view_of_an_ant_that_looks_along_its_command_is_read_off() -> None:
+    """Rolled by 0.5 rad to the left, in a world frame that is also the heading frame."""
+    qpos, qvel = np.zeros((1, 15)), np.arange(1, 15, dtype=np.float64)[None]
+    qpos[0, :3], qpos[0, 3:5] = [5.0, -3.0, 0.75], [np.cos(-0.25), np.sin(-0.25)]
+    qpos[0, 7:] = [0.1, 1.0, 0.2, -0.9, 0.3, -0.8, 0.4, 0.7]
+    observation, quarters = canonical_view(qpos, qvel, np.array([[0.8, 0.3]]))
+    spin = np.zeros(3)
+    mujoco.mju_rotVecQuat(spin, qvel[0, 3:6].copy(), qpos[0, 3:7].copy())
+    expected = [
+        *(0.15, 0.0, np.sin(0.5), np.cos(0.5)),
+        *(1.0, 2.0, 3.0, *spin),
+        *(0.1, 0.2, 0.3, 0.4, 1.0, 0.9, 0.8, 0.7),
+        # A fifth of the joints' rates, those of ankles 2 and 3 the other way round.
+        *(1.4, 1.8, 2.2, 2.6, 1.6, -2.0, -2.4, 2.8),
+        *(0.8, 0.3),
+    ]
+    np.testing.assert_allclose(observation[0], expected, atol=1e-12)
+    assert quarters.tolist() == [0]
+
+
 def test_torques_to_body_undoes_the_view() -> None:
     # The same canonical torques move the turned body exactly as the unturned one.
     rng = np.random.default_rng(4)
@@ -149,6 +185,15 @@ def test_actuators_are_listed_as_torques_to_body_lists_them() -> None:
         control = torques_to_body(torques, np.zeros(1, dtype=np.intp))[0]
         joint = model.actuator_trnid[int(np.flatnonzero(control)[0]), 0]
         assert model.joint(joint).name == f"hip_{leg + 1}"
+
+
+def test_another_controller_can_be_loaded(tmp_path: Path) -> None:
+    tensors = {"0.weight": torch.zeros(8, 28), "0.bias": torch.full((8,), 9.0)}
+    save_file(tensors | {"torque_scale": torch.tensor(0.25)}, tmp_path / "own.safetensors")
+    controller = VelocityController.load(tmp_path / "own.safetensors")
+    torques = controller(ant_model().qpos0[None], np.zeros((1, 14)), np.array([[1.0, 0.0]]))
+    # Hips, and ankles by the signs of their axes, of legs 4, 1, 2, 3.
+    np.testing.assert_allclose(torques, [[0.25, 0.25, 0.25, 0.25, 0.25, -0.25, 0.25, -0.25]], atol=1e-6)
 
 
 @pytest.mark.parametrize("command", [[0.8, 0.0], [0.0, -0.8], [-0.5, 0.5]])

@@ -31,7 +31,11 @@ def rolled(env: AntMazeEnv, rows: list[int], angle: float) -> None:
     env.reset_to(np.array(rows), state)
 
 
-@pytest.mark.parametrize(("degrees", "toppled"), [(0.0, False), (60.0, False), (100.0, True), (180.0, True)])
+@pytest.mark.parametrize(
+    ("degrees", "toppled"),
+    # A cosine of 0.2 is that of 78.5 degrees.
+    [(0.0, False), (60.0, False), (76.0, False), (81.0, True), (100.0, True), (180.0, True)],
+)
 def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> None:
     env = placed([[-4, 4], [-4, 4]])
     rolled(env, [0], np.radians(degrees))

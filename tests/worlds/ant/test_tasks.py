@@ -8,7 +8,9 @@ from astra_data.worlds.ant.body import ant_model
 from astra_data.worlds.ant.tasks import ANTMAZE_TASKS
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
+from astra_data.worlds.task import Task
 
 TASK = TASKS["antmaze-umaze"]
 
@@ -51,6 +53,16 @@ def test_the_point_mass_is_as_fast_as_the_longest_command() -> None:
         "velocity_m_s": [2, 3],
     }
     assert TASK.planar.wall_reach_m == 1.3
+
+
+@pytest.mark.parametrize("task", ANTMAZE_TASKS, ids=lambda task: task.name)
+def test_point_masses_stand_among_the_walls_of_their_own_maze(task: Task) -> None:
+    simulator = task.simulator(1)
+    assert isinstance(simulator, PointMass)
+    walls = [task.maze.cell_centre(*cell) for cell in task.maze.wall_cells()]
+    for centres, blocked in ((task.maze.free_centres(), False), (walls, True)):
+        cells = simulator.free.cells(torch.tensor(np.array(centres), dtype=torch.float32))
+        assert (simulator.free.blocked[cells] == blocked).all()
 
 
 @pytest.mark.parametrize(("name", "metres"), [("-sparse", 0.0), ("-euclidean", 0.5), ("", 0.14)])

@@ -64,6 +64,14 @@ def test_frozen_humanoids_earn_nothing() -> None:
     assert humanoids.reward[1] == 0.0
 
 
+def test_who_is_set_anew_has_earned_nothing_yet() -> None:
+    humanoids = Humanoids(Locomotion(), 2, num_threads=1)
+    humanoids.step(np.zeros((2, 17)))
+    kept = humanoids.reward[1]
+    humanoids.reset_to(np.array([0]), humanoids.state[:1])
+    assert humanoids.reward.tolist() == [0.0, kept] and kept > 4.0
+
+
 def test_holding_still_falls_forward_as_measured() -> None:
     # 64 of them fell after 78 to 124 steps, 95 in the mean, all forward.
     humanoids = Humanoids(Locomotion(), 24, num_threads=2)

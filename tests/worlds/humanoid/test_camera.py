@@ -30,6 +30,19 @@ def test_the_camera_follows_who_walks_and_sees_who_lies() -> None:
     assert np.ptp(columns) > 1.5 * np.ptp(rows)
 
 
+def test_who_walks_along_x_goes_to_the_right() -> None:
+    fallen = np.array(STANDING)
+    fallen[[2, *range(3, 7)]] = 0.1, *(0.5**0.5 * np.array([1.0, 0.0, 1.0, 0.0]))  # with its head along x
+    try:
+        (lying,) = map(skin, photograph(fallen[None], height=120, width=160))
+    except BadInputError as error:
+        pytest.skip(str(error))
+    assert lying.shape == (120, 160)
+    columns = np.flatnonzero(lying.any(axis=0))
+    # Legs reach farther from the torso, in the middle of the picture, than the head does.
+    assert 80 - columns.min() > 1.3 * (columns.max() - 80) > 0
+
+
 def test_without_opengl_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(*_: object) -> None:
         raise ImportError("no libEGL")

@@ -134,3 +134,17 @@ def test_a_centre_of_mass_near_the_floor_has_fallen() -> None:
     assert objective.missed(state * torch.nan, NOTHING).all()  # as what no simulator comes back from
     reward = objective.reward(state, state, NOTHING, failed)
     np.testing.assert_allclose(reward.numpy(), [5.0, 0.0, 5.0 + 1.25 * 2.0], atol=1e-6)
+
+
+def test_torsos_that_are_low_high_or_nowhere_have_fallen() -> None:
+    state = torch.zeros(7, 15)
+    state[:, 0] = torch.tensor([0.99, 1.0, 1.01, 1.99, 2.0, 2.01, torch.nan])
+    failed = PlanarWalking(horizon=5).missed(state, torch.zeros(7, 0))
+    assert failed.tolist() == [True, True, False, False, True, True, True]
+
+
+def test_how_low_a_mass_may_be_is_an_option() -> None:
+    state = torch.zeros(3, 46)
+    state[:, 36] = torch.tensor([0.74, 0.75, 0.76])
+    failed = MassWalking(horizon=5, lowest_mass_m=0.75).missed(state, NOTHING)
+    assert failed.tolist() == [True, False, False]

@@ -95,3 +95,30 @@ def test_legs_touch_nothing_but_the_floor() -> None:
     data.qpos[1] = 0.3
     mujoco.mj_forward(walker, data)
     assert data.ncon > 0
+
+
+def test_a_walker_lands_on_its_trunk_too() -> None:
+    walker = walker_model()
+    data = mujoco.MjData(walker)
+    data.qpos[:3] = [0.0, 0.2, np.pi]  # upside down, its legs in the air
+    mujoco.mj_forward(walker, data)
+    assert data.ncon > 0
+    data.qpos[1] = 0.4
+    mujoco.mj_forward(walker, data)
+    assert data.ncon == 0
+
+
+def test_floor_and_solver_are_the_humanoids() -> None:
+    walker, humanoid = walker_model(), humanoid_model()
+    for name in ("timestep", "integrator", "solver", "iterations", "cone", "gravity", "tolerance"):
+        np.testing.assert_array_equal(getattr(walker.opt, name), getattr(humanoid.opt, name))
+    touches = []
+    for model, height in ((walker, 1), (humanoid, 2)):
+        data = mujoco.MjData(model)
+        data.qpos[height] = 1.28
+        mujoco.mj_forward(model, data)
+        assert data.ncon == 2
+        touches += [data.contact[0], data.contact[1]]
+    for touch in touches[:2]:
+        for name in ("friction", "dim", "solref", "solimp", "includemargin"):
+            np.testing.assert_array_equal(getattr(touch, name), getattr(touches[2], name))

@@ -199,6 +199,15 @@ def test_parameters_name_the_commands() -> None:
     }
 
 
+def test_other_ranges_give_commands_other_targets() -> None:
+    narrow, action = CommandRanges(hip_deg=(-25.0, 5.0)), torch.tensor([[1.0, 0.2, -1.0, 0.4]])
+    landed = HumanoidWalker2d(1, ranges=narrow, num_threads=1).step(action)
+    plain = HumanoidWalker2d(1, num_threads=1)
+    # 5 and -25 degrees are 55 and 25 of the 70 degrees from -50 to 20.
+    same = torch.tensor([[2 * 55 / 70 - 1, 0.2, 2 * 25 / 70 - 1, 0.4]])
+    torch.testing.assert_close(landed, plain.step(same), atol=1e-5, rtol=1e-5)
+
+
 def test_a_correction_says_what_touches_as_the_humanoids_feet_do() -> None:
     """A humanoid that stands touches the floor with feet that are too high for it in the plane."""
     walker = HumanoidWalker2d(3, num_threads=1)

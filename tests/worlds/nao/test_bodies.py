@@ -129,6 +129,24 @@ def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(
     assert (followed[0] < TICKS) == waits
 
 
+@pytest.mark.parametrize(("roll_rate", "waits"), [(-2.0, True), (2.0, False)])
+def test_a_foot_waits_as_soon_as_the_torso_turns_toward_it(roll_rate: float, waits: bool) -> None:
+    """An upright torso that is measured to roll to the left, over the left foot that is to be lifted."""
+    robots, measured, planned = bodies(height_m=1.0), noise(), targets()
+    measured[0, 0, 0] = roll_rate
+    planned.lifts_off[:, 0] = 1
+    followed = robots.step(np.array([0]), planned, measured)
+    assert (followed[0] < TICKS) == waits
+
+
+def test_the_gyroscope_reads_the_last_rates_with_their_noise() -> None:
+    robots, measured = bodies(height_m=1.0), noise()
+    measured[0, :, 2] = 9.0
+    measured[0, -1] = [1.0, -2.0, 3.0]
+    robots.step(np.array([0]), targets(), measured)
+    assert robots.gyro[0] == pytest.approx([1.0, -2.0, 3.0], abs=0.2)
+
+
 def test_it_waits_only_so_long() -> None:
     robots = bodies(height_m=1.0, style=replace(STYLE, longest_wait_ticks=5))
     half = np.radians(-20) / 2
@@ -137,6 +155,19 @@ def test_it_waits_only_so_long() -> None:
     # Five ticks of waiting before each that is followed: in 16 ticks two are.
     assert followed.tolist() == [2]
     assert robots.waited.tolist() == [4]
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("degrees", "fallen"), [(44.5, False), (-44.5, False), (46.5, True), (-46.5, True)])
+def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(
+    axis: int, degrees: float, fallen: bool
+) -> None:
+    """In the air, where nothing turns it."""
+    robots, half = bodies(height_m=1.0), np.radians(degrees) / 2
+    robots.qpos[0, 3] = np.cos(half)
+    robots.qpos[0, 4 + axis] = np.sin(half)
+    robots.step(np.array([0]), targets(), noise())
+    assert bool(robots.fallen[0]) == fallen
 
 
 def test_who_falls_stays_as_it_is_until_it_is_reset() -> None:

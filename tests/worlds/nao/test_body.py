@@ -4,7 +4,14 @@ import pytest
 
 from astra_data.worlds.ant.body import ant_model
 from astra_data.worlds.batched_mujoco import wall_geoms
-from astra_data.worlds.nao.body import BALL_MASS_KG, SUBSTEPS, TICK_S, nao_model
+from astra_data.worlds.nao.body import (
+    BALL_MASS_KG,
+    PITCH_TORQUE_NM,
+    ROLL_TORQUE_NM,
+    SUBSTEPS,
+    TICK_S,
+    nao_model,
+)
 from astra_data.worlds.nao.links import LEG_JOINTS
 from astra_data.worlds.plane.ball import BALL_RADIUS_M
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -79,3 +86,27 @@ def test_the_ball_rolls_to_a_stop_at_the_published_rate() -> None:
     middle = np.array(speeds[25:])
     decelerations = -np.diff(middle) / model.opt.timestep
     assert decelerations.mean() == pytest.approx(0.30, abs=0.003)
+
+
+def test_motors_are_as_strong_as_the_table_has_them() -> None:
+    model = nao_model()
+    for number in range(model.nu):
+        name = model.actuator(number).name
+        is_pitch = name[1:] in ("HipPitch", "KneePitch", "AnklePitch")
+        torque = PITCH_TORQUE_NM if is_pitch else ROLL_TORQUE_NM
+        assert model.actuator_forcerange[number].tolist() == [-torque, torque]
+        # Nominal and stall torque of Aldebaran's motors.
+        low, high = (1.6, 7.8) if is_pitch else (2.5, 12.0)
+        assert low < torque < high
+
+
+@pytest.mark.parametrize("part", ["LShank", "RShank", "LFoot", "RFoot", "chest"])
+def test_shanks_and_feet_touch_the_ball_and_the_chest_does_not(part: str) -> None:
+    model = nao_model(ball=True)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 1.0
+    mujoco.mj_forward(model, data)
+    data.qpos[19:22] = data.geom(part).xpos
+    mujoco.mj_forward(model, data)
+    touched = {model.geom(int(geom)).name for pair in data.contact.geom for geom in pair}
+    assert (part in touched) == (part != "chest")

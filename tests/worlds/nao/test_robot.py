@@ -1,3 +1,4 @@
+import mujoco
 import numpy as np
 import pytest
 from nao_values import TOTAL_MASS_KG
@@ -111,6 +112,55 @@ def test_measured_angles_hide_the_joints_offsets() -> None:
     np.testing.assert_allclose(nao.senses.angles + nao.traits.joint_offset_rad, true)
 
 
+def turned(*roll_pitch_yaw: float) -> Floats:
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll)."""
+    quaternion = np.zeros(4)
+    mujoco.mju_euler2Quat(quaternion, np.array(roll_pitch_yaw), "XYZ")
+    return quaternion
+
+
+def test_a_lean_to_the_right_and_one_ahead_are_positive_and_tilts_see_no_heading() -> None:
+    nao = BatchedNao(3, seed=0, num_threads=1)
+    nao.bodies.qpos[:, 3:7] = [turned(0.1, 0.0, 0.0), turned(0.0, 0.2, 0.0), turned(-0.3, 0.2, 2.5)]
+    np.testing.assert_allclose(nao.senses.tilt, [[0.1, 0.0], [0.0, 0.2], [-0.3, 0.2]], atol=1e-12)
+    np.testing.assert_allclose(nao.pose[:, 2], [0.0, 0.0, 2.5], atol=1e-12)
+
+
+def test_the_turn_of_a_leaning_robot_is_about_the_vertical() -> None:
+    nao = BatchedNao(1, seed=0, num_threads=1)
+    rates, world = np.array([0.3, -0.4, 1.0]), np.zeros(3)
+    nao.bodies.qpos[0, 3:7] = turned(-0.3, 0.5, 2.5)
+    nao.bodies.qvel[0, :6] = [0.2, -0.1, 0.5, *rates]  # MuJoCo tells rates of a free body in its own frame
+    mujoco.mju_rotVecQuat(world, rates, nao.bodies.qpos[0, 3:7].copy())
+    np.testing.assert_allclose(nao.velocity, [[0.2, -0.1, world[2]]])
+
+
+def test_gyroscopes_have_other_noise_in_every_step_and_the_same_from_the_same_seed() -> None:
+    nao = BatchedNao(2, seed=0, num_threads=1)
+
+    def standing() -> Floats:
+        nao.reset(np.arange(2), np.zeros((2, 3)), np.random.default_rng(0))
+        nao.reseed(7)
+        read = []
+        for _ in range(40):
+            nao.step(np.zeros((2, 3)))
+            read.append(nao.senses.gyro)
+        return np.array(read)
+
+    first = standing()
+    np.testing.assert_allclose(first[10:].std(axis=0), 0.05, rtol=0.5)
+    np.testing.assert_array_equal(standing(), first)
+
+
+def test_balls_lie_a_metre_ahead_unless_they_are_placed() -> None:
+    nao = BatchedNao(3, seed=0, ball=True, num_threads=1)
+    nao.reset(
+        EVERYONE, np.array([[1.0, 2.0, 0.0], [1.0, 2.0, np.pi / 2], [0, 0, -2.5]]), np.random.default_rng(0)
+    )
+    ahead = [[2.0, 2.0], [1.0, 3.0], [np.cos(2.5), -np.sin(2.5)]]
+    np.testing.assert_allclose(nao.ball, ahead, atol=1e-12)
+
+
 def test_walls_are_felt_and_stop_it() -> None:
     # The wall's face is at x = -6; the robot's toes are 0.1 m ahead of it.
     nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)
@@ -121,6 +171,27 @@ def test_walls_are_felt_and_stop_it() -> None:
         felt |= nao.touching
     assert felt.tolist() == [True, False]
     assert nao.pose[0, 0] > -5.95
+
+
+def test_a_touch_lasts_no_longer_than_the_step_that_felt_it() -> None:
+    nao = BatchedNao(3, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)
+    middle, wall = [-4.0, 4.0, np.pi], [-5.92, 4.0, np.pi]
+    nao.reset(EVERYONE, np.array([wall, wall, middle]), np.random.default_rng(0))
+    nao.step(np.zeros((3, 3)))
+    assert nao.touching.tolist() == [True, True, False]
+    nao.reset(np.array([0]), np.array([wall]), np.random.default_rng(0))
+    assert nao.touching.tolist() == [False, True, False]
+    nao.bodies.qpos[1, 0] += 1.0
+    nao.step(np.zeros((3, 3)))
+    assert nao.touching.tolist() == [True, False, False]
+
+
+def test_a_ball_at_a_wall_is_not_the_robot() -> None:
+    nao = BatchedNao(1, seed=0, maze=U_MAZE, ball=True, spread=IDENTICAL, num_threads=1)
+    nao.reset(np.array([0]), np.array([[-4.0, 4.0, 0.0]]), np.random.default_rng(0), np.array([[-5.96, 4.0]]))
+    nao.step(np.zeros((1, 3)))
+    assert nao.ball[0, 0] > -5.96  # the wall pushes it off
+    assert not nao.touching.any()
 
 
 def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
@@ -160,6 +231,26 @@ def test_a_ball_dead_ahead_is_kicked_too() -> None:
     for _ in range(8):
         nao.step(np.zeros((1, 3)), kick=np.array([True]))
     assert nao.ball[0, 0] > 0.4
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_balls_are_kicked_by_the_foot_on_their_side_wherever_the_robot_looks(side: int) -> None:
+    yaw = np.array([0.0, 1.5, 3.0, -1.5])
+    nao = BatchedNao(4, seed=0, ball=True, spread=IDENTICAL, num_threads=1)
+    ball = np.exp(1j * yaw) * (0.3 + 0.06j * side)
+    nao.reset(
+        np.arange(4),
+        np.column_stack([np.zeros((4, 2)), yaw]),
+        np.random.default_rng(0),
+        np.column_stack([ball.real, ball.imag]),
+    )
+    kicked = np.zeros(4, dtype=bool)
+    for _ in range(8):
+        nao.step(np.zeros((4, 3)), kick=np.ones(4, dtype=bool))
+        gait = nao.gait
+        kicked |= gait.kicking
+        assert (gait.left_swings[gait.kicking] == (side > 0)).all()
+    assert kicked.all()
 
 
 def test_bad_input_is_told() -> None:

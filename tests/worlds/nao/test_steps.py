@@ -40,6 +40,8 @@ def strides(command: Floats, seconds: float, gait: Gait | None = None) -> list[G
         # A turn that leaves nothing of the forward speed: 24 degrees in the wider step.
         ((0.25, 0, np.radians(24) / 0.5 / 0.67), (0, 0, np.radians(24) / 0.5 / 0.67)),
         ((0.25, 0, np.radians(12) / 0.5 / 0.67), (0.25 * 0.75, 0, np.radians(12) / 0.5 / 0.67)),
+        # Half of the 45.4 degrees at which nothing is left of the sideways speed.
+        ((0, 0.2, np.radians(22.7) / 0.5 / 0.67), (0, 0.2 * 0.75, np.radians(22.7) / 0.5 / 0.67)),
     ],
 )
 def test_attainable_speeds(command: tuple[float, ...], attained: tuple[float, ...]) -> None:
@@ -49,6 +51,12 @@ def test_attainable_speeds(command: tuple[float, ...], attained: tuple[float, ..
 def test_a_worn_robot_is_slower() -> None:
     command = np.array([[0.9, 0.0, 0.0], [0.9, 0.0, 0.0]])
     np.testing.assert_allclose(planner(1.0, 0.83).attainable(command)[:, 0], [0.25, 0.25 * 0.83])
+
+
+def test_a_worn_robot_is_slower_in_every_direction() -> None:
+    commands = np.array([[-0.9, 0.0, 0.0], [0.0, -0.9, 0.0], [0.0, 0.0, 9.0]])
+    worn = planner(0.83, 0.83, 0.83).attainable(commands)
+    np.testing.assert_allclose(np.diag(worn), 0.83 * np.array([-0.15, -0.2, np.radians(120)]))
 
 
 def test_forward_speed_is_gained_slowly_and_lost_fast() -> None:
@@ -79,6 +87,16 @@ def test_a_turn_is_split_between_wide_and_narrow_steps() -> None:
     assert not seen[3].left_swings[0]
 
 
+def test_the_foot_on_the_inside_of_a_turn_opens_it() -> None:
+    for sign in (1, -1):
+        assert strides(one(0, 0, sign * 1.0), 2.0)[0].left_swings[0] == (sign > 0)
+
+
+def test_steps_that_end_between_ticks_last_as_long_as_told_on_average() -> None:
+    """Of 0.25 s, or 20.83 ticks, each."""
+    assert len(strides(one(0.1, 0, 0), 60.0)) == pytest.approx(60.0 / 0.25, abs=1.1)
+
+
 def test_planned_velocities_are_the_commanded_ones_over_two_steps() -> None:
     seen = strides(one(0.1, 0.05, 0.4), 4.0)
     mean = (seen[-1].velocity() + seen[-2].velocity()) / 2
@@ -96,6 +114,16 @@ def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
     assert set(kinds[1:-1]) == {STRIDE}
     assert not gait.walking[0]
     assert (gait.after == 0).all()
+
+
+@pytest.mark.parametrize("walked_ticks", range(100, 150, 7))
+def test_feet_are_together_before_the_last_shift_of_weight(walked_ticks: int) -> None:
+    gait = Gait.standing(1, LIMITS)
+    for tick in range(300):
+        command = one(0, 0.2, 0) if tick < walked_ticks else one(0, 0, 0)
+        if planner(1.0).advance(gait, command, TICK_S)[0] and gait.kind[0] == STOP:
+            assert not gait.before.any()
+    assert gait.kind[0] == STOP and not gait.walking[0]
 
 
 def test_robots_that_are_called_to_step_on_the_spot_do() -> None:

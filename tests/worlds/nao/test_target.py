@@ -160,3 +160,79 @@ def test_robots_can_be_stood_where_a_state_believes_them() -> None:
     np.testing.assert_allclose(one.robots.pose[:, :2], state[:, :2], atol=1e-6)
     np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), state[:, 2], atol=1e-6)
     np.testing.assert_allclose(one.robots.ball, state[:, 29:31], atol=1e-6)
+
+
+def test_robots_turn_the_short_way_and_at_most_by_1_rad_a_second() -> None:
+    one = env(count=5, errors=NO_ERRORS)
+    heading = np.array([0.0, 0.0, 3.0, -3.0, 2.0])
+    one.localisation.pose[:, 2] = heading
+    angle = torch.tensor([0.25, np.pi / 2, -3.0, 3.0, 2.0])
+    command = one._body_command(torch.stack([angle.cos(), angle.sin()], dim=1), None)
+    short = 2 * np.pi - 6.0
+    np.testing.assert_allclose(command[:, 2], [0.5, 1.0, 2 * short, -2 * short, 0.0], atol=1e-6)
+    # A full command is 0.25 m/s, told along the heading and to its left.
+    ahead = 0.25 * np.exp(1j * (angle.double().numpy() - heading))
+    np.testing.assert_allclose(command[:, :2], np.column_stack([ahead.real, ahead.imag]), atol=1e-6)
+
+
+def test_commands_are_clipped_and_next_to_none_turns_nobody() -> None:
+    one = env(count=3, errors=NO_ERRORS)
+    one.localisation.pose[:, 2] = 1.0
+    commands = torch.tensor([[7.0, -3.0], [1.0, -1.0], [0.04, 0.0]])
+    wild, tame, standing = one._body_command(commands, None)
+    np.testing.assert_array_equal(wild, tame)
+    assert tame[2] < 0 and standing[2] == 0
+
+
+def test_states_tell_the_planned_velocity_in_the_world() -> None:
+    one = env(count=3, errors=NO_ERRORS)
+    heading = np.array([0.3, 2.0, -2.5])
+    one.localisation.pose[:, 2] = heading
+    gait = one.robots.gait
+    gait.before[:], gait.after[:], gait.duration_s[:] = [0.02, 0.01, 0.1], [0.04, -0.05, 0.1], 0.25
+    # Half of 6 cm forward and of 4 cm to the right in 0.25 s.
+    planned = (0.12 - 0.08j) * np.exp(1j * heading)
+    np.testing.assert_allclose(one.state[:, 4:6], np.column_stack([planned.real, planned.imag]), atol=1e-6)
+    np.testing.assert_allclose(one.state[:, 26:29], np.tile([0.12, -0.08, 0.4], (3, 1)), atol=1e-6)
+
+
+def test_loads_are_those_of_the_left_and_of_the_right_foot() -> None:
+    one = env(count=2)
+    one.robots.bodies.pressure[:] = [[1, 2, 3, 4, 10, 20, 30, 40], [0, 0, 0, 50, 0, 0, 25, 0]]
+    columns = TASKS["nao-navigation"].state_columns[0].names
+    assert columns is not None
+    left, right = columns.index("load_left"), columns.index("load_right")
+    np.testing.assert_allclose(one.state[:, [left, right]], [[0.2, 2.0], [1.0, 0.5]])
+
+
+def test_true_velocities_are_those_of_the_way() -> None:
+    one = env(count=4, errors=NO_ERRORS)
+    for _ in range(8):
+        one.step(torch.tensor([[0.5, 0.0]]).expand(4, 2))
+    start, velocities = one.truth[:, :2], []
+    for _ in range(20):
+        one.step(torch.tensor([[0.5, 0.0]]).expand(4, 2))
+        velocities.append(one.truth[:, 2:4])
+    way = (one.truth[:, :2] - start) / (20 * 0.192)
+    assert way[:, 0].min() > 0.05
+    np.testing.assert_allclose(torch.stack(velocities).mean(0), way, atol=0.04)
+
+
+def test_a_fall_ends_the_episode() -> None:
+    one, half = env(count=2), np.radians(60) / 2
+    one.robots.bodies.qpos[0, 3:7] = [np.cos(half), 0.0, np.sin(half), 0.0]
+    step = one.step(torch.zeros(2, 2))
+    assert one.failed.tolist() == step.terminated.tolist() == [True, False]
+    assert float(step.reward[0]) == pytest.approx(one.objective.failure_reward, abs=0.3)
+    one.reset(step.terminated)
+    assert not one.failed.any() and not one.robots.fallen.any()
+
+
+def test_a_seed_repeats_starts_traits_errors_and_noise() -> None:
+    one, seen = env(), []
+    for seed in (4, 4, 5):
+        one.reseed(seed)
+        first = one.reset()
+        seen.append(torch.cat([first, one.step(torch.full((3, 2), 0.5)).observation], dim=1))
+    assert torch.equal(seen[0], seen[1])
+    assert (seen[0] != seen[2]).any(dim=1).all()

@@ -49,6 +49,16 @@ def test_the_supporting_foot_moves_back_evenly_and_the_swinging_one_comes_forwar
     assert feet_at(0.25)[0][0] == pytest.approx(ahead - 0.02 + 0.04 * (1 - 0.5**0.5) / 2)
 
 
+def test_each_direction_of_a_step_has_its_own_scale() -> None:
+    scaled, spread = engine(style=WalkStyle(step_scale=(1.1, 1.3, 0.9))), [[0.04, 0.1, 0.0]]
+    left, right = scaled.feet(striding(phase=1.0, before=spread, after=spread))[0]
+    assert left[0] - right[0] == pytest.approx(1.1 * 0.04)
+    assert left[1] - right[1] == pytest.approx(2 * HIP_OFFSET_Y_M + 1.3 * 0.1)
+    turn = [[0.0, 0.0, 0.4]]
+    left, right = scaled.feet(striding(phase=1.0, before=turn, after=turn))[0]
+    assert left[5] - right[5] == pytest.approx(0.9 * 0.4)
+
+
 def test_only_the_swinging_foot_is_lifted_and_most_in_the_middle() -> None:
     ground = -STYLE.hip_height_m - HIP_OFFSET_Z_M
     heights = np.array([feet_at(phase)[:, 2] for phase in (0.0, 1 / 6, 0.5, 1.0)]) - ground
@@ -92,6 +102,20 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
     assert sway.min() > -0.05 and sway.max() < 0
     acceleration = (sway[0] - 2 * sway[1] + sway[2]) / dt**2
     np.testing.assert_allclose(acceleration, rate**2 * (sway[1] + STYLE.sway_foot_m), rtol=1e-3)
+
+
+def test_the_torso_is_a_pendulum_on_the_supporting_foot_in_steps_to_the_side_too() -> None:
+    style, dt = WalkStyle(), 1e-3
+    assert style.sway_foot_m == HIP_OFFSET_Y_M
+    phases = np.linspace(0.1, 0.9, 9) + np.array([-1, 0, 1])[:, None] * dt / LIMITS.step_s
+    step = {"before": [[0.0, 0.02, 0.0]], "after": [[0.0, 0.06, 0.0]]}
+
+    def right_foot(phase: float) -> float:
+        return float(engine(style=style).feet(striding(phase=phase, **step))[0, 1, 1])
+
+    right = np.array([[right_foot(phase) for phase in row] for row in phases])
+    acceleration = (right[0] - 2 * right[1] + right[2]) / dt**2
+    np.testing.assert_allclose(acceleration, GRAVITY / style.pendulum_m * right[1], rtol=1e-3)
 
 
 def test_first_and_last_step_lead_from_rest_to_the_strides_speed_and_back() -> None:
@@ -143,3 +167,9 @@ def test_a_kick_waits_for_the_foot_that_is_asked_for_and_keeps_the_robot_steppin
         assert kicking and set(kicking) == {swings_left}
     still = engine().advance(Gait.standing(1, LIMITS), np.zeros((1, 3)), 120, np.array([[False, False]]))
     assert not any(gait.walking[0] for gait in still.gaits)
+
+
+def test_kicks_wait_for_the_first_stride() -> None:
+    targets = engine().advance(Gait.standing(1, LIMITS), np.zeros((1, 3)), 60, np.array([[True, True]]))
+    kicking = [gait for gait in targets.gaits if gait.kicking[0]]
+    assert kicking and {int(gait.kind[0]) for gait in kicking} == {STRIDE}

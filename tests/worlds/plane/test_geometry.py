@@ -82,6 +82,13 @@ def test_bodies_turn_as_a_matrix_says(change: PlanarMap) -> None:
     np.testing.assert_allclose(rotation_matrix(moved), expected, atol=1e-12)
 
 
+def test_half_a_turn_is_minus_pi() -> None:
+    turns = np.array([np.pi, -np.pi, 3 * np.pi, 0.5 - 2 * np.pi])
+    expected = [-np.pi, -np.pi, -np.pi, 0.5]
+    np.testing.assert_allclose(wrapped(turns), expected, atol=1e-12)
+    np.testing.assert_allclose(wrapped(torch.from_numpy(turns)), expected, atol=1e-12)
+
+
 @pytest.mark.parametrize("column", COLUMNS.values(), ids=COLUMNS)
 def test_columns_of_every_task_tell_all(column: Column) -> None:
     words = column.astra or {}

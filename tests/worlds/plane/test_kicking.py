@@ -50,6 +50,11 @@ def test_recorded_episodes_begin_near_the_ball() -> None:
         ((-1.99, 1.99), False, False),
         ((1.6, -0.74), True, False),
         ((1.6, -0.76), False, True),
+        # Lines belong to the field, posts and goal line to the goal.
+        ((1.5, 0.75), True, False),
+        ((1.5, 1.0), False, True),
+        ((-2.0, 2.0), False, False),
+        ((0.0, -2.0), False, False),
     ],
 )
 def test_a_ball_is_in_the_goal_in_the_field_or_out(

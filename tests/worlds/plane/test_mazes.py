@@ -90,6 +90,18 @@ def test_a_margin_keeps_paths_away_from_corners() -> None:
     assert wide[start] < 2 * np.hypot(6.0, 3.0) + 6.0 + 1.0
 
 
+def test_who_goes_downhill_keeps_the_margin_all_the_way() -> None:
+    goal = np.array([-4.0, -4.0])
+    field, clearance = U_MAZE.distance_field(goal, margin=1.0), []
+    row, column = map(int, U_MAZE.fine_index(np.array([-4.0, 4.0])))
+    while field[row, column] > 0:
+        around = [(row + dy, column + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+        row, column = min(around, key=lambda cell: float(field[cell]))
+        clearance.append(float(U_MAZE.clearance_field[row, column]))
+    assert [row, column] == [*map(int, U_MAZE.fine_index(goal))]
+    assert 0.9 < min(clearance) < 1.1
+
+
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [
@@ -107,6 +119,24 @@ def test_a_margin_keeps_paths_away_from_corners() -> None:
 def test_a_maze_that_cannot_be_is_refused(changes: dict[str, Any], fault: str) -> None:
     with pytest.raises(BadInputError, match=f"maze: {fault}"):
         replace(CORRIDOR, **changes)
+
+
+def test_every_fault_of_a_maze_is_told_at_once() -> None:
+    faults = r"maze: start: expected .* got \(0, 0\); goal: expected .* got \(9, 9\); fine_m: expected a half"
+    with pytest.raises(BadInputError, match=faults):
+        replace(CORRIDOR, start=(0, 0), goal=(9, 9), fine_m=3.0)
+
+
+@pytest.mark.parametrize(("scale", "fine_m"), [(0.0, 0.1), (-4.0, -0.1), (-4.0, 0.1)])
+def test_cells_have_a_size(scale: float, fine_m: float) -> None:
+    with pytest.raises(BadInputError, match="maze: fine_m: expected a half of the scale"):
+        replace(CORRIDOR, scale=scale, fine_m=fine_m)
+
+
+def test_cells_of_a_maze_that_is_not_square_are_where_they_are_drawn() -> None:
+    assert CORRIDOR.half_extent.tolist() == [14.0, 6.0]
+    assert (CORRIDOR.cell_centre(0, 0), CORRIDOR.cell_centre(1, 5)) == ((-12.0, 4.0), (8.0, 0.0))
+    assert CORRIDOR.fine_walls.shape == (120, 280)
 
 
 def test_there_is_no_distance_to_a_goal_in_a_wall() -> None:

@@ -141,6 +141,22 @@ def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -
     assert arms == pytest.approx(2 * 10.4 * 2.4 / (2 * 10.4 * 2.4 + 4 * 2.4), abs=0.03)
 
 
+def test_starts_anywhere_are_anywhere_in_the_cells_of_the_grid() -> None:
+    points = TASK.draw_anywhere(np.random.default_rng(0), 4000)[:, :2]
+    within = (points + U_MAZE.half_extent) / U_MAZE.fine_m % 1.0
+    # Uniform from 0 to 1, along both axes and without regard to each other.
+    assert within.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.02)
+    assert within.std(axis=0) == pytest.approx([12**-0.5] * 2, abs=0.01)
+    assert np.corrcoef(within.T)[0, 1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_failure_is_paid_for_its_way_too() -> None:
+    goal = torch.tensor([[-4.0, -4.0]])
+    before, after = goal + torch.tensor([[3.0, 0.0]]), goal + torch.tensor([[2.0, 0.0]])
+    task = Navigation(U_MAZE, horizon=9, reward_kind="euclidean")
+    assert float(task.reward(before, after, goal, torch.tensor([True]))) == pytest.approx(1.0 - 10.0)
+
+
 def test_draws_repeat() -> None:
     first = TASK.draw_anywhere(np.random.default_rng(7), 5)
     np.testing.assert_array_equal(first, TASK.draw_anywhere(np.random.default_rng(7), 5))

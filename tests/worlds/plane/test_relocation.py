@@ -91,6 +91,14 @@ def test_turns_that_lengthen_a_command_beyond_its_limit_are_drawn_again() -> Non
     assert len({round(float(x), 3) for x, _ in turned}) == 20
 
 
+def test_any_turn_is_as_likely_as_any_other() -> None:
+    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
+    path.columns[ACTION][:] = 0.1
+    turns = np.array([change.rotation_rad for change, _ in draws(400, path, rotations="any")])
+    quarter = np.histogram(turns, np.linspace(-np.pi, np.pi, 5))[0]
+    assert quarter.tolist() == pytest.approx([100] * 4, abs=35)
+
+
 def test_without_translation_a_stretch_starts_where_it_did() -> None:
     path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
     for change, steps in draws(10, path, translations=False):
@@ -145,6 +153,18 @@ def test_an_episode_that_just_stops_is_truncated() -> None:
     judged = outcomes(TASK.objective, before, after, AIM, np.zeros(10, dtype=bool))
     assert judged["next.truncated"].tolist() == judged["next.done"].tolist() == [False] * 9 + [True]
     assert not judged["next.terminated"].any()
+
+
+def test_each_copy_has_a_goal_of_its_own_among_those_of_the_task() -> None:
+    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
+    columns = {**path.columns, GOAL: np.tile(AIM, (20, 1)), TERMINATED: np.zeros(20, bool)}
+    episode = Episode(0, columns | {SUCCESS: np.zeros(20, bool)})
+    moving, rng = [TASK.state, replace(TASK.state, name=NEXT_STATE), TASK.action], np.random.default_rng(0)
+    copies = [relocation().copied(episode, moving, rng) for _ in range(12)]
+    goals = np.array([copy.columns[GOAL] for copy in copies if copy is not None])
+    assert len(goals) == 12 and (goals == goals[:, :1]).all()
+    assert len(np.unique(goals[:, 0], axis=0)) == 12
+    assert 0.0 < np.abs(goals - AIM).max() <= 0.6 + 1e-6
 
 
 def kick(steps: int, ball_m: float, *, ends: bool = False) -> Episode:

@@ -183,6 +183,14 @@ def test_sensors_show_other_states_than_the_true_ones() -> None:
     assert torch.equal(varied.true_state, torch.stack([here[0], torch.zeros(8), here[2]]))
 
 
+def test_what_is_observed_after_a_reset_is_not_the_callers_tensor() -> None:
+    _, varied = resting(3, 5, PlanarVariation())
+    given = HERE.clone()
+    varied.reset_to(given)
+    given.zero_()
+    assert torch.equal(varied.state, HERE) and torch.equal(varied.true_state, HERE)
+
+
 def test_noise_is_for_velocities_and_not_for_the_wish_to_kick() -> None:
     torch.manual_seed(0)
     inner, varied = resting(20_000, 8, BallVariation(action_noise=(0.1, 0.1)))
