@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.ant.body import ant_model, standing_pose
+from astra_data.worlds.ant.body import VelocityController, ant_model, standing_pose
 from astra_data.worlds.ant.target import AntMazeEnv
 from astra_data.worlds.batched_mujoco import wall_geoms
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -105,6 +105,20 @@ def test_commands_are_clipped() -> None:
         first = wild.step(torch.tensor([[7.0, -3.0]]))
         second = tame.step(torch.tensor([[1.0, -1.0]]))
     assert torch.equal(first.observation[:, :29], second.observation[:, :29])
+
+
+def test_ants_follow_the_controller_that_they_are_given() -> None:
+    limp = VelocityController([(torch.zeros(8, 28), torch.ones(8))], torque_scale=0.0)
+    env = AntMazeEnv(TASK, 1, seed=0, controller=limp, num_threads=1)
+    env.reset()
+    model = ant_model(U_MAZE)
+    data = mujoco.MjData(model)
+    data.qpos[:] = env.physics.qpos[0]
+    mujoco.mj_forward(model, data)
+    for _ in range(10):
+        env.step(torch.ones(1, 2))
+        mujoco.mj_step(model, data, 5)
+    np.testing.assert_allclose(env.physics.qpos[0], data.qpos, atol=1e-9)
 
 
 def test_starts_goals_and_headings() -> None:

@@ -139,6 +139,18 @@ def test_a_foot_waits_as_soon_as_the_torso_turns_toward_it(roll_rate: float, wai
     assert (followed[0] < TICKS) == waits
 
 
+def test_a_robot_that_waits_stands_on_both_feet() -> None:
+    """Both ankles push against the rates that are measured then, whichever foot is planned to carry."""
+    style = replace(STYLE, gyro_gain=(0.1, 0.2), gyro_keep=0.0)
+    robots, measured, planned = bodies(height_m=1.0, style=style), noise(), targets(carries=(False, True))
+    measured[0, 0, :2] = [-2.0, 0.8]
+    planned.lifts_off[:, 0] = 1
+    followed = robots.step(np.array([0]), planned, measured)
+    assert followed[0] < TICKS
+    added = robots.sent[0, FIRST] - STANDING[TO_MOTORS]
+    assert added[[4, 5, 10, 11]] == pytest.approx([0.08, -0.4] * 2, abs=2e-3)
+
+
 def test_the_gyroscope_reads_the_last_rates_with_their_noise() -> None:
     robots, measured = bodies(height_m=1.0), noise()
     measured[0, :, 2] = 9.0

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -50,6 +52,15 @@ def test_an_outer_corner_met_diagonally_lets_one_axis_pass() -> None:
     reached, stopped = slide(PILLAR, [-1.12, -1.12], [-1.08, -1.08])
     assert reached == pytest.approx([-1.08, -1.1], abs=2e-4)
     assert stopped
+
+
+@pytest.mark.parametrize(("fine_m", "radius_m"), [(0.1, 0.3), (0.1, 0.6), (0.05, 0.35), (0.25, 0.75)])
+def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float) -> None:
+    """Also where a radius is a hair less than its number of cells, as 0.3 / 0.1 is."""
+    free = FreeSpace.of_maze(replace(ROOM, fine_m=fine_m), radius_m=radius_m)
+    inside, outside = 2.0 - radius_m - fine_m / 2, 2.0 - radius_m + fine_m / 2
+    points = torch.tensor([[inside, 0.0], [0.0, -inside], [outside, 0.0], [0.0, -outside]])
+    assert free.blocked[free.cells(points)].tolist() == [False, False, True, True]
 
 
 def test_a_long_walk_never_leaves_the_free_space() -> None:

@@ -120,6 +120,11 @@ def test_goals_have_to_be_within_their_cell() -> None:
     ]
 
 
+def test_the_way_to_the_farthest_goals_that_are_drawn_ends_at_them() -> None:
+    corners = torch.tensor([U_MAZE.cell_centre(*U_MAZE.goal)]) + torch.tensor([[-0.6, -0.6], [0.6, -0.6]])
+    assert TASK.goal_distance(corners, corners).tolist() == pytest.approx([0.0, 0.0], abs=0.1)
+
+
 def test_paths_to_the_goal_keep_the_clearance() -> None:
     maze = replace(U_MAZE, scale=1.0, fine_m=0.05)
     distance = Navigation(maze, horizon=1, spread_m=0.05, path_clearance_m=0.25).goal_distance
