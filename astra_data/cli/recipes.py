@@ -14,7 +14,10 @@ RecipePath = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).", show_default=False)
 ]
 RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE", help="Recipes (TOML files).")]
-Method = Annotated[str | None, typer.Option(help="Run only this row of the recipe.", show_default=False)]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option("--method", help="Run only this row of the recipe; may be repeated.", show_default=False),
+]
 Seeds = Annotated[
     list[int] | None,
     typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.", show_default=False),
@@ -101,13 +104,15 @@ def _of_networks(stage: str, summary: str) -> Callable[..., None]:
 
     def command(
         recipe: RecipePath,
-        method: Method = None,
+        methods: Methods = None,
         seeds: Seeds = None,
         jobs: Jobs = None,
         device: Device = "cpu",
         root: Root = RUNS,
     ) -> None:
-        run_stage(recipe, stage, method=method, seeds=seeds or (), jobs=jobs, device=device, root=root)
+        run_stage(
+            recipe, stage, methods=methods or (), seeds=seeds or (), jobs=jobs, device=device, root=root
+        )
 
     command.__doc__ = summary
     return command
@@ -122,7 +127,7 @@ align = _of_networks("align", "Fit the target encoder so that its latents match 
 
 def evaluate(
     recipe: RecipePath,
-    method: Method = None,
+    methods: Methods = None,
     seeds: Seeds = None,
     jobs: Jobs = None,
     root: Root = RUNS,
@@ -141,11 +146,11 @@ def evaluate(
     if policy is None:
         if out is not None:
             raise BadInputError("evaluate: --out goes with --policy; without it, leave out --out")
-        run_stage(recipe, "evaluate", method=method, seeds=seeds or (), jobs=jobs, root=root)
+        run_stage(recipe, "evaluate", methods=methods or (), seeds=seeds or (), jobs=jobs, root=root)
         return
-    if method is None or out is None or len(seeds or ()) != 1 or jobs is not None:
+    if not (methods and seeds and out) or len(methods) + len(seeds) > 2 or jobs is not None:
         raise BadInputError(
-            "evaluate: with --policy, give --method, one --seed and --out, and leave out --jobs"
+            "evaluate: with --policy, give one --method, one --seed and --out, and leave out --jobs"
         )
     from astra_data.experiments.display import shown
     from astra_data.experiments.grounded_env import evaluate_policy
@@ -153,7 +158,7 @@ def evaluate(
 
     with shown("evaluate") as progress:
         evaluate_policy(
-            root / recipe.stem, method, own_object(policy), out=out, seed=(seeds or [0])[0], progress=progress
+            root / recipe.stem, methods[0], own_object(policy), out=out, seed=seeds[0], progress=progress
         )
     typer.echo(f"finished: {out}")
 
@@ -170,7 +175,7 @@ def run_stage(
     stage: str,
     *,
     root: Path,
-    method: str | None = None,
+    methods: Sequence[str] = (),
     seeds: Sequence[int] = (),
     jobs: int | None = None,
     device: str = "cpu",
@@ -184,7 +189,7 @@ def run_stage(
         folder = run(
             recipe,
             stage,
-            method=method,
+            methods=methods,
             seeds=seeds,
             root=root,
             jobs=jobs,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.recipes import Device, Jobs, RecipePath, Root, Seeds, Until, resumable, show_made
+from astra_data.cli.recipes import Device, Jobs, Methods, RecipePath, Root, Seeds, Until, resumable, show_made
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS
 
@@ -19,12 +19,7 @@ class Engine(StrEnum):
 
 def sweep(
     recipe: RecipePath,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--method", help="Run only this row of the recipe; may be repeated.", show_default=False
-        ),
-    ] = None,
+    methods: Methods = None,
     seeds: Seeds = None,
     percents: Annotated[
         list[int] | None,

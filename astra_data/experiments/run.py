@@ -86,7 +86,7 @@ def run_stage(
     recipe_path: Path,
     stage: str,
     *,
-    method: str | None = None,
+    methods: Sequence[str] = (),
     seeds: Sequence[int] = (),
     root: Path = RUNS,
     jobs: int | None = None,
@@ -94,7 +94,7 @@ def run_stage(
     publish: bool = False,
     add: bool = False,
 ) -> Path:
-    """Make the artefacts of one stage of a recipe, of one `method` and of some `seeds` only where given.
+    """Make the artefacts of one stage of a recipe, of some `methods` and `seeds` only where given.
 
     With `publish`, the report is also copied to the published results; with `add`, it includes the results
     that are published already.
@@ -117,7 +117,7 @@ def run_stage(
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
-    part = Selection.of(recipe, () if method is None else (method,), seeds)
+    part = Selection.of(recipe, methods, seeds)
     if add:
         experiment.published()
     planned = plan(
@@ -129,7 +129,7 @@ def run_stage(
         publish=experiment.results if publish else None,
         add_to=experiment.published_in if add else None,
     )
-    make(experiment, _selected(planned, stage, method), jobs=jobs, device=device)
+    make(experiment, _selected(planned, stage, methods), jobs=jobs, device=device)
     return folder / stage
 
 
@@ -270,15 +270,12 @@ def finished(item: Item, experiment: Experiment) -> bool:
     return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
 
 
-def _selected(items: tuple[Item, ...], stage: str, method: str | None) -> list[Item]:
-    if method is not None and stage in ("ground", "align"):
-        method = grounded_as(method)
-
-    def is_asked_for(key: str) -> bool:
-        made_by, *row_and_seed = key.split("/")
-        return made_by == stage and method in (None, *row_and_seed[:-1])
-
-    selected = [item for item in items if is_asked_for(item.key)]
-    if not selected:
-        raise BadInputError(f"{method or 'the recipe'} has no stage '{stage}'")
-    return selected
+def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> list[Item]:
+    selected = [item for item in items if stage_of(item) == stage]
+    if not selected and not methods:
+        raise BadInputError(f"the recipe has no stage '{stage}'")
+    rows = dict.fromkeys(map(grounded_as, methods) if stage in ("ground", "align") else methods)
+    for row in rows:
+        if not any(row in item.key.split("/") for item in selected):
+            raise BadInputError(f"{row} has no stage '{stage}'")
+    return [item for item in selected if not rows or not rows.keys().isdisjoint(item.key.split("/"))]

@@ -58,10 +58,10 @@ def test_a_run_ends_with_the_pages_to_look_at(
 @pytest.mark.parametrize(
     ("stage", "takes"),
     [
-        ("ground", {"method", "seeds", "jobs", "device"}),
-        ("train", {"method", "seeds", "jobs", "device"}),
-        ("align", {"method", "seeds", "jobs", "device"}),
-        ("evaluate", {"method", "seeds", "jobs"}),
+        ("ground", {"methods", "seeds", "jobs", "device"}),
+        ("train", {"methods", "seeds", "jobs", "device"}),
+        ("align", {"methods", "seeds", "jobs", "device"}),
+        ("evaluate", {"methods", "seeds", "jobs"}),
         ("report", {"seeds", "publish", "add"}),
         ("pair", {"seeds", "jobs"}),
         ("subset", {"seeds", "jobs"}),
@@ -78,7 +78,7 @@ def test_a_command_passes_its_options_to_its_stage(
 
     monkeypatch.setattr("astra_data.experiments.run.run_stage", run_stage)
     words = {
-        "method": (["--method", "astra"], "astra"),
+        "methods": (["--method", "nas", "--method", "astra"], ["nas", "astra"]),
         "seeds": (["--seed", "4", "--seed", "7"], [4, 7]),
         "jobs": (["--jobs", "3"], 3),
         "device": (["--device", "cuda:1"], "cuda:1"),
@@ -88,7 +88,7 @@ def test_a_command_passes_its_options_to_its_stage(
     given = [word for name in sorted(takes) for word in words[name][0]]
     result = CliRunner().invoke(cli.app, [stage, str(recipe), "--root", str(tmp_path), *given])
     assert result.output == f"finished: {tmp_path / 'made'}\n"
-    defaults = {"method": None, "seeds": (), "jobs": None, "device": "cpu", "publish": False, "add": False}
+    defaults = {"methods": (), "seeds": (), "jobs": None, "device": "cpu", "publish": False, "add": False}
     expected = defaults | {name: words[name][1] for name in takes} | {"root": tmp_path}
     assert asked == [(recipe, stage, expected)]
 

@@ -322,8 +322,9 @@ def test_the_command_says_what_a_policy_of_ones_own_is_given_with(tmp_path: Path
         [*policy, *one],
         [*policy, *out, "--seed", "0"],
         [*policy, *out, *one, "--seed", "1"],
+        [*policy, *out, *one, "--method", "astra"],
     ):
-        with pytest.raises(BadInputError, match="with --policy, give --method, one --seed and --out"):
+        with pytest.raises(BadInputError, match="with --policy, give one --method, one --seed and --out"):
             app(["evaluate", "cart.toml", *given], standalone_mode=False)
     with pytest.raises(BadInputError, match="--out goes with --policy"):
         app(["evaluate", "cart.toml", *one, *out], standalone_mode=False)

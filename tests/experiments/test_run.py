@@ -152,7 +152,19 @@ def test_a_task_is_walked_through_where_its_policies_are_trained(
 @pytest.mark.parametrize("stage", ["ground", "align"])
 def test_a_row_is_grounded_and_aligned_as_its_method(recipe: Path, tmp_path: Path, stage: str) -> None:
     with pytest.raises(MissingStageError, match="pair/seed_0 is missing"):
-        run_stage(recipe, stage, method="astra_plus", root=tmp_path)
+        run_stage(recipe, stage, methods=["astra_plus"], root=tmp_path)
+
+
+def test_several_rows_of_a_stage(recipe: Path, tmp_path: Path) -> None:
+    rows = ["direct_transfer", "astra", "astra_plus"]
+    recipe.write_text(
+        recipe.read_text().replace('"astra", "astra_plus"', ", ".join(f'"{row}"' for row in rows))
+    )
+    run(recipe, root=tmp_path, until="ground")
+    folder = run_stage(recipe, "train", methods=["direct_transfer", "astra_plus"], root=tmp_path)
+    assert sorted(row.name for row in folder.iterdir()) == ["astra_plus", "direct_transfer"]
+    with pytest.raises(BadInputError, match=r"^direct_transfer has no stage 'align'$"):
+        run_stage(recipe, "align", methods=["astra", "direct_transfer"], root=tmp_path)
 
 
 def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> None:
@@ -191,7 +203,7 @@ def test_a_folder_in_use_is_left_alone(recipe: Path, tmp_path: Path, monkeypatch
 
 def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> None:
     with pytest.raises(MissingStageError) as caught:
-        run_stage(recipe, "train", method="astra", root=tmp_path)
+        run_stage(recipe, "train", methods=["astra"], root=tmp_path)
     root = tmp_path / "r"
     assert str(caught.value) == (
         f"{root / 'pair/seed_0'} is missing: run `astra-data pair {recipe} --root {tmp_path}` first"
@@ -267,9 +279,9 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     ("arguments", "message"),
     [
         ({"stage": "trian"}, "unknown stage 'trian': did you mean 'train'?"),
-        ({"stage": "train", "method": "astr"}, "the recipe has no method 'astr': did you mean 'astra'?"),
+        ({"stage": "train", "methods": ["astr"]}, "the recipe has no method 'astr': did you mean 'astra'?"),
         ({"stage": "augment"}, "the recipe has no stage 'augment'"),
-        ({"stage": "pair", "method": "astra"}, "astra has no stage 'pair'"),
+        ({"stage": "pair", "methods": ["astra"]}, "astra has no stage 'pair'"),
         ({"stage": "train", "seeds": [0, 3]}, "the recipe has no seed 3; its seeds: 0"),
         ({"stage": "collect", "device": "gpu"}, "expected a device such as cpu, cuda or cuda:1, got 'gpu'"),
     ],
