@@ -2,38 +2,41 @@
 
 import numpy as np
 
-from astra_data.dataset.columns import ACTION, STATE, SUCCESS, TERMINATED, TIMESTAMP, Column
+from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP, Column
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.field_names import Role
 from astra_data.exchange.logs import Field, Logs
 
 _FAILED = "failed"
-_ROLES: dict[str, Role] = {STATE: "state", ACTION: "command"}
+_ROLES: dict[str, Role] = {STATE: "state", ACTION: "command", GOAL: "goal"}
 
 
 def logs_of(data: Dataset) -> Logs:
-    """Return the episodes of `data` as logs: its states and commands by their own names, and failures.
+    """Return the episodes of `data` as logs: its states, commands and goals by their own names, and failures.
 
     Raises:
         BadInputError: it has no states or commands, or a value is not finite.
         CorruptDatasetError: a file cannot be read, or values differ from their digests.
     """
     fields = [Field(TIMESTAMP, "time", "time", "s", 1.0, f"{data.info['fps']} rows a second")]
-    columns = data.specs([STATE, ACTION])
+    read = [STATE, ACTION, *(name for name in (GOAL,) if name in data.features)]
+    columns = data.specs(read)
     of_columns = [field for column in columns for field in _fields(column)]
     fields += of_columns
     ends = [name for name in (TERMINATED, SUCCESS) if name in data.features]
-    if TERMINATED in ends:
-        fields.append(Field(_FAILED, "failure", "failure", "1", 1.0, f"{TERMINATED}, and no success"))
-    episodes = []
-    for episode in data.episodes([STATE, ACTION, *ends]):
+    episodes, failures = [], 0
+    for episode in data.episodes([*read, *ends]):
         values = np.column_stack([episode.columns[column.name] for column in columns]).astype(float)
         found = {field.name: series for field, series in zip(of_columns, values.T, strict=True)}
         found[TIMESTAMP] = np.arange(len(values)) / data.info["fps"]
         if TERMINATED in ends:
             failed = episode.columns[TERMINATED] & ~episode.columns.get(SUCCESS, np.zeros(len(values), bool))
             found[_FAILED] = failed.astype(float)
+            failures += bool(failed.any())
         episodes.append(found)
+    if TERMINATED in ends:
+        why = f"{TERMINATED}, and no success: {failures} of {len(episodes)} episodes"
+        fields.append(Field(_FAILED, "failure", "failure", "1", 1.0, why))
     return Logs(tuple(fields), tuple(episodes), {})
 
 

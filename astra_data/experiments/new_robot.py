@@ -29,7 +29,7 @@ from astra_data.exchange.logs import Logs
 from astra_data.experiments.fitted_kinds import Bicycle, Differential
 from astra_data.experiments.planar_kinds import Holonomic, Planar
 from astra_data.experiments.robot_kinds import Direct
-from astra_data.experiments.written_values import significant, texts
+from astra_data.experiments.written_values import numbers, significant, texts
 
 _COLUMNS: dict[Role, str] = {
     "state": STATE,
@@ -69,7 +69,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
         kind = next(filter(None, (one.of(found) for one in kinds)), None) or Direct.of(found)
         values = _common(name, found) | kind.values()
         values["simulator"] = kind.simulator
-        values |= _of_dataset(data.root) if data else _of_mapping(name, places)
+        values |= _of_dataset(data.root, found) if data else _of_mapping(name, places)
         written_as = {
             kind.template: f"{name}.py",
             "recipe.toml": f"{name}.toml",
@@ -115,12 +115,14 @@ def _folder(place: Path) -> Path | None:
     return folder if folder != place or (folder / INFO_PATH).is_file() else None
 
 
-def _of_dataset(root: Path) -> dict[str, str]:
-    """Return what recipe and page say where the data are a dataset."""
+def _of_dataset(root: Path, logs: Logs) -> dict[str, str]:
+    """Return what recipe, page and task say where the data are a dataset."""
     place = str(root.resolve())
-    return {"data": _toml(place), "dataset": shlex.quote(place)} | dict.fromkeys(
-        ("and_mapping", "versions", "import_line", "mapping_row"), ""
-    )
+    return {
+        "data": _toml(place),
+        "dataset": shlex.quote(place),
+        "goals": _recorded_goals(logs),
+    } | dict.fromkeys(("and_mapping", "versions", "import_line", "mapping_row"), "")
 
 
 def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
@@ -130,6 +132,7 @@ def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
         "logs": places,
         "data": _toml(f"{name}-logs@data-1.0.0"),
         "dataset": f"{name}-logs",
+        "goals": "",
         "and_mapping": " and `logs.toml`",
         "versions": "\nAfter a change of `logs.toml` give it a `version`, and the recipe's `data` the same.",
         "import_line": f"astra-data import {places} --mapping logs.toml  # a dataset, {name}-logs\n",
@@ -217,6 +220,19 @@ def _goals(logs: Logs) -> str:
         "# objective goal_size and draw_goals:\n"
         f'# [columns."{GOAL}"]\n# fields = {_toml([field.name for field in goals])}\n'
         f"# scale = {_toml([field.scale for field in goals])}\n"
+    )
+
+
+def _recorded_goals(logs: Logs) -> str:
+    """Return what an objective says of goals that its data have; nothing without any."""
+    if not (fields := logs.of("goal")):
+        return ""
+    goals = np.concatenate(logs.values(fields))
+    low, high = numbers(goals.min(axis=0)), numbers(goals.max(axis=0))
+    return (
+        f"\n    goal_size = {len(fields)}  # CHECK: {GOAL} of the data, which nothing below uses\n\n"
+        "    def draw_goals(self, rng, count):  # CHECK: where goals were\n"
+        f"        return rng.uniform({low}, {high}, (count, {len(fields)}))"
     )
 
 

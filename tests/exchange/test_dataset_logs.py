@@ -7,6 +7,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
+    GOAL,
     OUTCOME_COLUMNS,
     STATE,
     SUCCESS,
@@ -52,6 +53,8 @@ def test_states_commands_and_failures_are_fields_of_logs(tmp_path: Path) -> None
     np.testing.assert_array_equal(logs.values(logs.of("state"))[1], 1 + np.arange(10).reshape(5, 2))
     np.testing.assert_array_equal(logs.values(logs.of("command"))[2][:, 0], np.arange(6) - 2)
     assert logs.failed == [False, True, False]
+    assert [field.why for field in logs.of("failure")] == ["next.terminated, and no success: 1 of 3 episodes"]
+    assert logs.of("goal") == ()
     assert (logs.rate, logs.uneven, logs.left_out) == (20, "", {})
 
 
@@ -59,3 +62,14 @@ def test_without_outcomes_nothing_fails(tmp_path: Path) -> None:
     logs = logs_of(recorded(tmp_path / "data", POSE, SPEED, fps=7))
     assert logs.failed == [False, False, False] and logs.rate == 7
     assert not logs.of("failure")
+
+
+def test_goals_are_fields_of_logs(tmp_path: Path) -> None:
+    goals = Column(GOAL, size=2, names=("goal_x", "goal_y"), astra={"unit": ["m", "m"]})
+    data = tmp_path / "data"
+    with writer(data, columns=(POSE, SPEED, goals)) as out:
+        values = np.arange(6, dtype=np.float32).reshape(3, 2)
+        out.add(Episode(0, {STATE: values, ACTION: values[:, 0], GOAL: 2 * values}))
+    logs = logs_of(Dataset.open(data))
+    assert [(field.short, field.unit) for field in logs.of("goal")] == [("goal_x", "m"), ("goal_y", "m")]
+    np.testing.assert_array_equal(logs.values(logs.of("goal"))[0], 2 * values)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from astra_data.cli.app import app
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import DatasetWriter
-from astra_data.dataset.columns import ACTION, STATE, Column, Episode
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.experiments.new_robot import write_robot
 from astra_data.experiments.run import check, run
@@ -463,3 +464,24 @@ def test_what_never_moves_is_a_part_of_the_task(tmp_path: Path) -> None:
     assert least <= 0.5 < largest
     observed = task.objective.observe(torch.from_numpy(angles), torch.zeros(30, 0))
     assert observed.isfinite().all()
+
+
+@pytest.mark.parametrize("names", [("x", "y"), ("shoulder.pos", "elbow.pos")])
+def test_a_dataset_with_goals_is_taken_as_it_is(names: tuple[str, str], tmp_path: Path) -> None:
+    state = Column(STATE, size=2, names=names)
+    columns = (state, replace(state, name=NEXT_STATE), Column(ACTION, size=2), Column(GOAL, size=3))
+    with DatasetWriter(Path("arm"), columns=columns, fps=10, task="reach", description=DESCRIPTION) as out:
+        for uid in range(3):
+            ways = np.random.default_rng(uid).normal(size=(30, 2)).astype(np.float32)
+            goals = np.full((30, 3), uid, np.float32)
+            states = np.cumsum(ways, axis=0)
+            values = {STATE: states, NEXT_STATE: states + ways, ACTION: ways, GOAL: goals}
+            out.add(Episode(uid, values))
+    shown = CliRunner().invoke(app, ["new", "reach", "--from", "arm"])
+    assert shown.exit_code == 0, shown.output
+    assert f"| `{GOAL} g2` | goal | 1 | 1 | its column |" in Path("reach/README.md").read_text()
+    task = task_named("reach/reach.py:TASK")
+    assert check_task(task) == [] and task.objective.goal_size == 3
+    drawn = task.objective.draw_goals(np.random.default_rng(0), 99)
+    assert drawn.shape == (99, 3) and 0 <= drawn.min() < 0.1 and 1.9 < drawn.max() <= 2
+    assert check(Path("reach/reach.toml"))["data"].state == "finished"
