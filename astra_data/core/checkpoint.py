@@ -10,8 +10,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import read_manifest
 
 type Nested = (
     Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
@@ -48,10 +50,17 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read the tensors (on the CPU) and the metadata that `save_tensors` wrote.
 
     Raises:
-        BadInputError: the file is missing, damaged, or not from `save_tensors`.
+        BadInputError: the file is missing, damaged, not the one of the manifest beside it, or not from
+            `save_tensors`.
     """
     if not path.is_file():
         raise BadInputError(f"{path} does not exist: expected a safetensors file")
+    manifest = read_manifest(path.parent)
+    if manifest and path.name in manifest.files and manifest.files[path.name][1] != file_digest(path):
+        raise BadInputError(
+            f"{path} was altered since it was made: restore it from a copy, or remove {path.parent} and run "
+            "the recipe again"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping

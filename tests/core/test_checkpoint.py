@@ -16,6 +16,7 @@ from astra_data.core.checkpoint import (
     understood,
 )
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import write_manifest
 
 
 def assert_same(actual: object, expected: object) -> None:
@@ -72,6 +73,18 @@ def test_files_that_are_missing_damaged_or_foreign_are_refused(tmp_path: Path) -
         load_tensors(path)
     save_file({"a": torch.ones(1)}, path, {"format": "pt"})
     with pytest.raises(BadInputError, match="not written by astra-data"):
+        load_tensors(path)
+
+
+def test_a_file_that_its_manifest_does_not_know_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
+    save_tensors(path, {"weight": torch.ones(3)}, {})
+    write_manifest(tmp_path, {})
+    assert torch.equal(load_tensors(path)[0]["weight"], torch.ones(3))
+    whole = bytearray(path.read_bytes())
+    whole[-1] ^= 1  # still a safetensors file
+    path.write_bytes(whole)
+    with pytest.raises(BadInputError, match=r"policy\.safetensors was altered since it was made: restore"):
         load_tensors(path)
 
 

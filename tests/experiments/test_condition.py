@@ -143,6 +143,18 @@ def test_altered_bytes_are_found_where_a_step_reads_them(recipe: Path, folder: P
     assert made_again(folder) == sorted(f"1/{key}" for key in (GROUND, TRAIN, ALIGN, EVALUATE, PLUS[0]))
 
 
+def test_what_only_its_bytes_give_away_is_to_be_removed(recipe: Path, folder: Path) -> None:
+    weights = folder / PLUS[0] / "policy.safetensors"
+    whole = weights.read_bytes()
+    weights.write_bytes(b"x" + whole[1:])
+    asked = ["check", str(recipe), "--verify", "--root", str(recipe.parent)]
+    told = CliRunner().invoke(cli.app, asked).exception
+    assert str(told).endswith(f" damaged: move them away, and `astra-data run {recipe}` recreates these")
+    shutil.rmtree(weights.parent)  # as it says
+    run(recipe, root=recipe.parent, jobs=1)
+    assert weights.read_bytes() == whole and states(recipe) == {}
+
+
 def test_altered_values_of_a_dataset_are_made_again_once_a_step_reads_them(
     recipe: Path, folder: Path
 ) -> None:

@@ -114,6 +114,18 @@ def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> No
         load_policy(run, "astra_plus", seed=1)
 
 
+@pytest.mark.parametrize("part", ["train/astra_plus", "ground/astra", "align/astra"])
+def test_no_policy_is_made_of_an_altered_file(part: str, run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    [file] = (folder / part / "seed_0").glob("*.safetensors")
+    whole = bytearray(file.read_bytes())
+    whole[-1] ^= 1
+    file.write_bytes(whole)
+    with pytest.raises(BadInputError, match=f"{re.escape(str(file))} was altered"):
+        load_policy(folder, "astra_plus")
+
+
 @pytest.mark.parametrize(
     ("row", "seed", "told"),
     [
