@@ -8,6 +8,7 @@ import pytest
 from small_run import ALIGN, COLLECT, GOLEMO, GROUND, TASK, TRAIN, short_task
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import silent
 from astra_data.stages.align import align
 from astra_data.stages.collect import collect
@@ -53,6 +54,7 @@ def grounded_anew(grounded: Path, paired: Path) -> Path:
     shutil.copytree(grounded, out)
     tensors, told = load_tensors(out / "grounding.safetensors")
     save_tensors(out / "grounding.safetensors", {name: value * 0.5 for name, value in tensors.items()}, told)
+    write_manifest(out, {})
     return out
 
 

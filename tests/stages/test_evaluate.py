@@ -17,7 +17,7 @@ from toy_episodes import no_episodes
 from astra_data.core.checkpoint import load_tensors
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import read_manifest
+from astra_data.core.manifest import read_manifest, write_manifest
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.grounding.files import load_grounding, save_grounding
@@ -143,6 +143,7 @@ def test_members_have_no_part_in_the_simulator_that_all_rows_share(
     shutil.copytree(grounded, tmp_path / "members")
     with_members = replace(alone, members=(other, other))
     save_grounding(tmp_path / "members/grounding.safetensors", with_members, no_episodes())
+    write_manifest(tmp_path / "members", {})
     tested = [
         make(task, "follower", tmp_path / f"follower {place}", {"reference": reference})[0]["grounded"]
         for place, reference in (("alone", grounded), ("members", tmp_path / "members"))

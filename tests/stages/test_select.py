@@ -130,8 +130,8 @@ def test_another_policy_is_judged_anew_after_an_interruption(
     monkeypatch.setattr(Judge, "success", success)
     with pytest.raises(KeyboardInterrupt):
         judged(root)
-    first, second = (root / f"train/direct_transfer/seed_{seed}/policy.safetensors" for seed in (0, 1))
-    shutil.copy(second, first)
+    first, second = (root / f"train/direct_transfer/seed_{seed}" for seed in (0, 1))
+    shutil.copytree(second, first, dirs_exist_ok=True)
     judged(root)
     assert asked[3:5] == asked[:2]
 
