@@ -247,7 +247,8 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
     Raises:
         BadInputError: lists the fields that are missing or have no rows, and differing numbers of rows.
     """
-    hints = {field: did_you_mean(field, shapes) for field in fields if field not in shapes}
+    unused, known = [name for name in shapes if name not in fields], f"; known: {', '.join(shapes)}"
+    hints = {field: did_you_mean(field, unused) or known for field in fields if field not in shapes}
     if len(hints) > 1 and len(set(hints.values())) == 1:  # all are listed, once
         faults = [f"no fields {', '.join(map(repr, hints))}{next(iter(hints.values()))}"]
     else:

@@ -13,6 +13,7 @@ from astra_data.exchange.recording import (
     bounded,
     find_sources,
     is_archive,
+    row_count,
 )
 from astra_data.exchange.source_names import identities
 
@@ -159,3 +160,13 @@ def test_of_a_member_that_was_appended_again_the_last_is_read(tmp_path: Path) ->
     (source,) = find_sources(path, [".csv"])
     with source.open() as stream:
         assert stream.read() == b"the last one"
+
+
+def test_a_field_that_is_read_already_is_not_proposed() -> None:
+    shapes = {"q1_deg": (3,), "q2_rad": (3,), "load": (3,)}
+    with pytest.raises(BadInputError, match=r"^a: no field 'q1_dog': did you mean 'q1_deg'\?$"):
+        row_count("a", ["q1_dog", "load"], shapes)
+    with pytest.raises(BadInputError, match=r"^a: no field 'q2_deg': did you mean 'q2_rad'\?$"):
+        row_count("a", ["q1_deg", "q2_deg"], shapes)
+    with pytest.raises(BadInputError, match=r"^a: no field 'q3'; known: q1_deg, q2_rad, load$"):
+        row_count("a", [*shapes, "q3"], shapes)

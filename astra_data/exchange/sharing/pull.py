@@ -61,7 +61,7 @@ def pull(
     asked = Version.parse(version.removeprefix("data-")) if version else named
     if named and asked != named:
         raise BadInputError(f"{source} names {named.tag}, but the version asked for is {version}.")
-    if isinstance(where, Hub) and Path(source).is_dir():
+    if isinstance(where, Hub) and not source.startswith("hf://") and Path(where.repo).is_dir():
         raise BadInputError(
             f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub"
         )

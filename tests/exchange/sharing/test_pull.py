@@ -99,8 +99,9 @@ def test_a_folder_here_is_not_looked_for_on_the_hub(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine/fake").mkdir(parents=True)
-    with pytest.raises(BadInputError, match=r"mine/fake is a folder here: pull ./mine/fake, or hf://"):
-        pull("mine/fake")
+    for source in ("mine/fake", "mine/fake@data-1.0.0"):
+        with pytest.raises(BadInputError, match=rf"^{source} is a folder here: pull ./{source}, or hf://"):
+            pull(source)
 
 
 def test_what_is_there_already_is_left_alone(fake: Dataset, shared: Path, tmp_path: Path) -> None:
