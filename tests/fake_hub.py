@@ -42,7 +42,7 @@ class Repository:
 class Hub(ThreadingHTTPServer):
     """Repositories "user/name" and large files by sha256; `refuse` may answer any request with a status.
 
-    Where nobody asks for another one, `visibility` is that of new repositories, as organisations may choose.
+    Where nobody asks for another one, `visibility` is that of new repositories, as organizations may choose.
     """
 
     daemon_threads = True

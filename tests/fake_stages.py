@@ -152,7 +152,7 @@ RESULTS = {
     "report": "results.json",
 }
 READ = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
-"""Parameters that are folders of artefacts."""
+"""Parameters that are folders of artifacts."""
 
 
 def asked(folder: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ HOUSE = ROOT / "astra_data"
 ALIASES = {"envs"}
 """Modules outside of every room, kept for what others import by an old name."""
 
-NO_NEIGHBOURS = {"exchange.exporters", "exchange.importers", "methods", "stages"}
+NO_NEIGHBORS = {"exchange.exporters", "exchange.importers", "methods", "stages"}
 """Rooms whose files do not import each other; their `__init__` and `registry` may import them all."""
 
 FOUNDATIONS = {"methods.method"}
@@ -64,13 +64,13 @@ def test_imports_only_go_down() -> None:
     assert not faults, "\n".join(faults)
 
 
-def test_stages_methods_and_formats_do_not_import_their_neighbours() -> None:
+def test_stages_methods_and_formats_do_not_import_their_neighbors() -> None:
     known = modules()
     faults = [
-        f"{name} imports its neighbour {target}"
+        f"{name} imports its neighbor {target}"
         for name, path in known.items()
         for target in set(imports(path, known)) - FOUNDATIONS
-        if (room := name.rpartition(".")[0]) in NO_NEIGHBOURS
+        if (room := name.rpartition(".")[0]) in NO_NEIGHBORS
         and target.rpartition(".")[0] == room
         and not name.endswith(".registry")
     ]

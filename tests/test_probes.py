@@ -119,9 +119,9 @@ def test_the_way_to_the_goal_cuts_the_corner_of_the_u() -> None:
     # Half a cell before the inner corner, and half a cell behind it, the way leads there at 45 degrees.
     maze = objective.maze
     state = torch.zeros(1, 2, 4)
-    state[0, :, :2] = torch.tensor([maze.cell_centre(1, 2), maze.cell_centre(2, 3)])
-    goal = torch.tensor(maze.cell_centre(*maze.goal)).float().expand(1, 2, 2)
+    state[0, :, :2] = torch.tensor([maze.cell_center(1, 2), maze.cell_center(2, 3)])
+    goal = torch.tensor(maze.cell_center(*maze.goal)).float().expand(1, 2, 2)
     found = way_to_goal(objective, toy_episodes(state, torch.zeros(1, 2, 2), next_state=state, goal=goal))
-    down = math.copysign(1.0, maze.cell_centre(2, 3)[1] - maze.cell_centre(1, 3)[1])
+    down = math.copysign(1.0, maze.cell_center(2, 3)[1] - maze.cell_center(1, 3)[1])
     way = torch.stack([found["way, x"][0], found["way, y"][0] * down], dim=-1)
     torch.testing.assert_close(way, torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / 2**0.5, atol=0.01, rtol=0)

@@ -1,4 +1,4 @@
-"""Corrections of the rail of small_cart.py that add a known number of metres, whatever the history."""
+"""Corrections of the rail of small_cart.py that add a known number of meters, whatever the history."""
 
 import torch
 

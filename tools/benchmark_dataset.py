@@ -179,10 +179,10 @@ def point_mass_pairs() -> Candidates:
     """Pair transitions of the point mass: all at once, or in one environment of Gymnasium's."""
     task = TASKS[TASK]
     rng = np.random.default_rng(0)
-    centres = np.array(task.maze.free_centres(), dtype=np.float32)
+    centers = np.array(task.maze.free_centers(), dtype=np.float32)
     size = next(column.size for column in task.state_columns if column.name == STATE)
     state = rng.normal(size=(PAIRED, size)).astype(np.float32)
-    state[:, :2] = centres[rng.integers(len(centres), size=PAIRED)]
+    state[:, :2] = centers[rng.integers(len(centers), size=PAIRED)]
     action = rng.uniform(-1, 1, size=(PAIRED, 2)).astype(np.float32)
     pairing = pairing_named(TASK)
     batch, simulator = pairing.simulator(BATCH_OF_PAIRS), task.simulator(1)

@@ -131,8 +131,8 @@ def steps_per_second(candidates: Candidates, rounds: int) -> dict[str, float]:
 def point_mass_stretch(num_points: int, steps: int) -> Stretch:
     """Step point masses in the maze with random commands."""
     simulator = TASK.simulator(num_points)
-    centres = torch.tensor(TASK.maze.free_centres(), dtype=torch.float32)
-    position = centres[torch.arange(num_points) % len(centres)]
+    centers = torch.tensor(TASK.maze.free_centers(), dtype=torch.float32)
+    position = centers[torch.arange(num_points) % len(centers)]
     simulator.reset_to(torch.cat([position, torch.zeros_like(position)], dim=-1))
     command = 2 * torch.rand(num_points, 2) - 1
 

@@ -17,7 +17,7 @@ import typer
 from door import run_tool
 from torch import Tensor
 
-from astra_data.core.naming import artefact_key
+from astra_data.core.naming import artifact_key
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.history import HistoryGrounding
@@ -48,13 +48,13 @@ def main(
 ) -> None:
     """Print tables of kicks in data and groundings, and of what a careful kicker reaches in the latter."""
     task = task_named(settings_of(run)["task"])
-    windows = PairedEpisodes.load(run / artefact_key("pair", "", seed)).windows
+    windows = PairedEpisodes.load(run / artifact_key("pair", "", seed)).windows
     moments, distance = kicks(windows)
     later = moments.after(STEPS)
     way = {"data": windows.state[moments.episode, later, 4:6] - moments.state[:, 4:6]}
     reached = []
     for name in row or ("nas", "astra"):
-        made = load_grounding(run / artefact_key("ground", name, seed) / GROUNDING)
+        made = load_grounding(run / artifact_key("ground", name, seed) / GROUNDING)
         assert isinstance(made, HistoryGrounding)
         way[name] = replayed(task, made, moments)
         simulator = SimulatorEnv(task.objective, made.simulator(task, EPISODES))

@@ -5,7 +5,7 @@
 Recorded commands of other seeds are replayed in a grounding, as it is and without its scatter. Paths over
 chords of a second tell how much a robot weaves, changes of its velocity over 0.1 to 2 s how unsteady it is;
 and how fast it walks along commands that are held for 2 s, 1.2 m away from walls, tells whether the
-correction is biased. Positions are the first two entries of abstract states, metres.
+correction is biased. Positions are the first two entries of abstract states, meters.
 """
 
 from collections.abc import Iterator

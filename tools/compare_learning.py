@@ -38,11 +38,11 @@ def main(
         figure = Figure(figsize=(0.6 + 2.2 * len(rows), 2.6), layout="constrained")
         for axes, row in zip(figure.subplots(1, len(rows), squeeze=False, sharey=True)[0], rows, strict=True):
             axes.set_title(method_title(row), loc="left")
-            for one, of_rows, colour in zip(results, curves, (FAINT, INK), strict=True):
+            for one, of_rows, color in zip(results, curves, (FAINT, INK), strict=True):
                 steps, scores = on_one_grid(of_rows[row])
                 low, high = scores.min(axis=0), scores.max(axis=0)
-                axes.fill_between(steps / 1e6, low, high, color=colour, alpha=0.2, lw=0)
-                axes.plot(steps / 1e6, scores.mean(axis=0), color=colour, label=one.recipe)
+                axes.fill_between(steps / 1e6, low, high, color=color, alpha=0.2, lw=0)
+                axes.plot(steps / 1e6, scores.mean(axis=0), color=color, label=one.recipe)
                 print(f"{row}: {one.recipe} {scores[:, -1].mean():.2f} of {len(scores)} trainings")
         score_axis(figure.axes[0], results[1].headline)
         figure.supxlabel("million steps of training")

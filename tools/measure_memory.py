@@ -39,7 +39,7 @@ from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 AMBLE_M = 0.4
-"""How far the robots go from the centre of their cell."""
+"""How far the robots go from the center of their cell."""
 
 Work = Callable[[Path, int, int], int]
 """Do something in a folder, with so many episodes of so many steps; return how many steps it was."""
@@ -101,12 +101,12 @@ def validate(root: Path, episodes: int, steps: int) -> int:
 def ambles(episodes: int, steps: int) -> Iterator[Episode]:
     """Yield episodes of ants that go around in their cell; the rest of the state is noise."""
     rng = np.random.default_rng(0)
-    centres = TASK.maze.free_centres()
+    centers = TASK.maze.free_centers()
     for uid in range(episodes):
         states = rng.standard_normal((steps + 1, 29), dtype=np.float32)
         angle = 0.05 * np.arange(steps + 1) + rng.uniform(-np.pi, np.pi)
         around = AMBLE_M * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        states[:, :2] = centres[uid % len(centres)] + around
+        states[:, :2] = centers[uid % len(centers)] + around
         states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
         last = np.arange(steps) == steps - 1
         columns: dict[str, Array] = {column.name: last for column in OUTCOME_COLUMNS}

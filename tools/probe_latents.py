@@ -22,7 +22,7 @@ from door import run_tool
 from probes import Probed, dropped_values, picking_split, probe, recent_actions, way_to_goal
 from torch import Tensor
 
-from astra_data.core.naming import artefact_key
+from astra_data.core.naming import artifact_key
 from astra_data.core.seeding import derive
 from astra_data.experiments.trained_policy import settings_of, trained_policy
 from astra_data.grounding.files import GROUNDING, load_grounding, load_history_model
@@ -64,7 +64,7 @@ def main(
 def _probes(run: Path, rows: list[str], seed: int, steps: int) -> None:
     settings = settings_of(run)
     task = task_named(settings["task"])
-    paired = PairedEpisodes.load(run / artefact_key("pair", "", seed))
+    paired = PairedEpisodes.load(run / artifact_key("pair", "", seed))
     training, held_out = paired.split(settings["ground"]["held_out_share"], seed)
     parts = (*picking_split(training, seed), held_out)
     values = [dropped_values(task.state, part) for part in parts]
@@ -77,7 +77,7 @@ def _probes(run: Path, rows: list[str], seed: int, steps: int) -> None:
         f"φ(s) and {steps} actions": [recent_actions(part, steps) for part in parts],
     }
     for name in rows:
-        file = run / artefact_key("ground", grounded_as(name), seed) / GROUNDING
+        file = run / artifact_key("ground", grounded_as(name), seed) / GROUNDING
         model = load_history_model(file)
         inputs[f"z of {name}"] = [model.encode(part.windows)[0] for part in parts]
     found = {name: probe(*map(Probed.of, parts, given, values)) for name, given in inputs.items()}

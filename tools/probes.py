@@ -56,7 +56,7 @@ def _turned(quaternion: Tensor) -> dict[str, Tensor]:
 
 
 def way_to_goal(objective: Navigation, episodes: PairedEpisodes) -> dict[str, Tensor]:
-    """Return where the way to the goal leads: the progress in m of a metre along each axis, (E, T).
+    """Return where the way to the goal leads: the progress in m of a meter along each axis, (E, T).
 
     φ(s) holds it, but as no linear function: around corners the way turns.
     """

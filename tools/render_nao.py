@@ -92,8 +92,8 @@ def _draw_limbs(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjDa
     rods += [(torso + turned @ from_m, torso + turned @ to_m, width) for from_m, to_m, width in UPPER_BODY]
     for start, end, radius in rods:
         rod = scene.geoms[scene.ngeom]
-        colour = np.array([0.88, 0.88, 0.9, 1.0], dtype=np.float32)
-        mujoco.mjv_initGeom(rod, capsule, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour)
+        color = np.array([0.88, 0.88, 0.9, 1.0], dtype=np.float32)
+        mujoco.mjv_initGeom(rod, capsule, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
         mujoco.mjv_connector(rod, capsule, radius, start, end)
         scene.ngeom += 1
 

@@ -63,11 +63,11 @@ def check(
     verify: Annotated[
         bool,
         typer.Option(
-            "--verify", help="Read every byte of the artefacts instead of comparing only their sizes."
+            "--verify", help="Read every byte of the artifacts instead of comparing only their sizes."
         ),
     ] = False,
 ) -> None:
-    """Check recipes without running them, and list which artefacts are finished, damaged or stale."""
+    """Check recipes without running them, and list which artifacts are finished, damaged or stale."""
     from astra_data.experiments.recipe_file import is_gap_recipe
     from astra_data.experiments.run import check as check_recipe
 
@@ -186,7 +186,7 @@ def run_stage(
     publish: bool = False,
     add: bool = False,
 ) -> None:
-    """Run one stage of a recipe, and print the folder of its artefacts."""
+    """Run one stage of a recipe, and print the folder of its artifacts."""
     from astra_data.experiments.run import run_stage as run
 
     with resumable():

@@ -141,16 +141,16 @@ def faults_of(error: ValidationError) -> str:
     return "; ".join([*faults, f"and {more} more"] if more else faults)
 
 
-def read_written[T](kind: type[T], path: Path, *, by: str, cure: str) -> T:
+def read_written[T](kind: type[T], path: Path, *, by: str, advice: str) -> T:
     """Read the JSON file `path` that `by` writes, as `kind`.
 
     Raises:
-        BadInputError: it holds something else; the message ends with the `cure`.
+        BadInputError: it holds something else; the message ends with the `advice`.
     """
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes())
     except ValidationError as error:
-        raise BadInputError(f"{path} is not what {by} writes: {faults_of(error)}; {cure}") from None
+        raise BadInputError(f"{path} is not what {by} writes: {faults_of(error)}; {advice}") from None
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -63,8 +63,8 @@ def disk_error(error: Exception) -> DiskError | None:
 
 def _report(fault: str, code: int) -> str:
     known = _OF_THE_DISK | _OF_THE_PLACE
-    why, cure = known.get(code, (os.strerror(code).lower(), "choose another place"))
-    return f"{fault}: {why}. What was finished before is safe: {cure}, then run the same command again."
+    why, advice = known.get(code, (os.strerror(code).lower(), "choose another place"))
+    return f"{fault}: {why}. What was finished before is safe: {advice}, then run the same command again."
 
 
 def _code(error: Exception) -> int | None:

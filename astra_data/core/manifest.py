@@ -1,9 +1,9 @@
-"""The manifest of an artefact: its files with their sizes and sha256, and what it was made from.
+"""The manifest of an artifact: its files with their sizes and sha256, and what it was made from.
 
     {"files": {"policy.safetensors": {"bytes": 13948, "sha256": "…"}, …},
      "made_from": {"dataset": "<content hash>", "grounding": "<sha256 of grounding.safetensors>"}}
 
-It is written into the working folder of an artefact, so that both appear at once. The settings are in one of
+It is written into the working folder of an artifact, so that both appear at once. The settings are in one of
 the files. Datasets have none: their description says the same.
 """
 
@@ -21,11 +21,11 @@ MANIFEST = "manifest.json"
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a finished artefact consists of.
+    """What a finished artifact consists of.
 
     Attributes:
         files: path inside the folder → its size in bytes and its sha256.
-        made_from: what the artefact was made from → the digest of that.
+        made_from: what the artifact was made from → the digest of that.
     """
 
     files: Mapping[str, tuple[int, str]]
@@ -44,7 +44,7 @@ class Manifest:
         return faults
 
     def foreign(self, folder: Path) -> list[str]:
-        """Return the files in `folder` that are not of the artefact."""
+        """Return the files in `folder` that are not of the artifact."""
         return [name for name in _files(folder) if name not in self.files]
 
 
@@ -59,7 +59,7 @@ def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """Return the manifest of the artefact in `folder`; None where version 0.1 made it.
+    """Return the manifest of the artifact in `folder`; None where version 0.1 made it.
 
     Raises:
         BadInputError: it cannot be read.

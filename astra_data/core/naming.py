@@ -8,7 +8,7 @@ from pathlib import Path
 
 PLUS = "_plus"
 RECORD = "recipe.json"
-"""In the folder of a run: the settings that its artefacts were made with."""
+"""In the folder of a run: the settings that its artifacts were made with."""
 
 CODE = "code.json"
 """Beside it: the digests of the user's code, "task" and methods by their names, and their settings."""
@@ -40,11 +40,11 @@ def seed_folder(seed: int, percent: int | None = None) -> str:
     return f"seed_{seed}" if percent is None else f"percent_{percent:03d}/seed_{seed}"
 
 
-def artefact_key(stage: str, row: str, seed: int, percent: int | None = None) -> str:
-    """Return the key of an artefact, its place in the folder of a run; `row` is empty for a dataset."""
+def artifact_key(stage: str, row: str, seed: int, percent: int | None = None) -> str:
+    """Return the key of an artifact, its place in the folder of a run; `row` is empty for a dataset."""
     return "/".join(filter(None, (stage, row, seed_folder(seed, percent))))
 
 
 def stage_of_key(key: str) -> str:
-    """Return the stage of an artefact's key, as "train" of "train/astra/seed_0"."""
+    """Return the stage of an artifact's key, as "train" of "train/astra/seed_0"."""
     return key.partition("/")[0]

@@ -1,4 +1,4 @@
-"""Normalisation of network inputs, and the shapes of columns."""
+"""Normalization of network inputs, and the shapes of columns."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-def normalised(state: "Tensor", mean: "Tensor | float", std: "Tensor | float") -> "Tensor":
+def normalized(state: "Tensor", mean: "Tensor | float", std: "Tensor | float") -> "Tensor":
     """Return states (..., S) in standard deviations from the data's mean, clipped to ±5.
 
     The data hold hardly anything beyond: a network extrapolates there, and a simulator that it corrects

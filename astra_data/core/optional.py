@@ -51,10 +51,10 @@ def missing_extra(error: ModuleNotFoundError) -> BadInputError | None:
     return _not_installed(package) if package in EXTRAS else None
 
 
-def cure(extra: str) -> str:
+def how_to_install(extra: str) -> str:
     """Return the commands that install an `extra`, for messages."""
     return f'uv sync --extra {extra} in a checkout, else pip install "astra-data[{extra}]"'
 
 
 def _not_installed(package: str) -> BadInputError:
-    return BadInputError(f"{package} is needed but not installed: {cure(EXTRAS[package])}")
+    return BadInputError(f"{package} is needed but not installed: {how_to_install(EXTRAS[package])}")

@@ -1,4 +1,4 @@
-"""Provenance of artefacts: commit, package versions and machine."""
+"""Provenance of artifacts: commit, package versions and machine."""
 
 import os
 import platform
@@ -59,7 +59,7 @@ def _git(*arguments: str) -> str:
 
 
 def origin(device: str = "cpu") -> dict[str, Any]:
-    """Return the provenance that every artefact records; call it when a stage begins."""
+    """Return the provenance that every artifact records; call it when a stage begins."""
     return {"git_commit": git_commit(), "packages": package_versions(), "machine": machine(device)}
 
 

@@ -21,9 +21,9 @@ def statistics(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return `STATISTICS` (9, size) of `rows` (size, T), sorted in place; quantiles are interpolated."""
     # One row per index: numpy then sums pairwise, and sorting is fast.
     mean = rows.mean(axis=1)
-    centred = rows - mean[:, None]
-    np.square(centred, out=centred)
-    std = np.sqrt(centred.mean(axis=1))
+    centered = rows - mean[:, None]
+    np.square(centered, out=centered)
+    std = np.sqrt(centered.mean(axis=1))
     rows.sort(axis=1)
     position = np.array(QUANTILES) * (rows.shape[1] - 1)
     below = np.floor(position).astype(np.intp)

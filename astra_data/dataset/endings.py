@@ -38,7 +38,7 @@ class Endings:
             self.made_up += ended and stands_still(columns[STATE][-1], columns[NEXT_STATE][-1])
 
     def __str__(self) -> str:
-        """Summarise them in a line."""
+        """Summarize them in a line."""
         return f"{self.terminated} terminated, {self.cut_off} cut off" + (
             f"; {self.made_up} next states of terminated episodes were made up: the state itself is used"
             if self.made_up

@@ -85,7 +85,7 @@ class Inspection:
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Summarise `dataset`, reading one episode at a time.
+    """Summarize `dataset`, reading one episode at a time.
 
     Raises:
         CorruptDatasetError: a file cannot be read.

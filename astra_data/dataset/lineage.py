@@ -102,8 +102,8 @@ def _found(identity: Mapping[str, str], beside: Path) -> _Described | None:
     for folder in beside.parents[:2]:
         if (folder / RECORD).exists():
             places += [folder.glob(f"{depth}/{DATASET_PATH}") for depth in ("*/*", "*/*/*")]
-    neighbours = [path.parents[2] for place in places for path in sorted(place)]
-    for folder in (home_of(identity), *neighbours):
+    neighbors = [path.parents[2] for place in places for path in sorted(place)]
+    for folder in (home_of(identity), *neighbors):
         try:
             found = read_description(folder)
         except CorruptDatasetError:

@@ -147,7 +147,7 @@ class StagedWriter:
                     self._write()
                     is_written = True
             finally:
-                with suppress(OSError):  # what stays is recognised by the next call
+                with suppress(OSError):  # what stays is recognized by the next call
                     if is_written or not self._holds_work():
                         discard(self.folder, self.root)
 

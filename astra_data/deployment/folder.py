@@ -35,7 +35,7 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
         percent: the size of the dataset, where the recipe sweeps over sizes.
 
     Raises:
-        BadInputError: the row trains no policy, an artefact of it is not there, code of the task cannot be
+        BadInputError: the row trains no policy, an artifact of it is not there, code of the task cannot be
             written as a graph, or `out` exists.
     """
     refuse_existing(out)

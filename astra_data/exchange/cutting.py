@@ -183,16 +183,16 @@ class Cutter:
         seconds, usual_seconds, steps = spent.sum(axis=0)
         pooled = steps / seconds, steps / usual_seconds
         if all(abs(rate / fps - 1) > RATE_TOLERANCE for rate in pooled):
-            cure = "correct fps or time_scale, or resample the recording"
+            advice = "correct fps or time_scale, or resample the recording"
             if self.tally.back_rows:
-                cure += (
+                advice += (
                     f"; time goes back in {self.tally.back_rows} rows, first in {self.tally.back_first}: "
                     "sort them if they belong together"
                 )
             if named and len(origins) > 1:
-                cure += f"; {first_few(named, 8)}"
+                advice += f"; {first_few(named, 8)}"
             raise BadInputError(
-                f"'{self._mapping.time}' gives {pooled[0]:.4g} rows per second, but fps is {fps}: {cure}"
+                f"'{self._mapping.time}' gives {pooled[0]:.4g} rows per second, but fps is {fps}: {advice}"
             )
         self.tally.notes += [f"{name}, {fps} Hz declared" for name in named]
         self.tally.clock = str(self._clock)

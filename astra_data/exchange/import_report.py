@@ -37,7 +37,7 @@ class ImportReport:
     left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """Summarise it in a few lines."""
+        """Summarize it in a few lines."""
         tally = self.tally
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
         first = f", the first is {tally.rejected_first}" if tally.rejected_first else ""

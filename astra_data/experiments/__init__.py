@@ -1,1 +1,1 @@
-"""Recipes, the plan of their artefacts, and how these are made: one machine or many."""
+"""Recipes, the plan of their artifacts, and how these are made: one machine or many."""

@@ -1,6 +1,6 @@
-"""The condition of a run's artefacts: whether each is finished, missing, damaged or stale, and why.
+"""The condition of a run's artifacts: whether each is finished, missing, damaged or stale, and why.
 
-An artefact is damaged if it is not what its manifest says, or a dataset that cannot be opened; it is stale if
+An artifact is damaged if it is not what its manifest says, or a dataset that cannot be opened; it is stale if
 it was made from something else than what lies there now, or with other settings. Version 0.1 wrote no
 manifests: what it finished counts as finished, if its result is there.
 """
@@ -24,7 +24,7 @@ from astra_data.experiments.execution import Item
 from astra_data.experiments.experiment import ALWAYS_NEW, Experiment
 from astra_data.experiments.plan import stage_of
 from astra_data.grounding.files import load_grounding, load_target_encoder
-from astra_data.reports.artefacts import Evaluation, read_json
+from astra_data.reports.artifacts import Evaluation, read_json
 from astra_data.reports.choice import Judged
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.training.policy_file import PolicyFile
@@ -41,19 +41,19 @@ LOADERS: dict[str, Callable[[Path], object]] = {
 
 @dataclass(frozen=True)
 class Condition:
-    """The condition of an artefact, and why, where there is something to say."""
+    """The condition of an artifact, and why, where there is something to say."""
 
     state: Literal["finished", "missing", "damaged", "stale"]
     why: str = ""
 
     @property
     def is_finished(self) -> bool:
-        """Whether the artefact can be used."""
+        """Whether the artifact can be used."""
         return self.state == "finished"
 
 
 def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Condition:
-    """Return the condition of the artefact of `item`; with `verify`, every byte of it is read."""
+    """Return the condition of the artifact of `item`; with `verify`, every byte of it is read."""
     key = item.key
     if not experiment.has(key):
         return Condition("missing")
@@ -66,7 +66,7 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
 
 
 def examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Manifest | None]:
-    """Return what is wrong with the files of the artefact `key`, and its manifest if it has one.
+    """Return what is wrong with the files of the artifact `key`, and its manifest if it has one.
 
     Their sizes are compared or, with `verify`, their bytes. Of datasets, it is what the metadata and the
     footers of the files show or, with `verify`, all values.
@@ -88,14 +88,14 @@ def examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Ma
 
 
 def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, str]:
-    """Return which finished artefacts of `items` have to be made again, key to reason.
+    """Return which finished artifacts of `items` have to be made again, key to reason.
 
     Those are the damaged and the stale ones, and what was made from them. Of all, the sizes are compared, of
     what an item to make reads, every byte.
 
     Args:
         items: each after those it reads.
-        experiment: whose artefacts they are.
+        experiment: whose artifacts they are.
     """
     absent = {item.key for item in items if stage_of(item) in ALWAYS_NEW or not experiment.has(item.key)}
     reasons: dict[str, str] = {}
@@ -120,7 +120,7 @@ def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, 
 
 
 def can_be_made_again(key: str, experiment: Experiment) -> bool:
-    """Return whether a stage made the artefact `key`; a dataset may also have been put there."""
+    """Return whether a stage made the artifact `key`; a dataset may also have been put there."""
     stage = _stage(key)
     if not stage.makes_dataset:
         return True
@@ -140,7 +140,7 @@ def _stage(key: str) -> Stage:
 
 
 def _unreadable(key: str, experiment: Experiment) -> str:
-    """Return why later stages cannot read the artefact `key`, such as weights that are not finite."""
+    """Return why later stages cannot read the artifact `key`, such as weights that are not finite."""
     stage = _stage(key)
     try:
         if stage.result:
@@ -151,7 +151,7 @@ def _unreadable(key: str, experiment: Experiment) -> str:
 
 
 def _replaced(item: Item, experiment: Experiment, manifest: Manifest | None) -> str:
-    """Return which of the artefacts that `item` is made from it was not made from, by its manifest."""
+    """Return which of the artifacts that `item` is made from it was not made from, by its manifest."""
     folder = experiment.place(item.key)
     if stage_of(item) == "label" and (data := _other_data(folder, experiment.recipe.data)):
         return f"made from another dataset than {data}"
@@ -171,12 +171,12 @@ def _replaced(item: Item, experiment: Experiment, manifest: Manifest | None) -> 
     return f"made from another {others[0]}" if others else ""
 
 
-def _other_data(labelled: Path, data: str | None) -> str:
-    """Return the reference of the dataset that a recipe names, if another one was labelled."""
+def _other_data(labeled: Path, data: str | None) -> str:
+    """Return the reference of the dataset that a recipe names, if another one was labeled."""
     if data is None or is_address(data):
         return ""
     with suppress(AstraDataError):
-        named, made = open_dataset(data), read_description(labelled)
+        named, made = open_dataset(data), read_description(labeled)
         known = {made["content_hash"], *(parent["hash"] for parent in made["parents"])}
         # What was made of it since, and has its name, is no other.
         return "" if known & set(_hashes(lineage(named))) else named.reference
@@ -190,7 +190,7 @@ def _hashes(ancestor: Ancestor) -> Iterator[str]:
 
 
 def _digest(key: str, experiment: Experiment) -> str | None:
-    """Return the digest by which later artefacts name the artefact `key`; None if it cannot be read."""
+    """Return the digest by which later artifacts name the artifact `key`; None if it cannot be read."""
     folder, stage = experiment.place(key), _stage(key)
     with suppress(AstraDataError, OSError, KeyError):
         if stage.makes_dataset:
@@ -201,7 +201,7 @@ def _digest(key: str, experiment: Experiment) -> str | None:
 
 
 def _remark(key: str, experiment: Experiment, manifest: Manifest | None) -> str:
-    """Return what is unusual about a finished artefact with this manifest."""
+    """Return what is unusual about a finished artifact with this manifest."""
     if _stage(key).makes_dataset:
         return ""
     if manifest is None:

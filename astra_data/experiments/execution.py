@@ -25,11 +25,11 @@ Note = tuple[float, str]
 
 @dataclass(frozen=True)
 class Item:
-    """One artefact to make.
+    """One artifact to make.
 
     Attributes:
         key: its name and its path in the run's folder: `<stage>/[<method>/]seed_<seed>`, or `report`.
-        inputs: keys of the artefacts that it reads.
+        inputs: keys of the artifacts that it reads.
         call: makes it; called as `call(progress=...)` in another process, so it must be picklable.
         is_threaded: whether `call` also takes `num_threads` and runs faster with more of them.
         device: torch device that it computes on.

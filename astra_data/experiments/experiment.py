@@ -1,9 +1,9 @@
-"""Experiments: a recipe, the folder of its artefacts, and the recipe that it is based on, if any.
+"""Experiments: a recipe, the folder of its artifacts, and the recipe that it is based on, if any.
 
     based_on = "antmaze_umaze"
 
 A recipe with this line lists only the differences from the recipe of that name beside it. Stages without a
-difference are not run again: links in its folder lead to the other recipe's artefacts. It may have another
+difference are not run again: links in its folder lead to the other recipe's artifacts. It may have another
 task with the same target; then it shares the collected episodes.
 """
 
@@ -33,11 +33,11 @@ ALWAYS_NEW = {"report"}
 
 @dataclass(frozen=True)
 class Experiment:
-    """A recipe and where its artefacts are.
+    """A recipe and where its artifacts are.
 
     Attributes:
         recipe: with what it takes from its base.
-        path: the recipe's file. folder: of its artefacts.
+        path: the recipe's file. folder: of its artifacts.
         base: the experiment that this one is based on, if any.
     """
 
@@ -48,7 +48,7 @@ class Experiment:
 
     @cached_property
     def borrowed(self) -> set[str]:
-        """The stages whose artefacts are taken from the base."""
+        """The stages whose artifacts are taken from the base."""
         if self.base is None:
             return set()
         changed = _differences(self.base.recipe.settings, self.recipe)
@@ -60,15 +60,15 @@ class Experiment:
         return STAGES.keys() - ALWAYS_NEW - absent - stale_stages(changed, resized)
 
     def maker(self, stage: str) -> "Experiment":
-        """Return the experiment that makes the artefacts of `stage`."""
+        """Return the experiment that makes the artifacts of `stage`."""
         return self.base if self.base and stage in self.borrowed else self
 
     def place(self, key: str) -> Path:
-        """Return the folder of the artefact `key`."""
+        """Return the folder of the artifact `key`."""
         return self.maker(stage_of_key(key)).folder / key
 
     def has(self, key: str) -> bool:
-        """Return whether the artefact `key` is finished."""
+        """Return whether the artifact `key` is finished."""
         stage = stage_of_key(key)
         return self.place(key).is_dir() and not self.maker(stage)._is_link(stage)
 
@@ -81,7 +81,7 @@ class Experiment:
         """Link the folders of borrowed stages to the base's.
 
         Raises:
-            RecipeError: a link would replace artefacts.
+            RecipeError: a link would replace artifacts.
         """
         for stage in STAGES:
             link = self.folder / stage
@@ -98,7 +98,7 @@ class Experiment:
             link.symlink_to(Path("..") / source.name / stage)
 
     def check_unchanged(self) -> None:
-        """Refuse settings that differ from those of existing artefacts, finished or not.
+        """Refuse settings that differ from those of existing artifacts, finished or not.
 
         Raises:
             RecipeError: they differ, here or in the base.
@@ -113,7 +113,7 @@ class Experiment:
             )
 
     def outdated(self, key: str) -> str:
-        """Return which settings changed since the artefact `key` was made, empty if none."""
+        """Return which settings changed since the artifact `key` was made, empty if none."""
         changed, folders = self.maker(stage_of_key(key))._outdated
         place = self.place(key)
         if not any(place.is_relative_to(folder) for folder in folders):
@@ -122,7 +122,7 @@ class Experiment:
 
     @cached_property
     def _outdated(self) -> tuple[str, list[Path]]:
-        """What changed since the artefacts were made, and the folders made with the old."""
+        """What changed since the artifacts were made, and the folders made with the old."""
         if not (self.folder / RECORD).is_file():
             return "", []
         recorded = recorded_settings(self.folder)
@@ -194,7 +194,7 @@ class Experiment:
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
-    """Read the recipe at `path`, whose artefacts are in a folder of its name in `root`.
+    """Read the recipe at `path`, whose artifacts are in a folder of its name in `root`.
 
     Raises:
         RecipeError: it, or the recipe that it is based on, has faults, or they do not fit each other.
@@ -235,7 +235,7 @@ def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
 def _is_same_place(before: object, now: object) -> bool:
     """Return whether two names of a file or folder of the user's, told from different folders, may be of one.
 
-    Whether it holds what it held then is told by digests: of code in code.json, of data as of artefacts.
+    Whether it holds what it held then is told by digests: of code in code.json, of data as of artifacts.
     """
     file, is_code, _ = str(now).partition(".py:")
     there = Path(f"{file}.py").is_file() if is_code else Path(file).is_dir()
@@ -250,7 +250,7 @@ def _share_target(task: str, other: str) -> bool:
 
 
 def _with_largest_size(settings: dict[str, Any]) -> dict[str, Any]:
-    """Replace `sweep` by the largest size, the only part of it that artefacts depend on."""
+    """Replace `sweep` by the largest size, the only part of it that artifacts depend on."""
     percents = settings.get("sweep", {}).get("percent", ())
     return settings | {"sweep": max(percents, default=WHOLE)}
 

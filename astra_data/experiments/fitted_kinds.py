@@ -48,10 +48,10 @@ class Bicycle(Planar):
         if steering.unit not in ("1", "rad") or not _STEERING.fullmatch(steering.plain):
             return None
         unit = cls(logs, unicycle.position, unicycle.heading)
-        per_metre = _slopes(unit)[1]
-        if not per_metre:
+        per_meter = _slopes(unit)[1]
+        if not per_meter:
             return None
-        bicycle = cls(logs, unicycle.position, unicycle.heading, _short(1 / per_metre))
+        bicycle = cls(logs, unicycle.position, unicycle.heading, _short(1 / per_meter))
         return bicycle if errors(bicycle, 1)[0][2] < errors(unicycle, 1)[0][2] else None
 
     def values(self) -> dict[str, str]:

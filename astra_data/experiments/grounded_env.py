@@ -10,7 +10,7 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import artefact_key, is_plus
+from astra_data.core.naming import artifact_key, is_plus
 from astra_data.core.progress import Progress, silent
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.plan import plan
@@ -50,7 +50,7 @@ def grounded(
         options: those of `OPTIONS` that are not to be as in the recipe, see `EnvConfig`.
 
     Raises:
-        BadInputError: the row is not trained in a simulator, an artefact is not there, or an option does not
+        BadInputError: the row is not trained in a simulator, an artifact is not there, or an option does not
             fit the row or the task.
     """
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=1, **options)
@@ -151,7 +151,7 @@ def training_of(
     The policy that another one starts from is not read.
 
     Raises:
-        BadInputError: the row trains nothing, an artefact is not there, or a change does not fit.
+        BadInputError: the row trains nothing, an artifact is not there, or a change does not fit.
     """
     return _training(run, settings_of(run), row, seed, percent, changes)
 
@@ -193,17 +193,17 @@ def _method_of(settings: Mapping[str, Any], row: str) -> Method:
 def _planned(
     run: str | Path, settings: dict[str, Any], stage: str, row: str, seed: int, percent: int | None
 ) -> partial[object]:
-    """Return the call by which a run with these `settings` makes the artefact of a row."""
+    """Return the call by which a run with these `settings` makes the artifact of a row."""
     recipe = validated(settings | {"select": None}, Recipe, f"{run}")
     only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
     items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
-    call = items.get(artefact_key(stage, row, seed, percent))
+    call = items.get(artifact_key(stage, row, seed, percent))
     if not isinstance(call, partial):
         raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
     return call
 
 
-def _check_made(given: dict[str, Any], artefacts: Iterable[str]) -> None:
-    """Refuse a call to which one of the `artefacts` is given that is not there."""
-    if missing := [str(given[name]) for name in artefacts if given[name] and not given[name].is_dir()]:
+def _check_made(given: dict[str, Any], artifacts: Iterable[str]) -> None:
+    """Refuse a call to which one of the `artifacts` is given that is not there."""
+    if missing := [str(given[name]) for name in artifacts if given[name] and not given[name].is_dir()]:
         raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")

@@ -1,4 +1,4 @@
-"""The artefacts that a recipe's rows, seeds and sizes need, each once.
+"""The artifacts that a recipe's rows, seeds and sizes need, each once.
 
     collect ──┬── (augment) ── pair ──┬── ground ──┬── train ──┬── evaluate ──┬── report
     or label ─┘                       │            └── align ──┘              │
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import artefact_key, base_method, reference_of, stage_of_key
+from astra_data.core.naming import artifact_key, base_method, reference_of, stage_of_key
 from astra_data.experiments.execution import Item
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
@@ -29,8 +29,8 @@ from astra_data.reports.runs import Reported
 from astra_data.stages.registry import STAGES, Stage
 from astra_data.stages.select import benches, judge_of
 
-ARTEFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
-"""Parameters of stages that are folders of artefacts."""
+ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
+"""Parameters of stages that are folders of artifacts."""
 
 
 def plan(
@@ -43,12 +43,12 @@ def plan(
     publish: Path | None = None,
     add_to: Path | None = None,
 ) -> tuple[Item, ...]:
-    """Return every artefact of `recipe`, each after those it reads, seed after seed.
+    """Return every artifact of `recipe`, each after those it reads, seed after seed.
 
     Args:
         recipe: what to make.
         path: the recipe's file.
-        folder: where it is made, such as `runs/antmaze_long`; an item's artefact is at `folder / key`.
+        folder: where it is made, such as `runs/antmaze_long`; an item's artifact is at `folder / key`.
         selection: the points to make and to report; by default all.
         device: torch device of the networks.
         publish: a folder that the report copies its results to, if any.
@@ -123,7 +123,7 @@ def check_stage(stage: str) -> None:
 
 @dataclass(frozen=True)
 class _Plan:
-    """The artefacts of a recipe, except its report."""
+    """The artifacts of a recipe, except its report."""
 
     recipe: Recipe
     folder: Path
@@ -132,7 +132,7 @@ class _Plan:
 
     @cached_property
     def _names(self) -> dict[str, tuple[str, ...]]:
-        """The methods or rows for which stages make one artefact each, per dataset."""
+        """The methods or rows for which stages make one artifact each, per dataset."""
         rows = self.selection.methods
         bases = tuple(dict.fromkeys(map(base_method, rows)))
         reference = reference_of(self.recipe.methods)
@@ -149,7 +149,7 @@ class _Plan:
         }
 
     def items(self) -> Iterator[Item]:
-        """Yield the artefacts, each after those it reads."""
+        """Yield the artifacts, each after those it reads."""
         percents = self.selection.percents
         for seed in self.selection.seeds:
             for stage in STAGES.values():
@@ -168,12 +168,12 @@ class _Plan:
         return stage.asked_by is None or getattr(self.recipe, stage.asked_by) is not None
 
     def _item(self, stage: Stage, seed: int, percent: int | None, name: str = "") -> Item:
-        """Return the artefact that a stage makes of a dataset, for a method or row if `name` is one."""
+        """Return the artifact that a stage makes of a dataset, for a method or row if `name` is one."""
         recipe, method = self.recipe, method_named(name) if name else None
-        key = artefact_key(stage.name, name, seed, percent)
+        key = artifact_key(stage.name, name, seed, percent)
         parameters = inspect.signature(stage.run).parameters
-        artefacts = self._artefacts(stage, seed, percent, name)
-        keys = {parameter: artefacts[parameter] for parameter in parameters if parameter in ARTEFACTS}
+        artifacts = self._artifacts(stage, seed, percent, name)
+        keys = {parameter: artifacts[parameter] for parameter in parameters if parameter in ARTIFACTS}
         known = {
             "task": recipe.task,
             "simulator": recipe.task,
@@ -205,24 +205,24 @@ class _Plan:
         """Return the dataset that the policy of a row was trained on; None if it is none."""
         if method is None or not method.trains_without_target:
             return None
-        made = self._artefacts(STAGES["train"], seed, percent, name)["dataset"]
+        made = self._artifacts(STAGES["train"], seed, percent, name)["dataset"]
         return self.folder / made if made else None
 
-    def _artefacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
-        """Return the keys of the artefacts that a stage may read, by its parameters."""
+    def _artifacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
+        """Return the keys of the artifacts that a stage may read, by its parameters."""
         datasets = [read for read in map(STAGES.get, stage.reads) if read and read.makes_dataset]
         last = next((read for read in reversed(datasets) if self._has(read)), None)
         size = percent if last and last.each == "size" else None
-        artefacts = {"dataset": artefact_key(last.name, "", seed, size) if last else None}
+        artifacts = {"dataset": artifact_key(last.name, "", seed, size) if last else None}
         if not name:
-            return artefacts
+            return artifacts
         base = base_method(name)
         method, reference = method_named(base), reference_of(self.recipe.methods) or base
 
         def made(by: str, of: str | None) -> str | None:
-            return artefact_key(by, of, seed, percent) if of else None
+            return artifact_key(by, of, seed, percent) if of else None
 
-        return artefacts | {
+        return artifacts | {
             "policy": made("train", name if method.trains else None),
             "grounding": made("ground", _grounding(base)),
             "target_encoder": made("align", grounded_as(base) if method.aligns else None),

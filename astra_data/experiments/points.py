@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import artefact_key
+from astra_data.core.naming import artifact_key
 from astra_data.experiments.recipe import Recipe
 
 
@@ -19,8 +19,8 @@ class RunPoint:
 
     @property
     def key(self) -> str:
-        """Key of its evaluation, the last artefact to be made for it."""
-        return artefact_key("evaluate", self.method, self.seed, self.percent)
+        """Key of its evaluation, the last artifact to be made for it."""
+        return artifact_key("evaluate", self.method, self.seed, self.percent)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0"
 """Otherwise Ray makes `uv run` build an environment for every worker, sends usage statistics, and runs
 its workers at a lower priority than every other process."""
 PATIENCE_S = 10
-"""How long to wait for cancelled tasks."""
+"""How long to wait for canceled tasks."""
 
 
 def execute_on_cluster(

@@ -282,11 +282,11 @@ class Recipe(Config):
 def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[Table]) -> type[Recipe]:
     """Return the model of recipes with the tables of `stages` and those that `methods` read.
 
-    Further keys: `based_on`, the recipe that provides the settings not given here and the artefacts that do
+    Further keys: `based_on`, the recipe that provides the settings not given here and the artifacts that do
     not change; `sweep`; and `plus`, the training of `_plus` rows, which is laid over `train`.
     """
     fields: dict[str, Any] = {stage.name: stage_field(stage) for stage in stages if stage.config}
-    about = "The recipe of the settings that are not given here, and of the artefacts that do not change."
+    about = "The recipe of the settings that are not given here, and of the artifacts that do not change."
     fields["based_on"] = (str | None, Field(default=None, description=about))
     fields["sweep"] = (SweepConfig, SweepConfig())
     fields["plus"] = plus_field(*fields["train"])

@@ -44,8 +44,8 @@ def recorded_settings(folder: Path) -> dict[str, Any]:
     Raises:
         BadInputError: their file is damaged.
     """
-    cure = "restore it from a copy, or move the folder away and run the recipe again"
-    return read_written(_Record, folder / RECORD, by="a run", cure=cure).model_dump(exclude_unset=True)
+    advice = "restore it from a copy, or move the folder away and run the recipe again"
+    return read_written(_Record, folder / RECORD, by="a run", advice=advice).model_dump(exclude_unset=True)
 
 
 def read_tables(path: Path) -> dict[str, Any]:

@@ -92,8 +92,8 @@ class Direct:
             filled.append(field)
         found = tuple(field for field in filled[: _length(filled)] if field)
         if not found:
-            cure = "make yaw of the quaternion" if parts else "name it as its command, cmd_q1 and q1"
-            raise BadInputError(f"found no state that a command could move: {cure}")
+            advice = "make yaw of the quaternion" if parts else "name it as its command, cmd_q1 and q1"
+            raise BadInputError(f"found no state that a command could move: {advice}")
         steps = judged_steps(logs.values(found))
         rates, targets = (
             errors(cls(logs, found, (is_rate,) * len(found)), steps)[0] for is_rate in (True, False)

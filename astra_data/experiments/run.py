@@ -1,4 +1,4 @@
-"""Run recipes: make every artefact that is not finished yet, for every row and seed."""
+"""Run recipes: make every artifact that is not finished yet, for every row and seed."""
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
@@ -32,7 +32,7 @@ from astra_data.worlds.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
 
 SET_ASIDE = "set_aside"
-"""The folder of a run for artefacts that are made again: what took hours to make is not deleted."""
+"""The folder of a run for artifacts that are made again: what took hours to make is not deleted."""
 
 
 def run(
@@ -44,7 +44,7 @@ def run(
     device: str = "cpu",
     until: str | None = None,
 ) -> Path:
-    """Make every artefact of a recipe that is not finished yet; return the recipe's folder.
+    """Make every artifact of a recipe that is not finished yet; return the recipe's folder.
 
     Where it grounds, the page of held-out errors is written there.
 
@@ -57,8 +57,8 @@ def run(
         until: the last stage to run, by default all.
 
     Raises:
-        RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
-        MissingStageError: an artefact of the recipe that it is based on is not finished.
+        RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
+        MissingStageError: an artifact of the recipe that it is based on is not finished.
         BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
 
@@ -94,14 +94,14 @@ def run_stage(
     publish: bool = False,
     add: bool = False,
 ) -> Path:
-    """Make the artefacts of one stage of a recipe, of some `methods` and `seeds` only where given.
+    """Make the artifacts of one stage of a recipe, of some `methods` and `seeds` only where given.
 
     With `publish`, the report is also copied to the published results; with `add`, it includes the results
     that are published already.
 
     Raises:
-        MissingStageError: an artefact that the stage reads is not finished.
-        RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
+        MissingStageError: an artifact that the stage reads is not finished.
+        RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
         BadInputError: another process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
@@ -134,9 +134,9 @@ def run_stage(
 
 
 def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict[str, Condition]:
-    """Validate a recipe without running it; return each planned artefact and its condition.
+    """Validate a recipe without running it; return each planned artifact and its condition.
 
-    A task of the user's own is walked through, as by `check_task`. With `verify`, every byte of the artefacts
+    A task of the user's own is walked through, as by `check_task`. With `verify`, every byte of the artifacts
     is read; otherwise their sizes are compared.
 
     Raises:
@@ -177,7 +177,7 @@ def make(
     why and where.
 
     Args:
-        experiment: whose artefacts they are.
+        experiment: whose artifacts they are.
         items: each after those it reads.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
@@ -186,8 +186,8 @@ def make(
         show: shows the progress of the items.
 
     Raises:
-        MissingStageError: an artefact that an item reads is neither finished nor among them.
-        RecipeError: the recipe differs from the one that made the existing artefacts.
+        MissingStageError: an artifact that an item reads is neither finished nor among them.
+        RecipeError: the recipe differs from the one that made the existing artifacts.
         BadInputError: another process runs in the recipe's folder, the device or cluster is not available, or
             a dataset is damaged that the recipe cannot make again.
         AstraDataError: an item failed.
@@ -257,7 +257,7 @@ def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
 
 
 def set_aside(folder: Path, key: str) -> Path:
-    """Move the artefact `key` out of the way; return where it is now."""
+    """Move the artifact `key` out of the way; return where it is now."""
     places = (folder / SET_ASIDE / str(number) / key for number in count(1))
     aside = next(place for place in places if not place.exists())
     make_folder(aside.parent)
@@ -266,7 +266,7 @@ def set_aside(folder: Path, key: str) -> Path:
 
 
 def finished(item: Item, experiment: Experiment) -> bool:
-    """Return whether the artefact of `item` is finished and need not be made again."""
+    """Return whether the artifact of `item` is finished and need not be made again."""
     return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
 
 

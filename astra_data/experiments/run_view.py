@@ -21,7 +21,7 @@ from astra_data.grounding.open_loop_replay import OpenLoopReplay, replay_open_lo
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.reports.figures import method_colour
+from astra_data.reports.figures import method_color
 from astra_data.reports.rerun_view import ReplayedEpisode, view
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import task_named
@@ -113,7 +113,7 @@ def _by_episode(
             known = {key: values for key, values in measures.items() if values is not None}
             replayed = ReplayedEpisode(
                 name,
-                _RAW_COLOR if name == RAW else _rgb(method_colour(name)),
+                _RAW_COLOR if name == RAW else _rgb(method_color(name)),
                 replay.state[number, : steps + 1].numpy(),
                 {key: values[number, :steps].numpy() for key, values in known.items()},
             )
@@ -121,8 +121,8 @@ def _by_episode(
     return found
 
 
-def _rgb(colour: str) -> tuple[int, int, int]:
-    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+def _rgb(color: str) -> tuple[int, int, int]:
+    red, green, blue = bytes.fromhex(color.removeprefix("#"))
     return red, green, blue
 
 

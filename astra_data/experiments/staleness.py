@@ -13,7 +13,7 @@ ROWS_TABLES = tables().keys() | {"plus", "ground", "align"}
 
 
 def reads(row: str, table: str) -> bool:
-    """Return whether a row, or the row that it is initialised from, depends on `table`.
+    """Return whether a row, or the row that it is initialized from, depends on `table`.
 
     A row whose method is not known here may have been grounded and aligned.
     """

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, validated
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import RUNS, artefact_key, reference_of
+from astra_data.core.naming import RUNS, artifact_key, reference_of
 from astra_data.core.progress import Progress, part, silent
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.own_methods import add_all
@@ -114,7 +114,7 @@ def _grounding_row(row: str | None, rows: tuple[str, ...]) -> str:
 def _places(folder: Path, recipe: dict[str, Any], base: str) -> list[str]:
     """Return the places of the finished groundings of a method at the largest size, seed by seed."""
     percent = max(recipe.get("sweep", {}).get("percent", ()), default=None)
-    places = [artefact_key("ground", base, seed, percent) for seed in recipe["seeds"]]
+    places = [artifact_key("ground", base, seed, percent) for seed in recipe["seeds"]]
     if found := [one for one in places if (folder / one / GROUNDING).is_file()]:
         return found
     raise BadInputError(

@@ -1,7 +1,7 @@
 """Sweeps: a recipe's rows on every seed and size, with a table of the finished points.
 
 A point is finished when its evaluation is. `sweep.csv` in the recipe's folder has one line per finished
-point, rewritten from the artefacts whenever one is finished.
+point, rewritten from the artifacts whenever one is finished.
 """
 
 import csv
@@ -28,7 +28,7 @@ from astra_data.experiments.plan import plan, stage_of, stages_until
 from astra_data.experiments.points import RunPoint, Selection
 from astra_data.experiments.recipe import WHOLE
 from astra_data.experiments.run import make
-from astra_data.reports.artefacts import CURVE, EVALUATION, METRICS, Artefact, Evaluation, read_json
+from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 
 TIMED = {"ground": METRICS, "train": CURVE, "align": METRICS, "evaluate": EVALUATION}
 """Stages that are run for few points at once, and the file with the time that they took."""
@@ -72,7 +72,7 @@ def sweep(
         until: the last stage to run, by default all; after "ground" comes a page of held-out errors.
 
     Raises:
-        RecipeError: the recipe has faults, or differs from the one that made the existing artefacts.
+        RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
         BadInputError: the recipe has no such row, seed or size, nothing unpublished or no published results,
             Ray or trackio is not installed, or another process runs in the recipe's folder.
         AstraDataError: an item failed.
@@ -155,9 +155,9 @@ class PointTable:
         means = evaluation.outcomes.means()
         stages = {key: stage_of_key(key) for key in sorted(set(_needed(point.key, self._items)))}
         timed = [self.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
-        # The artefacts that a point was made of may have been deleted since.
+        # The artifacts that a point was made of may have been deleted since.
         is_complete = all(file.is_file() for file in timed)
-        seconds = [read_json(Artefact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
+        seconds = [read_json(Artifact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
         simulated = evaluation.simulated
         return {
             "method": point.method,
@@ -176,7 +176,7 @@ class PointTable:
 
 
 def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
-    """Yield `key` and the keys of all artefacts that it is made of.
+    """Yield `key` and the keys of all artifacts that it is made of.
 
     An evaluation is made of the policy and its encoder, not of the simulators in which it tests them.
     """

@@ -6,7 +6,7 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import RECORD, artefact_key
+from astra_data.core.naming import RECORD, artifact_key
 from astra_data.experiments.own_files import check_unchanged
 from astra_data.experiments.own_methods import add_all
 from astra_data.experiments.recipe_file import recorded_settings
@@ -64,7 +64,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
         percent: the size of the dataset, where the recipe sweeps over sizes.
 
     Raises:
-        BadInputError: the run has no such row or seed, the row trains no policy, an artefact of it is not
+        BadInputError: the run has no such row or seed, the row trains no policy, an artifact of it is not
             there, or the code of the task or of the row's method changed since the run was made.
 
     Example:
@@ -112,7 +112,7 @@ def _files(
 ) -> dict[str, Path]:
     own_methods = settings.get("own_methods", {})
     add_all(own_methods)
-    files = {"train": folder / artefact_key("train", row, seed, percent) / POLICY}
+    files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}
     if not files["train"].is_file():
         _check_asked(settings, row, seed)
     method = method_named(row)
@@ -126,9 +126,9 @@ def _files(
     for name in own_methods.keys() & {method.name, base}:
         check_unchanged(own_methods[name]["method"], folder, name=name)
     if method.grounds:
-        files["ground"] = folder / artefact_key("ground", base, seed, percent) / GROUNDING
+        files["ground"] = folder / artifact_key("ground", base, seed, percent) / GROUNDING
     if method.aligns and (settings.get("evaluate") or {}).get("encoder") != "source":
-        files["align"] = folder / artefact_key("align", base, seed, percent) / TARGET_ENCODER
+        files["align"] = folder / artifact_key("align", base, seed, percent) / TARGET_ENCODER
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
     return files

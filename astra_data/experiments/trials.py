@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from shutil import copy2
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artifact import finished_folder
 from astra_data.core.errors import BadInputError
 from astra_data.core.lock import alone_in
 from astra_data.core.manifest import read_manifest

@@ -18,7 +18,7 @@ def telemetry(
     They are: R² of each head that is trained (for the correction: the share of the simulator's error that it
     removes), None where there is no variance to explain, as in a perfect simulator; the mean standard
     deviation of the latent's entries; and the latent's effective rank (exponential of the entropy of the
-    normalised eigenvalues of its covariance); both None for a single step.
+    normalized eigenvalues of its covariance); both None for a single step.
 
     Raises:
         BadInputError: latents are not finite: the fit diverged.

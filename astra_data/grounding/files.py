@@ -20,7 +20,7 @@ KINDS: dict[str, type[FittedGrounding]] = {
 """The groundings that can be read, by what their files call them."""
 
 GROUNDING, TARGET_ENCODER = "grounding.safetensors", "target_encoder.safetensors"
-"""Names of the files of their artefacts."""
+"""Names of the files of their artifacts."""
 _TARGET_ENCODER = "target encoder"
 
 

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.artefact import CHECKPOINT
+from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, CountFromZero, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part
@@ -97,7 +97,7 @@ class Fitting:
         settings: the method's own table of the recipe, if it has one.
         training: paired episodes to fit. held_out: paired episodes to measure on.
         seed: of all randomness. device: of the networks.
-        folder: for checkpoints and further files; files left in it become part of the artefact.
+        folder: for checkpoints and further files; files left in it become part of the artifact.
         progress: called with the share done and a note.
     """
 
@@ -219,7 +219,7 @@ def _fitted(
     # Where a failure model tells them, R_pred would fill the latent with the failures of the data in vain.
     model.set_reward_scales(rewards, goes_on, failed, config.failure_weight * weights.failures)
     fitting = replace(whole, training=training, seed=seed, progress=progress)
-    return model, _optimise(model, weights, fitting, whole.folder / name)
+    return model, _optimize(model, weights, fitting, whole.folder / name)
 
 
 def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
@@ -247,7 +247,7 @@ def residual_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     return replace(episodes, windows=replace(windows, reward=residual, goes_on=goes_on, failed=failed))
 
 
-def _optimise(
+def _optimize(
     model: GroundingModel, weights: LossWeights, fitting: Fitting, checkpoint: Path
 ) -> dict[str, Any]:
     config = fitting.config

@@ -1,1 +1,1 @@
-"""Policy optimisation, on any batched environment or from recorded episodes."""
+"""Policy optimization, on any batched environment or from recorded episodes."""

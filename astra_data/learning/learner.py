@@ -12,7 +12,7 @@ from astra_data.learning.acting import Acting
 
 
 class Resumable(Protocol):
-    """What checkpoints of a training hold, such as a network or an optimiser."""
+    """What checkpoints of a training hold, such as a network or an optimizer."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that `load_state_dict` needs."""

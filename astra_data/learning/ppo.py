@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al. 2017) on a batched environment, with TorchRL's GAE.
+"""Proximal policy optimization (Schulman et al. 2017) on a batched environment, with TorchRL's GAE.
 
 One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are whole
 rollouts of some environments, so the same code trains policies with and without memory.

@@ -226,7 +226,7 @@ class Sac(Learner):
 class _Critics(nn.Module):
     """Two action values, and the memory that both share, if the policy has one.
 
-    Layer normalisation keeps them from diverging at this learning rate.
+    Layer normalization keeps them from diverging at this learning rate.
     """
 
     def __init__(self, shape: PolicyShape) -> None:

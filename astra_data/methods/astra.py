@@ -9,7 +9,7 @@ from astra_data.training.train import InSimulator
 ASTRA = Method(
     name="astra",
     title="ASTRA",
-    colour="#009E73",
+    color="#009E73",
     fit=HistoryFit(latent=True, reward=True),
     predicts_reward=True,
     learn=InSimulator(reward="predicted"),
@@ -20,7 +20,7 @@ ASTRA_WITHOUT_LATENT = replace(
     ASTRA,
     name="astra_without_latent",
     title="ASTRA w/o L_trans",
-    colour="#44AA99",
+    color="#44AA99",
     fit=HistoryFit(latent=False, reward=True),
     aligns=False,
 )
@@ -30,7 +30,7 @@ ASTRA_WITHOUT_REWARD = replace(
     ASTRA,
     name="astra_without_reward",
     title="ASTRA w/o L_rew",
-    colour="#999933",
+    color="#999933",
     fit=HistoryFit(latent=True, reward=False),
     predicts_reward=False,
     learn=InSimulator(),
@@ -41,7 +41,7 @@ ASTRA_TASK_REWARD = replace(
     ASTRA,
     name="astra_task_reward",
     title="ASTRA, task reward",
-    colour="#117733",
+    color="#117733",
     learn=InSimulator(reward="abstract"),
     grounded_as="astra",
 )

@@ -13,7 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.artefact import CHECKPOINT
+from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.checkpoint import resumed, save_state
 from astra_data.core.config import AtOnce, Count, own_settings
 from astra_data.core.errors import BadInputError
@@ -185,7 +185,7 @@ def _iterate(search: Search, config: CompassConfig, fitting: Fitting, name: str)
     cause = torch.cat([parameters, summary.expand(len(contexts), -1, -1)], dim=-1)
     effect = (difference / scale).flatten(0, 1)
     torch.manual_seed(derive(fitting.seed, f"{name} model"))
-    model = fit_causes(cause.flatten(0, 1), effect, config, penalised=len(varied))
+    model = fit_causes(cause.flatten(0, 1), effect, config, penalized=len(varied))
     mask = (model.probability > config.mask_threshold).float()
     steers = torch.tensor([parameter in box.steering for parameter in varied], device=device)
     moves = mask[: len(varied)].any(-1) & steers
@@ -215,7 +215,7 @@ TABLE = Table("compass", CompassConfig, ranges="wide")
 COMPASS = Method(
     name="compass",
     title="COMPASS",
-    colour="#F0E442",
+    color="#F0E442",
     fit=identify,
     table=TABLE,
     configures="ground",
@@ -225,7 +225,7 @@ COMPASS = Method(
 COMPASS_UNIFORM = Method(
     name="compass_uniform",
     title="COMPASS, uniform",
-    colour="#B8A000",
+    color="#B8A000",
     learn=InSimulator(ranges="wide"),
     table=TABLE,
 )

@@ -2,4 +2,4 @@
 
 from astra_data.methods.method import Method
 
-DIRECT_TRANSFER = Method(name="direct_transfer", title="Direct transfer", colour="#E69F00", role="floor")
+DIRECT_TRANSFER = Method(name="direct_transfer", title="Direct transfer", color="#E69F00", role="floor")

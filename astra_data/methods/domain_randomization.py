@@ -11,7 +11,7 @@ from astra_data.worlds.variation import AnyVariation
 DOMAIN_RANDOMIZATION = Method(
     name="domain_randomization",
     title="Domain randomization",
-    colour="#CC79A7",
+    color="#CC79A7",
     learn=InSimulator(ranges="randomized"),
     table=Table("domain_randomization", AnyVariation, ranges="randomized"),
 )

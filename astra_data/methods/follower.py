@@ -12,7 +12,7 @@ from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 
 FOLLOWER = Method(
-    name="follower", title="Careful follower", colour="#9A9A9A", role="ceiling", learn=None, planar=True
+    name="follower", title="Careful follower", color="#9A9A9A", role="ceiling", learn=None, planar=True
 )
 
 Act = Callable[[Tensor, Tensor], Tensor]

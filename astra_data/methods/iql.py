@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from astra_data.core.artefact import CHECKPOINT
+from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.logbook import Logbook
@@ -61,7 +61,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
         policy: Policy = ActorCritic(shape).to(training.device)
     else:
         policy = copy.deepcopy(training.initial.policy).requires_grad_(True)
-    curve = _optimise(Iql(policy, experience, config, seed=training.seed), training)
+    curve = _optimize(Iql(policy, experience, config, seed=training.seed), training)
     return PolicyFile(policy, None, episodes.reference, episodes.content_hash), curve
 
 
@@ -100,7 +100,7 @@ def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
     )
 
 
-def _optimise(iql: Iql, training: Training) -> dict[str, Any]:
+def _optimize(iql: Iql, training: Training) -> dict[str, Any]:
     """Train to the end, resuming from the checkpoint in the folder if there is one; return the losses."""
     logbook = Logbook(training.folder / CHECKPOINT, iql.load_state_dict)
     points, stopwatch = logbook.points, logbook.stopwatch
@@ -122,7 +122,7 @@ _RATES = ("updates_per_second",)
 IQL = Method(
     name="iql",
     title="IQL",
-    colour="#D55E00",
+    color="#D55E00",
     learn=learn_from_episodes,
     learns_from="episodes",
     table=Table("iql", IqlConfig),
@@ -130,13 +130,13 @@ IQL = Method(
 )
 
 BEHAVIOR_CLONING = replace(
-    IQL, name="behavior_cloning", title="Behavior cloning", colour="#AA4499", learn=clone_behavior
+    IQL, name="behavior_cloning", title="Behavior cloning", color="#AA4499", learn=clone_behavior
 )
 
 DIRECT_TRANSFER_IQL = Method(
     name="direct_transfer_iql",
     title="Direct transfer + IQL",
-    colour="#7B3294",
+    color="#7B3294",
     learn=learn_from_episodes,
     learns_from="episodes",
     initial="direct_transfer",

@@ -50,7 +50,7 @@ class Method:
 
     Attributes:
         name: in recipes and folders. title: in tables and figures.
-        colour: in figures, as "#rrggbb"; one of the spare colours where empty.
+        color: in figures, as "#rrggbb"; one of the spare colors where empty.
         role: set for rows that the others are compared with.
         fit: what it learns about the simulator from pairs; None where the simulator stays raw.
         predicts_reward: whether that includes the target's reward.
@@ -66,7 +66,7 @@ class Method:
 
     name: str
     title: str
-    colour: str = ""
+    color: str = ""
     role: Role | None = None
     fit: Fit | None = None
     predicts_reward: bool = False

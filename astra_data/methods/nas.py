@@ -6,4 +6,4 @@ The reward is the task's own on corrected states, as Golemo et al. recompute it.
 from astra_data.grounding.fit import HistoryFit
 from astra_data.methods.method import Method
 
-NAS = Method(name="nas", title="NAS", colour="#56B4E9", fit=HistoryFit(latent=False, reward=False))
+NAS = Method(name="nas", title="NAS", color="#56B4E9", fit=HistoryFit(latent=False, reward=False))

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from astra_data.core.artefact import CHECKPOINT
+from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, Count, Positive, own_settings
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive, generator
@@ -47,14 +47,14 @@ def fit_residual(fitting: Fitting) -> tuple[ResidualGrounding, dict[str, Any]]:
     model.set_scales(
         training.steps(windows.state), training.steps(windows.next_state - windows.simulated_next)
     )
-    metrics = _optimise(model, config, fitting)
+    metrics = _optimize(model, config, fitting)
     held_out = fitting.held_out
     residual = held_out.windows.next_state - _corrected(model, held_out)
     model.residual_factor.copy_(scatter_factor(held_out.steps(residual)))
     return ResidualGrounding(model), metrics
 
 
-def _optimise(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> dict[str, Any]:
+def _optimize(model: ResidualModel, config: GolemoConfig, fitting: Fitting) -> dict[str, Any]:
     optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     episodes, count = fitting.training, len(fitting.training)
 
@@ -116,7 +116,7 @@ def _r2(model: ResidualModel, episodes: PairedEpisodes) -> float | None:
 NAS_GOLEMO = Method(
     name="nas_golemo",
     title="NAS (Golemo et al.)",
-    colour="#0072B2",
+    color="#0072B2",
     fit=fit_residual,
     table=Table("nas_golemo", GolemoConfig),
     configures="ground",

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from astra_data.core.artefact import CHECKPOINT
+from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import part
@@ -20,7 +20,7 @@ from astra_data.learning.rma import Adaptation, RmaConfig
 from astra_data.methods.method import Method, Table
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.ramp import Ramp
-from astra_data.training.train import InSimulator, PpoTrainConfig, Training, optimise
+from astra_data.training.train import InSimulator, PpoTrainConfig, Training, optimize
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class TeacherThenStudent(InSimulator):
         phase_1 = replace(training, progress=part(training.progress, 0.0, first))
         phase_2 = replace(training, progress=part(training.progress, first, 1.0))
         ppo = Ppo(env, teacher, config, horizon=horizon, seed=seed)
-        curve = optimise(ppo, env, config.penalty_ramp, phase_1)
+        curve = optimize(ppo, env, config.penalty_ramp, phase_1)
         adaptation = Adaptation(
             env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
         )
-        curve["adaptation"] = optimise(adaptation, env, Ramp(), phase_2, f"adaptation_{CHECKPOINT}")
+        curve["adaptation"] = optimize(adaptation, env, Ramp(), phase_2, f"adaptation_{CHECKPOINT}")
         for clock in CLOCKS:
             curve[clock] += curve["adaptation"][clock]
         episodes = training.episodes
@@ -64,7 +64,7 @@ class TeacherThenStudent(InSimulator):
 RMA = Method(
     name="rma",
     title="RMA",
-    colour="#A6761D",
+    color="#A6761D",
     learn=TeacherThenStudent(ranges="wide"),
     table=Table("rma", RmaConfig),
 )

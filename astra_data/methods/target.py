@@ -8,11 +8,11 @@ from astra_data.training.train_in_target import InTarget, TargetConfig
 TARGET = Method(
     name="target",
     title="Target",
-    colour="#4D4D4D",
+    color="#4D4D4D",
     role="trained there",
     learn=InTarget("abstract"),
     learns_from="target",
     table=Table("target", TargetConfig),
 )
 
-FULL_OBS = replace(TARGET, name="full_obs", title="Full Obs", colour="#1A1A1A", learn=InTarget("full"))
+FULL_OBS = replace(TARGET, name="full_obs", title="Full Obs", color="#1A1A1A", learn=InTarget("full"))

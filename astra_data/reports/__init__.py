@@ -1,11 +1,11 @@
-"""Results of a recipe: artefacts of its runs → tables, figures and a page.
+"""Results of a recipe: artifacts of its runs → tables, figures and a page.
 
-artefacts     JSON files that the other stages write, strictly validated
+artifacts     JSON files that the other stages write, strictly validated
 runs          where those files are, for all rows and seeds
 schema        Results: what results.json holds
 seed_table    Results as a tidy table: one line per row and seed
-costs         times and speeds of the artefacts
-assembly      artefacts → Results
+costs         times and speeds of the artifacts
+assembly      artifacts → Results
 mean_bands    errors by horizon, averaged over seeds
 merging       Results of several places → one
 comparing     summaries over seeds, comparisons of rows, predictive validity

@@ -1,4 +1,4 @@
-"""Artefacts of all rows and seeds → Results."""
+"""Artifacts of all rows and seeds → Results."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import origin
 from astra_data.methods import method_named
-from astra_data.reports.artefacts import (
+from astra_data.reports.artifacts import (
     CURVE,
     GAP,
     METRICS,
     TRAJECTORIES,
-    Artefact,
+    Artifact,
     Band,
     CurveFile,
     Evaluation,
@@ -55,16 +55,16 @@ def assemble(
     compare: Sequence[str] = ("astra",),
     published: Results | None = None,
 ) -> Results:
-    """Read the artefacts under `root` of every row, for the seeds that it has finished.
+    """Read the artifacts under `root` of every row, for the seeds that it has finished.
 
     The task is given by its name, as in its evaluations. `percent` selects the dataset size, if there are
     several. Rows of the methods in `compare` are compared with the others. Results in `published` are merged
     in, unless there are newer ones under `root`, which for a choice is one among all policies of the outcome.
 
     Raises:
-        MissingStageError: no row has an evaluation and nothing is published; or a row lacks other artefacts
+        MissingStageError: no row has an evaluation and nothing is published; or a row lacks other artifacts
             for some of its finished seeds.
-        BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
+        BadInputError: an artifact is malformed, or rows differ in task, episodes, robot or data.
     """
     read, sources = Runs(reported, root, percent), []
     if published:
@@ -111,7 +111,7 @@ def _measured(results: Results) -> dict[tuple[str, int], float]:
 
 
 def _read(read: Runs, command: str, scores: tuple[Score, ...], judged: Judged | None) -> Results:
-    """Return the results under one root, before rows are summarised and compared."""
+    """Return the results under one root, before rows are summarized and compared."""
     evaluations = read.evaluations()
     read.require("evaluate", TRAJECTORIES, tuple(read.finished))
     episodes = check_alike(evaluations, read.reported.task)
@@ -127,7 +127,7 @@ def _read(read: Runs, command: str, scores: tuple[Score, ...], judged: Judged | 
         encoders = [{name: sorted(of) for name, of in file.encoders.items()} for file in of_seeds.values()]
         _require_alike(encoders, "encoders")
         grounding = read.owner("ground", method)
-        made: dict[str, Mapping[int, Artefact]] = {
+        made: dict[str, Mapping[int, Artifact]] = {
             "ground": metrics.get(grounding, {}),
             "train": curves.get(method, {}),
             "align": alignments.get(read.owner("align", method), {}),
@@ -171,7 +171,7 @@ def _read(read: Runs, command: str, scores: tuple[Score, ...], judged: Judged | 
         command=command,
         scores=scores,
         settings=dict(read.reported.settings),
-        origins=_origins({**files, "report": {"all": [Artefact.model_validate(origin())]}}),
+        origins=_origins({**files, "report": {"all": [Artifact.model_validate(origin())]}}),
         own_code=code_of_rows(read.root, rows),
         wall_seconds=seconds(timed, "wall_seconds"),
         cpu_seconds=seconds(timed, "cpu_seconds"),
@@ -192,7 +192,7 @@ def _read(read: Runs, command: str, scores: tuple[Score, ...], judged: Judged | 
 
 
 def _first_trainings(
-    read: Runs, rows: Mapping[str, Mapping[int, Artefact]]
+    read: Runs, rows: Mapping[str, Mapping[int, Artifact]]
 ) -> dict[str, dict[int, CurveFile]]:
     """Return, row → seed → file, the trainings from whose policies those of the row start."""
     found: dict[str, dict[int, CurveFile]] = {}
@@ -203,7 +203,7 @@ def _first_trainings(
     return found
 
 
-def _listed[T: Artefact](files: Mapping[str, Mapping[int, T]]) -> dict[str, list[T]]:
+def _listed[T: Artifact](files: Mapping[str, Mapping[int, T]]) -> dict[str, list[T]]:
     return {row: list(of_seeds.values()) for row, of_seeds in files.items()}
 
 

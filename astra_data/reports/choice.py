@@ -7,7 +7,7 @@ from statistics import fmean
 import numpy as np
 from pydantic import Field
 
-from astra_data.reports.artefacts import Artefact, WrittenPart, read_json
+from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
 from astra_data.reports.schema import Calibration, Choice, Ranked
 from astra_data.reports.statistics import Correlation, mean_interval, mean_rank_correlation
 
@@ -52,7 +52,7 @@ class Candidate(WrittenPart):
         return mean_interval(values) if len(values) >= LEAST else None
 
 
-class Judged(Artefact):
+class Judged(Artifact):
     """select.json: all candidates of a recipe; nothing in it comes from the target."""
 
     judge: str

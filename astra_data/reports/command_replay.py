@@ -38,14 +38,14 @@ def can_replay(task: Task) -> bool:
 
 
 def replay_commands(task: Task) -> CommandReplay:
-    """Drive one simulated and 60 target robots from the centre of the start cell by the same commands."""
+    """Drive one simulated and 60 target robots from the center of the start cell by the same commands."""
     command = np.concatenate(
         [np.tile(velocity, (round(seconds * task.fps), 1)) for velocity, seconds in _COMMANDS]
     )
     robots = task.target(_ROBOTS, seed=0)
     robots.reset()
     states = robots.state.double().numpy()
-    states[:, :2] = task.maze.cell_centre(*task.maze.start)
+    states[:, :2] = task.maze.cell_center(*task.maze.start)
     robots.reset_to(np.arange(_ROBOTS), states)
     simulator = task.simulator(1)
     simulator.reset_to(task.abstraction(robots.state[:1]))

@@ -13,7 +13,7 @@ from astra_data.reports.statistics import (
     correlation,
     paired_difference,
     probability_of_improvement,
-    summarise,
+    summarize,
 )
 from astra_data.worlds.score import Score
 
@@ -21,13 +21,13 @@ SHARED_WORLDS = ("raw", "grounded")
 """Simulators in which all rows are tested."""
 
 
-def summarised(row: MethodResults, replicates: int) -> MethodResults:
+def summarized(row: MethodResults, replicates: int) -> MethodResults:
     """Return a row with the summary of each of its measures over the seeds that have it."""
     summary = {}
     for name, values in row.measures().items():
         known = np.array([value for value in values or () if not np.isnan(value)])
         if len(known):
-            summary[name] = summarise(known, replicates=replicates)
+            summary[name] = summarize(known, replicates=replicates)
     return row.model_copy(update={"summary": summary})
 
 

@@ -1,10 +1,10 @@
-"""Time and speed of all stages, from their artefacts."""
+"""Time and speed of all stages, from their artifacts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from astra_data.methods import METHODS
-from astra_data.reports.artefacts import Artefact
+from astra_data.reports.artifacts import Artifact
 from astra_data.reports.schema import Cost
 
 DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")
@@ -22,12 +22,12 @@ THROUGHPUT = {
 }
 """The keys under which each stage records its speed."""
 
-Files = Mapping[str, Mapping[str, Sequence[Artefact]]]
-"""Stage → row, shared grounding, or "all" → one artefact per seed."""
+Files = Mapping[str, Mapping[str, Sequence[Artifact]]]
+"""Stage → row, shared grounding, or "all" → one artifact per seed."""
 
 
 def seconds(files: Files, clock: Literal["wall_seconds", "cpu_seconds"]) -> dict[str, float]:
-    """Return the time of each stage over all artefacts that record it, each counted once, and the "total"."""
+    """Return the time of each stage over all artifacts that record it, each counted once, and the "total"."""
     recorded = {
         stage: [spent for row in rows.values() for file in row if (spent := getattr(file, clock)) is not None]
         for stage, rows in files.items()
@@ -36,7 +36,7 @@ def seconds(files: Files, clock: Literal["wall_seconds", "cpu_seconds"]) -> dict
     return summed | {"total": sum(summed.values())}
 
 
-def seed_cost(files: Mapping[str, Artefact]) -> dict[str, Cost]:
+def seed_cost(files: Mapping[str, Artifact]) -> dict[str, Cost]:
     """Return the cost by stage of what one seed is made of; a stage that recorded no time is left out."""
     return {
         stage: Cost(wall_seconds=file.wall_seconds, cpu_seconds=file.cpu_seconds)
@@ -45,7 +45,7 @@ def seed_cost(files: Mapping[str, Artefact]) -> dict[str, Cost]:
     }
 
 
-def with_first(cost: dict[str, Cost], first: Artefact | None) -> dict[str, Cost]:
+def with_first(cost: dict[str, Cost], first: Artifact | None) -> dict[str, Cost]:
     """Add to what a training costs, by stage, the training `first` from whose policy it starts, if any."""
     own = cost.get("train")
     if first is None or first.wall_seconds is None or own is None:
@@ -63,7 +63,7 @@ def throughput(files: Files) -> dict[str, dict[str, dict[str, list[float]]]]:
 
 
 def _stage_throughput(
-    stage: str, files: Mapping[str, Sequence[Artefact]]
+    stage: str, files: Mapping[str, Sequence[Artifact]]
 ) -> dict[str, dict[str, list[float]]]:
     figures = {}
     for figure in THROUGHPUT[stage]:

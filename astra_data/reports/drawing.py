@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import artefact_key
+from astra_data.core.naming import artifact_key
 from astra_data.dataset.inspection import Map, visited
 from astra_data.dataset.reader import Dataset
-from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
+from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
 from astra_data.reports.figures import (
     Curve,
     OpenLoop,
@@ -113,7 +113,7 @@ def _with_trajectories(root: Path, results: Results, rows: Sequence[str]) -> dic
     """Return row → folder of its first seed with trajectories; empty if any row has none."""
     found = {}
     for row in rows:
-        folders = (root / artefact_key("evaluate", row, seed) for seed in results.methods[row].seeds)
+        folders = (root / artifact_key("evaluate", row, seed) for seed in results.methods[row].seeds)
         folder = next((folder for folder in folders if (folder / TRAJECTORIES).exists()), None)
         if folder is None:
             return {}
@@ -231,7 +231,7 @@ def _scored(row: MethodResults, score: Score) -> Scored:
 def _subsets(found: SizesResults, root: Path) -> list[Path]:
     """Return the datasets of all sizes of the first seed that has all of them; empty without one."""
     for seed in found.sizes[0].results.seeds:
-        folders = [root / artefact_key("subset", "", seed, size.percent) for size in found.sizes]
+        folders = [root / artifact_key("subset", "", seed, size.percent) for size in found.sizes]
         if all(folder.is_dir() for folder in folders):
             return folders
     return []

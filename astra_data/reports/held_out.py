@@ -8,10 +8,10 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.durable import write_file
-from astra_data.core.naming import artefact_key
+from astra_data.core.naming import artifact_key
 from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
-from astra_data.reports.artefacts import GAP, METRICS, Foresight, Gap, Metrics, read_json
+from astra_data.reports.artifacts import GAP, METRICS, Foresight, Gap, Metrics, read_json
 from astra_data.reports.assembly import mean_gap
 from astra_data.reports.formatting import fill, measured
 from astra_data.reports.schema import GapMeans, judged_horizon, shared_horizons
@@ -53,7 +53,7 @@ def write_held_out(
     for method in groundings:
         for percent in sorted(percents) or (None,):
             files = {
-                seed: root / artefact_key("ground", method, seed, percent) / GAP for seed in sorted(seeds)
+                seed: root / artifact_key("ground", method, seed, percent) / GAP for seed in sorted(seeds)
             }
             gaps = {seed: read_json(Gap, file) for seed, file in files.items() if file.is_file()}
             if gaps:
@@ -133,7 +133,7 @@ def _measured(
 ) -> dict[str, list[Foresight]]:
     measured: dict[str, list[Foresight]] = {}
     for seed in seeds:
-        file = root / artefact_key("ground", method, seed, percent) / METRICS
+        file = root / artifact_key("ground", method, seed, percent) / METRICS
         for part, one in read_json(Metrics, file).failures.items() if file.is_file() else ():
             if one.auc:
                 measured.setdefault(part, []).append(one)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from astra_data.reports.artefacts import Band
+from astra_data.reports.artifacts import Band
 from astra_data.reports.schema import BandMeans
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from astra_data.core.errors import BadInputError
 from astra_data.methods import method_title
-from astra_data.reports.comparing import improvement, summarised, validity
+from astra_data.reports.comparing import improvement, summarized, validity
 from astra_data.reports.mean_bands import mean_band
 from astra_data.reports.origins import dataset_uses, merged_origins
 from astra_data.reports.schema import BandMeans, DatasetOrigin, GapMeans, Results, shared_horizons
@@ -23,7 +23,7 @@ def merge(
 ) -> Results:
     """Return one Results of those `methods` and `seeds` that any of the `sources` has, compared anew.
 
-    A source of which later ones have all rows and seeds is left out. Times are summed, so other artefacts
+    A source of which later ones have all rows and seeds is left out. Times are summed, so other artifacts
     that were made twice count twice. A grounding's gap is the mean over the seeds of all sources; where they
     share seeds, of the source with most of them.
 
@@ -38,7 +38,7 @@ def merge(
     }
     finished = {method: lines for method, lines in by_method.items() if lines}
     gaps = _gaps(sources)
-    rows = {method: summarised(row_of(lines, gaps), replicates) for method, lines in finished.items()}
+    rows = {method: summarized(row_of(lines, gaps), replicates) for method, lines in finished.items()}
     reported = {line.seed for lines in finished.values() for line in lines}
     return sources[-1].model_copy(
         update={

@@ -29,8 +29,8 @@ def recorded_code(root: Path) -> dict[str, str]:
     """
     if not (root / CODE).is_file():
         return {}
-    cure = "restore it from a copy, or remove it if the code is still what the run was made with"
-    return read_written(dict[str, str], root / CODE, by="a run", cure=cure)
+    advice = "restore it from a copy, or remove it if the code is still what the run was made with"
+    return read_written(dict[str, str], root / CODE, by="a run", advice=advice)
 
 
 def code_of_rows(root: Path, rows: Iterable[str]) -> dict[str, str]:

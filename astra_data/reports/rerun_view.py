@@ -162,7 +162,7 @@ def _send_values(rerun: Any, stream: Any, entity: str, values: Array, times: lis
 def _paths(
     schema: dict[str, Column], episode: Episode
 ) -> Iterator[tuple[str, Array, bool, tuple[int, int, int]]]:
-    """Yield name, points (n, 3), whether they come a step later, and colour of each path on the plane."""
+    """Yield name, points (n, 3), whether they come a step later, and color of each path on the plane."""
     for state, following in ((ABSTRACT_STATE, ABSTRACT_NEXT_STATE), (STATE, NEXT_STATE)):
         plane = _plane(schema[state]) if state in schema else None
         if plane is None:

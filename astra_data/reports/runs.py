@@ -1,4 +1,4 @@
-"""Find the artefacts of all rows and seeds of a recipe."""
+"""Find the artifacts of all rows and seeds of a recipe."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,13 +8,13 @@ from pathlib import Path
 from pydantic import JsonValue
 
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.naming import artefact_key
+from astra_data.core.naming import artifact_key
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.methods import grounded_as
-from astra_data.reports.artefacts import EVALUATION, Artefact, DatasetFile, Evaluation, read_json
+from astra_data.reports.artifacts import EVALUATION, Artifact, DatasetFile, Evaluation, read_json
 
 SHARED_BY_ROWS = ("ground", "align")
-"""Stages whose artefacts a "_plus" row takes from its base row."""
+"""Stages whose artifacts a "_plus" row takes from its base row."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Reported:
 
 @dataclass(frozen=True)
 class Runs:
-    """The artefacts of one recipe: `root`/<stage>/<method>/seed_<seed>/.
+    """The artifacts of one recipe: `root`/<stage>/<method>/seed_<seed>/.
 
     Attributes:
         reported: what is reported of the recipe.
@@ -58,14 +58,14 @@ class Runs:
             )
 
     def owner(self, stage: str, method: str) -> str:
-        """Return the row in whose folder the artefact is: rows may share a grounding and its alignment."""
+        """Return the row in whose folder the artifact is: rows may share a grounding and its alignment."""
         if stage in SHARED_BY_ROWS and not (self.root / stage / method).is_dir():
             return grounded_as(method)
         return method
 
     def path(self, stage: str, method: str, seed: int, name: str) -> Path:
         """Return the path of a stage's file for one row and seed."""
-        return self.root / artefact_key(stage, self.owner(stage, method), seed, self.percent) / name
+        return self.root / artifact_key(stage, self.owner(stage, method), seed, self.percent) / name
 
     @cached_property
     def _seeds(self) -> dict[str, tuple[int, ...]]:
@@ -98,7 +98,7 @@ class Runs:
         """Read the evaluation of every row and finished seed: row → seed → file."""
         return self._read("evaluate", EVALUATION, Evaluation, tuple(self.finished))
 
-    def optional[T: Artefact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
+    def optional[T: Artifact](self, stage: str, name: str, model: type[T]) -> dict[str, dict[int, T]]:
         """Read a file for the rows that have it for all finished seeds (or none): owner → seed → file."""
         present = [
             method
@@ -111,7 +111,7 @@ class Runs:
         """Read the metadata of the datasets that a stage wrote, by seed."""
         percent = self.percent if stage == "subset" else None
         paths = {
-            seed: self.root / artefact_key(stage, "", seed, percent) / DATASET_PATH
+            seed: self.root / artifact_key(stage, "", seed, percent) / DATASET_PATH
             for seed in self.reported.seeds
         }
         return {seed: read_json(DatasetFile, path) for seed, path in paths.items() if path.exists()}
@@ -139,13 +139,13 @@ class Runs:
             f"run the recipe {self.reported.name} again: it continues with what is missing"
         )
 
-    def _read[T: Artefact](
+    def _read[T: Artifact](
         self, stage: str, name: str, model: type[T], methods: Sequence[str]
     ) -> dict[str, dict[int, T]]:
         self.require(stage, name, methods)
         paths: dict[str, dict[int, Path]] = {}
         for method in methods:
-            # Rows that share an artefact may have different seeds of it.
+            # Rows that share an artifact may have different seeds of it.
             found = paths.setdefault(self.owner(stage, method), {})
             found |= {seed: self.path(stage, method, seed, name) for seed in self.finished[method]}
         return {

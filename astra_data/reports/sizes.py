@@ -65,7 +65,7 @@ def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
     """
     first = found.sizes[0].results
     seconds = sum(size.results.wall_seconds["total"] for size in found.sizes)
-    # The artefacts of these stages are in the results of every size.
+    # The artifacts of these stages are in the results of every size.
     seconds -= (len(found.sizes) - 1) * sum(first.wall_seconds.get(stage, 0.0) for stage in SHARED_BY_SIZES)
     means, intervals = size_lines(found)
     return fill(

@@ -86,8 +86,8 @@ class Correlation:
     high: float
 
 
-def summarise(scores: Floats, *, replicates: int = REPLICATES) -> Summary:
-    """Summarise the `scores` (seeds,) or (seeds, tasks) of one row.
+def summarize(scores: Floats, *, replicates: int = REPLICATES) -> Summary:
+    """Summarize the `scores` (seeds,) or (seeds, tasks) of one row.
 
     Raises:
         BadInputError: there is no score, or one that is not finite.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from astra_data.reports.artefacts import Artefact, WrittenPart, read_json
+from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
 
 TRIALS = "trials.json"
 
@@ -28,7 +28,7 @@ class TrialRound(WrittenPart):
     """Those that are finished."""
 
 
-class TrialsFile(Artefact):
+class TrialsFile(Artifact):
     """trials.json: trials of candidates in the target."""
 
     trials: int

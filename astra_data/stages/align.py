@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from astra_data.core.artefact import CHECKPOINT, finished_folder
+from astra_data.core.artifact import CHECKPOINT, finished_folder
 from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.progress import Progress, silent
@@ -20,7 +20,7 @@ from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.paired_windows import PairedWindows
-from astra_data.reports.artefacts import METRICS
+from astra_data.reports.artifacts import METRICS
 
 _KEEP_EVERY = 50
 

@@ -92,8 +92,8 @@ class CollectConfig(Config):
             raise ValueError(
                 f'plan: expected with behavior "planned" and only then, got "{self.behavior}" and {self.plan}'
             )
-        artefacts = ("policy", "grounding", "target_encoder")
-        given = [name for name in artefacts if getattr(self, name) is not None]
+        artifacts = ("policy", "grounding", "target_encoder")
+        given = [name for name in artifacts if getattr(self, name) is not None]
         if self.behavior != "policy" and given:
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
         if self.random_share and self.behavior in {"random", "stress", "planned"}:
@@ -130,7 +130,7 @@ def collect(
         resume: keep the finished episodes of an interrupted call and record the rest.
 
     Raises:
-        BadInputError: the task is unknown, `out` exists, or an artefact of the behavior is missing.
+        BadInputError: the task is unknown, `out` exists, or an artifact of the behavior is missing.
 
     Example:
         >>> from pathlib import Path

@@ -15,7 +15,7 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.core.artefact import finished_folder, refuse_finished
+from astra_data.core.artifact import finished_folder, refuse_finished
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.digest import file_digest
@@ -35,7 +35,7 @@ from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.reports.artefacts import EVALUATION, TRAJECTORIES
+from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import own_world
 from astra_data.training.policy_file import POLICY, PolicyFile, running

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method
@@ -16,7 +16,7 @@ from astra_data.grounding.open_loop_error import gap_report
 from astra_data.grounding.own_grounding import check_step, fitted
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import is_of_package, method_named
-from astra_data.reports.artefacts import GAP, METRICS
+from astra_data.reports.artifacts import GAP, METRICS
 from astra_data.worlds.registry import task_named
 
 

@@ -71,7 +71,7 @@ def label(
     Example:
         >>> from pathlib import Path
         >>> from astra_data import label
-        >>> labelled = label("antmaze-umaze", data="walks", out=Path("labelled"))  # lacks nothing: a link
+        >>> labeled = label("antmaze-umaze", data="walks", out=Path("labeled"))  # lacks nothing: a link
     """
     world, source = task_named(task), opened(data)
     check_fits(source, world)
@@ -100,18 +100,18 @@ def label(
         more=more,
     ) as writer:
         for number, episode in enumerate(source.episodes(), start=1):
-            labelled = with_outcomes(world, episode, seed)
-            writer.add(labelled)
-            steps += len(labelled)
-            successes += bool(labelled.metadata["success"])
-            failures += bool(labelled.metadata["failed"])
-            at_goal += SUCCESS not in episode.columns and _failed_at_its_goal(world, labelled, seed)
+            labeled = with_outcomes(world, episode, seed)
+            writer.add(labeled)
+            steps += len(labeled)
+            successes += bool(labeled.metadata["success"])
+            failures += bool(labeled.metadata["failed"])
+            at_goal += SUCCESS not in episode.columns and _failed_at_its_goal(world, labeled, seed)
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
         writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
     if at_goal:
         _log.warning(
             "%s",
-            f"{source.reference}: {at_goal} episodes terminate at their goal and are labelled as failures, "
+            f"{source.reference}: {at_goal} episodes terminate at their goal and are labeled as failures, "
             f"because {TERMINATED} does not say why: also import {SUCCESS} if they ended on arrival",
         )
     return writer.root
@@ -181,12 +181,12 @@ def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
 
 
-def _failed_at_its_goal(task: Task, labelled: Episode, seed: int) -> bool:
+def _failed_at_its_goal(task: Task, labeled: Episode, seed: int) -> bool:
     """Whether an episode failed in a step that reached the goal."""
-    if not labelled.metadata["failed"]:
+    if not labeled.metadata["failed"]:
         return False
-    after = _abstracted(task, labelled.columns[NEXT_STATE][-1:])
-    return bool(judged(task.objective, "reached", after, _goals(task, labelled, seed)[-1:]))
+    after = _abstracted(task, labeled.columns[NEXT_STATE][-1:])
+    return bool(judged(task.objective, "reached", after, _goals(task, labeled, seed)[-1:]))
 
 
 def _abstracted(task: Task, states: Array) -> Tensor:

@@ -58,7 +58,7 @@ def pair(
     out: Path | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Add the columns `abstract.*` to `dataset`, vectorised over its steps; return the new folder.
+    """Add the columns `abstract.*` to `dataset`, vectorized over its steps; return the new folder.
 
     Args:
         simulator: a task, for its abstract simulator, or `path.py:MySimulator`; see `pairing_named`.

@@ -1,4 +1,4 @@
-"""All stages of the pipeline by name: what each reads, its settings, and what makes its artefacts."""
+"""All stages of the pipeline by name: what each reads, its settings, and what makes its artifacts."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER
 from astra_data.grounding.fit import GroundConfig
-from astra_data.reports.artefacts import EVALUATION
+from astra_data.reports.artifacts import EVALUATION
 from astra_data.reports.choice import SELECTED
 from astra_data.stages.align import AlignConfig, align
 from astra_data.stages.augment import AugmentConfig, augment
@@ -29,13 +29,13 @@ class Stage:
 
     Attributes:
         name: in recipes, folders and on the command line.
-        run: makes one artefact. `experiments.plan` gives it what its parameters name.
-        each: the unit that it makes one artefact for: a seed; a size of a seed's dataset; a grounding, a
+        run: makes one artifact. `experiments.plan` gives it what its parameters name.
+        each: the unit that it makes one artifact for: a seed; a size of a seed's dataset; a grounding, a
             policy, an aligned grounding or a row, each per dataset; or the recipe.
-        reads: the stages whose artefacts it may read.
+        reads: the stages whose artifacts it may read.
         config: the type of its table in a recipe; None where it has no settings.
         asked_by: the key of recipes without which the stage is left out; None if all have it.
-        result: the file of its artefacts that other stages read; None for datasets and the report.
+        result: the file of its artifacts that other stages read; None for datasets and the report.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Stage:
 
     @property
     def makes_dataset(self) -> bool:
-        """Whether its artefacts are datasets."""
+        """Whether its artifacts are datasets."""
         return self.each in ("seed", "size")
 
 

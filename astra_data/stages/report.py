@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
-from astra_data.core.naming import artefact_key
+from astra_data.core.naming import artifact_key
 from astra_data.core.progress import Progress, silent
 from astra_data.methods import method_named
-from astra_data.reports.artefacts import EVALUATION
+from astra_data.reports.artifacts import EVALUATION
 from astra_data.reports.assembly import assemble
 from astra_data.reports.choice import FOLDER, SELECTED
 from astra_data.reports.command_replay import can_replay, replay_commands
@@ -87,9 +87,9 @@ def report(
         config: settings.
 
     Raises:
-        MissingStageError: no row has an evaluation, or one lacks other artefacts for some of its finished
+        MissingStageError: no row has an evaluation, or one lacks other artifacts for some of its finished
             seeds.
-        BadInputError: an artefact is malformed, or rows differ in task, episodes, robot or data.
+        BadInputError: an artifact is malformed, or rows differ in task, episodes, robot or data.
     """
     from astra_data.reports.figures import png, reliability
 
@@ -180,7 +180,7 @@ def _of_one(
 def _read(recipe: Reported, root: Path) -> dict[str, str]:
     """Return the digest of each evaluation that is finished, and of a choice, by its folder in `root`."""
     folders = [
-        artefact_key("evaluate", row, seed, percent)
+        artifact_key("evaluate", row, seed, percent)
         for row in recipe.methods
         for percent in recipe.percents or (None,)
         for seed in recipe.seeds

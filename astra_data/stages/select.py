@@ -10,12 +10,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artifact import finished_folder
 from astra_data.core.config import AtOnce, Config, CountFromZero
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import artefact_key, reference_of
+from astra_data.core.naming import artifact_key, reference_of
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -53,7 +53,7 @@ class SelectConfig(Config):
 
 @dataclass(frozen=True)
 class Entry:
-    """A policy to judge: the keys of its artefacts in a run's folder; `grounding` is None without one."""
+    """A policy to judge: the keys of its artifacts in a run's folder; `grounding` is None without one."""
 
     row: str
     seed: int
@@ -82,12 +82,12 @@ class Bench:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The artefacts that are read, each once."""
+        """The artifacts that are read, each once."""
         read = [key for one in self.entries for key in (one.policy, one.grounding) if key]
         return tuple(dict.fromkeys([*read, *(key for judge in self.judges.values() for key in judge)]))
 
     def finished(self, root: Path) -> "Bench":
-        """Return those whose artefacts are in a run's folder."""
+        """Return those whose artifacts are in a run's folder."""
         entries = [
             one
             for one in self.entries
@@ -127,7 +127,7 @@ def benches(recipe: Reported, judge: str) -> list[Bench]:
 
 
 def digests(of: list[Bench], root: Path) -> dict[str, str]:
-    """Return the digest of each artefact that is read, by its key."""
+    """Return the digest of each artifact that is read, by its key."""
     keys = dict.fromkeys(key for bench in of for key in bench.keys)
     return {key: _digest(root / key) for key in keys}
 
@@ -202,14 +202,14 @@ def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -
             row,
             seed,
             percent,
-            artefact_key("train", row, seed, percent),
-            artefact_key("ground", grounded_as(row), seed, percent) if method_named(row).grounds else None,
+            artifact_key("train", row, seed, percent),
+            artifact_key("ground", grounded_as(row), seed, percent) if method_named(row).grounds else None,
         )
         for row in rows
         for seed in recipe.seeds
     ]
     judges = {
-        seed: (artefact_key("ground", judge, seed, percent), artefact_key(dataset, "", seed, percent))
+        seed: (artifact_key("ground", judge, seed, percent), artifact_key(dataset, "", seed, percent))
         for seed in recipe.seeds
     }
     return Bench(percent, tuple(entries), judges)

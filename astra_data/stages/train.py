@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from astra_data.core.artefact import finished_folder
+from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
@@ -13,7 +13,7 @@ from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
-from astra_data.reports.artefacts import CURVE
+from astra_data.reports.artifacts import CURVE
 from astra_data.training.policy_file import POLICY, PolicyFile
 from astra_data.training.restarts import with_restarts
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
@@ -52,7 +52,7 @@ def train(
         num_threads: of the target's physics, for methods that train in the target.
 
     Raises:
-        BadInputError: the method has no policy to train, needs an artefact and got none, or `out` was begun
+        BadInputError: the method has no policy to train, needs an artifact and got none, or `out` was begun
             with other settings.
 
     Example:

@@ -73,7 +73,7 @@ def summary(
     axes: Sequence[str] = AXES,
     judged: Sequence[str] = BODY_AXES,
 ) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-    """Summarise the errors of several models by model, horizon and axis.
+    """Summarize the errors of several models by model, horizon and axis.
 
     Args:
         squared: squared errors of each model, (seeds, N, K, E), at the same N starts; "raw" among them.

@@ -10,16 +10,16 @@ class Model:
     """How a model is shown.
 
     Attributes:
-        title: in tables and figures. colour: in figures, as "#rrggbb". text: what it is, in a clause.
+        title: in tables and figures. color: in figures, as "#rrggbb". text: what it is, in a clause.
     """
 
     title: str
-    colour: str
+    color: str
     text: str
 
 
 def _of_method(name: str, text: str) -> Model:
-    return Model(METHODS[name].title, METHODS[name].colour, text)
+    return Model(METHODS[name].title, METHODS[name].color, text)
 
 
 MODELS = {

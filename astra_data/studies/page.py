@@ -81,7 +81,7 @@ def figure(found: Mapping[str, Any]) -> Figure:
         for axis in axes
     }
     minutes = [size["minutes"] for size in case["sizes"]]
-    looks = {name: (model.title, model.colour) for name, model in _looks(found).items()}
+    looks = {name: (model.title, model.color) for name, model in _looks(found).items()}
     return walk_prediction(case["horizons_s"], by_horizon, minutes, by_minutes, float(shown), looks)
 
 

@@ -31,7 +31,7 @@ class PlanarWalker(FreeStates):
     """B bodies [x, y, heading, forward and left velocity, turn rate, ball x, ball y], in m, rad and s.
 
     Positions are in the field's frame, velocities in the body's. A command is the velocity of the next step,
-    along an arc. Not modelled: legs, the delay of the walk, kicks, and the motion of the ball.
+    along an arc. Not modeled: legs, the delay of the walk, kicks, and the motion of the ball.
 
     Attributes:
         state: (B, 8) float32.

@@ -207,7 +207,7 @@ def _tested(recipe: GapRecipe, case: Case, fps: int, folder: Path, progress: Pro
                 seed,
                 starts,
                 path,
-                _labelled(share, f"{case.name}/{name}/{size}/{seed}"),
+                _labeled(share, f"{case.name}/{name}/{size}/{seed}"),
             )
         tensors, metadata = load_tensors(path)
         cpu_seconds += metadata["cpu_seconds"]
@@ -262,6 +262,6 @@ def _fit_one(
     save_tensors(path, tensors | {_ERRORS: starts.squared_errors(model)}, metadata)
 
 
-def _labelled(progress: Progress, label: str) -> Progress:
+def _labeled(progress: Progress, label: str) -> Progress:
     """Return progress with `label` before every note."""
     return lambda fraction, note: progress(fraction, f"{label}  {note}")

@@ -226,7 +226,7 @@ def training_env(
         num_envs: episodes side by side.
         device: torch device.
         starts: recorded moments, see `data_starts`; without them, all episodes start where the task does.
-        shows_parameters: end observations with the normalised parameters of a simulator that varies.
+        shows_parameters: end observations with the normalized parameters of a simulator that varies.
 
     Raises:
         BadInputError: the switches ask for what needs a maze, and the task has none.

@@ -39,7 +39,7 @@ class OwnLearner(InSimulator):
         if training.device != "cpu":
             raise BadInputError(
                 f"--device {training.device}: a learner of your own gets an environment of numpy arrays, "
-                "expected --device cpu; run the recipe again with it, finished artefacts are kept"
+                "expected --device cpu; run the recipe again with it, finished artifacts are kept"
             )
         from astra_data.training.watched_env import WatchedEnv
 

@@ -23,7 +23,7 @@ from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
 POLICY = "policy.safetensors"
-"""Name of the file of its artefact."""
+"""Name of the file of its artifact."""
 _KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
     "actor_critic": (ActorCritic, ActorCriticShape),
     "adaptive": (Student, AdaptiveShape),

@@ -89,7 +89,7 @@ class SimulatorEnv:
             change_penalty: subtracted from it, times the squared change of the command.
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
-            shows_parameters: end observations with the normalised parameters of a simulator that varies.
+            shows_parameters: end observations with the normalized parameters of a simulator that varies.
         """
         self.objective = objective
         self.simulator = simulator

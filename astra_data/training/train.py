@@ -15,7 +15,7 @@ import torch
 from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
-from astra_data.core.artefact import CHECKPOINT
+from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, CountFromZero, Share, choice
 from astra_data.core.logbook import Logbook
 from astra_data.core.progress import Progress
@@ -243,10 +243,10 @@ def train_in(
     learner = learner_of(
         config, env, shape, training.device, horizon=horizon, seed=training.seed, recorded=recorded
     )
-    return learner.policy, optimise(learner, env, config.penalty_ramp, training)
+    return learner.policy, optimize(learner, env, config.penalty_ramp, training)
 
 
-def optimise(
+def optimize(
     learner: Learner,
     env: ResumableEnv,
     ramp: Ramp,

@@ -38,7 +38,7 @@ def code_digest(name: str) -> str | None:
     if not files or not files[0].is_file():
         return None
     digest = hashlib.sha256()
-    for path, tree in with_neighbours(files, folder):
+    for path, tree in with_neighbors(files, folder):
         name = path.relative_to(folder).as_posix()
         digest.update(f"{name}\n{ast.dump(tree, **_WHOLE)}\n".encode())
         for file in _named_beside(path, tree):
@@ -46,7 +46,7 @@ def code_digest(name: str) -> str | None:
     return digest.hexdigest()
 
 
-def with_neighbours(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast.Module]]:
+def with_neighbors(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast.Module]]:
     """Yield `files` and those in `folder` that they import, all of a package, each once, and what is in it.
 
     Raises:

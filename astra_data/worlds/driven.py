@@ -56,7 +56,7 @@ class DrivenSimulator:
         keep_clear(self.simulator, distance_m)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
+        """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X)."""
         if hasattr(self.simulator, "settle"):
             there: Tensor = self.simulator.settle(before.to(self._there), landed.to(self._there))
             return there.to(self._device, copy=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
-from astra_data.worlds.code_digest import with_neighbours
+from astra_data.worlds.code_digest import with_neighbors
 
 _PREFIX = "astra_data_own_"
 """Of the names of modules that are files of the user's."""
@@ -81,7 +81,7 @@ def _of_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
     try:
-        with explained(f"importing {path}"), _among_neighbours(path.resolve()):
+        with explained(f"importing {path}"), _among_neighbors(path.resolve()):
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
@@ -94,7 +94,7 @@ _APPENDED: set[str] = set()
 
 
 @contextmanager
-def _among_neighbours(path: Path) -> Iterator[None]:
+def _among_neighbors(path: Path) -> Iterator[None]:
     """Let a file import those beside it, whatever files of their names other files of the user's imported.
 
     Installed packages come first. What the others imported is theirs again afterwards.
@@ -103,7 +103,7 @@ def _among_neighbours(path: Path) -> Iterator[None]:
     known = {_folder_of(module) for name, module in loaded.items() if name.startswith(_PREFIX)} - {folder}
     theirs = {}
     with suppress(BadInputError):  # what is no Python is told where it is run
-        for file, _ in with_neighbours([path], path.parent):
+        for file, _ in with_neighbors([path], path.parent):
             if file.stem in loaded and _folder_of(loaded[file.stem]) in known:
                 theirs[file.stem] = sys.modules.pop(file.stem)
     ours = [len(places) - 1 - places[::-1].index(place) for place in _APPENDED if place in places]

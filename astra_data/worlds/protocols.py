@@ -100,7 +100,7 @@ class PlacedSimulator(SteppedSimulator, Protocol):
         ...
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X).
+        """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X).
 
         What the correction cannot tell may be drawn, with torch's generator.
         """

@@ -73,7 +73,7 @@ def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert str(result.exception).startswith("wrong.toml: task ") and str(result.exception).endswith(told)
 
 
-def test_a_log_is_labelled_by_a_task_in_a_file(tmp_path: Path) -> None:
+def test_a_log_is_labeled_by_a_task_in_a_file(tmp_path: Path) -> None:
     state = np.column_stack([0.1 * np.arange(6), np.ones(6)]).astype(np.float32)
     columns = [Column(STATE, size=2), Column(ACTION), Column(NEXT_STATE, size=2)]
     about: dict[str, Any] = {"fps": 10, "task": "drive", "description": {"name": "logs", "stage": "import"}}
@@ -82,13 +82,13 @@ def test_a_log_is_labelled_by_a_task_in_a_file(tmp_path: Path) -> None:
             Episode(0, {STATE: state[:-1], ACTION: np.ones(5, np.float32), NEXT_STATE: state[1:].copy()})
         )
     goals = []
-    for name, more in (("labelled", list[str]()), ("again", ["--seed", "0"]), ("other", ["--seed", "1"])):
+    for name, more in (("labeled", list[str]()), ("again", ["--seed", "0"]), ("other", ["--seed", "1"])):
         out = f"{tmp_path}/{name}"
         command = ["label", f"{tmp_path}/logs", "--task", f"{CART}:LOGS_ALONE", "--out", out, *more]
         result = CliRunner().invoke(app, command)
         assert result.exit_code == 0, result.output
         assert f"finished: {out}" in result.output.replace("\n", "")
-        labelled = Dataset.open(out).columns([REWARD, GOAL])
-        np.testing.assert_allclose(labelled[REWARD], 0.1, atol=1e-6)
-        goals.append(float(labelled[GOAL][0]))
+        labeled = Dataset.open(out).columns([REWARD, GOAL])
+        np.testing.assert_allclose(labeled[REWARD], 0.1, atol=1e-6)
+        goals.append(float(labeled[GOAL][0]))
     assert goals[0] == goals[1] != goals[2]

@@ -79,7 +79,7 @@ def test_all_faults_come_in_one_message(tmp_path: Path) -> None:
         ('tsk = "maze"', "tsk: unknown key: did you mean 'task'?"),
         ("learning_rates = 1.0", "learning_rates: unknown key: did you mean 'train.learning_rate'?"),
         ("[trian]", "trian: unknown key: did you mean 'train'?"),
-        ("[train]\ncolour = 1", "train.colour: unknown key; known: env_steps, learning_rate, hidden_sizes,"),
+        ("[train]\ncolor = 1", "train.color: unknown key; known: env_steps, learning_rate, hidden_sizes,"),
         ("[train]\nenv_steps = 1.5", "train.env_steps: expected a whole number, got 1.5"),
         ("train = 3", "train: expected a table, got 3"),
         ("seeds = 3", "seeds: expected an array, got 3"),

@@ -9,7 +9,7 @@ from astra_data.core.errors import BadInputError, DiskError
 
 
 @pytest.mark.parametrize(
-    ("code", "why", "cure"),
+    ("code", "why", "advice"),
     [
         (errno.ENOSPC, "the disk is full", "free space"),
         (errno.EDQUOT, "the quota is exceeded", "free space"),
@@ -19,12 +19,12 @@ from astra_data.core.errors import BadInputError, DiskError
         (errno.ESTALE, "the disk is gone", "connect it again"),
     ],
 )
-def test_what_the_disk_refuses_is_one_line(code: int, why: str, cure: str) -> None:
+def test_what_the_disk_refuses_is_one_line(code: int, why: str, advice: str) -> None:
     with pytest.raises(DiskError) as caught, writing(Path("a/set")):
         raise OSError(code, os.strerror(code))
     message = str(caught.value)
     assert message.startswith(f"a/set cannot be written: {why}. What was finished before is safe: ")
-    assert cure in message
+    assert advice in message
     assert message.endswith(", then run the same command again.")
     assert "\n" not in message
 

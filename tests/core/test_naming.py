@@ -1,4 +1,4 @@
-from astra_data.core.naming import artefact_key, base_method, is_plus, reference_of, seed_folder, stage_of_key
+from astra_data.core.naming import artifact_key, base_method, is_plus, reference_of, seed_folder, stage_of_key
 
 
 def test_a_row_is_a_method_or_its_plus() -> None:
@@ -17,8 +17,8 @@ def test_folders_of_seeds_lie_in_those_of_sizes() -> None:
 
 
 def test_a_key_is_the_place_in_a_run() -> None:
-    assert artefact_key("train", "astra", 3, 5) == "train/astra/percent_005/seed_3"
-    assert artefact_key("pair", "", 0) == "pair/seed_0"
+    assert artifact_key("train", "astra", 3, 5) == "train/astra/percent_005/seed_3"
+    assert artifact_key("pair", "", 0) == "pair/seed_0"
 
 
 def test_a_key_begins_with_its_stage() -> None:

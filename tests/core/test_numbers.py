@@ -1,13 +1,13 @@
 import numpy as np
 import torch
 
-from astra_data.core.numbers import as_column, as_rows, normalised
+from astra_data.core.numbers import as_column, as_rows, normalized
 
 
 def test_states_are_in_standard_deviations_and_clipped() -> None:
     mean, std = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 4.0])
     state = torch.tensor([[1.5, -6.0], [3.5, 18.0], [3.6, -30.0]])
-    assert torch.allclose(normalised(state, mean, std), torch.tensor([[1.0, -1.0], [5.0, 5.0], [5.0, -5.0]]))
+    assert torch.allclose(normalized(state, mean, std), torch.tensor([[1.0, -1.0], [5.0, 5.0], [5.0, -5.0]]))
 
 
 def test_columns_of_one_value_a_step_have_no_second_axis() -> None:

@@ -260,7 +260,7 @@ def test_a_kill_in_any_operation_never_mixes_two_recordings(
 
 
 @pytest.mark.parametrize("gone", [["plan.json"], ["000000.arrow"], ["000000.arrow", "plan.json"]])
-def test_what_version_0_1_left_half_removed_is_recognised(tmp_path: Path, gone: list[str]) -> None:
+def test_what_version_0_1_left_half_removed_is_recognized(tmp_path: Path, gone: list[str]) -> None:
     interrupted(tmp_path / "set", fake_episodes())
     write_fake(tmp_path / "set")
     for name in gone:

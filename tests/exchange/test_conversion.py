@@ -219,7 +219,7 @@ def test_numbers_that_float32_cannot_tell_apart_are_refused(dtype: type) -> None
 
 @pytest.mark.parametrize(("offset", "step"), [(5.3e6, 0.02), (5.3e6, 0.3), (-4.2e6, 0.1), (1e5, 0.004)])
 def test_positions_far_from_their_origin_are_refused(offset: float, step: float) -> None:
-    """Such as northings, and positions from the centre of the Earth; not what float32 came with."""
+    """Such as northings, and positions from the center of the Earth; not what float32 came with."""
     away = offset + step * np.arange(40)
     with pytest.raises(BadInputError, match=r"columns\.c: entry 0: .* set an offset that makes them small"):
         convert({}, away.tolist())

@@ -72,7 +72,7 @@ def test_jitter_of_the_first_messages_moves_no_row(phase_ms: float, seed: int) -
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_jitter_moves_no_row_towards_fast_commands_or_slow_states(seed: int) -> None:
+def test_jitter_moves_no_row_toward_fast_commands_or_slow_states(seed: int) -> None:
     """Commands at 100 Hz; states at 10 Hz, each in two rows."""
     jitter = np.random.default_rng(seed).uniform(-8, 8, 500)
     _, rows = sampled(20, 1000 + 50.0 * np.arange(500) + 2.4 * jitter, 900.0 + 10 * np.arange(2500))
@@ -106,7 +106,7 @@ def test_jitter_changes_no_row_of_a_state_that_comes_every_other_row() -> None:
     assert rows == [(row // 2, row) for row in range(200)]
 
 
-def test_a_command_out_of_step_moves_no_row_towards_the_states() -> None:
+def test_a_command_out_of_step_moves_no_row_toward_the_states() -> None:
     """Commands at 16 Hz, the first of them 20 ms after the first state."""
     odom = 50.0 * np.arange(100)
     odom[1::3] += 20

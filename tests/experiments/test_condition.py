@@ -1,4 +1,4 @@
-"""The condition of artefacts that fake stages made, with real manifests."""
+"""The condition of artifacts that fake stages made, with real manifests."""
 
 import json
 import re
@@ -93,7 +93,7 @@ def test_an_emptied_file_is_found_and_made_again(
     assert not (aside / "report").exists(), "every run makes it"
 
 
-def test_each_artefact_is_made_again_for_its_own_damage_first(
+def test_each_artifact_is_made_again_for_its_own_damage_first(
     recipe: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for key in (GROUND, ALIGN):
@@ -182,7 +182,7 @@ def test_a_damaged_input_of_one_stage_is_refused_with_what_to_run(recipe: Path, 
     )
 
 
-def test_an_artefact_of_another_input_is_stale(recipe: Path, folder: Path) -> None:
+def test_an_artifact_of_another_input_is_stale(recipe: Path, folder: Path) -> None:
     shutil.rmtree(folder / "collect/seed_0")
     run(recipe, root=recipe.parent, jobs=1)
     assert states(recipe) == {}, "the same episodes again"
@@ -202,7 +202,7 @@ def test_a_file_that_somebody_added_is_a_remark(recipe: Path, folder: Path) -> N
     assert (folder / TRAIN / "notes.txt").exists()
 
 
-def test_artefacts_without_manifests_are_finished_as_in_0_1(recipe: Path, folder: Path) -> None:
+def test_artifacts_without_manifests_are_finished_as_in_0_1(recipe: Path, folder: Path) -> None:
     for path in folder.rglob(MANIFEST):
         path.unlink()
     remark = ("finished", "no manifest (made by 0.1)")

@@ -94,7 +94,7 @@ def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest
     assert not (recipe.parent / "runs").exists()
 
 
-def test_data_are_not_asked_for_once_they_are_labelled(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_are_not_asked_for_once_they_are_labeled(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     home, runs = recipe.parent / "home", recipe.parent / "runs"
     monkeypatch.setenv("ASTRA_DATA_HOME", str(home))
     write_logs(home / "logs/data-1.0.0", -1.0, 4.0)

@@ -12,7 +12,7 @@ from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
 from astra_data.dataset.reader import Dataset
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.plan import plan
-from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
+from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
 from astra_data.worlds.own_code import own_object
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.walk_through import check_task
@@ -38,7 +38,7 @@ SMALL = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The artefacts of the recipe, made small."""
+    """The artifacts of the recipe, made small."""
     made = tmp_path_factory.mktemp("fetch")
     for file in FETCH.glob("*.py"):
         shutil.copy(file, made)

@@ -23,7 +23,7 @@ from astra_data.experiments.plan import plan
 from astra_data.experiments.points import Selection
 from astra_data.experiments.run import check, set_aside
 from astra_data.experiments.trained_policy import load_policy
-from astra_data.reports.artefacts import EVALUATION, Evaluation, read_json
+from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
 from astra_data.stages.label import label
 
 CART = Path(__file__).parents[2] / "recipes/examples/cart"
@@ -66,7 +66,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(
     folder: Path, name: str, text: str, wanted: Callable[[str], bool] = lambda stage: True
 ) -> tuple[Path, list[str]]:
-    """Make the artefacts of a recipe in this process; return its folder and their keys."""
+    """Make the artifacts of a recipe in this process; return its folder and their keys."""
     path = folder / f"{name}.toml"
     path.write_text(f'task = "cart.py:TASK"\ndata = "logs"\nseeds = [0]\n{text}{SMALL}')
     experiment = load_experiment(path, folder / "runs")
@@ -80,8 +80,8 @@ def made(
 def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
     folder, keys = made(logs, "cart", 'methods = ["direct_transfer", "nas", "astra"]\n')
     assert keys[:2] == ["label/seed_0", "pair/seed_0"] and not any(key.startswith("collect") for key in keys)
-    labelled = Dataset.open(folder / "label/seed_0")
-    assert REWARD in labelled.features and GOAL not in labelled.features and len(labelled) == 8
+    labeled = Dataset.open(folder / "label/seed_0")
+    assert REWARD in labeled.features and GOAL not in labeled.features and len(labeled) == 8
     for row in ("direct_transfer", "nas", "astra"):
         evaluation = read_json(Evaluation, folder / "evaluate" / row / "seed_0" / EVALUATION)
         assert evaluation.tested_in == "grounded" and evaluation.target is None
@@ -133,24 +133,24 @@ def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
     assert sum(line.startswith("- NAS, `") for line in lines) == 4
 
 
-def test_other_data_of_the_same_name_are_labelled_anew(logs: Path, tmp_path: Path) -> None:
+def test_other_data_of_the_same_name_are_labeled_anew(logs: Path, tmp_path: Path) -> None:
     shutil.copy(logs / "cart.py", tmp_path / "cart.py")
     drives = sorted((logs / "csv").glob("*.csv"))
     import_dataset(drives, CART / "logs.toml", out=tmp_path / "logs")
     made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
     path = tmp_path / "again.toml"
 
-    def labelled() -> tuple[str, str]:
+    def labeled() -> tuple[str, str]:
         found = check(path, root=tmp_path / "runs")["label/seed_0"]
         return found.state, found.why
 
-    assert labelled() == ("finished", "")
+    assert labeled() == ("finished", "")
     shutil.rmtree(tmp_path / "logs")
     import_dataset(drives[:4], CART / "logs.toml", out=tmp_path / "logs")
-    assert labelled() == ("stale", "made from another dataset than cart-logs@data-1.0.0")
+    assert labeled() == ("stale", "made from another dataset than cart-logs@data-1.0.0")
     set_aside(tmp_path / "runs/again", "label/seed_0")
     made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
-    assert labelled() == ("finished", "")
+    assert labeled() == ("finished", "")
     assert len(Dataset.open(tmp_path / "runs/again/label/seed_0")) == 4
     # Data that lack nothing are linked to.
     whole = subset(Dataset.open(tmp_path / "runs/again/label/seed_0"), percent=100, out=tmp_path / "whole")
@@ -173,6 +173,6 @@ def test_other_data_of_the_same_name_are_labelled_anew(logs: Path, tmp_path: Pat
     assert condition(item, experiment).is_finished
     import_dataset(drives[4:], CART / "logs.toml", out=tmp_path / "others")
     link.unlink()
-    link.symlink_to(label(experiment.recipe.task, data=tmp_path / "others", out=tmp_path / "labelled"))
+    link.symlink_to(label(experiment.recipe.task, data=tmp_path / "others", out=tmp_path / "labeled"))
     assert condition(item, experiment).why.startswith("made from another dataset than cart-logs@")
     assert can_be_made_again(item.key, experiment)

@@ -1,4 +1,4 @@
-"""Artefacts that were made with other code of the user's."""
+"""Artifacts that were made with other code of the user's."""
 
 import json
 import shutil

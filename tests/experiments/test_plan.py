@@ -178,7 +178,7 @@ def test_who_steps_the_target_gets_threads_and_networks_a_device(
     assert settings["train/target/seed_0"] is not None and settings["train/astra/seed_0"] is None
 
 
-def test_every_artefact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
+def test_every_artifact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
     seen: set[str] = set()
     for item in plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path):
         assert seen.issuperset(item.inputs)

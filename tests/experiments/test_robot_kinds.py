@@ -39,7 +39,7 @@ def test_a_position_a_heading_and_two_commands_are_a_unicycle(tmp_path: Path) ->
     assert values["goal"] == "(49.0, 98.0)" and values["lows"] == values["highs"] == "[0.0, 0.0, 0.0]"
     assert float(values["close"]) == pytest.approx(np.hypot(49, 98) / 10, rel=0.05)
     assert values["phi"] == "[0.0, 0.0, 1.0, 0.0]"  # x, y, cosine and sine
-    # Towards y for a tenth of a second at a speed of 1.
+    # Toward y for a tenth of a second at a speed of 1.
     assert (values["before"], values["after"]) == ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.1, 0.0, 1.0]")
 
 

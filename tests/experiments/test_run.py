@@ -314,7 +314,7 @@ def test_seeds_that_other_machines_ran_are_copied_together(recipe: Path, tmp_pat
     assert asked(ours / "report")["seeds"] == [0, 1]
 
 
-def test_a_recipe_with_data_is_labelled_and_has_nothing_to_collect(recipe: Path, tmp_path: Path) -> None:
+def test_a_recipe_with_data_is_labeled_and_has_nothing_to_collect(recipe: Path, tmp_path: Path) -> None:
     recipe.write_text('data = "me/walks"\n' + recipe.read_text())
     with pytest.raises(BadInputError, match=r"r\.toml uses the data me/walks: there is nothing to collect"):
         run_stage(recipe, "collect", root=tmp_path)

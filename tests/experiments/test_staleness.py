@@ -20,7 +20,7 @@ def planned(rows: list[str]) -> dict[str, Item]:
 
 
 def made_from(key: str, items: dict[str, Item]) -> Iterator[str]:
-    """Yield the stages of the artefact `key` and of all that it is made from."""
+    """Yield the stages of the artifact `key` and of all that it is made from."""
     yield stage_of(items[key])
     for source in items[key].inputs:
         yield from made_from(source, items)

@@ -25,7 +25,7 @@ FEW: dict[str, Any] = {"episodes": 3, "proposals": 20}
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A run with groundings of three seeds that add different numbers of metres."""
+    """A run with groundings of three seeds that add different numbers of meters."""
     experiment = load_experiment(write_recipe(tmp_path), tmp_path / "runs")
     for seed, offset in enumerate(OFFSETS_M):
         tensors, metadata = HistoryGrounding(shifted(offset)).to_file()

@@ -36,7 +36,7 @@ def attempts(folder: Path) -> dict[str, str]:
     return {str(path.parent.relative_to(folder)): path.read_text() for path in folder.rglob("attempts")}
 
 
-def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
+def test_a_sweep_goes_on_point_by_point_and_makes_shared_artifacts_once(
     recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = sweep(recipe, methods=["nas"], seeds=[1], percents=[50], root=tmp_path, jobs=1)
@@ -59,7 +59,7 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artefacts_once(
     told = capsys.readouterr().out
     assert "evaluate/nas/percent_050/seed_1  done 1.00  (1 of 1 points)" in told
 
-    # A point whose artefacts are removed is not finished any more; the table says what is there.
+    # A point whose artifacts are removed is not finished any more; the table says what is there.
     sweep(recipe, root=tmp_path, jobs=2)
     made = attempts(folder)
     assert set(made.values()) == {"."}

@@ -23,7 +23,7 @@ from astra_data.worlds.registry import TASKS
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a run with ASTRA's artefacts of seed 0, and a policy of its `+` row."""
+    """Return the folder of a run with ASTRA's artifacts of seed 0, and a policy of its `+` row."""
     folder = tmp_path_factory.mktemp("runs") / "small"
     with short_task():
         walks = collect(TASK, COLLECT, seed=0, out=folder / "collect/seed_0", progress=silent)
@@ -51,7 +51,7 @@ def test_the_encoder_is_that_of_the_tests(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("row", ["astra_plus", "astra_task_reward"])
-def test_it_acts_as_the_artefacts_put_together_by_hand(row: str, run: Path) -> None:
+def test_it_acts_as_the_artifacts_put_together_by_hand(row: str, run: Path) -> None:
     by_hand = running(
         TASKS["antmaze-umaze"],
         PolicyFile.load(run / "train" / row / "seed_0/policy.safetensors"),

@@ -232,7 +232,7 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     left = steps_left(episodes)
     said = torch.where((left >= 11) & (left <= 30) & (torch.arange(2) == 0)[:, None], 0.9, 0.1)
     auc = foresight(said, episodes)["auc"]
-    # Ten of the twenty steps of the neighbouring windows are above all calm ones, ten level with them.
+    # Ten of the twenty steps of the neighboring windows are above all calm ones, ten level with them.
     assert auc == {"1-20": pytest.approx(0.75), "11-30": 1.0, "21-40": pytest.approx(0.75)}
     # Before the last window of others, its steps are calm ones, too: 20 of 110 on the level.
     near = foresight(said, episodes, [(11, 20)])["auc"]

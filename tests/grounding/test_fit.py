@@ -9,7 +9,7 @@ from toy_episodes import toy_episodes
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
 from astra_data.grounding import fit as fit_module
-from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, _optimise, residual_rewards
+from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, _optimize, residual_rewards
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import DescentConfig
 from astra_data.learning.networks.grounding import GroundingModel, LossWeights
@@ -19,7 +19,7 @@ from astra_data.worlds.registry import TASKS
 def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     """Steps: ahead, into the goal, failing unseen, into a goal that only abstract states show, none."""
     task = TASKS["antmaze-umaze"]
-    goal = torch.tensor(task.maze.cell_centre(*task.maze.goal)).float()
+    goal = torch.tensor(task.maze.cell_center(*task.maze.goal)).float()
     away, near, there = (goal + torch.tensor([shift, 0.0]) for shift in (2.0, 1.0, 0.0))
     after = torch.stack([near, there, near, there, goal])
     before = torch.stack([away, near, away, near, goal])
@@ -125,9 +125,9 @@ def test_members_are_fitted_to_draws_of_the_episodes(tmp_path: Path, monkeypatch
         model: GroundingModel, weights: LossWeights, fitting: Fitting, checkpoint: Path
     ) -> dict[str, Any]:
         fitted.append(fitting)
-        return _optimise(model, weights, fitting, checkpoint)
+        return _optimize(model, weights, fitting, checkpoint)
 
-    monkeypatch.setattr("astra_data.grounding.fit._optimise", seen)
+    monkeypatch.setattr("astra_data.grounding.fit._optimize", seen)
     alone, _ = fit(tmp_path, "alone")
     fitted.clear()
     config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8, members=2)
@@ -270,7 +270,7 @@ def test_failures_weigh_what_is_asked(tmp_path: Path) -> None:
 
 def test_members_cost_time_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spent = {"wall_seconds": 2.0, "cpu_seconds": 3.0, "epochs": [{}]}
-    monkeypatch.setattr(fit_module, "_optimise", lambda *_: dict(spent))
+    monkeypatch.setattr(fit_module, "_optimize", lambda *_: dict(spent))
     config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8, members=2)
     parts = (episodes(0), episodes(1, 3))
     given = Fitting(TASKS["antmaze-umaze"], config, None, *parts, 0, "cpu", tmp_path, silent)

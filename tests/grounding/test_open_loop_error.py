@@ -26,7 +26,7 @@ def episodes(speed: float) -> PairedEpisodes:
     action[..., 0] = torch.tensor([0.5, 0.8, 1.0])[:, None]
     velocity = torch.zeros(3, STEPS + 1, 2)
     velocity[:, 1:] = speed * action
-    start = torch.tensor(TASK.maze.cell_centre(1, 1), dtype=torch.float32)
+    start = torch.tensor(TASK.maze.cell_center(1, 1), dtype=torch.float32)
     position = start + (velocity * TASK.timestep_s).cumsum(1)
     state = torch.cat([position, velocity], dim=-1)
     simulator = TASK.simulator(3 * STEPS)

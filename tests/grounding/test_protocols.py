@@ -38,7 +38,7 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(
     torch.manual_seed(0)
     grounding = make()
     goal, action = torch.randn(COUNT, 2), 2 * torch.rand(COUNT, STEPS, 2) - 1
-    start = torch.tensor([[*TASK.maze.cell_centre(1, 1), 0.0, 0.0]]).float().expand(COUNT, 4)
+    start = torch.tensor([[*TASK.maze.cell_center(1, 1), 0.0, 0.0]]).float().expand(COUNT, 4)
     rows = torch.arange(COUNT)
     whole = grounding.simulator(TASK, COUNT)
     whole.start(start, rows, goal)

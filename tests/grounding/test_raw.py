@@ -15,8 +15,8 @@ def test_the_scatter_factor_is_triangular_and_its_square_the_covariance() -> Non
     torch.manual_seed(0)
     residual = torch.randn(500, 3) @ torch.tensor([[1.0, 0.5, 0.0], [0.0, 0.2, 0.1], [0.0, 0.0, 3.0]])
     factor = scatter_factor(residual)
-    centred = residual - residual.mean(0)
-    torch.testing.assert_close(factor @ factor.T, centred.T @ centred / 499, atol=1e-5, rtol=1e-4)
+    centered = residual - residual.mean(0)
+    torch.testing.assert_close(factor @ factor.T, centered.T @ centered / 499, atol=1e-5, rtol=1e-4)
     assert torch.equal(factor, factor.tril())
     assert (factor.diagonal() > 0).all()
 

@@ -81,7 +81,7 @@ def test_a_summary_outside_of_a_maze_is_of_what_is_observed_with_the_goal() -> N
 
 def test_gaps_are_mean_distances_from_the_recording() -> None:
     """The target moves at 0.8 of the command in the open: speeds and places are off in proportion."""
-    start = torch.tensor([*TASK.maze.cell_centre(1, 1), 0.0, 0.0]).float().expand(2, 4)
+    start = torch.tensor([*TASK.maze.cell_center(1, 1), 0.0, 0.0]).float().expand(2, 4)
     action = torch.tensor([[0.5, 0.0], [-0.0, -1.0]])[:, None].expand(2, 4, 2)
     speed = torch.tensor([0.5, 1.0])
     along = torch.arange(1, 5) * TASK.timestep_s
@@ -101,7 +101,7 @@ def test_gaps_are_mean_distances_from_the_recording() -> None:
 
 def test_errors_to_either_side_add_up() -> None:
     """Commands go back and forth, so that the plain simulator is too fast in either direction."""
-    start = torch.tensor([[*TASK.maze.cell_centre(1, 1), 0.0, 0.0]]).float()
+    start = torch.tensor([[*TASK.maze.cell_center(1, 1), 0.0, 0.0]]).float()
     action = torch.tensor([[0.5, 0.0], [-0.5, 0.0]]).repeat(2, 1)[None]
     moved = 0.8 * TASK.timestep_s * action.cumsum(1)
     target = torch.cat([start[:, None, :2] + moved, 0.8 * action], dim=-1)
@@ -111,7 +111,7 @@ def test_errors_to_either_side_add_up() -> None:
 
 
 def test_all_parameters_are_replayed_with_the_same_noise() -> None:
-    start = torch.tensor([*TASK.maze.cell_centre(1, 1), 0.0, 0.0]).float().expand(3, 4)
+    start = torch.tensor([*TASK.maze.cell_center(1, 1), 0.0, 0.0]).float().expand(3, 4)
     action = torch.zeros(3, 5, 2)
     recorded = ReplayWindows(start, start[:, :2], action, start[:, None].expand(3, 5, 4))
     noisy = PlanarVariation(position_noise_m=(0.1, 0.1)).ranges()[:, 0].repeat(2, 1)

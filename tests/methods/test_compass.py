@@ -43,7 +43,7 @@ def record(task: Task, planted: Variation, seed: int, episodes: int = 16, steps:
     torch.manual_seed(seed)
     target = task.varied_simulator(episodes, planted)
     if task.plane:
-        start = torch.tensor(task.maze.cell_centre(*task.maze.start), dtype=torch.float32)
+        start = torch.tensor(task.maze.cell_center(*task.maze.start), dtype=torch.float32)
         target.reset_to(torch.cat([start, torch.zeros(2)]).repeat(episodes, 1))
     held = torch.rand(episodes, steps // 15, task.objective.action_size) * 2.0 - 1.0
     action = held.repeat_interleave(15, dim=1)
@@ -187,10 +187,10 @@ def test_windows_with_the_largest_gaps_are_left_out(tmp_path: Path, monkeypatch:
     )
     told: list[tuple[Tensor, Tensor]] = []
 
-    def fit(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalised: int) -> CausalModel:
+    def fit(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalized: int) -> CausalModel:
         told.append((cause, effect))
-        assert penalised == 6
-        return fit_causes(cause, effect, config, penalised=penalised)
+        assert penalized == 6
+        return fit_causes(cause, effect, config, penalized=penalized)
 
     monkeypatch.setattr(compass, "fit_causes", fit)
     identify(fitting(tmp_path, settings))

@@ -12,7 +12,7 @@ PLAIN = Method(name="mine", title="Mine")
 def test_by_default_a_method_trains_in_the_raw_simulator() -> None:
     assert (PLAIN.grounds, PLAIN.trains, PLAIN.in_simulator, PLAIN.steps_target) == (False, True, True, False)
     assert PLAIN.learn == InSimulator(reward="abstract", ranges=None)
-    assert not (PLAIN.aligns or PLAIN.planar or PLAIN.initial or PLAIN.table or PLAIN.role or PLAIN.colour)
+    assert not (PLAIN.aligns or PLAIN.planar or PLAIN.initial or PLAIN.table or PLAIN.role or PLAIN.color)
 
 
 def test_where_a_policy_comes_from() -> None:

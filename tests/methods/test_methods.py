@@ -8,8 +8,8 @@ from astra_data.learning.iql import FINE_TUNING
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.methods import METHODS, method_named, method_role, method_title, tables
 from astra_data.reports.costs import THROUGHPUT
-from astra_data.reports.figures import method_colour
-from astra_data.reports.figures.style import SPARE_COLOURS
+from astra_data.reports.figures import method_color
+from astra_data.reports.figures.style import SPARE_COLORS
 from astra_data.training.train import InSimulator
 from astra_data.training.train_in_target import InTarget
 
@@ -21,15 +21,15 @@ def test_methods_are_known_by_their_names() -> None:
         method_named("astro")
 
 
-def test_methods_have_titles_and_colours_of_their_own() -> None:
+def test_methods_have_titles_and_colors_of_their_own() -> None:
     assert method_title("nas_golemo") == "NAS (Golemo et al.)" and method_title("nas_plus") == "NAS+"
     assert method_title("my_own_plus") == "My own+"
     titles = [method.title for method in METHODS.values()]
     assert len(set(titles)) == len(titles)
-    assert all(re.fullmatch(r"#[0-9A-F]{6}", method.colour) for method in METHODS.values())
-    colours = [method_colour(name) for name in METHODS]
-    assert len(set(colours)) == len(colours)
-    assert not set(colours).intersection(SPARE_COLOURS)
+    assert all(re.fullmatch(r"#[0-9A-F]{6}", method.color) for method in METHODS.values())
+    colors = [method_color(name) for name in METHODS]
+    assert len(set(colors)) == len(colors)
+    assert not set(colors).intersection(SPARE_COLORS)
 
 
 def test_roles_say_what_the_others_are_compared_with() -> None:

@@ -20,7 +20,7 @@ def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place() -
     assert replay.command.shape == (steps, 2)
     assert replay.simulated.shape == (steps, 4)
     assert replay.target.shape == (60, steps, 4)
-    start = task.maze.cell_centre(*task.maze.start)
+    start = task.maze.cell_center(*task.maze.start)
     # 0.8 of 0.25 m/s for ten control steps of 0.192 s, and back again in the end.
     way = replay.simulated[:, :2] - replay.simulated[0, :2]
     assert way[9] == pytest.approx([0.2 * 9 * 0.192, 0.0], abs=1e-5)

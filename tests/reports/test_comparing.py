@@ -3,7 +3,7 @@ import pytest
 from fake_runs import bare_results
 from scipy.stats import pearsonr, spearmanr
 
-from astra_data.reports.comparing import improvement, summarised, validity
+from astra_data.reports.comparing import improvement, summarized, validity
 from astra_data.reports.schema import MethodResults
 from astra_data.worlds.score import RETURN, SUCCESS
 
@@ -15,14 +15,14 @@ def row(**changes: object) -> MethodResults:
     return bare.model_copy(update=changes)
 
 
-def test_each_measure_is_summarised_over_the_seeds_that_have_it() -> None:
-    found = summarised(row(success=[0.1, 0.2, 0.6], distance=[float("nan"), 4.0, 6.0]), 100).summary
+def test_each_measure_is_summarized_over_the_seeds_that_have_it() -> None:
+    found = summarized(row(success=[0.1, 0.2, 0.6], distance=[float("nan"), 4.0, 6.0]), 100).summary
     assert found["success"].mean == pytest.approx(0.3)
     assert [found["distance"].mean, found["distance"].std] == pytest.approx([5.0, np.sqrt(2)])
     assert "simulated_success" not in found
-    alone = summarised(row(distance=[float("nan"), 4.0, float("nan")]), 100).summary["distance"]
+    alone = summarized(row(distance=[float("nan"), 4.0, float("nan")]), 100).summary["distance"]
     assert (alone.mean, alone.std) == (4.0, None)
-    assert "distance" not in summarised(row(distance=[float("nan")] * 3), 100).summary
+    assert "distance" not in summarized(row(distance=[float("nan")] * 3), 100).summary
 
 
 def test_astra_is_compared_with_rows_that_are_trained_alike() -> None:

@@ -1,6 +1,6 @@
 import pytest
 
-from astra_data.reports.artefacts import Artefact, CurveFile, Metrics
+from astra_data.reports.artifacts import Artifact, CurveFile, Metrics
 from astra_data.reports.costs import THROUGHPUT, Files, seconds, seed_cost, throughput, with_first
 from astra_data.reports.schema import Cost
 
@@ -13,7 +13,7 @@ def curve(**values: float) -> CurveFile:
     return CurveFile.model_validate({"points": [{"steps": 0, "success": None}], **values})
 
 
-def files(**stages: dict[str, list[Artefact]]) -> Files:
+def files(**stages: dict[str, list[Artifact]]) -> Files:
     return {stage: stages.get(stage, {}) for stage in THROUGHPUT}
 
 

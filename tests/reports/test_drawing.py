@@ -170,12 +170,12 @@ def test_crosses_stand_where_episodes_fail_in_either_world(results: Results, tmp
     save_file(tensors, folder / "trajectories.safetensors")
     (panel,) = drawn(results, folder.parents[2], U_MAZE, methods=("astra",))["trajectories"].axes
     crosses = {
-        colour: [
+        color: [
             np.asarray(line.get_xydata())[0].tolist()
             for line in panel.lines
-            if line.get_marker() == "x" and line.get_color() == colour
+            if line.get_marker() == "x" and line.get_color() == color
         ]
-        for colour in (DEPLOYED, SIMULATED)
+        for color in (DEPLOYED, SIMULATED)
     }
     assert crosses == {DEPLOYED: [[4, 0]], SIMULATED: [[4, 4]]}
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.artefacts import Metrics, read_json
+from astra_data.reports.artifacts import Metrics, read_json
 from astra_data.reports.figures import reliability
 from astra_data.reports.held_out import enough, write_held_out
 from astra_data.reports.schema import BandMeans, GapMeans

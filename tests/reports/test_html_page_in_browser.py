@@ -24,7 +24,7 @@ MEASURE = """
 addEventListener("load", () => {
   const inner = document.querySelector("iframe").contentWindow, page = inner.document;
   page.querySelectorAll("details").forEach((folded) => { folded.open = true; });
-  const colour = (name) => inner.getComputedStyle(page.querySelector(name)).backgroundColor;
+  const color = (name) => inner.getComputedStyle(page.querySelector(name)).backgroundColor;
   const boxed = (element) => element.closest(".scroll, .plate, nav ul, pre");
   const outside = [...page.querySelectorAll("body *")].filter(
     (element) => !boxed(element) && element.getBoundingClientRect().right > inner.innerWidth + 0.5);
@@ -38,7 +38,7 @@ addEventListener("load", () => {
     cut: cut.map((element) => element.outerHTML.slice(0, 80)),
     images: images.map((image) => [image.complete, image.naturalWidth, image.getBoundingClientRect().width]),
     tables: [...page.querySelectorAll(".scroll")].map((box) => [box.scrollWidth, box.clientWidth]),
-    page: colour("body"), plate: page.querySelector(".plate") ? colour(".plate") : null,
+    page: color("body"), plate: page.querySelector(".plate") ? color(".plate") : null,
   });
 });
 """

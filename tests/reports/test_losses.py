@@ -2,7 +2,7 @@ import pytest
 from fake_runs import ROWS, SEEDS, FakeRecipe, write_runs
 
 from astra_data.reports.assembly import assemble
-from astra_data.reports.comparing import summarised
+from astra_data.reports.comparing import summarized
 from astra_data.reports.losses import loss_head, losses, remaining_errors, seed_lines
 from astra_data.reports.schema import Results
 from astra_data.worlds.score import RETURN, SURVIVED_STEPS
@@ -15,7 +15,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
 
 
 def changed(results: Results, row: str, **of: object) -> Results:
-    edited = summarised(results.methods[row].model_copy(update=of), 100)
+    edited = summarized(results.methods[row].model_copy(update=of), 100)
     return results.model_copy(update={"methods": results.methods | {row: edited}})
 
 

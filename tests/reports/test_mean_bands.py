@@ -1,6 +1,6 @@
 import pytest
 
-from astra_data.reports.artefacts import Band
+from astra_data.reports.artifacts import Band
 from astra_data.reports.mean_bands import mean_band
 
 

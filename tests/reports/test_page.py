@@ -5,7 +5,7 @@ import pytest
 from fake_runs import ROWS, FakeRecipe, write_runs
 
 from astra_data.reports.assembly import assemble
-from astra_data.reports.comparing import improvement, summarised
+from astra_data.reports.comparing import improvement, summarized
 from astra_data.reports.files import FIGURES, published_figures, read_published
 from astra_data.reports.page import render
 from astra_data.reports.schema import MethodResults, Results
@@ -44,9 +44,9 @@ def page_of(results: Results, **changes: object) -> str:
 
 
 def rows_of(results: Results, **changes: Mapping[str, object]) -> dict[str, MethodResults]:
-    """Return the rows, some of them changed and summarised again."""
+    """Return the rows, some of them changed and summarized again."""
     edited = {
-        name: summarised(results.methods[name].model_copy(update=of), 100) for name, of in changes.items()
+        name: summarized(results.methods[name].model_copy(update=of), 100) for name, of in changes.items()
     }
     return results.methods | edited
 

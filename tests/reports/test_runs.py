@@ -5,7 +5,7 @@ import pytest
 from fake_runs import MADE, ROWS, SEEDS, FakeRecipe, write_evaluation, write_json, write_runs
 
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.reports.artefacts import Gap
+from astra_data.reports.artifacts import Gap
 from astra_data.reports.runs import Runs
 
 
@@ -35,7 +35,7 @@ def test_a_row_has_the_seeds_that_it_has_finished_of_those_asked_for(root: Path)
     assert [file.seed for file in found["astra"].values()] == list(found["astra"]) == [0, 2]
 
 
-def test_rows_share_the_artefacts_of_their_base_or_of_the_row_that_is_named(root: Path) -> None:
+def test_rows_share_the_artifacts_of_their_base_or_of_the_row_that_is_named(root: Path) -> None:
     named = "astra_task_reward"
     read = runs(root, ("astra_plus", named))
     assert read.owner("ground", "astra_plus") == read.owner("align", named) == "astra"

@@ -35,8 +35,8 @@ def test_names_of_files_differ_from_those_in_code_where_python_has_them_reserved
 
 
 def test_unknown_keys_are_refused_and_results_cannot_be_changed() -> None:
-    with pytest.raises(ValidationError, match="colour"):
-        Results.model_validate(json.loads(stored(BARE)) | {"colour": "red"})
+    with pytest.raises(ValidationError, match="color"):
+        Results.model_validate(json.loads(stored(BARE)) | {"color": "red"})
     with pytest.raises(ValidationError, match="frozen"):
         BARE.recipe = "other"
 

@@ -1,14 +1,14 @@
 from fake_runs import bare_results
 
 from astra_data.reports.choice import Candidate, Judged, choice_of
-from astra_data.reports.comparing import summarised
+from astra_data.reports.comparing import summarized
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizeResults, SizesResults, by_size, render_sizes
 
 
 def results(success: list[float]) -> Results:
     bare = bare_results("toy", {"astra": [0, 1]}, {})
-    row = summarised(bare.methods["astra"].model_copy(update={"success": success}), 100)
+    row = summarized(bare.methods["astra"].model_copy(update={"success": success}), 100)
     times = {"collect": 100.0, "pair": 60.0, "train": 50.0, "total": 210.0}
     return bare.model_copy(update={"methods": {"astra": row}, "wall_seconds": times, "seeds": [0, 1]})
 
@@ -39,7 +39,7 @@ def test_the_table_has_a_column_for_each_size() -> None:
 
 def test_rows_that_are_not_finished_are_left_open() -> None:
     nas = bare_results("toy", {"nas": [0, 1], "iql": [0, 1, 2], "astra": [1]}, {})
-    rows = {name: summarised(row, 100) for name, row in nas.methods.items()}
+    rows = {name: summarized(row, 100) for name, row in nas.methods.items()}
     found = SizesResults(
         recipe="toy",
         task="maze",

@@ -19,7 +19,7 @@ from astra_data.reports.statistics import (
     paired_difference,
     probability_of_improvement,
     share_interval,
-    summarise,
+    summarize,
 )
 
 PUBLISHED = Path(__file__).parents[2] / "recipes/results"
@@ -38,7 +38,7 @@ def drawn(scores: Floats, replicates: int = 10_000) -> Floats:
 
 
 def test_summary_of_five_seeds_is_the_one_worked_out_by_hand() -> None:
-    summary = summarise(np.array([0.1, 0.2, 0.4, 0.5, 0.8]), replicates=200)
+    summary = summarize(np.array([0.1, 0.2, 0.4, 0.5, 0.8]), replicates=200)
     assert summary.mean == pytest.approx(0.4)
     # Squares of the deviations from 0.4: 0.09 + 0.04 + 0 + 0.01 + 0.16 = 0.30, over 4.
     assert summary.std == pytest.approx(np.sqrt(0.075))
@@ -49,18 +49,18 @@ def test_summary_of_five_seeds_is_the_one_worked_out_by_hand() -> None:
 
 
 def test_one_seed_has_neither_spread_nor_interval() -> None:
-    assert summarise(np.array([0.7])) == Summary(0.7, None, 0.7, None, None)
-    several_tasks = summarise(np.array([[0.25, 0.75]]))
+    assert summarize(np.array([0.7])) == Summary(0.7, None, 0.7, None, None)
+    several_tasks = summarize(np.array([[0.25, 0.75]]))
     assert several_tasks == Summary(0.5, None, 0.5, None, None)
 
 
 def test_equal_seeds_have_an_interval_without_width() -> None:
-    assert summarise(np.full(3, 0.5), replicates=100) == Summary(0.5, 0.0, 0.5, 0.5, 0.5)
+    assert summarize(np.full(3, 0.5), replicates=100) == Summary(0.5, 0.0, 0.5, 0.5, 0.5)
 
 
 def test_the_interval_holds_95_percent_of_the_resampled_interquartile_means() -> None:
     scores = np.random.default_rng(0).normal(5.0, 2.0, 24)
-    summary = summarise(scores, replicates=2000)
+    summary = summarize(scores, replicates=2000)
     means = trim_mean(drawn(scores), 0.25, axis=1)
     # A 90 % interval would be 0.16 of a half-width narrower at each end, two of these tolerances.
     tolerance = 0.08 * float(np.ptp(ends(means))) / 2
@@ -69,13 +69,13 @@ def test_the_interval_holds_95_percent_of_the_resampled_interquartile_means() ->
 
 def test_tasks_are_strata() -> None:
     # Within each task all seeds agree, so resampling seeds within tasks changes nothing.
-    summary = summarise(np.array([[0.0, 1.0], [0.0, 1.0], [0.0, 1.0]]), replicates=100)
+    summary = summarize(np.array([[0.0, 1.0], [0.0, 1.0], [0.0, 1.0]]), replicates=100)
     assert (summary.low, summary.high, summary.std) == (summary.iqm, summary.iqm, 0.0)
 
 
 def test_seeds_are_resampled_in_each_task_apart_but_spread_is_that_of_their_means() -> None:
     first = np.random.default_rng(0).uniform(0, 1, 20)
-    summary = summarise(np.stack([first, 1 - first], axis=1), replicates=2000)
+    summary = summarize(np.stack([first, 1 - first], axis=1), replicates=2000)
     # Every seed has the mean 0.5 over its two tasks.
     assert [summary.mean, summary.std] == pytest.approx([0.5, 0.0])
     both = np.concatenate([drawn(first), 1 - drawn(first)[::-1]], axis=1)
@@ -85,10 +85,10 @@ def test_seeds_are_resampled_in_each_task_apart_but_spread_is_that_of_their_mean
 
 def test_intervals_are_reproducible_and_leave_the_global_generator_alone() -> None:
     scores = np.array([0.1, 0.5, 0.2, 0.9])
-    first = summarise(scores, replicates=100)
+    first = summarize(scores, replicates=100)
     np.random.seed(123)
     state = np.random.get_state()[1].tolist()  # type: ignore[index]
-    assert summarise(scores, replicates=100) == first
+    assert summarize(scores, replicates=100) == first
     assert np.random.get_state()[1].tolist() == state  # type: ignore[index]
 
 
@@ -97,7 +97,7 @@ def test_published_intervals_come_out_again() -> None:
     found = Results.model_validate_json((PUBLISHED / "antmaze_umaze.json").read_text())
     astra, other = found.methods["astra"], found.methods["direct_transfer"]
     ours, theirs = np.array(astra.success), np.array(other.success)
-    assert summarise(ours) == astra.summary["success"]
+    assert summarize(ours) == astra.summary["success"]
     published = found.probability_of_improvement["astra"]["direct_transfer"]
     difference = paired_difference(ours, theirs)
     assert replace(probability_of_improvement(ours, theirs), difference=difference) == published
@@ -157,7 +157,7 @@ def test_the_difference_of_paired_seeds_is_that_of_a_paired_t_test() -> None:
 def test_figures_are_those_of_rliable(seeds: int) -> None:
     rng = np.random.default_rng(seeds)
     scores, others = (rng.integers(0, 5, (count, 3)) / 4 for count in (seeds, 6))  # with ties
-    assert summarise(scores, replicates=10).iqm == metrics.aggregate_iqm(scores)
+    assert summarize(scores, replicates=10).iqm == metrics.aggregate_iqm(scores)
     found = probability_of_improvement(scores, others, replicates=10).probability
     assert found == pytest.approx(metrics.probability_of_improvement(scores, others), abs=1e-12)
 
@@ -223,7 +223,7 @@ def test_what_does_not_vary_correlates_with_nothing() -> None:
 @pytest.mark.parametrize("scores", [[], [0.1, np.nan], [0.1, np.inf]])
 def test_missing_scores_are_refused(scores: list[float]) -> None:
     with pytest.raises(BadInputError, match="one finite score per seed"):
-        summarise(np.array(scores))
+        summarize(np.array(scores))
     with pytest.raises(BadInputError, match="one finite score per seed"):
         probability_of_improvement(np.array([0.1, 0.2]), np.array(scores))
 

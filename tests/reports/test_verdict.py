@@ -7,7 +7,7 @@ import pytest
 from fake_runs import SEEDS, FakeRecipe, write_choice, write_runs
 
 from astra_data.reports.assembly import assemble
-from astra_data.reports.comparing import summarised
+from astra_data.reports.comparing import summarized
 from astra_data.reports.files import read_published
 from astra_data.reports.schema import Choice, Ranked, Results
 from astra_data.reports.statistics import Summary, share_interval
@@ -30,7 +30,7 @@ def made(parent: Path, *, select: bool = False, seeds: tuple[int, ...] = SEEDS) 
 
 def with_success(results: Results, **shares: list[float]) -> Results:
     rows = {
-        name: summarised(results.methods[name].model_copy(update={"success": of}), 100)
+        name: summarized(results.methods[name].model_copy(update={"success": of}), 100)
         for name, of in shares.items()
     }
     return results.model_copy(update={"methods": results.methods | rows})
@@ -212,7 +212,7 @@ def test_ties_and_failures_are_told(results: Results) -> None:
     tied = verdict_of(with_success(results, astra=[1.0, 0.75, 1.0]))
     assert tied.row == "astra" and "Equal by the mean: ASTRA+." in tied.remarks
     row = results.methods["astra_plus"].model_copy(update={"failed": [0.75, 0.25, 0.5]})
-    failing = results.model_copy(update={"methods": results.methods | {"astra_plus": summarised(row, 100)}})
+    failing = results.model_copy(update={"methods": results.methods | {"astra_plus": summarized(row, 100)}})
     assert verdict_of(failing).remarks[-1].startswith("ASTRA+ fails in 50\N{NO-BREAK SPACE}% of its episodes")
 
 
@@ -304,7 +304,7 @@ def test_the_row_with_fewer_seeds_decides_whether_there_are_enough(
 ) -> None:
     seeds = {"astra_plus": (ours, 1.0), "direct_transfer": (its, 0.0)}
     rows = {
-        name: summarised(
+        name: summarized(
             results.methods[name].model_copy(update={"seeds": [*range(count)], "success": [share] * count}),
             100,
         )

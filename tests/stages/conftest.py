@@ -1,4 +1,4 @@
-"""The artefacts of one small run, each made once."""
+"""The artifacts of one small run, each made once."""
 
 import shutil
 from collections.abc import Iterator

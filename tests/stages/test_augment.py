@@ -178,8 +178,8 @@ def test_copies_are_judged_with_a_goal_of_their_own(collected: Path, augmented: 
         columns = copy.columns
         assert (columns[GOAL] == columns[GOAL][0]).all()
         goals.add(tuple(columns[GOAL][0].tolist()))
-        centre = navigation.maze.cell_centre(*navigation.maze.goal)
-        assert np.abs(columns[GOAL][0] - centre).max() < 0.7
+        center = navigation.maze.cell_center(*navigation.maze.goal)
+        assert np.abs(columns[GOAL][0] - center).max() < 0.7
         near = np.linalg.norm(columns[NEXT_STATE][:, :2] - columns[GOAL], axis=1) <= 0.45
         np.testing.assert_array_equal(columns[SUCCESS], near)
         toppled = cut.columns[TERMINATED] & ~cut.columns[SUCCESS]
@@ -189,8 +189,8 @@ def test_copies_are_judged_with_a_goal_of_their_own(collected: Path, augmented: 
         distance = navigation.goal_distance
         start, end = (torch.from_numpy(columns[name][:, :2].copy()) for name in (STATE, NEXT_STATE))
         goal = torch.from_numpy(columns[GOAL])
-        metres = (distance(start, goal) - distance(end, goal)).numpy()
-        np.testing.assert_allclose(columns[REWARD], metres + 10.0 * near - 10.0 * toppled, atol=1e-4)
+        meters = (distance(start, goal) - distance(end, goal)).numpy()
+        np.testing.assert_allclose(columns[REWARD], meters + 10.0 * near - 10.0 * toppled, atol=1e-4)
         assert copy.metadata["return"] == pytest.approx(columns[REWARD].sum(), abs=1e-4)
         assert copy.metadata["success"] == near.any()
         assert copy.metadata["failed"] == (toppled.any() and not near.any())

@@ -145,7 +145,7 @@ def test_episodes_can_begin_where_the_task_does(task: str, tmp_path: Path) -> No
     collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
     position = Dataset.open(tmp_path / "out").columns([STATE])[STATE][:, :2]
     maze = TASKS[task].maze
-    assert np.abs(position - maze.cell_centre(*maze.start)).max() < 0.7
+    assert np.abs(position - maze.cell_center(*maze.start)).max() < 0.7
 
 
 @pytest.fixture

@@ -67,7 +67,7 @@ def test_members_leave_no_checkpoints(task: str, paired: Path, tmp_path: Path) -
     assert isinstance(made, HistoryGrounding) and len(made.members) == 2
 
 
-def test_the_artefact_is_complete(task: str, grounded: Path) -> None:
+def test_the_artifact_is_complete(task: str, grounded: Path) -> None:
     files = {"config.json", "gap.json", "grounding.safetensors", "manifest.json", "metrics.json"}
     assert {file.name for file in grounded.iterdir()} == files
     told = json.loads((grounded / "config.json").read_text())
@@ -235,7 +235,7 @@ def test_methods_without_a_grounding_and_raw_datasets_are_refused(
         make(task, tmp_path / "nowhere", tmp_path / "out")
 
 
-def test_identified_parameters_are_an_artefact_that_policies_are_trained_with(
+def test_identified_parameters_are_an_artifact_that_policies_are_trained_with(
     task: str, paired: Path, tmp_path: Path
 ) -> None:
     settings = CompassConfig(

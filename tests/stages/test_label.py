@@ -61,9 +61,9 @@ def write(
 def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     logs = write(tmp_path / "logs", [drive(0.5, 10), drive(4.0, 10)])
     notes = list[str]()
-    out = label(CART, data=logs, out=tmp_path / "labelled", progress=lambda _, note: notes.append(note))
-    labelled = Dataset.open(out)
-    slow, fast = labelled.episodes()
+    out = label(CART, data=logs, out=tmp_path / "labeled", progress=lambda _, note: notes.append(note))
+    labeled = Dataset.open(out)
+    slow, fast = labeled.episodes()
     assert len(slow) == 10 and not slow.columns[SUCCESS].any() and not slow.columns[TERMINATED].any()
     np.testing.assert_allclose(slow.columns[REWARD], 0.05, atol=1e-6)
     assert slow.columns[TRUNCATED].tolist() == slow.columns[DONE].tolist() == [False] * 9 + [True]
@@ -77,10 +77,10 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     )
     assert not fast.columns[TRUNCATED].any()
     np.testing.assert_allclose(fast.columns[REWARD][-1], 10.4, atol=1e-5)
-    assert labelled.metadata["success"] == [False, True] and labelled.metadata["failed"] == [False, False]
-    assert labelled.metadata["return"] == pytest.approx([0.5, 10 + 0.4 * len(fast)], abs=1e-5)
-    assert labelled.description["dropped_steps"] == 10 - len(fast)
-    assert labelled.reference == "logs@data-2.0.0"
+    assert labeled.metadata["success"] == [False, True] and labeled.metadata["failed"] == [False, False]
+    assert labeled.metadata["return"] == pytest.approx([0.5, 10 + 0.4 * len(fast)], abs=1e-5)
+    assert labeled.description["dropped_steps"] == 10 - len(fast)
+    assert labeled.reference == "logs@data-2.0.0"
     assert notes[-1] == f"1 successes, 0 failures in {10 + len(fast)} steps"
 
 
@@ -90,10 +90,10 @@ def test_steps_that_do_not_lead_to_the_next_row_are_told(
     ahead = drive(0.5, 10)
     ahead[NEXT_STATE] = ahead[NEXT_STATE] + np.float32(0.01)
     told = f"steps whose {NEXT_STATE} is not the state of the next row: 9 of 9"
-    labelled = label(CART, data=write(tmp_path / "logs", [ahead]), out=tmp_path / "out")
+    labeled = label(CART, data=write(tmp_path / "logs", [ahead]), out=tmp_path / "out")
     assert told in caplog.text
     caplog.clear()
-    label(CART, data=labelled, out=tmp_path / "linked")  # has all that a task asks for
+    label(CART, data=labeled, out=tmp_path / "linked")  # has all that a task asks for
     assert told in caplog.text
 
 
@@ -115,8 +115,8 @@ def test_what_the_log_knows_is_kept(tmp_path: Path) -> None:
     given = drive(1.0, 10) | {TERMINATED: fell, GOAL: np.full(10, 0.95, np.float32)}
     more = (goal, *(column for column in OUTCOME_COLUMNS if column.name == TERMINATED))
     logs = write(tmp_path / "logs", [given], more, driver="Ada")
-    labelled = Dataset.open(label(CART, data=logs, out=tmp_path / "labelled"))
-    (episode,) = labelled.episodes()
+    labeled = Dataset.open(label(CART, data=logs, out=tmp_path / "labeled"))
+    (episode,) = labeled.episodes()
     # It is at the goal when it falls: a failure.
     assert episode.columns[TERMINATED].tolist() == fell.tolist() and not episode.columns[SUCCESS].any()
     assert episode.columns[REWARD][-1] == pytest.approx(0.1 - 10.0)
@@ -137,7 +137,7 @@ def test_names_that_are_not_the_tasks_are_told(tmp_path: Path, caplog: pytest.Lo
     logs = Dataset.open(tmp_path / "logs")
     told = "takes north, heading of observation.state as "
     assert any(told in remark for remark in remarks(logs, task_named(CART)))
-    label(CART, data=logs.root, out=tmp_path / "labelled")
+    label(CART, data=logs.root, out=tmp_path / "labeled")
     assert told in caplog.text
 
 
@@ -150,8 +150,8 @@ def test_who_terminates_at_the_goal_is_told(
         GOAL: np.full(10, distance, np.float32),
     }
     more = (Column(GOAL), *(column for column in OUTCOME_COLUMNS if column.name == TERMINATED))
-    label(CART, data=write(tmp_path / "logs", [ended, ended], more), out=tmp_path / "labelled")
-    told = "2 episodes terminate at their goal and are labelled as failures"
+    label(CART, data=write(tmp_path / "logs", [ended, ended], more), out=tmp_path / "labeled")
+    told = "2 episodes terminate at their goal and are labeled as failures"
     assert (told in caplog.text) == is_told
     caplog.clear()
     known = ended | {SUCCESS: np.zeros(10, bool)}
@@ -167,7 +167,7 @@ def test_who_falls_while_it_lasts_is_at_no_goal(
     monkeypatch.setattr("astra_data.stages.label.task_named", lambda _: task)
     fell = drive(0.01, 5) | {TERMINATED: np.arange(5) == 4}
     more = tuple(column for column in OUTCOME_COLUMNS if column.name == TERMINATED)
-    out = label(CART, data=write(tmp_path / "logs", [fell], more), out=tmp_path / "labelled")
+    out = label(CART, data=write(tmp_path / "logs", [fell], more), out=tmp_path / "labeled")
     assert Dataset.open(out).metadata["failed"] == [True] and "at their goal" not in caplog.text
 
 
@@ -201,19 +201,19 @@ class ShortRail(Reach):
 def test_who_can_no_longer_reach_the_goal_has_failed() -> None:
     task = replace(task_named(CART), objective=ShortRail(horizon=40))
     given = drive(4.0, 10) | {GOAL: np.full(10, 1.9, np.float32)}
-    labelled = with_outcomes(task, Episode(0, given, {}), 0)
+    labeled = with_outcomes(task, Episode(0, given, {}), 0)
     # 0.4 m a step: the third leaves the rail.
-    assert labelled.columns[TERMINATED].tolist() == labelled.columns[DONE].tolist() == [False, False, True]
-    assert labelled.columns[REWARD].tolist() == pytest.approx([0.4, 0.4, 0.4 - 10.0])
-    assert labelled.metadata["failed"] and not labelled.metadata["success"]
+    assert labeled.columns[TERMINATED].tolist() == labeled.columns[DONE].tolist() == [False, False, True]
+    assert labeled.columns[REWARD].tolist() == pytest.approx([0.4, 0.4, 0.4 - 10.0])
+    assert labeled.metadata["failed"] and not labeled.metadata["success"]
 
 
 def test_outcomes_are_those_of_the_steps_that_are_kept() -> None:
     recorded: dict[str, float | str] = {"success": False, "failed": True, "return": -3.0, "driver": "Ada"}
-    labelled = with_outcomes(task_named(CART), Episode(0, drive(4.0, 10), recorded), 0)
-    reward = float(labelled.columns[REWARD].sum(dtype=np.float64))
+    labeled = with_outcomes(task_named(CART), Episode(0, drive(4.0, 10), recorded), 0)
+    reward = float(labeled.columns[REWARD].sum(dtype=np.float64))
     outcome = {"success": True, "failed": False, "return": reward}
-    assert len(labelled) < 10 and dict(labelled.metadata) == {"driver": "Ada"} | outcome
+    assert len(labeled) < 10 and dict(labeled.metadata) == {"driver": "Ada"} | outcome
 
 
 def test_the_seed_decides_the_goals(tmp_path: Path) -> None:
@@ -232,9 +232,9 @@ def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
         BadInputError, match=r"observation.state has 2 values, expected those of antmaze-umaze: 29"
     ):
         label("antmaze-umaze", data=logs, out=tmp_path / "out")
-    labelled = label(CART, data=logs, out=tmp_path / "labelled")
+    labeled = label(CART, data=logs, out=tmp_path / "labeled")
     with pytest.raises(BadInputError, match="already has goals and outcomes: there is nothing to label"):
-        label(CART, data=labelled)
+        label(CART, data=labeled)
     assert not (tmp_path / "out").exists()
 
 
@@ -321,14 +321,14 @@ def test_what_an_objective_returns_has_a_value_per_step(name: str, monkeypatch: 
 def test_what_lacks_nothing_is_linked_and_what_lies_elsewhere_is_pulled(
     tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    labelled = label(CART, data=write(tmp_path / "logs", [drive(0.1, 3)]), out=tmp_path / "labelled")
+    labeled = label(CART, data=write(tmp_path / "logs", [drive(0.1, 3)]), out=tmp_path / "labeled")
     monkeypatch.chdir(tmp_path)
-    link = label(CART, data="labelled", out=tmp_path / "run" / "seed_0")
-    assert link.is_symlink() and Dataset.open(link).content_hash == Dataset.open(labelled).content_hash
-    for taken in (link, labelled):
+    link = label(CART, data="labeled", out=tmp_path / "run" / "seed_0")
+    assert link.is_symlink() and Dataset.open(link).content_hash == Dataset.open(labeled).content_hash
+    for taken in (link, labeled):
         with pytest.raises(BadInputError, match="exists already; delete it or choose another folder"):
-            label(CART, data=labelled, out=taken)
-    address = push(str(labelled), f"file://{tmp_path}/shared")
+            label(CART, data=labeled, out=taken)
+    address = push(str(labeled), f"file://{tmp_path}/shared")
     pulled = label(CART, data=address, out=tmp_path / "run" / "seed_1")
     assert pulled.resolve() == home / "logs" / "data-2.0.0"
 
@@ -341,5 +341,5 @@ def test_who_terminates_is_at_the_goal_of_that_moment(
     goals = np.linspace(first, last, 10, dtype=np.float32)
     ended = drive(1.0, 10) | {TERMINATED: np.arange(10) == 9, GOAL: goals}
     more = (Column(GOAL), *(column for column in OUTCOME_COLUMNS if column.name == TERMINATED))
-    label(CART, data=write(tmp_path / "logs", [ended], more), out=tmp_path / "labelled")
+    label(CART, data=write(tmp_path / "logs", [ended], more), out=tmp_path / "labeled")
     assert ("1 episodes terminate at their goal" in caplog.text) == is_told

@@ -1,6 +1,6 @@
 import inspect
 
-from astra_data.experiments.plan import ARTEFACTS
+from astra_data.experiments.plan import ARTIFACTS
 from astra_data.stages.registry import STAGES
 
 
@@ -37,7 +37,7 @@ def test_a_stage_asks_for_nothing_that_the_plan_does_not_know() -> None:
             continue
         parameters = inspect.signature(stage.run).parameters.values()
         needed = {parameter.name for parameter in parameters if parameter.default is parameter.empty}
-        assert needed <= known | set(ARTEFACTS) | {"progress"}, stage.name
+        assert needed <= known | set(ARTIFACTS) | {"progress"}, stage.name
         assert ("config" in {parameter.name for parameter in parameters}) == (stage.config is not None)
 
 

@@ -77,7 +77,7 @@ def values(folder: Path) -> Any:  # noqa: ANN401 - JSON
     return json.loads((folder / "results.json").read_text())
 
 
-def test_json_uses_the_names_of_the_artefacts(values: Any) -> None:  # noqa: ANN401 - JSON
+def test_json_uses_the_names_of_the_artifacts(values: Any) -> None:  # noqa: ANN401 - JSON
     row = values["methods"]["astra"]
     assert row["return"] == [0.0, 1.0, 2.0]
     assert set(row["summary"]) == {
@@ -118,7 +118,7 @@ def test_the_methods_that_are_named_are_compared(root: Path) -> None:
     assert compared["direct_transfer"]["astra"]["difference"]["mean"] < 0
 
 
-def test_origin_is_what_the_artefacts_recorded(values: Any, folder: Path) -> None:  # noqa: ANN401 - JSON
+def test_origin_is_what_the_artifacts_recorded(values: Any, folder: Path) -> None:  # noqa: ANN401 - JSON
     assert values["command"] == "astra-data run recipes/antmaze_u.toml"
     made, drawn = values["origins"]
     assert made["stages"] == ["collect", "pair", "ground", "train", "evaluate"]

@@ -80,7 +80,7 @@ def test_who_judges_whom_with_what_drawn_where(root: Path, monkeypatch: pytest.M
     assert latents == [False] * 6 + [True] * 6  # NAS brings the encoder of its own grounding
 
 
-def test_the_artefact_names_all_that_it_was_made_from(root: Path) -> None:
+def test_the_artifact_names_all_that_it_was_made_from(root: Path) -> None:
     judged(root)
     manifest = read_manifest(root / "select")
     assert manifest is not None and set(manifest.files) == {"config.json", "select.json", "select.md"}

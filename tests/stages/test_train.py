@@ -43,7 +43,7 @@ def make(
     return (out / "policy.safetensors").read_bytes()
 
 
-def test_the_artefact_is_complete(task: str, grounded: Path, trained: Path) -> None:
+def test_the_artifact_is_complete(task: str, grounded: Path, trained: Path) -> None:
     assert {file.name for file in trained.iterdir()} == {
         "config.json",
         "curve.json",

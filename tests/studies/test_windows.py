@@ -58,7 +58,7 @@ def test_the_window_moves_on_with_each_step(stretch: Stretch) -> None:
     torch.testing.assert_close(moved[:, :-1, 3:], stretch.past_action[:, 1:])
 
 
-def test_inputs_are_normalised_motions_actions_and_the_bounded_ball(stretch: Stretch) -> None:
+def test_inputs_are_normalized_motions_actions_and_the_bounded_ball(stretch: Stretch) -> None:
     model = linear(stretch)
     ball, action, simulated = step(stretch)
     inputs = model.inputs(model.begin(stretch), ball, action, simulated)
@@ -79,11 +79,11 @@ def test_ridge_regression_is_least_squares_with_a_row_for_each_penalty(
     model.solve(stretch, strength)
     inputs = model.inputs(model.begin(stretch), *step(stretch)).double().numpy()
     correction = (stretch.motion - stretch.simulated)[:, 0].double().numpy()
-    # The penalty is relative to the samples, and spares the intercept, so all is centred.
-    centred = inputs - inputs.mean(axis=0)
+    # The penalty is relative to the samples, and spares the intercept, so all is centered.
+    centered = inputs - inputs.mean(axis=0)
     penalty = np.sqrt(strength * len(inputs)) * np.eye(inputs.shape[1])
     target = np.concatenate([correction - correction.mean(axis=0), np.zeros((len(penalty), 3))])
-    weights = np.linalg.lstsq(np.concatenate([centred, penalty]), target)[0]
-    expected = stretch.simulated[:, 0].numpy() + centred @ weights + correction.mean(axis=0)
+    weights = np.linalg.lstsq(np.concatenate([centered, penalty]), target)[0]
+    expected = stretch.simulated[:, 0].numpy() + centered @ weights + correction.mean(axis=0)
     found = model.motion(model.begin(stretch), *step(stretch))
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)

@@ -38,8 +38,8 @@ def nearest(behavior: RandomCommands) -> float:
 
 
 def test_a_watch_foresees_the_clearance_of_a_second() -> None:
-    towards, along = [0.0, 1.0], [1.0, 0.0]
-    clearance = WallWatch(TASK, 0.2).clearance(believed(STARTS[1:2]), np.array([[towards, along]]))
+    toward, along = [0.0, 1.0], [1.0, 0.0]
+    clearance = WallWatch(TASK, 0.2).clearance(believed(STARTS[1:2]), np.array([[toward, along]]))
     # 0.25 m/s for five steps of 0.192 s, on a grid of 0.05 m.
     assert clearance.shape == (1, 2)
     assert clearance[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)

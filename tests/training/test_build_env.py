@@ -31,7 +31,7 @@ from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
-HERE = torch.tensor(TASK.maze.cell_centre(1, 2), dtype=torch.float32)
+HERE = torch.tensor(TASK.maze.cell_center(1, 2), dtype=torch.float32)
 
 
 @pytest.fixture

@@ -209,7 +209,7 @@ def test_predicted_rewards_leave_to_the_task_walls_that_end_it() -> None:
     one = SimulatorEnv(task.objective, GroundedSimulator(task.simulator(2), model), reward="predicted")
     # The one in the middle of a corridor, the other just before the wall at x = -2.
     state = torch.tensor([[0.0, 2.0, 0.0, 0.0], [-1.999, 2.0, 0.0, 0.0]])
-    goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)]).float().expand(2, 2)
+    goal = torch.tensor([task.maze.cell_center(*task.maze.goal)]).float().expand(2, 2)
     one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(2, 8)})
     latent = one.simulator.latent
     assert latent is not None
@@ -242,20 +242,20 @@ def test_the_penalty_scale_scales_the_penalties() -> None:
 
 
 def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -> None:
-    still, penalised = world(2), world(2, change_penalty=0.5, command_limit=0.5)
-    penalised.penalty_scale = 0.0
+    still, penalized = world(2), world(2, change_penalty=0.5, command_limit=0.5)
+    penalized.penalty_scale = 0.0
     paid = []
     for command in ([0.0, 0.4], [0.0, 0.4], [3.0, 0.0]):  # the last is shortened to 0.5
-        state = penalised.state_dict()
+        state = penalized.state_dict()
         still.load_state_dict(state)
-        reward = penalised.step(torch.tensor([command] * 2)).reward
+        reward = penalized.step(torch.tensor([command] * 2)).reward
         paid.append((still.step(torch.tensor([command] * 2).clamp(-0.5, 0.5)).reward - reward).tolist())
     for row, change in zip(paid, (0.16, 0.0, 0.41), strict=True):
         assert row == pytest.approx([0.5 * change] * 2, abs=1e-5)
-    penalised.reset(torch.tensor([True, False]))
-    still.load_state_dict(penalised.state_dict())
+    penalized.reset(torch.tensor([True, False]))
+    still.load_state_dict(penalized.state_dict())
     same = torch.tensor([[0.5, 0.0]] * 2)
-    less = still.step(same).reward - penalised.step(same).reward
+    less = still.step(same).reward - penalized.step(same).reward
     assert less.tolist() == pytest.approx([0.125, 0.0], abs=1e-5)
 
 

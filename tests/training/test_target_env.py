@@ -113,7 +113,7 @@ def test_a_share_of_the_episodes_starts_from_the_data() -> None:
     from_data = matches.any(1)
     assert from_data.float().mean() == pytest.approx(0.3, abs=0.1)
     assert torch.equal(saved["goal"][from_data], starts.goal[matches[from_data].float().argmax(1)])
-    start, goal = (torch.tensor(TASK.maze.cell_centre(*cell)) for cell in (TASK.maze.start, TASK.maze.goal))
+    start, goal = (torch.tensor(TASK.maze.cell_center(*cell)) for cell in (TASK.maze.start, TASK.maze.goal))
     assert ((saved["physics"][~from_data, 1:3] - start).abs() < 0.7).all()
     assert ((saved["goal"][~from_data] - goal).abs() < 0.7).all()
 

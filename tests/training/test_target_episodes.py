@@ -111,7 +111,7 @@ def test_only_the_ant_has_legs_of_several_lengths(task: Task) -> None:
 
 
 class Apart(Cart):
-    """A robot that begins a metre behind the one that was built before."""
+    """A robot that begins a meter behind the one that was built before."""
 
     made = 0
 

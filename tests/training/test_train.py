@@ -33,7 +33,7 @@ from astra_data.training.train import (
     _lately,
     imitates,
     learner_of,
-    optimise,
+    optimize,
     train_in,
 )
 from astra_data.worlds.registry import TASKS
@@ -163,7 +163,7 @@ def counted(
 ) -> tuple[Counting, dict[str, Any]]:
     env = ToyWorld(2)
     learner = Counting(env, figures)
-    return learner, optimise(cast(Learner, learner), env, ramp, given)
+    return learner, optimize(cast(Learner, learner), env, ramp, given)
 
 
 def test_penalties_ramp_up_over_a_share_of_the_training(tmp_path: Path) -> None:
@@ -217,14 +217,14 @@ def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     env = ToyWorld(2)
     again = Counting(env, lambda step: {"success": 0.5})
     again.total_steps = 12
-    curve = optimise(cast(Learner, again), env, WHOLE, given)
+    curve = optimize(cast(Learner, again), env, WHOLE, given)
     assert again.scales == [1.0, 1.0] and again.goes_on
     assert torch.equal(again.observation, first.env.observe())
     assert [point["steps"] for point in curve["points"]] == list(range(1, 13))
     assert curve["simulator_steps_per_second"] == pytest.approx(2 / 0.5)
     ended = Counting(env, lambda step: {"success": 0.5})
     ended.total_steps = 12
-    curve = optimise(cast(Learner, ended), env, WHOLE, given)
+    curve = optimize(cast(Learner, ended), env, WHOLE, given)
     assert len(curve["points"]) == 12 and curve["simulator_steps_per_second"] is None
 
 
@@ -234,7 +234,7 @@ def test_the_episodes_of_robots_do_not_go_on(tmp_path: Path, monkeypatch: pytest
     given = training(tmp_path)
     counted(given, WHOLE, lambda step: {"success": 0.5})
     again = Counting(ToyWorld(2), lambda step: {"success": 0.5})
-    optimise(cast(Learner, again), again.env, WHOLE, given)
+    optimize(cast(Learner, again), again.env, WHOLE, given)
     assert again.steps == 10 and not again.goes_on
 
 

@@ -91,7 +91,7 @@ def test_each_file_imports_those_beside_it(tmp_path: Path, monkeypatch: pytest.M
     assert sys.modules["own_facts"].VALUE == 1  # what was imported first stays so for all else
 
 
-def test_a_file_that_failed_hides_no_neighbours_of_others(
+def test_a_file_that_failed_hides_no_neighbors_of_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -182,7 +182,7 @@ def test_a_file_of_another_kind_is_no_module(tmp_path: Path) -> None:
         own_object(f"{tmp_path / 'cart.csv'}:TASK")
 
 
-def test_a_file_s_neighbours_come_before_those_of_others_whatever_was_appended(
+def test_a_file_s_neighbors_come_before_those_of_others_whatever_was_appended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -190,7 +190,7 @@ def test_a_file_s_neighbours_come_before_those_of_others_whatever_was_appended(
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "gears_of_mine.py").write_text(f"FOLDER = '{folder}'\n")
         (tmp_path / folder / "robot.py").write_text("from gears_of_mine import FOLDER\n")
-    (tmp_path / "one/robot.py").write_text("FOLDER = 'one'\n")  # does not import its neighbour
+    (tmp_path / "one/robot.py").write_text("FOLDER = 'one'\n")  # does not import its neighbor
     assert own_object(f"{tmp_path}/one/robot.py:FOLDER") == "one"
     sys.path.append(f"{tmp_path}/policy")
     assert own_object(f"{tmp_path}/two/robot.py:FOLDER") == "two"

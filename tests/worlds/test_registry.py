@@ -62,10 +62,10 @@ def test_targets_start_in_the_free_space(task: Task) -> None:
 @pytest.mark.parametrize("task", IN_A_MAZE, ids=lambda task: task.name)
 def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
     maze = task.maze
-    start = maze.fine_index(np.array(maze.cell_centre(*maze.start)))
-    metres = maze.distance_field(np.array(maze.cell_centre(*maze.goal)))[start]
+    start = maze.fine_index(np.array(maze.cell_center(*maze.start)))
+    meters = maze.distance_field(np.array(maze.cell_center(*maze.goal)))[start]
     # Below the largest command along one axis, 1 m/s, with time to spare.
-    assert metres / (task.objective.horizon * task.timestep_s) < 0.8
+    assert meters / (task.objective.horizon * task.timestep_s) < 0.8
 
 
 def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(

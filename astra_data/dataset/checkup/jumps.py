@@ -14,8 +14,8 @@ from astra_data.dataset.reader import Dataset
 LARGE = 20.0
 """Median steps above which a step may be a jump; steps without any movement do not count for the median."""
 ALONE = 10.0
-"""How much larger than each of its neighbours a jump is."""
-NEIGHBOURS = 3
+"""How much larger than each of its neighbors a jump is."""
+NEIGHBORS = 3
 """Steps on either side that are compared."""
 LONGEST = 2
 """Consecutive large steps that are still one jump: there and back, or in two."""
@@ -164,12 +164,12 @@ def shortest(steps: Floats, turns: Floats) -> Floats:
 
 
 def jumps(steps: Floats, limit: float) -> Iterator[int]:
-    """Yield where in `steps` (T,) one, or two in a row, are above `limit` and far above their neighbours."""
+    """Yield where in `steps` (T,) one, or two in a row, are above `limit` and far above their neighbors."""
     large = np.flatnonzero(steps > limit)
     for run in np.split(large, np.flatnonzero(np.diff(large) > 1) + 1):
         if 0 < len(run) <= LONGEST:
             first, last = int(run[0]), int(run[-1])
-            before = steps[max(0, first - NEIGHBOURS) : first]
-            beside = np.concatenate([before, steps[last + 1 : last + 1 + NEIGHBOURS]])
-            if len(beside) >= NEIGHBOURS and steps[run].min() > ALONE * beside.max():
+            before = steps[max(0, first - NEIGHBORS) : first]
+            beside = np.concatenate([before, steps[last + 1 : last + 1 + NEIGHBORS]])
+            if len(beside) >= NEIGHBORS and steps[run].min() > ALONE * beside.max():
                 yield first

@@ -40,7 +40,7 @@ class HubStore:
         """
         with _explained(self._repo) as api:
             _validate(api, (card / "README.md").read_text(encoding="utf-8"))
-            # None stands for the default of the user or the organisation.
+            # None stands for the default of the user or the organization.
             api.create_repo(self._repo, repo_type=KIND, private=private or None, exist_ok=True)
             if private and not api.repo_info(self._repo, repo_type=KIND).private:
                 raise BadInputError(

@@ -7,7 +7,7 @@ from pathlib import Path
 from astra_data.core.disk import writing
 from astra_data.core.durable import hidden_folder, move, sync
 from astra_data.core.errors import AstraDataError, BadInputError, SharingError
-from astra_data.core.optional import cure
+from astra_data.core.optional import how_to_install
 from astra_data.core.progress import Progress
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
@@ -38,7 +38,7 @@ class UrlStore:
                 self._filesystem, self._path = fsspec.core.url_to_fs(url)
             except ImportError as error:
                 extra = EXTRAS.get(protocol)
-                how = cure(extra) if extra else error
+                how = how_to_install(extra) if extra else error
                 raise BadInputError(
                     f"{url}: the package for {protocol}:// is not installed: {how}"
                 ) from error

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from astra_data.core.numbers import normalised
+from astra_data.core.numbers import normalized
 from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures
 from astra_data.learning.networks.scales import add_scales, take_scales
 
@@ -62,9 +62,9 @@ class TargetEncoder(nn.Module):
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble [s_i, features of its position, goal, a_{i-1}] (..., I)."""
-        normal_state = normalised(state, self.state_mean, self.state_std)
+        normal_state = normalized(state, self.state_mean, self.state_std)
         waves = self.position_features(state[..., :2])
-        normal_goal = normalised(goal, self.goal_mean, self.goal_std)
+        normal_goal = normalized(goal, self.goal_mean, self.goal_std)
         return torch.cat([normal_state, waves, normal_goal, previous_action], dim=-1)
 
 

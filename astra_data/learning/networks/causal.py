@@ -74,16 +74,16 @@ class CausalModel(nn.Module):
         return effect
 
 
-def fit_causes(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalised: int) -> CausalModel:
+def fit_causes(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalized: int) -> CausalModel:
     """Fit a causal model to causes (N, I) and effects (N, J), these of mean 0 and deviation 1; freeze it.
 
     All randomness comes from torch's global generator.
 
     Args:
         cause: scaled to about one.
-        effect: normalised.
+        effect: normalized.
         config: the settings.
-        penalised: the masks of the first so many causes are to be sparse.
+        penalized: the masks of the first so many causes are to be sparse.
     """
     model = CausalModel(cause.shape[1], effect.shape[1]).to(cause.device)
     networks = [weight for name, weight in model.named_parameters() if name != "logits"]
@@ -96,7 +96,7 @@ def fit_causes(cause: Tensor, effect: Tensor, config: CausalConfig, *, penalised
     for _ in range(config.updates):
         rows = torch.randint(len(cause), (config.batch_size,), device=cause.device)
         wrong = model(cause[rows], model.draw_mask(config.batch_size)) - effect[rows]
-        loss = wrong.square().mean() + config.sparsity * model.probability[:penalised].mean()
+        loss = wrong.square().mean() + config.sparsity * model.probability[:penalized].mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from astra_data.core.numbers import normalised
+from astra_data.core.numbers import normalized
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
 from astra_data.learning.networks.scales import add_scales, take_scales
 
@@ -149,7 +149,7 @@ class FailureModel(nn.Module):
 
         That is before the shift to how frequent failures are: they are drawn more often than they come.
         """
-        normal = normalised(inputs, self.input_mean, self.input_std)
+        normal = normalized(inputs, self.input_mean, self.input_std)
         return torch.stack([member(normal).squeeze(-1) for member in self.members])
 
     @torch.no_grad()
@@ -180,7 +180,7 @@ class FailureModel(nn.Module):
         return [shape.state_size, shape.state_size, shape.action_size, self.averages_size]
 
     def _averaged(self, averages: Tensor, magnitudes: Tensor) -> Tensor:
-        """Move averages (B, 3 * 5) towards `magnitudes` (B, 5), each at its rate."""
+        """Move averages (B, 3 * 5) toward `magnitudes` (B, 5), each at its rate."""
         now = averages.unflatten(-1, (len(AVERAGED_S), _MAGNITUDES))
         moved: Tensor = now + self.rates * (magnitudes.unsqueeze(-2) - now)
         return moved.flatten(-2)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from astra_data.core.numbers import normalised
+from astra_data.core.numbers import normalized
 from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures, mlp
 from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
 from astra_data.learning.networks.scales import add_scales, take_scales
@@ -134,18 +134,18 @@ class GroundingModel(nn.Module):
             list(self.reward_head.parameters())[-1][1] = rate.logit()
 
     def state_features(self, state: Tensor) -> Tensor:
-        """Normalise abstract states (..., X) and append features of the robot's and the ball's position."""
+        """Normalize abstract states (..., X) and append features of the robot's and the ball's position."""
         position, index = state[..., :2], self.shape.ball_index
-        features = [normalised(state, self.state_mean, self.state_std), self.position_features(position)]
+        features = [normalized(state, self.state_mean, self.state_std), self.position_features(position)]
         if index is not None:
             apart = state[..., index : index + 2] - position
             near = torch.cat([apart, apart.norm(dim=-1, keepdim=True)], dim=-1)
-            features.append(normalised(near, 0.0, _BALL_M))
+            features.append(normalized(near, 0.0, _BALL_M))
         return torch.cat(features, dim=-1)
 
     def normal_goal(self, goal: Tensor) -> Tensor:
-        """Normalise goals (..., G)."""
-        return normalised(goal, self.goal_mean, self.goal_std)
+        """Normalize goals (..., G)."""
+        return normalized(goal, self.goal_mean, self.goal_std)
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
@@ -194,7 +194,7 @@ class GroundingModel(nn.Module):
         return torch.stack(parts, dim=-1)
 
     def _reward_outputs(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the normalised reward of a step that goes on, and the log-odds that it fails, (...) each."""
+        """Return the normalized reward of a step that goes on, and the log-odds that it fails, (...) each."""
         going_on, log_odds = self.reward_head(torch.cat([latent, action], dim=-1)).unbind(-1)
         return going_on, log_odds
 

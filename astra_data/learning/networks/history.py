@@ -1,4 +1,4 @@
-"""The history encoder: a GRU over states and actions whose layer-normalised hidden state is the latent."""
+"""The history encoder: a GRU over states and actions whose layer-normalized hidden state is the latent."""
 
 from itertools import pairwise
 from typing import Protocol

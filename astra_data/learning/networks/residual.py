@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from astra_data.core.numbers import normalised
+from astra_data.core.numbers import normalized
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class ResidualModel(nn.Module):
             simulated_next: where the simulator landed from there, (B, T, X).
             memory: before the first step, (B, M).
         """
-        normal = [normalised(one, self.state_mean, self.state_std) for one in (state, simulated_next)]
+        normal = [normalized(one, self.state_mean, self.state_std) for one in (state, simulated_next)]
         embedded = functional.leaky_relu(self.embedding(torch.cat([normal[0], action, normal[1]], dim=-1)))
         shape = (len(memory), 2, self.shape.layers, self.shape.hidden_size)
         hidden, cell = memory.view(shape).permute(1, 2, 0, 3).contiguous()

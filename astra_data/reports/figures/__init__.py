@@ -1,6 +1,6 @@
 """Figures: pure functions from arrays to a matplotlib Figure, in one style.
 
-style         colours, titles and roles of the methods; fonts and lines
+style         colors, titles and roles of the methods; fonts and lines
 scores        score_bars, learning_curves
 motion        trajectories (the paper's Fig. 3), dynamics_mismatch (the paper's Fig. 1)
 coverage      coverage: which positions or velocities a dataset holds
@@ -20,7 +20,7 @@ from astra_data.reports.figures.reliability import reliability
 from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
 from astra_data.reports.figures.sizes import Scored, data_efficiency
 from astra_data.reports.figures.strips import Strip, strips
-from astra_data.reports.figures.style import method_colour, method_title, png
+from astra_data.reports.figures.style import method_color, method_title, png
 from astra_data.reports.figures.suggestions import information_map
 from astra_data.reports.figures.validity import SimulatorReturns, predictive_validity
 from astra_data.reports.figures.walks import walk_prediction
@@ -37,7 +37,7 @@ __all__ = [
     "dynamics_mismatch",
     "information_map",
     "learning_curves",
-    "method_colour",
+    "method_color",
     "method_title",
     "open_loop_error",
     "png",

@@ -134,14 +134,14 @@ def _speed(states: Floats) -> Floats:
 
 def _view(maze: Maze) -> tuple[Floats, Floats]:
     """Return (left, right) and (bottom, top) in m: the free cells and a rim of the walls around them."""
-    centres = maze.free_centres()
+    centers = maze.free_centers()
     reach = (0.5 + RIM) * maze.scale
-    low, high = centres.min(axis=0) - reach, centres.max(axis=0) + reach
+    low, high = centers.min(axis=0) - reach, centers.max(axis=0) + reach
     return np.array([low[0], high[0]]), np.array([low[1], high[1]])
 
 
 def _goals(maze: Maze, goals: Floats) -> list[Floats]:
-    """Return the mean of the `goals` (N, 2) in each cell: goals scatter around its centre."""
+    """Return the mean of the `goals` (N, 2) in each cell: goals scatter around its center."""
     cells = np.floor((goals + maze.half_extent) / maze.scale)
     return [goals[(cells == cell).all(axis=1)].mean(axis=0) for cell in np.unique(cells, axis=0)]
 
@@ -151,9 +151,9 @@ def draw_walls(axes: Axes, maze: Maze) -> None:
     corner = maze.scale / 2
     cells = []
     for row, column in maze.wall_cells():
-        x, y = maze.cell_centre(row, column)
+        x, y = maze.cell_center(row, column)
         cells.append(Rectangle((x - corner, y - corner), maze.scale, maze.scale))
-    # The thin edge in the wall's own colour closes the hairlines between neighbouring cells.
+    # The thin edge in the wall's own color closes the hairlines between neighboring cells.
     axes.add_collection(PatchCollection(cells, fc=WALL, ec=WALL, lw=0.5, zorder=1))
     (left, right), (bottom, top) = _view(maze)
     axes.set_xlim(left, right)
@@ -162,17 +162,17 @@ def draw_walls(axes: Axes, maze: Maze) -> None:
     axes.set_axis_off()
 
 
-def _paths(axes: Axes, positions: Floats, success: Bools, colour: str, dashes: str) -> None:
+def _paths(axes: Axes, positions: Floats, success: Bools, color: str, dashes: str) -> None:
     for path, reached in zip(positions, success, strict=True):
         points = path[np.isfinite(path).all(axis=-1)]
         if not len(points):
             continue
-        axes.plot(points[:, 0], points[:, 1], dashes, color=colour, lw=1.0, alpha=0.7, zorder=3)
+        axes.plot(points[:, 0], points[:, 1], dashes, color=color, lw=1.0, alpha=0.7, zorder=3)
         if points.shape[1] > 2:
-            axes.plot(points[:, 2], points[:, 3], ":", color=colour, lw=1.4, alpha=0.9, zorder=3)
-            axes.plot(*points[-1, 2:], "o", color="white", mec=colour, ms=4, mew=1.0, zorder=5)
+            axes.plot(points[:, 2], points[:, 3], ":", color=color, lw=1.4, alpha=0.9, zorder=3)
+            axes.plot(*points[-1, 2:], "o", color="white", mec=color, ms=4, mew=1.0, zorder=5)
         if not reached:
             axes.plot(*points[-1, :2], "x", color="white", ms=7, mew=3.4, zorder=5)
-            axes.plot(*points[-1, :2], "x", color=colour, ms=6, mew=1.8, zorder=5)
+            axes.plot(*points[-1, :2], "x", color=color, ms=6, mew=1.8, zorder=5)
     starts = positions[:, 0] if len(positions) else np.empty((0, 2))
     axes.plot(starts[:, 0], starts[:, 1], "o", color=FAINT, ms=2.5, mew=0, zorder=4)

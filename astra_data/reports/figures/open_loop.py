@@ -10,7 +10,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
-from astra_data.reports.figures.style import INK, method_colour, method_title, style
+from astra_data.reports.figures.style import INK, method_color, method_title, style
 
 SAME = 0.01
 """Ungrounded simulators whose errors differ by less than this share are drawn once."""
@@ -48,11 +48,11 @@ def open_loop_error(gaps: Mapping[str, OpenLoop]) -> Figure:
                 if not any(raw.shape == seen.shape and np.allclose(raw, seen, rtol=SAME) for seen in drawn):
                     drawn.append(raw)
                     label = "no grounding" if len(drawn) == 1 else None
-                    _line(axes, gap.horizons, raw, colour=INK, dashes=":", label=label)
+                    _line(axes, gap.horizons, raw, color=INK, dashes=":", label=label)
             for method, gap in gaps.items():
                 dashes = "--" if is_plus(method) else "-"
-                colour, label = method_colour(method), method_title(method)
-                _line(axes, gap.horizons, gap.grounded[quantity], colour=colour, dashes=dashes, label=label)
+                color, label = method_color(method), method_title(method)
+                _line(axes, gap.horizons, gap.grounded[quantity], color=color, dashes=dashes, label=label)
             horizons = np.unique(np.concatenate([gap.horizons for gap in gaps.values()]))
             axes.set(xscale="log", yscale="log", xlabel="horizon (steps)", ylabel=_label(quantity))
             axes.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
@@ -65,10 +65,10 @@ def open_loop_error(gaps: Mapping[str, OpenLoop]) -> Figure:
         return figure
 
 
-def _line(axes: Axes, horizons: Floats, band: Floats, *, colour: str, dashes: str, label: str | None) -> None:
+def _line(axes: Axes, horizons: Floats, band: Floats, *, color: str, dashes: str, label: str | None) -> None:
     mean, low, high = band
-    axes.fill_between(horizons, low, high, color=colour, alpha=0.13, lw=0)
-    axes.plot(horizons, mean, dashes, color=colour, marker="o", ms=3.5, label=label)
+    axes.fill_between(horizons, low, high, color=color, alpha=0.13, lw=0)
+    axes.plot(horizons, mean, dashes, color=color, marker="o", ms=3.5, label=label)
 
 
 def _label(quantity: str) -> str:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
-from astra_data.reports.figures.style import FAINT, method_colour, method_title, style
+from astra_data.reports.figures.style import FAINT, method_color, method_title, style
 
 _TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
 
@@ -31,9 +31,9 @@ def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
             axes.plot([0, 1], [0, 1], color=FAINT, ls="--", lw=0.9, zorder=1)
             for row, (predicted, observed, steps) in rates.items():
                 look = f"{'--' if is_plus(row) else '-'}o"
-                colour, label = method_colour(row), method_title(row)
-                axes.plot(predicted, observed, look, color=colour, ms=4, label=label, clip_on=False)
-                counts.plot(predicted, steps, look, color=colour, ms=4)
+                color, label = method_color(row), method_title(row)
+                axes.plot(predicted, observed, look, color=color, ms=4, label=label, clip_on=False)
+                counts.plot(predicted, steps, look, color=color, ms=4)
             axes.set_title(title, loc="left")
             _by_square_root(axes)
             counts.set_yscale("log")

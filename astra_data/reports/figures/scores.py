@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import base_method, is_plus
-from astra_data.reports.figures.style import FAINT, INK, method_colour, method_title, score_axis, style
+from astra_data.reports.figures.style import FAINT, INK, method_color, method_title, score_axis, style
 from astra_data.worlds.score import Score
 
 CURVE_POINTS = 200
@@ -105,11 +105,11 @@ def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figu
         for method, seeds in curves.items():
             axes = every[panels.index(base_method(method))]
             steps, scores = on_one_grid(seeds)
-            colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
+            color, dashes = method_color(method), "--" if is_plus(method) else "-"
             if len(seeds) > 1:
                 low, high = scores.min(axis=0), scores.max(axis=0)
-                axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0)
-            axes.plot(steps, scores.mean(axis=0), dashes, color=colour)
+                axes.fill_between(steps, low, high, color=color, alpha=0.15, lw=0)
+            axes.plot(steps, scores.mean(axis=0), dashes, color=color)
         score_axis(every[0], score)
         every[0].set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
         every[0].xaxis.set_major_formatter(_steps_label)
@@ -132,7 +132,7 @@ def _bar(
     iqm, low, high = interval
     hatch = "////" if is_plus(method) else None
     axes.barh(
-        place, iqm, height=0.68, color=method_colour(method), ec=(1, 1, 1, 0.4), lw=0, hatch=hatch, zorder=2
+        place, iqm, height=0.68, color=method_color(method), ec=(1, 1, 1, 0.4), lw=0, hatch=hatch, zorder=2
     )
     if np.isfinite(low):
         axes.plot([low, high], [place, place], color=INK, lw=1.6, zorder=3)

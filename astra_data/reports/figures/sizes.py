@@ -11,7 +11,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
 from astra_data.dataset.inspection import Map
 from astra_data.reports.figures.coverage import draw_visits
-from astra_data.reports.figures.style import method_colour, method_title, score_axis, style
+from astra_data.reports.figures.style import method_color, method_title, score_axis, style
 from astra_data.worlds.score import Score
 
 
@@ -75,7 +75,7 @@ def data_efficiency(
 
 
 def _maps(panels: Sequence[Axes], visits: Sequence[Map], label: str) -> None:
-    """Draw one map per panel, with the colours and the limits of the one that covers most."""
+    """Draw one map per panel, with the colors and the limits of the one that covers most."""
     most = max(int(visit.counts.max()) for visit in visits)
     extents = np.array([visit.extent for visit in visits])
     for axes, visit in zip(panels, visits, strict=True):
@@ -90,11 +90,11 @@ def _band(axes: Axes, sizes: Mapping[int, Scored], method: str) -> None:
     percents = sorted(sizes)
     scored = [sizes[percent] for percent in percents]
     low, high = [one.low for one in scored], [one.high for one in scored]
-    colour, dashes = method_colour(method), "--" if is_plus(method) else "-"
+    color, dashes = method_color(method), "--" if is_plus(method) else "-"
     if np.isfinite(low).all():
-        axes.fill_between(percents, low, high, color=colour, alpha=0.18, lw=0)
+        axes.fill_between(percents, low, high, color=color, alpha=0.18, lw=0)
     middle = [one.middle for one in scored]
-    axes.plot(percents, middle, dashes, color=colour, marker="o", ms=4, label=method_title(method))
+    axes.plot(percents, middle, dashes, color=color, marker="o", ms=4, label=method_title(method))
     places = np.repeat(percents, [len(one.seeds) for one in scored])
     seeds = np.concatenate([one.seeds for one in scored])
-    axes.plot(places, seeds, ".", color=colour, alpha=0.45, ms=4, zorder=1)
+    axes.plot(places, seeds, ".", color=color, alpha=0.45, ms=4, zorder=1)

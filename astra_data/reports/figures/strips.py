@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from astra_data.reports.figures.style import FAINT, method_colour, method_title, style
+from astra_data.reports.figures.style import FAINT, method_color, method_title, style
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def strips(times_s: Sequence[float], rows: Mapping[str, Strip]) -> Figure:
             ended = f"fell after {strip.ended_s:.1f} s" if strip.failed else f"{strip.ended_s:.0f} s"
             place = {"transform": line[0].transAxes, "ha": "right"}
             name = method_title(method).replace(" + ", " +\n").replace(", ", ",\n")
-            line[0].text(-0.08, 0.55, name, va="bottom", weight="bold", color=method_colour(method), **place)
+            line[0].text(-0.08, 0.55, name, va="bottom", weight="bold", color=method_color(method), **place)
             line[0].text(-0.08, 0.5, ended, va="top", color=FAINT, size=8, **place)
         for axes, time_s in zip(grid[0], times_s, strict=True):
             axes.set_title(f"{time_s:g} s", size=8, weight="normal")

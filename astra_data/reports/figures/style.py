@@ -1,4 +1,4 @@
-"""One style for all figures; each method has its colour and title wherever it appears."""
+"""One style for all figures; each method has its color and title wherever it appears."""
 
 import zlib
 from collections.abc import Iterator
@@ -14,9 +14,9 @@ from PIL import Image
 from astra_data.core.naming import base_method, is_plus
 from astra_data.worlds.score import Score
 
-SPARE_COLOURS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
-"""For methods without a colour of their own. The others are Okabe and Ito's palette and shades that
-colour-blind readers can tell from it."""
+SPARE_COLORS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
+"""For methods without a color of their own. The others are Okabe and Ito's palette and shades that
+color-blind readers can tell from it."""
 
 SIMULATED = "#E07B00"
 """A simulator, in every figure (as in the paper's Fig. 3)."""
@@ -67,17 +67,17 @@ def style() -> Iterator[None]:
         yield
 
 
-def method_colour(method: str) -> str:
-    """Return the colour of a row as "#rrggbb": a variant's is its base row's, darker."""
+def method_color(method: str) -> str:
+    """Return the color of a row as "#rrggbb": a variant's is its base row's, darker."""
     from astra_data.methods import METHODS
 
     base = base_method(method)
-    own = METHODS[base].colour if base in METHODS else ""
-    colour = own or SPARE_COLOURS[zlib.crc32(base.encode()) % len(SPARE_COLOURS)]
+    own = METHODS[base].color if base in METHODS else ""
+    color = own or SPARE_COLORS[zlib.crc32(base.encode()) % len(SPARE_COLORS)]
     if is_plus(method):
-        red, green, blue = to_rgb(colour)
+        red, green, blue = to_rgb(color)
         return to_hex((0.68 * red, 0.68 * green, 0.68 * blue))
-    return colour.lower()
+    return color.lower()
 
 
 def method_title(method: str) -> str:
@@ -96,7 +96,7 @@ def score_axis(axes: Axes, score: Score) -> None:
 
 
 def png(figure: Figure) -> bytes:
-    """Render a figure as PNG of 256 colours (a fifth of the bytes of all colours), without a display."""
+    """Render a figure as PNG of 256 colors (a fifth of the bytes of all colors), without a display."""
     drawn, small = BytesIO(), BytesIO()
     with style():
         figure.savefig(drawn, format="png")

@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
-from astra_data.reports.figures.style import FAINT, method_colour, method_title, style
+from astra_data.reports.figures.style import FAINT, method_color, method_title, style
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ def predictive_validity(simulators: list[SimulatorReturns]) -> Figure:
             axes.axline((0, 0), slope=1, color=FAINT, ls="--", lw=0.9, zorder=1)
             for row, (simulated, target) in simulator.returns.items():
                 axes.plot(
-                    simulated, target, _marker(row), color=method_colour(row), mec="white", mew=0.6, ms=6
+                    simulated, target, _marker(row), color=method_color(row), mec="white", mew=0.6, ms=6
                 )
             axes.set_title(simulator.title, loc="left")
             axes.set_xlabel("return in this simulator")
             axes.grid(visible=True, axis="both")
         grid[0].set_ylabel("return in the target")
         handles = [
-            Line2D([], [], marker=_marker(row), ls="", color=method_colour(row), mec="white", ms=6.5)
+            Line2D([], [], marker=_marker(row), ls="", color=method_color(row), mec="white", ms=6.5)
             for row in rows
         ]
         figure.legend(handles, [method_title(row) for row in rows], loc="outside right center")

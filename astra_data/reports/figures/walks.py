@@ -37,7 +37,7 @@ def walk_prediction(
         minutes: the M sizes of the data.
         by_minutes: errors at `horizon_s`.
         horizon_s: the horizon of the lower row.
-        looks: title and colour of each model.
+        looks: title and color of each model.
     """
     with style():
         rows = 2 if len(minutes) > 1 else 1
@@ -65,7 +65,7 @@ def _lines(
     axes: Axes, places: Floats, bands: Mapping[str, Floats], looks: Mapping[str, tuple[str, str]]
 ) -> None:
     for name, (middle, low, high) in bands.items():
-        title, colour = looks[name]
-        axes.fill_between(places, low, high, color=colour, alpha=0.08, lw=0)
-        axes.plot(places, middle, ":" if name == RAW else "-", color=colour, marker="o", ms=3, label=title)
+        title, color = looks[name]
+        axes.fill_between(places, low, high, color=color, alpha=0.08, lw=0)
+        axes.plot(places, middle, ":" if name == RAW else "-", color=color, marker="o", ms=3, label=title)
     axes.set_ylim(bottom=0)

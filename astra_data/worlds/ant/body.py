@@ -36,7 +36,7 @@ TOPPLE_COSINE = 0.2
 TORSO_HEIGHT_M = 0.75
 WALL_REACH_M = 1.3
 """With more clearance than this on the maze's grid the ant touches no wall: a stretched leg ends 1.21 m from
-the torso's centre, and the grid is up to 0.1 m off."""
+the torso's center, and the grid is up to 0.1 m off."""
 WALL_HEIGHT = 0.5
 """In units of the maze scale, as in gymnasium-robotics."""
 # Ankle axes alternate; these signs make every leg look like leg 1 (angle 30..70 degrees).
@@ -61,7 +61,7 @@ def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> mujoco.MjM
         half = 0.5 * maze.scale
         height = 0.5 * WALL_HEIGHT * maze.scale
         for row, column in maze.wall_cells():
-            x, y = maze.cell_centre(row, column)
+            x, y = maze.cell_center(row, column)
             ElementTree.SubElement(
                 worldbody,
                 "geom",

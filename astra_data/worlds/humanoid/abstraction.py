@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.core.numbers import normalised
+from astra_data.core.numbers import normalized
 from astra_data.worlds.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
 from astra_data.worlds.humanoid.skeleton import mass_and_feet, mass_velocity
 from astra_data.worlds.humanoid.spread import VELOCITY_M_S, in_spreads
@@ -49,11 +49,11 @@ def humanoid_to_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Ten
 def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
     state: Array,
 ) -> Array:
-    """Keep all joints, the motion of the centre of mass and the lean of the torso: (..., 47) to (..., 46).
+    """Keep all joints, the motion of the center of mass and the lean of the torso: (..., 47) to (..., 46).
 
-    After the joints (34): x and y of the centre of mass relative to the midpoint of the feet, and its height
+    After the joints (34): x and y of the center of mass relative to the midpoint of the feet, and its height
     above the floor, in m; its velocity (3) in m/s. These are in a level frame whose x axis is the torso's
-    heading, so that steps look the same in all directions. The centre of mass of a falling humanoid first
+    heading, so that steps look the same in all directions. The center of mass of a falling humanoid first
     leaves the area above the feet, then drops. Then, in the torso's frame, the direction of up (3) and the
     torso's angular velocity (3) in rad/s: what the paper calls robot-level information, citing a robot that
     observes both (Radosavovic et al. 2024). Dropped: the heading.
@@ -71,7 +71,7 @@ def beyond_walker2d(state: Tensor) -> Tensor:
     velocity = _headed(rotation(state[..., _QUATERNION]), state[..., _VELOCITY])
     rest = [joint for joint in range(len(JOINTS)) if joint not in COMMANDED]
     joints, rates = seen[..., _JOINTS][..., rest], seen[..., _RATES][..., rest]
-    left = normalised(velocity[..., 1:2], 0.0, VELOCITY_M_S)
+    left = normalized(velocity[..., 1:2], 0.0, VELOCITY_M_S)
     return torch.cat([seen[..., _QUATERNION], joints, left, seen[..., _SPIN], rates], dim=-1)
 
 

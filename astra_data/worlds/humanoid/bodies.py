@@ -77,7 +77,7 @@ class Humanoids:
         self.reward = reward if active is None else np.where(active, reward, 0.0)
 
     def _measure(self, data: mujoco.MjData) -> tuple[float, float, float]:
-        """Return x of the centre of mass, and the sums of squared controls and contact forces.
+        """Return x of the center of mass, and the sums of squared controls and contact forces.
 
         As in Gymnasium, they are of the last evaluation of the dynamics, not of the state after it.
         """

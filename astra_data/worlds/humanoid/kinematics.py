@@ -1,7 +1,7 @@
 """The humanoid's joints without its body: they follow commands, whatever happens to its balance.
 
 Joints approach their targets, those that no command moves zero, as position control moves a massless joint;
-the extended simulator adds the centre of mass and the torso's lean. What both leave out: docs/humanoid.md.
+the extended simulator adds the center of mass and the torso's lean. What both leave out: docs/humanoid.md.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from astra_data.worlds.humanoid.model import (
 from astra_data.worlds.humanoid.skeleton import mass_and_feet
 
 _COUNT = len(JOINTS)
-_CENTRE = slice(2 * _COUNT, 2 * _COUNT + 3)
+_CENTER = slice(2 * _COUNT, 2 * _COUNT + 3)
 _VELOCITY = slice(2 * _COUNT + 3, 2 * _COUNT + 6)
 _UP = slice(2 * _COUNT + 6, 2 * _COUNT + 9)
 _SPIN = slice(2 * _COUNT + 9, None)
@@ -92,7 +92,7 @@ class HumanoidKinematics(FreeStates):
 
 
 class HumanoidExtendedKinematics(HumanoidKinematics):
-    """The same, with the centre of mass and its velocity, and lean and angular velocity of the torso.
+    """The same, with the center of mass and its velocity, and lean and angular velocity of the torso.
 
     Attributes:
         state: (B, 46) float32, as `humanoid_to_extended_kinematics` makes it.
@@ -133,7 +133,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         return {**super().parameters, "follow_s": self.follow_s}
 
     def _moved(self, action: Tensor) -> Tensor:
-        """Return joints, centre of mass and its velocity, lean and spin (B, 46) after the step."""
+        """Return joints, center of mass and its velocity, lean and spin (B, 46) after the step."""
         joints = super()._moved(action)
         mass, feet = mass_and_feet(self.state[:, :_COUNT])
         later_mass, later_feet = mass_and_feet(joints[:, :_COUNT])
@@ -147,4 +147,4 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
         spin = (1.0 - share) * self.state[:, _SPIN]
         up = self.state[:, _UP]
         up = functional.normalize(up - self._timestep_s * torch.linalg.cross(spin, up), dim=-1)
-        return torch.cat([joints, self.state[:, _CENTRE] + shift, velocity, up, spin], dim=-1)
+        return torch.cat([joints, self.state[:, _CENTER] + shift, velocity, up, spin], dim=-1)

@@ -15,7 +15,7 @@ class Locomotion:
     """Rewards, starts and ends of episodes.
 
     Attributes:
-        forward_reward: per m/s of the centre of mass along x.
+        forward_reward: per m/s of the center of mass along x.
         healthy_reward: for every step that ends at a healthy height.
         healthy_m: range of healthy heights of the torso, outside of which the episode ends.
         effort_cost: per unit of the sum of the squared controls.
@@ -48,7 +48,7 @@ class Locomotion:
         """Return the reward (B,) of a step.
 
         Args:
-            velocity: of the centre of mass along x, (B,) in m/s.
+            velocity: of the center of mass along x, (B,) in m/s.
             healthy: after the step, (B,).
             effort: sum of the squared controls, (B,).
             contact: sum of the squared contact forces and torques of all bodies, (B,).

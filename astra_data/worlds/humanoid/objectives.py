@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.core.numbers import normalised
+from astra_data.core.numbers import normalized
 from astra_data.worlds.humanoid.abstraction import (
     humanoid_to_extended_kinematics,
     humanoid_to_kinematics,
@@ -62,7 +62,7 @@ class Walking(Objective):
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return the deviations of states (..., X) from standing, in spreads and clipped to ±5, (..., X)."""
-        return normalised(state, state.new_tensor(self._standing), state.new_tensor(self.spread))
+        return normalized(state, state.new_tensor(self._standing), state.new_tensor(self.spread))
 
     @cached_property
     def _standing(self) -> NDArray[np.float64]:
@@ -110,7 +110,7 @@ class PlanarWalking(Walking):
         return ~((state[:, 0] > low) & (state[:, 0] < high))
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return the forward velocity of the centre of mass after the step, with stiff arms, (B,) in m/s."""
+        """Return the forward velocity of the center of mass after the step, with stiff arms, (B,) in m/s."""
         joints = after.new_zeros(2, len(after), _COUNT)
         joints[..., COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
         mass, _ = mass_and_feet(joints[0])
@@ -140,10 +140,10 @@ class JointWalking(Walking):
 
 @dataclass(frozen=True)
 class MassWalking(Walking):
-    """Walking of joints, centre of mass and the torso's lean, states (..., 46).
+    """Walking of joints, center of mass and the torso's lean, states (..., 46).
 
     Attributes:
-        lowest_mass_m: a humanoid whose centre of mass is lower than this has fallen, on average two steps
+        lowest_mass_m: a humanoid whose center of mass is lower than this has fallen, on average two steps
             before the target's episode ends; standing it is 0.9 m high.
     """
 
@@ -159,9 +159,9 @@ class MassWalking(Walking):
         return humanoid_to_extended_kinematics(state)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Return which centres of mass of states (B, 46) are too low, (B,) bool."""
+        """Return which centers of mass of states (B, 46) are too low, (B,) bool."""
         return ~(state[:, 2 * _COUNT + 2] >= self.lowest_mass_m)
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return the velocity of the centre of mass along the heading after the step, (B,) in m/s."""
+        """Return the velocity of the center of mass along the heading after the step, (B,) in m/s."""
         return after[:, 2 * _COUNT + 3]

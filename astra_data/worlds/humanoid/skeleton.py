@@ -1,4 +1,4 @@
-"""Forward kinematics of the humanoid: centre of mass and feet, for batches of joint angles.
+"""Forward kinematics of the humanoid: center of mass and feet, for batches of joint angles.
 
 Everything is in the torso's frame, in m.
 """
@@ -40,15 +40,15 @@ class _Skeleton:
     Attributes:
         links: by the body's number.
         axes: of the joints in their bodies, (17, 3). crosses: matrices K with K v = axis x v, (17, 3, 3).
-        centres: of mass of each of the 13 bodies in its own frame, (3,) by its number.
+        centers: of mass of each of the 13 bodies in its own frame, (3,) by its number.
         shares: of the bodies in the total mass, (13,). moved: the shares that each joint moves, (17, 13).
-        feet: number of the body that each foot belongs to, and the foot's centre, (3,).
+        feet: number of the body that each foot belongs to, and the foot's center, (3,).
     """
 
     links: dict[int, _Link]
     axes: Tensor
     crosses: Tensor
-    centres: dict[int, Tensor]
+    centers: dict[int, Tensor]
     shares: Tensor
     moved: Tensor
     feet: tuple[tuple[int, Tensor], ...]
@@ -86,7 +86,7 @@ def _skeleton(dtype: torch.dtype, device: torch.device) -> _Skeleton:
         links=links,
         axes=tensor(axes),
         crosses=tensor([np.cross(np.eye(3), axis) for axis in axes]),
-        centres={body: tensor(model.body_ipos[body]) for body in bodies},
+        centers={body: tensor(model.body_ipos[body]) for body in bodies},
         shares=tensor(shares),
         moved=tensor(moved),
         feet=tuple((int(foot.bodyid[0]), tensor(foot.pos)) for foot in map(model.geom, FEET)),
@@ -98,12 +98,12 @@ class _Placed:
     """Positions of the parts of a humanoid.
 
     Attributes:
-        mass: centre of mass, (..., 3). centres: those of the bodies, (..., 13, 3). feet: (..., 2, 3).
+        mass: center of mass, (..., 3). centers: those of the bodies, (..., 13, 3). feet: (..., 2, 3).
         axes: of the joints, (..., 17, 3). anchors: points on them, (..., 17, 3).
     """
 
     mass: Tensor
-    centres: Tensor
+    centers: Tensor
     feet: Tensor
     axes: Tensor
     anchors: Tensor
@@ -132,18 +132,18 @@ def _place(joints: Tensor) -> _Placed:
         origin, turn = frames[body]
         return origin + turn @ point
 
-    centres = torch.stack([place(body, centre) for body, centre in skeleton.centres.items()], dim=-2)
+    centers = torch.stack([place(body, center) for body, center in skeleton.centers.items()], dim=-2)
     return _Placed(
-        mass=skeleton.shares @ centres,
-        centres=centres,
-        feet=torch.stack([place(body, centre) for body, centre in skeleton.feet], dim=-2),
+        mass=skeleton.shares @ centers,
+        centers=centers,
+        feet=torch.stack([place(body, center) for body, center in skeleton.feet], dim=-2),
         axes=torch.stack(axes, dim=-2),
         anchors=torch.stack(anchors, dim=-2),
     )
 
 
 def mass_and_feet(joints: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the centre of mass (..., 3), and the centres of the left and the right foot (..., 2, 3).
+    """Return the center of mass (..., 3), and the centers of the left and the right foot (..., 2, 3).
 
     `joints` (..., 17) are angles in rad, in the order of the state.
     """
@@ -152,11 +152,11 @@ def mass_and_feet(joints: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mass_velocity(joints: Tensor, rates: Tensor) -> Tensor:
-    """Return the velocity (..., 3) in m/s of the centre of mass relative to the torso.
+    """Return the velocity (..., 3) in m/s of the center of mass relative to the torso.
 
     `joints` (..., 17) are angles in rad, `rates` (..., 17) their rates in rad/s.
     """
     placed, skeleton = _place(joints), _skeleton(joints.dtype, joints.device)
-    lever = skeleton.moved @ placed.centres - skeleton.moved.sum(-1, keepdim=True) * placed.anchors
+    lever = skeleton.moved @ placed.centers - skeleton.moved.sum(-1, keepdim=True) * placed.anchors
     velocity: Tensor = (rates.unsqueeze(-1) * torch.linalg.cross(placed.axes, lever)).sum(-2)
     return velocity

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from astra_data.core.numbers import normalised
+from astra_data.core.numbers import normalized
 from astra_data.worlds.humanoid.model import COMMANDED, JOINTS, STANDING
 
 JOINTS_RAD = tuple(0.3 if joint in COMMANDED else 0.025 for joint in range(len(JOINTS)))
@@ -23,4 +23,4 @@ _STATE = (
 
 def in_spreads(state: Tensor) -> Tensor:
     """Return the deviations of target states (..., 47) from standing, clipped at 5 spreads, (..., 47)."""
-    return normalised(state, state.new_tensor(STANDING), state.new_tensor(_STATE))
+    return normalized(state, state.new_tensor(STANDING), state.new_tensor(_STATE))

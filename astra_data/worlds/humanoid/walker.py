@@ -115,24 +115,24 @@ class _Mjcf:
         body = self.humanoid.body(name).id
         geom = int(self.humanoid.body_geomadr[body])
         radius, half_length, _ = self.humanoid.geom_size[geom]
-        centre = self.data.geom_xpos[geom] - origin
+        center = self.data.geom_xpos[geom] - origin
         if self.humanoid.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
-            shape = f'type="sphere" size="{radius}" pos="{attribute(centre)}"'
+            shape = f'type="sphere" size="{radius}" pos="{attribute(center)}"'
         else:
             along = half_length * self.data.geom_xmat[geom].reshape(3, 3)[:, 2]
             shape = (
-                f'type="capsule" size="{radius}" fromto="{attribute([*(centre - along), *(centre + along)])}"'
+                f'type="capsule" size="{radius}" fromto="{attribute([*(center - along), *(center + along)])}"'
             )
         return f"{self._inertia([body], origin)}<geom {shape}/>"
 
     def _inertia(self, bodies: list[int], origin: Floats) -> str:
         """Return the inertia of `bodies` taken together in a frame at `origin`; only that about y matters."""
         masses, places = self.humanoid.body_mass[bodies], self.data.xipos[bodies]
-        centre = masses @ places / masses.sum()
+        center = masses @ places / masses.sum()
         turns = self.data.ximat[bodies].reshape(-1, 3, 3)
         own = (turns[:, 1] ** 2 * self.humanoid.body_inertia[bodies]).sum()
-        about_y = own + masses @ ((places - centre)[:, [0, 2]] ** 2).sum(axis=1)
-        where = f'pos="{attribute(centre - origin)}" mass="{float(masses.sum())!r}"'
+        about_y = own + masses @ ((places - center)[:, [0, 2]] ** 2).sum(axis=1)
+        where = f'pos="{attribute(center - origin)}" mass="{float(masses.sum())!r}"'
         return f'<inertial {where} diaginertia="{attribute([about_y] * 3)}"/>'
 
 

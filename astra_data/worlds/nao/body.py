@@ -78,7 +78,7 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel
     if maze:
         size = (0.5 * maze.scale, 0.5 * maze.scale, WALL_HEIGHT_M / 2)
         for row, column in maze.wall_cells():
-            place = (*maze.cell_centre(row, column), WALL_HEIGHT_M / 2)
+            place = (*maze.cell_center(row, column), WALL_HEIGHT_M / 2)
             _geom(world, f"block_{row}_{column}", "box", size, at=place, collides=(_WALL, 0))
     torso = _body(world, TORSO, "Torso", 1.0)
     ElementTree.SubElement(torso, "freejoint", name="root")
@@ -143,9 +143,9 @@ def _body(parent: ElementTree.Element, link: Link, name: str, sign: float) -> El
     """Add a link's body with its joint, mirrored for `sign` -1."""
     x, y, z = link.offset_m
     body = ElementTree.SubElement(parent, "body", name=name, pos=attribute((x, sign * y, z)))
-    x, y, z = link.centre_m
-    centre, inertia = attribute((x, sign * y, z)), attribute(link.inertia)
-    ElementTree.SubElement(body, "inertial", pos=centre, mass=str(link.mass_kg), diaginertia=inertia)
+    x, y, z = link.center_m
+    center, inertia = attribute((x, sign * y, z)), attribute(link.inertia)
+    ElementTree.SubElement(body, "inertial", pos=center, mass=str(link.mass_kg), diaginertia=inertia)
     if link.axis is not None:
         low, high = joint_limits_deg(link, sign)
         x, y, z = link.axis

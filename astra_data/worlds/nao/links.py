@@ -1,7 +1,7 @@
-"""The NAO's links and joints in numbers: lengths, masses, centres of mass, inertias, limits, torques.
+"""The NAO's links and joints in numbers: lengths, masses, centers of mass, inertias, limits, torques.
 
 Sources: Aldebaran's documentation of the NAO H25 (links, joints, masses); B-Human's published calibration of
-the V6 (masses, limits, soles; centres of mass from its calibration of the V4, whose links are the same).
+the V6 (masses, limits, soles; centers of mass from its calibration of the V4, whose links are the same).
 Frames are Aldebaran's: in the zero posture all are parallel, x forward, y to the left, z up. Only left limbs
 are listed; right ones are their mirror images.
 """
@@ -36,8 +36,8 @@ class Link:
         name: its joint's name in Aldebaran's documentation, without the side.
         offset_m: its frame's origin in the parent's frame.
         mass_kg: its mass.
-        centre_m: its centre of mass.
-        inertia: about the centre of mass along the frame's axes, in kg m².
+        center_m: its center of mass.
+        inertia: about the center of mass along the frame's axes, in kg m².
         axis: the joint's axis; None for a fixed link.
         limits_deg: the joint's range.
     """
@@ -45,7 +45,7 @@ class Link:
     name: str
     offset_m: Triple
     mass_kg: float
-    centre_m: Triple
+    center_m: Triple
     inertia: Triple
     axis: Triple | None = None
     limits_deg: tuple[float, float] = (0.0, 0.0)
@@ -58,14 +58,14 @@ def box_inertia(mass_kg: float, size_m: Triple) -> Triple:
     return share * (y * y + z * z), share * (x * x + z * z), share * (x * x + y * y)
 
 
-# Torso and thigh: the published tensors about the joint, moved to the centre of mass. All others: boxes of
+# Torso and thigh: the published tensors about the joint, moved to the center of mass. All others: boxes of
 # about the links' outer size, ours.
 TORSO = Link("Torso", (0, 0, 0), 1.0496, (-0.00413, 0, 0.04342), (3.08e-3, 2.88e-3, 1.59e-3))
 HEAD = (
     Link("HeadYaw", NECK_M, 0.0784, (0, 0, -0.02742), box_inertia(0.0784, (0.04, 0.04, 0.08))),
     Link("HeadPitch", NECK_M, 0.6594, (-0.00112, 0, 0.05258), box_inertia(0.6594, (0.11, 0.13, 0.12))),
 )
-# Offsets from the shoulder, the arm stretched forward; the centre of mass of forearm and hand is ours.
+# Offsets from the shoulder, the arm stretched forward; the center of mass of forearm and hand is ours.
 ARM = (
     Link("ShoulderPitch", (0, 0, 0), 0.0930, (-0.00165, -0.02663, 0.00014), (8.4e-5, 8.4e-5, 8.4e-5)),
     Link(

@@ -30,7 +30,7 @@ class PerceptionErrors:
     ball_m: float = 0.012
     """Standard deviation, per axis, of the ball's position at the robot's feet."""
     ball_m_per_m: float = 0.033
-    """Its increase per metre of distance."""
+    """Its increase per meter of distance."""
     ball_most_m: float = 0.106
     """Its upper limit."""
     ball_s: float = 0.5

@@ -25,7 +25,7 @@ _BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "s
 _CONTACT: dict[str, Any] = {"kick_reach_m": 0.35, "kick_m_s": 1.0, "reach_m": 0.22, "knock_m_s": 0.7}
 """Of the robot with its ball. The reach of a kick is that of the paper's group's published simulator of an
 attacking NAO (AbstractSim 2023); a foot really reaches 0.22 m far. Walking bodies touch the ball with feet
-and shins, at a median of 0.22 m between the centres in episodes of random commands; it leaves at a median of
+and shins, at a median of 0.22 m between the centers in episodes of random commands; it leaves at a median of
 0.7 m/s."""
 
 KICK_RANGES = BallVariation(
@@ -124,8 +124,8 @@ NAO_TASKS = (
             spread_m=0.05,
             start_clearance_m=0.3,
             start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0)),
-            # A touch costs as much as a metre; if it cost a third of the path, policies would learn to stand.
-            metre_reward=4.0,
+            # A touch costs as much as a meter; if it cost a third of the path, policies would learn to stand.
+            meter_reward=4.0,
             failure_reward=-4.0,
             path_clearance_m=0.25,
             # Policies without a memory, whose position is not in the latent, do not learn it without these.

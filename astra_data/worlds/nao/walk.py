@@ -31,7 +31,7 @@ class WalkStyle:
     sway_foot_m: float = 0.05
     """Distance of the foot of the sway's pendulum from the middle."""
     pendulum_m: float = 0.26
-    """Length of the sway's pendulum, about the height of the centre of mass."""
+    """Length of the sway's pendulum, about the height of the center of mass."""
     step_scale: tuple[float, float, float] = (1.05, 1.3, 1.05)
     """Factors on steps (x, y, yaw) that make up for servos and slip; fitted to reach commands."""
     gyro_gain: tuple[float, float] = (0.08, 0.04)

@@ -67,8 +67,8 @@ def knock(
         after: after it, (B, 2) in m.
         ball: positions of the balls, (B, 2) in m.
         velocity: of the balls, (B, 2) in m/s.
-        reach_m: distance between the centres below which a body touches a ball.
-        speed_m_s: of a touched ball, along the line between the centres, (B, 1) or one for all.
+        reach_m: distance between the centers below which a body touches a ball.
+        speed_m_s: of a touched ball, along the line between the centers, (B, 1) or one for all.
         turn_rad: angle between that line and the ball's direction, (B,) or one for all.
 
     Returns:
@@ -101,8 +101,8 @@ def kick_away(
         ball: of the balls, (B, 2) in m.
         velocity: of the balls, (B, 2) in m/s.
         asked: which bodies are to kick, (B, 1) bool.
-        reach_m: distance between the centres below which a body can kick a ball.
-        speed_m_s: of a kicked ball, along the line between the centres, (B, 1) or one for all.
+        reach_m: distance between the centers below which a body can kick a ball.
+        speed_m_s: of a kicked ball, along the line between the centers, (B, 1) or one for all.
         turn_rad: angle between that line and the ball's direction, (B,) or one for all.
 
     Returns:

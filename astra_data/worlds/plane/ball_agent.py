@@ -29,11 +29,11 @@ class BallAgent(PlanarStates):
 
     A command is the velocity of the next step, in units of the top speed along each axis, and whether to
     stand and kick. Walls stop the mass, not the ball. A kicked ball within reach leaves at one speed along
-    the line between the centres, one that the mass walks into at another. Left out: the legs, the positions
+    the line between the centers, one that the mass walks into at another. Left out: the legs, the positions
     and timing of the feet, and the robot's heading.
 
     Corrections move only balls that rolled or were touched in the step, and say how fast they are, not where
-    they go: recorded balls keep to the way that they rolled, and leave along the line between the centres,
+    they go: recorded balls keep to the way that they rolled, and leave along the line between the centers,
     scattered, more than they keep to what is expected of them. Those that rolled go on, or lie again if that
     is slow. Whether one that lay starts to roll is drawn, such that the speed expected after the step is the
     corrected one: an expected correction mixes balls that are hit with others that are missed into one that
@@ -70,9 +70,9 @@ class BallAgent(PlanarStates):
             timestep_s: control period.
             radius_m: distance that the mass keeps from walls, a multiple of the maze's `fine_m`.
             speed_m_s: top speed along each axis.
-            reach_m: distance between the centres below which the mass touches the ball.
+            reach_m: distance between the centers below which the mass touches the ball.
             knock_m_s: speed of a ball that the mass walks into.
-            kick_reach_m: distance between the centres below which the mass can kick the ball.
+            kick_reach_m: distance between the centers below which the mass can kick the ball.
             kick_m_s: speed of a kicked ball.
             device: torch device.
         """

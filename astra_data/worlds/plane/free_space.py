@@ -17,7 +17,7 @@ _EDGE_M = 1e-4
 
 
 class FreeSpace:
-    """The cells in which the centre of a disc may be.
+    """The cells in which the center of a disc may be.
 
     Attributes:
         blocked: (height, width) bool, True where the disc would overlap a wall.
@@ -103,8 +103,8 @@ class GoalDistance:
     def of_maze(cls, maze: Maze, *, spacing_m: float, radius_m: float = 0.0) -> "GoalDistance":
         """Compute a disc's fields for 7 x 7 goals, `spacing_m` apart, around the goal cell's middle."""
         steps = np.arange(-3, 4) * spacing_m
-        centre = np.array(maze.cell_centre(*maze.goal))
-        lattice = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2) + centre
+        center = np.array(maze.cell_center(*maze.goal))
+        lattice = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2) + center
         fields = np.stack([maze.distance_field(goal, radius=radius_m) for goal in lattice])
         return cls(
             torch.from_numpy(fields).float(),
@@ -127,7 +127,7 @@ class GoalDistance:
         """
         field = (goal[:, None] - self.lattice).square().sum(-1).argmin(dim=1)
         _, height, width = self.fields.shape
-        # Values are those at cell centres.
+        # Values are those at cell centers.
         grid = (position + self.half_extent) / self.cell_m - 0.5
         x, y = grid.unbind(-1)
         grid = torch.stack([x.clamp(0, width - 1.001), y.clamp(0, height - 1.001)], dim=-1)

@@ -1,6 +1,6 @@
 """The kicking objective: get the ball into the goal.
 
-The paper prints no reward. Ours: metres by which the ball comes closer to the goal, plus half the metres by
+The paper prints no reward. Ours: meters by which the ball comes closer to the goal, plus half the meters by
 which the robot comes closer to the point behind the ball, +10 for a goal, -10 for a ball that leaves the
 field elsewhere and for falling. Lines and goal are those of RoboCup's Standard Platform League, at smaller
 distances.

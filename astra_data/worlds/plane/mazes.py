@@ -1,7 +1,7 @@
 """Maze grids: walls, free space, distance along the corridors; shared by targets and abstract simulators.
 
 Cells are indexed (row, column) from the top left; x grows with the column, y falls with the row, and the
-maze is centred on the origin, as in gymnasium-robotics.
+maze is centered on the origin, as in gymnasium-robotics.
 """
 
 from dataclasses import dataclass
@@ -70,8 +70,8 @@ class Maze:
         height, width = self.walls.shape
         return np.array([width, height]) * self.scale / 2
 
-    def cell_centre(self, row: int, column: int) -> tuple[float, float]:
-        """Return the centre (x, y) of a cell in m."""
+    def cell_center(self, row: int, column: int) -> tuple[float, float]:
+        """Return the center (x, y) of a cell in m."""
         half_width, half_height = self.half_extent
         return (column + 0.5) * self.scale - half_width, half_height - (row + 0.5) * self.scale
 
@@ -83,9 +83,9 @@ class Maze:
         """Return the (row, column) of every free cell, row by row."""
         return [(int(row), int(column)) for row, column in np.argwhere(~self.walls)]
 
-    def free_centres(self) -> Floats:
-        """Return the centres (N, 2) of the free cells in m."""
-        return np.array([self.cell_centre(row, column) for row, column in self.free_cells()])
+    def free_centers(self) -> Floats:
+        """Return the centers (N, 2) of the free cells in m."""
+        return np.array([self.cell_center(row, column) for row, column in self.free_cells()])
 
     @cached_property
     def fine_walls(self) -> NDArray[np.bool_]:
@@ -95,7 +95,7 @@ class Maze:
 
     @cached_property
     def clearance_field(self) -> Floats:
-        """Distance in m from each fine grid cell to the centre of the nearest wall cell, indexed [y, x]."""
+        """Distance in m from each fine grid cell to the center of the nearest wall cell, indexed [y, x]."""
         return np.asarray(scipy.ndimage.distance_transform_edt(~self.fine_walls)) * self.fine_m
 
     def fine_index(self, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -130,7 +130,7 @@ class Maze:
         if margin > 0:
             cost += 20.0 * np.clip(1.0 - self.clearance_field / margin, 0.0, 1.0)
         sources, targets, weights = [], [], []
-        # Knight moves beside the eight neighbours keep the error of grid distances below 3 %.
+        # Knight moves beside the eight neighbors keep the error of grid distances below 3 %.
         for dy, dx in [(0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1)]:
             here, there = _shifted(free.shape, dy, dx)
             both = free[here] & free[there]
@@ -164,7 +164,7 @@ U_MAZE = Maze(rows=("11111", "10001", "11101", "10001", "11111"), scale=4.0, sta
 LONG_MAZE = Maze(
     rows=("11111", "10001", "11101", "10001", "10111", "10001", "11111"), scale=4.0, start=(1, 1), goal=(5, 3)
 )
-"""Two U's in a row, four right-angle turns, 40 m along the centre line: ours, the paper prints no layout."""
+"""Two U's in a row, four right-angle turns, 40 m along the center line: ours, the paper prints no layout."""
 
 S_MAZE = Maze(
     rows=("111111", "100001", "111101", "100001", "101111", "100001", "111111"),

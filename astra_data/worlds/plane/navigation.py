@@ -27,18 +27,18 @@ class Navigation(PlanarObjective):
     Attributes:
         reward_kind: "geodesic" (progress along the corridors), "euclidean" (along the straight line) or
             "sparse" (none), each plus the bonuses of success and failure.
-        metre_reward: for a metre of progress.
+        meter_reward: for a meter of progress.
         path_clearance_m: clearance from walls of the shortest free path.
         success_radius_m: distance from the goal within which the episode ends in success.
         position_waves: number of waves of which policies see sine and cosine of the position along each
             axis; the first is as long as the maze is wide, each other half as long as the one before.
-        spread_m: standard deviation of start and goal around their cells' centres, per axis.
+        spread_m: standard deviation of start and goal around their cells' centers, per axis.
         start_clearance_m: clearance from walls of starts that are drawn anywhere.
-        start_offsets_m: offsets of the usual starts from the centre of the start cell, drawn uniformly.
+        start_offsets_m: offsets of the usual starts from the center of the start cell, drawn uniformly.
     """
 
     reward_kind: RewardKind = "geodesic"
-    metre_reward: float = 1.0
+    meter_reward: float = 1.0
     path_clearance_m: float = 0.0
     position_waves: int = 0
     success_radius_m: float = 0.45
@@ -56,7 +56,7 @@ class Navigation(PlanarObjective):
         if farthest >= self.maze.scale / 2:
             raise BadInputError(
                 f"expected goals within their cell of {self.maze.scale:g} m, got 3 spread_m + "
-                f"path_clearance_m = {farthest:g} m around its centre: take a smaller spread_m"
+                f"path_clearance_m = {farthest:g} m around its center: take a smaller spread_m"
             )
 
     @cached_property
@@ -95,7 +95,7 @@ class Navigation(PlanarObjective):
 
     def _around(self, cell: tuple[int, int], rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         noise = rng.normal(0.0, self.spread_m, (count, 2)).clip(-3 * self.spread_m, 3 * self.spread_m)
-        return np.asarray(np.array(self.maze.cell_centre(*cell)) + noise)
+        return np.asarray(np.array(self.maze.cell_center(*cell)) + noise)
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return position, velocity, goal and the vector to it, (..., 8), and the position's waves."""
@@ -122,7 +122,7 @@ class Navigation(PlanarObjective):
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
         """Return the reward (B,) of a step between states that begin with the position, (B, 2 or more)."""
         bonus = self.success_reward * self.reached(after, goal) + self.failure_reward * failed
-        return self.metre_reward * self.progress(before, after, goal) + bonus
+        return self.meter_reward * self.progress(before, after, goal) + bonus
 
 
 def _at_rest(position: NDArray[np.float64]) -> NDArray[np.float64]:

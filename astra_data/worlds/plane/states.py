@@ -22,7 +22,7 @@ class PlanarStates:
     Attributes:
         parameters: what a dataset paired with this simulator records about it.
         state: (B, X) float32.
-        free: where the disc's centre may be.
+        free: where the disc's center may be.
         blocked: (B,) bool, a wall stopped the disc in the last step, or in its correction.
         period_s: control period, one for all or (B, 1).
     """
@@ -45,7 +45,7 @@ class PlanarStates:
             maze: the walls.
             num_envs: B.
             timestep_s: control period.
-            radius_m: distance that the disc's centre keeps from walls, a multiple of the maze's `fine_m`.
+            radius_m: distance that the disc's center keeps from walls, a multiple of the maze's `fine_m`.
             speed_m_s: top speed along each axis.
             device: torch device.
 
@@ -98,7 +98,7 @@ class PlanarStates:
         self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=device)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Slide the discs from `before` towards `landed`, both (B, X); all else is that of `landed`.
+        """Slide the discs from `before` toward `landed`, both (B, X); all else is that of `landed`.
 
         A wall that stopped the step itself still counts as touched: otherwise policies lean on walls that the
         correction draws them away from. Who is kept clear of one stands there: otherwise policies lean on a
@@ -136,7 +136,7 @@ class VariedPlanar(VariedSimulator):
         self._observed = self.true_state if rows is None else self._observed.index_copy(0, rows, state)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move from `before` as far towards `landed`, both (B, X), as there is room; return where (B, X)."""
+        """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X)."""
         self._observed = self.simulator.settle(before, landed)
         return self._observed
 

@@ -1,6 +1,6 @@
 """The robot itself: a simulated cart stands in for it.
 
-python robot.py logs [drives]       records drives by random commands as CSV, in millimetres and degrees
+python robot.py logs [drives]       records drives by random commands as CSV, in millimeters and degrees
 python robot.py play RUN [trials]   sends the cart to its dock by the policies of a run, and counts
 """
 

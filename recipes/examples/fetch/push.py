@@ -50,15 +50,15 @@ class Push(Objective):
     """Push the puck to within 5 cm of a place up to 15 cm from the middle along each axis."""
 
     action_size, goal_size = 2, 2
-    centre = np.array([1.342, 0.749])
+    center = np.array([1.342, 0.749])
 
     def draw_starts(self, rng, count):
         angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.1, 0.15, count)
-        puck = self.centre + distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-        return np.column_stack([np.tile(self.centre, (count, 1)), puck])
+        puck = self.center + distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        return np.column_stack([np.tile(self.center, (count, 1)), puck])
 
     def draw_goals(self, rng, count):
-        return self.centre + rng.uniform(-0.15, 0.15, (count, 2))
+        return self.center + rng.uniform(-0.15, 0.15, (count, 2))
 
     def observe(self, state, goal):
         gripper, puck = state[..., :2], state[..., 2:]

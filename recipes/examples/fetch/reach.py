@@ -39,13 +39,13 @@ class Reach(Objective):
     """Come within 2 cm of a point up to 15 cm away along each axis."""
 
     action_size, goal_size = 3, 3
-    centre = np.array([1.342, 0.749, 0.535])
+    center = np.array([1.342, 0.749, 0.535])
 
     def draw_starts(self, rng, count):
-        return np.tile(self.centre, (count, 1))
+        return np.tile(self.center, (count, 1))
 
     def draw_goals(self, rng, count):
-        return self.centre + rng.uniform(-0.15, 0.15, (count, 3))
+        return self.center + rng.uniform(-0.15, 0.15, (count, 3))
 
     def observe(self, state, goal):
         return (goal - state) / 0.1

@@ -37,7 +37,7 @@ METHOD = Method(
     name="script",
     title="Script",
     role="ceiling",
-    colour="#555555",
+    color="#555555",
     learn=OwnLearner(learn=lambda env, training: Script(), policy=Script),
     learn_rates=(),
 )

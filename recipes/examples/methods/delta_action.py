@@ -124,7 +124,7 @@ def fit(fitting):
 METHOD = Method(
     name="delta_action",
     title="Delta action",
-    colour="#8C564B",
+    color="#8C564B",
     fit=fit,
     grounding=DeltaAction,
     table=Table("delta_action", DeltaConfig),

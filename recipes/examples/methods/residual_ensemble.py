@@ -100,5 +100,5 @@ def fit(fitting):
 
 
 METHOD = Method(
-    name="residual_ensemble", title="Residual ensemble", colour="#E377C2", fit=fit, grounding=ResidualEnsemble
+    name="residual_ensemble", title="Residual ensemble", color="#E377C2", fit=fit, grounding=ResidualEnsemble
 )

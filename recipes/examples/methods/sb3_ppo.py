@@ -49,7 +49,7 @@ def learn(env, training):
 METHOD = Method(
     name="sb3_ppo",
     title="NAS, PPO of SB3",
-    colour="#7F7F7F",
+    color="#7F7F7F",
     fit=NAS.fit,
     grounded_as="nas",
     learn=OwnLearner(learn=learn, policy=Sb3Policy),

@@ -25,7 +25,7 @@ def steps(*large: float, usual: float = 0.1) -> Array:
         ([5.0, 5.0], [10]),  # there and back
         ([5.0, 5.0, 5.0], []),  # a robot that moves
         ([0.49, 5.0], [11]),
-        ([0.51, 5.0], []),  # a neighbour has a tenth of it
+        ([0.51, 5.0], []),  # a neighbor has a tenth of it
         ([5.0, 0.51], []),
         ([5.0, 0.1, 0.51], []),
         ([5.0, 0.1, 0.1, 0.51], []),
@@ -34,12 +34,12 @@ def steps(*large: float, usual: float = 0.1) -> Array:
         ([5.0] + [0.1] * 2 + [6.0], []),
     ],
 )
-def test_a_jump_is_far_above_its_neighbours(large: list[float], found: list[int]) -> None:
+def test_a_jump_is_far_above_its_neighbors(large: list[float], found: list[int]) -> None:
     assert list(jumps(steps(*large), 2.0)) == found
 
 
 @pytest.mark.parametrize(("before", "found"), [(2, []), (3, [3])])
-def test_a_jump_has_three_neighbours(before: int, found: list[int]) -> None:
+def test_a_jump_has_three_neighbors(before: int, found: list[int]) -> None:
     assert list(jumps(np.array([0.1] * before + [5.0]), 2.0)) == found
 
 

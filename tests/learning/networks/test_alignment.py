@@ -56,7 +56,7 @@ def test_the_gradient_is_alive_at_latent_size_64() -> None:
     assert gradient(torch.tensor([1.0])) < 1e-12  # without the factor sqrt(Z) it is dead
 
 
-def test_target_encoder_clips_normalised_states() -> None:
+def test_target_encoder_clips_normalized_states() -> None:
     encoder = TargetEncoder(3, 2, 1, embedding_size=4, latent_size=4, position_octaves=2)
     state, goal = 2.0 + 3.0 * torch.randn(5000, 3), torch.randn(5000, 2)
     encoder.set_scales(state, goal)

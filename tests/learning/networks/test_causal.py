@@ -19,7 +19,7 @@ def fitted() -> CausalModel:
     cause = torch.rand(4000, 5) * 2.0 - 1.0
     effect = law(cause)
     effect = (effect - effect.mean(0)) / effect.std(0) + 0.1 * torch.randn(4000, 2)
-    return fit_causes(cause, effect, CONFIG, penalised=4)
+    return fit_causes(cause, effect, CONFIG, penalized=4)
 
 
 def test_the_mask_tells_what_causes_what(fitted: CausalModel) -> None:

@@ -161,7 +161,7 @@ def test_all_heads_learn_together() -> None:
     assert float(unexplained) < 0.2
 
 
-def test_where_the_ball_lies_from_the_robot_is_seen_to_the_centimetre_and_not_from_afar() -> None:
+def test_where_the_ball_lies_from_the_robot_is_seen_to_the_centimeter_and_not_from_afar() -> None:
     model = GroundingModel(GroundingShape(8, 2, 2, position_octaves=0, ball_index=4))
     state = torch.tensor([[1.0, 2.0, 0, 0, 1.03, 1.96, 0, 0], [1.0, 2.0, 0, 0, -4.0, 2.0, 0, 0]])
     seen = model.state_features(state)[:, -3:]

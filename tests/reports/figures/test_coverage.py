@@ -4,7 +4,7 @@ from astra_data.reports.figures.coverage import coverage
 from astra_data.reports.figures.style import png
 
 
-def test_only_visited_cells_are_coloured() -> None:
+def test_only_visited_cells_are_colored() -> None:
     counts = np.array([[0, 3], [40, 0], [1, 0]])
     figure = coverage(counts, (-1.0, 1.0, 0.0, 3.0), "position", "m")
     axes = figure.axes[0]

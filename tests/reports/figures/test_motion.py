@@ -90,7 +90,7 @@ def test_rows_of_mazes_are_four_wide_and_long_titles_small() -> None:
 def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
     time_s = np.array([0.1, 0.2, 0.3])
     simulated = np.tile([1.0, 2.0, 3.0, 4.0], (3, 1))
-    # 101 robots, a metre apart in x, two in y.
+    # 101 robots, a meter apart in x, two in y.
     shift = np.arange(101.0)[:, None, None] * np.array([1.0, 2.0, 0.0, 0.0])
     command = np.tile([0.8, -0.5], (3, 1))
     x, y, _, sent = dynamics_mismatch(time_s, command, simulated, simulated + shift).axes

@@ -1,7 +1,7 @@
 import numpy as np
 
 from astra_data.reports.figures.reliability import reliability
-from astra_data.reports.figures.style import method_colour, png
+from astra_data.reports.figures.style import method_color, png
 
 
 def test_observed_rates_stand_over_predicted_ones_above_their_numbers_of_steps() -> None:
@@ -15,8 +15,8 @@ def test_observed_rates_stand_over_predicted_ones_above_their_numbers_of_steps()
     assert [np.asarray(axis).tolist() for axis in equal.get_data()] == [[0, 1], [0, 1]]
     assert [np.asarray(axis).tolist() for axis in first.get_data()] == nas[:2].tolist()
     assert [line.get_color() for line in (first, second)] == [
-        method_colour("nas"),
-        method_colour("astra_plus"),
+        method_color("nas"),
+        method_color("astra_plus"),
     ]
     assert (first.get_linestyle(), second.get_linestyle()) == ("-", "--")
     counts, _ = model_steps.lines

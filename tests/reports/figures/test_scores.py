@@ -7,7 +7,7 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 
 from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
-from astra_data.reports.figures.style import method_colour
+from astra_data.reports.figures.style import method_color
 from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS, Score
 
 
@@ -22,7 +22,7 @@ def test_success_bars_show_bars_seeds_and_intervals() -> None:
     axes = figure.axes[0]
     assert [bar.get_width() for bar in axes.patches] == [0.3, 0.8, 1.0]  # type: ignore[attr-defined]
     assert [bool(bar.get_hatch()) for bar in axes.patches] == [False, True, False]
-    assert [to_hex(bar.get_facecolor()) for bar in axes.patches] == [method_colour(row) for row in scores]
+    assert [to_hex(bar.get_facecolor()) for bar in axes.patches] == [method_color(row) for row in scores]
     dots = [line for line in axes.lines if line.get_marker() == "o"]
     assert [sorted(np.asarray(line.get_xdata())) for line in dots] == [[0.2, 0.3, 0.4], [0.8], [1.0]]
     assert sum(line.get_marker() == "D" for line in axes.lines) == 2

@@ -8,7 +8,7 @@ from matplotlib.image import imread
 
 from astra_data.methods import METHODS
 from astra_data.reports.figures.scores import score_bars
-from astra_data.reports.figures.style import method_colour, method_title, png, style
+from astra_data.reports.figures.style import method_color, method_title, png, style
 from astra_data.worlds.score import SUCCESS
 
 ROWS = ("direct_transfer", "nas", "astra", "direct_transfer_plus", "nas_plus", "astra_plus", "follower")
@@ -27,13 +27,13 @@ def test_titles_follow_from_the_names() -> None:
     assert method_title("my_own_plus") == "My own+"
 
 
-def test_every_row_has_its_own_colour_and_a_plus_row_its_base_rows_darker() -> None:
-    assert len({method_colour(row) for row in ROWS}) == len(ROWS)
+def test_every_row_has_its_own_color_and_a_plus_row_its_base_rows_darker() -> None:
+    assert len({method_color(row) for row in ROWS}) == len(ROWS)
     for base in (*METHODS, "my_own"):
-        light, dark = to_rgb(method_colour(base)), to_rgb(method_colour(f"{base}_plus"))
+        light, dark = to_rgb(method_color(base)), to_rgb(method_color(f"{base}_plus"))
         assert sum(dark) < sum(light)
         assert dark == pytest.approx([0.68 * channel for channel in light], abs=0.01)
-    assert method_colour("my_own") == method_colour("my_own")
+    assert method_color("my_own") == method_color("my_own")
 
 
 def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
@@ -46,7 +46,7 @@ def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
     assert dict(matplotlib.rcParams) == before
 
 
-def test_a_palette_keeps_the_colours_of_methods() -> None:
+def test_a_palette_keeps_the_colors_of_methods() -> None:
     scores = {method: np.array([0.5]) for method in ROWS}
     figure = score_bars(SUCCESS, scores, {method: (0.5, np.nan, np.nan) for method in ROWS}, {})
     everything = BytesIO()

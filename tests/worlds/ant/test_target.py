@@ -126,7 +126,7 @@ def test_starts_goals_and_headings() -> None:
     observation = env.reset().double()
     assert observation.shape == (400, 31)
     for points, cell in ((observation[:, :2], U_MAZE.start), (observation[:, 29:], U_MAZE.goal)):
-        offset = points - torch.tensor(U_MAZE.cell_centre(*cell))
+        offset = points - torch.tensor(U_MAZE.cell_center(*cell))
         assert float(offset.mean()) == pytest.approx(0.0, abs=0.03)
         assert float(offset.std()) == pytest.approx(0.2, abs=0.02)
     yaw = 2 * torch.atan2(observation[:, 6], observation[:, 3])
@@ -138,7 +138,7 @@ def test_starts_goals_and_headings() -> None:
 def test_starts_anywhere_leave_the_start_cell() -> None:
     env = AntMazeEnv(TASK, 50, seed=0, start_anywhere=True, num_threads=1)
     position = env.reset()[:, :2].numpy()
-    assert (np.linalg.norm(position - U_MAZE.cell_centre(*U_MAZE.start), axis=1) > 2).mean() > 0.5
+    assert (np.linalg.norm(position - U_MAZE.cell_center(*U_MAZE.start), axis=1) > 2).mean() > 0.5
 
 
 def test_success_ends_the_episode() -> None:
@@ -182,7 +182,7 @@ def test_zero_command_stands_still() -> None:
 
 
 def test_the_reach_covers_every_leg() -> None:
-    # The farthest that any geom's surface is from the torso's centre, legs stretched.
+    # The farthest that any geom's surface is from the torso's center, legs stretched.
     def farthest(leg_scale: float) -> float:
         model = ant_model(leg_scale=leg_scale)
         data = mujoco.MjData(model)
@@ -191,8 +191,8 @@ def test_the_reach_covers_every_leg() -> None:
         ends = []
         for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE):
             axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
-            centre = data.geom_xpos[geom] - torso
-            ends += [np.linalg.norm(centre + sign * axis) + model.geom_size[geom, 0] for sign in (1, -1)]
+            center = data.geom_xpos[geom] - torso
+            ends += [np.linalg.norm(center + sign * axis) + model.geom_size[geom, 0] for sign in (1, -1)]
         return float(max(ends))
 
     assert farthest(1.0) < 1.6

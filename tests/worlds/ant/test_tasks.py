@@ -59,22 +59,22 @@ def test_the_point_mass_is_as_fast_as_the_longest_command() -> None:
 def test_point_masses_stand_among_the_walls_of_their_own_maze(task: Task) -> None:
     simulator = task.simulator(1)
     assert isinstance(simulator, PointMass)
-    walls = [task.maze.cell_centre(*cell) for cell in task.maze.wall_cells()]
-    for centres, blocked in ((task.maze.free_centres(), False), (walls, True)):
-        cells = simulator.free.cells(torch.tensor(np.array(centres), dtype=torch.float32))
+    walls = [task.maze.cell_center(*cell) for cell in task.maze.wall_cells()]
+    for centers, blocked in ((task.maze.free_centers(), False), (walls, True)):
+        cells = simulator.free.cells(torch.tensor(np.array(centers), dtype=torch.float32))
         assert (simulator.free.blocked[cells] == blocked).all()
 
 
-@pytest.mark.parametrize(("name", "metres"), [("-sparse", 0.0), ("-euclidean", 0.5), ("", 0.14)])
-def test_names_tell_rewards_apart(name: str, metres: float) -> None:
+@pytest.mark.parametrize(("name", "meters"), [("-sparse", 0.0), ("-euclidean", 0.5), ("", 0.14)])
+def test_names_tell_rewards_apart(name: str, meters: float) -> None:
     task = TASKS[f"antmaze-umaze{name}"]
-    start = torch.tensor([task.maze.cell_centre(*task.maze.start)])
-    goal = torch.tensor([task.maze.cell_centre(*task.maze.goal)])
-    # Half a metre straight at the goal, which is behind a wall: the path round the wall's corner, 6 m to the
-    # right of the start and 2 m down, is sqrt(6² + 2²) - sqrt(6² + 1.5²) metres shorter.
+    start = torch.tensor([task.maze.cell_center(*task.maze.start)])
+    goal = torch.tensor([task.maze.cell_center(*task.maze.goal)])
+    # Half a meter straight at the goal, which is behind a wall: the path round the wall's corner, 6 m to the
+    # right of the start and 2 m down, is sqrt(6² + 2²) - sqrt(6² + 1.5²) meters shorter.
     after = start + torch.tensor([[0.0, -0.5]])
     reward = task.objective.reward(start, after, goal, torch.zeros(1))
-    assert float(reward) == pytest.approx(metres, abs=0.04)
+    assert float(reward) == pytest.approx(meters, abs=0.04)
 
 
 def test_starts_of_the_sparse_task_are_those_of_the_others() -> None:

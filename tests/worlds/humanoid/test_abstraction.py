@@ -101,19 +101,19 @@ def test_joints_are_kept() -> None:
     )
 
 
-def test_centre_of_mass_and_its_velocity_are_mujocos() -> None:
+def test_center_of_mass_and_its_velocity_are_mujocos() -> None:
     state = states(20)
     abstract = humanoid_to_extended_kinematics(state)
     np.testing.assert_array_equal(abstract[:, :34], humanoid_to_kinematics(state))
     for row, ours in zip(state, abstract[:, 34:40], strict=True):
         data = posed(row)
         between = np.mean([data.geom(foot).xpos for foot in FEET], axis=0)
-        centre, forward = data.subtree_com[1], data.body("torso").xmat.reshape(3, 3)[:, 0]
+        center, forward = data.subtree_com[1], data.body("torso").xmat.reshape(3, 3)[:, 0]
         angle = np.arctan2(forward[1], forward[0])
         # A turn by minus the heading, about the vertical.
         to_heading = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        np.testing.assert_allclose(ours[:2], to_heading @ (centre - between)[:2], atol=1e-12)
-        np.testing.assert_allclose(ours[2], centre[2], atol=1e-12)
+        np.testing.assert_allclose(ours[:2], to_heading @ (center - between)[:2], atol=1e-12)
+        np.testing.assert_allclose(ours[2], center[2], atol=1e-12)
         np.testing.assert_allclose(ours[3:5], to_heading @ data.subtree_linvel[1][:2], atol=1e-12)
         np.testing.assert_allclose(ours[5], data.subtree_linvel[1][2], atol=1e-12)
 

@@ -99,7 +99,7 @@ def test_no_command_asks_a_motor_for_more_than_it_has() -> None:
 
 
 def level(angles: Floats) -> tuple[Floats, Floats]:
-    """Return MuJoCo's centre of mass (3,) and feet (2, 3) of a humanoid whose torso is at the origin."""
+    """Return MuJoCo's center of mass (3,) and feet (2, 3) of a humanoid whose torso is at the origin."""
     model = humanoid_model()
     data = mujoco.MjData(model)
     data.qpos[:3], data.qpos[7:] = 0.0, angles
@@ -108,7 +108,7 @@ def level(angles: Floats) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.parametrize("bent", [5, 9])  # the right or the left hip, so that the other foot is lower
-def test_the_centre_of_mass_moves_as_if_the_lower_foot_stood(bent: int) -> None:
+def test_the_center_of_mass_moves_as_if_the_lower_foot_stood(bent: int) -> None:
     simulator = HumanoidExtendedKinematics(1, follow_s=1e-6)
     before = simulator.state.clone()
     before[0, bent] = -0.4

@@ -123,7 +123,7 @@ def test_joints_are_paid_for_the_way_of_the_torso_over_the_lower_foot() -> None:
     assert not objective.missed(after, NOTHING[:1]).any()
 
 
-def test_a_centre_of_mass_near_the_floor_has_fallen() -> None:
+def test_a_center_of_mass_near_the_floor_has_fallen() -> None:
     objective = MassWalking(horizon=5)
     lying = np.tile(STANDING, (3, 1))
     lying[1, 2], lying[1, 3:7] = 0.2, [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # on its back

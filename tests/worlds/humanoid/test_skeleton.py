@@ -20,7 +20,7 @@ def posed(joints: Floats, rates: Floats) -> mujoco.MjData:
 
 
 @pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
-def test_centre_of_mass_and_feet_are_mujocos(dtype: torch.dtype, atol: float) -> None:
+def test_center_of_mass_and_feet_are_mujocos(dtype: torch.dtype, atol: float) -> None:
     rng = np.random.default_rng(0)
     joints, rates = rng.uniform(-1.5, 1.5, (20, 17)), rng.uniform(-3, 3, (20, 17))
     shaped = torch.from_numpy(joints).to(dtype).reshape(4, 5, 17)

@@ -75,7 +75,7 @@ def test_motion_and_lean_are_told_by_their_names() -> None:
     assert [extended[f"w{axis}"] for axis in "xyz"] == pytest.approx([0.4, 0.5, 0.6])
 
 
-def test_the_centre_of_mass_is_told_by_its_names() -> None:
+def test_the_center_of_mass_is_told_by_its_names() -> None:
     model, state = humanoid_model(), np.array(STANDING)
     state[7 + JOINTS.index("left_shoulder1")] = -0.8
     state[7 + JOINTS.index("left_hip_y")] = -0.6

@@ -37,9 +37,9 @@ def test_links_are_of_matter(link: Link) -> None:
     x, y, z = link.inertia
     # Moments of inertia of any body satisfy the triangle inequality.
     assert min(x, y, z) > 0 and 2 * max(x, y, z) <= x + y + z + 1e-12
-    # A radius of gyration, and a centre of mass, within the link.
+    # A radius of gyration, and a center of mass, within the link.
     assert math.sqrt(max(link.inertia) / link.mass_kg) < 0.1
-    assert np.linalg.norm(link.centre_m) < 0.07
+    assert np.linalg.norm(link.center_m) < 0.07
     assert link.limits_deg[0] <= link.limits_deg[1]
 
 

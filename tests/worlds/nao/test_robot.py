@@ -152,7 +152,7 @@ def test_gyroscopes_have_other_noise_in_every_step_and_the_same_from_the_same_se
     np.testing.assert_array_equal(standing(), first)
 
 
-def test_balls_lie_a_metre_ahead_unless_they_are_placed() -> None:
+def test_balls_lie_a_meter_ahead_unless_they_are_placed() -> None:
     nao = BatchedNao(3, seed=0, ball=True, num_threads=1)
     nao.reset(
         EVERYONE, np.array([[1.0, 2.0, 0.0], [1.0, 2.0, np.pi / 2], [0, 0, -2.5]]), np.random.default_rng(0)

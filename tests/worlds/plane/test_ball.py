@@ -42,7 +42,7 @@ def test_only_bodies_that_approach_knock_their_ball_wherever_they_are() -> None:
     after = before + torch.tensor([[0.02, 0.01], [-0.02, -0.01], [0.01, -0.02]])
     ball = after + torch.tensor([[0.12, 0.06], [0.12, 0.06], [0.12, 0.07]])
     _, velocity = knock(before, after, ball, torch.zeros(3, 2), reach_m=0.19, speed_m_s=0.7)
-    # Towards the ball; away from it; a little away, nearly across.
+    # Toward the ball; away from it; a little away, nearly across.
     assert (velocity != 0).any(-1).tolist() == [True, False, False]
 
 

@@ -66,7 +66,7 @@ def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float
 def test_a_long_walk_never_leaves_the_free_space() -> None:
     free = FreeSpace.of_maze(U_MAZE, radius_m=0.1)
     generator = torch.Generator().manual_seed(0)
-    position = torch.tensor(U_MAZE.free_centres(), dtype=torch.float32).repeat(20, 1)
+    position = torch.tensor(U_MAZE.free_centers(), dtype=torch.float32).repeat(20, 1)
     heading = torch.randn(position.shape, generator=generator)
     for _ in range(100):
         heading = heading + 0.1 * torch.randn(position.shape, generator=generator)
@@ -108,7 +108,7 @@ def test_a_wall_cannot_be_walked_through_from_inside() -> None:
 
 
 def test_goal_distance_is_bilinear() -> None:
-    # A field that is itself linear is reproduced exactly, between cell centres too.
+    # A field that is itself linear is reproduced exactly, between cell centers too.
     height, width = ROOM.fine_walls.shape
     half = torch.tensor(ROOM.half_extent, dtype=torch.float32)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -138,13 +138,13 @@ def test_goal_distance_follows_the_goal() -> None:
 def test_goal_distance_in_a_maze_that_is_not_square(rows: tuple[str, ...], goal: tuple[int, int]) -> None:
     maze = Maze(rows=rows, scale=1.0, start=goal, goal=goal)
     distance = GoalDistance.of_maze(maze, spacing_m=0.1)
-    here = torch.tensor([maze.cell_centre(*goal)])
+    here = torch.tensor([maze.cell_center(*goal)])
     assert distance(-here, here).tolist() == pytest.approx([2.0], abs=0.1)
 
 
 def test_points_outside_of_the_maze_have_the_values_of_its_edge() -> None:
     distance = GoalDistance.of_maze(U_MAZE, spacing_m=0.2)
-    goal = torch.tensor([U_MAZE.cell_centre(*U_MAZE.goal)]).expand(4, 2)
+    goal = torch.tensor([U_MAZE.cell_center(*U_MAZE.goal)]).expand(4, 2)
     outside = torch.tensor([[-4.0, 15.0], [-4.0, -15.0], [-15.0, 4.0], [15.0, 4.0]])
     edge = outside.clamp(-9.95, 9.95)
     torch.testing.assert_close(distance(outside, goal), distance(edge, goal), atol=0.01, rtol=0)

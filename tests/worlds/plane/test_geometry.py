@@ -23,8 +23,8 @@ from astra_data.worlds.rotation import rotation_matrix
 from astra_data.worlds.task import Task
 
 angles = st.floats(-10, 10)
-metres = st.floats(-20, 20)
-maps = st.builds(PlanarMap, angles, st.tuples(metres, metres))
+meters = st.floats(-20, 20)
+maps = st.builds(PlanarMap, angles, st.tuples(meters, meters))
 properties = settings(max_examples=20, deadline=None)
 
 TASK = TASKS["antmaze-umaze"]

@@ -65,7 +65,7 @@ def test_a_ball_is_in_the_goal_in_the_field_or_out(
     assert bool(TASK.missed(where, GOAL)) == missed
 
 
-def test_rewards_are_metres_gained_and_the_outcome() -> None:
+def test_rewards_are_meters_gained_and_the_outcome() -> None:
     before, after = state((-1.0, 0.0), (0.0, 0.0)), state((-0.75, 0.0), (0.5, 0.0))
     none = torch.zeros(1, dtype=torch.bool)
     # The ball gains 0.5 m; the place behind it moved 0.5 m away, the robot 0.25 m on.

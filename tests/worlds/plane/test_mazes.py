@@ -16,15 +16,15 @@ def shortest(maze: Maze, start: tuple[float, float], goal: tuple[float, float]) 
 
 def test_the_long_maze_is_the_u_maze_twice() -> None:
     assert LONG_MAZE.rows[:5] == (*U_MAZE.rows[:4], "10111")
-    assert LONG_MAZE.cell_centre(*LONG_MAZE.start) == (-4.0, 8.0)
-    assert LONG_MAZE.cell_centre(*LONG_MAZE.goal) == (4.0, -8.0)
+    assert LONG_MAZE.cell_center(*LONG_MAZE.start) == (-4.0, 8.0)
+    assert LONG_MAZE.cell_center(*LONG_MAZE.goal) == (4.0, -8.0)
 
 
 def test_cells_and_points_agree() -> None:
-    centres = U_MAZE.free_centres()
-    assert len(centres) == len(U_MAZE.free_cells()) == 7
-    assert (U_MAZE.clearance(centres) > 1.9).all()
-    walls = np.array([U_MAZE.cell_centre(*cell) for cell in U_MAZE.wall_cells()])
+    centers = U_MAZE.free_centers()
+    assert len(centers) == len(U_MAZE.free_cells()) == 7
+    assert (U_MAZE.clearance(centers) > 1.9).all()
+    walls = np.array([U_MAZE.cell_center(*cell) for cell in U_MAZE.wall_cells()])
     assert len(walls) == 25 - 7
     assert not U_MAZE.clearance(walls).any()
     assert not U_MAZE.clearance(np.array([[100.0, 0.0], [0.0, -100.0]])).any()
@@ -32,8 +32,8 @@ def test_cells_and_points_agree() -> None:
 
 def test_the_fine_grid_repeats_the_walls() -> None:
     points = np.random.default_rng(0).uniform(-9.9, 9.9, (500, 2))
-    centres = np.array([U_MAZE.cell_centre(row, column) for row in range(5) for column in range(5)])
-    nearest = np.abs(points[:, None] - centres).max(axis=-1).argmin(axis=1)
+    centers = np.array([U_MAZE.cell_center(row, column) for row in range(5) for column in range(5)])
+    nearest = np.abs(points[:, None] - centers).max(axis=-1).argmin(axis=1)
     assert (U_MAZE.fine_walls[U_MAZE.fine_index(points)] == U_MAZE.walls.ravel()[nearest]).all()
 
 
@@ -135,7 +135,7 @@ def test_cells_have_a_size(scale: float, fine_m: float) -> None:
 
 def test_cells_of_a_maze_that_is_not_square_are_where_they_are_drawn() -> None:
     assert CORRIDOR.half_extent.tolist() == [14.0, 6.0]
-    assert (CORRIDOR.cell_centre(0, 0), CORRIDOR.cell_centre(1, 5)) == ((-12.0, 4.0), (8.0, 0.0))
+    assert (CORRIDOR.cell_center(0, 0), CORRIDOR.cell_center(1, 5)) == ((-12.0, 4.0), (8.0, 0.0))
     assert CORRIDOR.fine_walls.shape == (120, 280)
 
 

@@ -60,7 +60,7 @@ def test_starts_have_as_many_places_as_there_are_offsets() -> None:
     task = Navigation(U_MAZE, horizon=9, spread_m=0.01, start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.3)))
     starts = task.draw_starts(np.random.default_rng(0), 3000)
     assert (starts[:, 2:] == 0).all() and starts.shape == (3000, 4)
-    offsets = starts[:, :2] - np.array(U_MAZE.cell_centre(*U_MAZE.start))
+    offsets = starts[:, :2] - np.array(U_MAZE.cell_center(*U_MAZE.start))
     which = np.round(2 * offsets[:, 0]).astype(int)
     assert np.bincount(which).tolist() == pytest.approx([1000] * 3, abs=100)
     np.testing.assert_allclose(offsets[which == 2], np.tile([1.0, 0.3], ((which == 2).sum(), 1)), atol=0.04)
@@ -84,14 +84,14 @@ def test_waves_tell_the_position_finely() -> None:
     assert cosines == pytest.approx([0.0, 0.5**0.5, -1.0, 0.0], abs=1e-6)
 
 
-def test_a_metre_is_paid_as_the_task_says() -> None:
+def test_a_meter_is_paid_as_the_task_says() -> None:
     goal = torch.tensor([[-4.0, -4.0]])
     before, after, failed = (
         goal + torch.tensor([[2.0, 0.0]]),
         goal + torch.tensor([[1.0, 0.0]]),
         goal[:, 0] > 0,
     )
-    task = Navigation(U_MAZE, horizon=700, metre_reward=4.0)
+    task = Navigation(U_MAZE, horizon=700, meter_reward=4.0)
     assert float(task.reward(before, after, goal, failed)) == pytest.approx(4.0, abs=0.1)
 
 
@@ -99,7 +99,7 @@ def test_a_metre_is_paid_as_the_task_says() -> None:
 def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
     task = Navigation(maze, horizon=1)
     for draw, cell in ((task.draw_starts, task.maze.start), (task.draw_goals, task.maze.goal)):
-        points = draw(np.random.default_rng(0), 4000)[:, :2] - np.array(task.maze.cell_centre(*cell))
+        points = draw(np.random.default_rng(0), 4000)[:, :2] - np.array(task.maze.cell_center(*cell))
         assert points.shape == (4000, 2)
         assert points.mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.02)
         assert points.std(axis=0) == pytest.approx([0.2, 0.2], abs=0.01)
@@ -108,7 +108,7 @@ def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
 
 def test_goals_have_to_be_within_their_cell() -> None:
     narrow = replace(U_MAZE, scale=1.0)
-    with pytest.raises(BadInputError, match=r"3 spread_m \+ path_clearance_m = 0.6 m around its centre"):
+    with pytest.raises(BadInputError, match=r"3 spread_m \+ path_clearance_m = 0.6 m around its center"):
         Navigation(narrow, horizon=1)
     with pytest.raises(BadInputError, match=r"goals within their cell of 1 m, got .* = 0.5 m"):
         Navigation(narrow, horizon=1, spread_m=0.1, path_clearance_m=0.2)
@@ -121,14 +121,14 @@ def test_goals_have_to_be_within_their_cell() -> None:
 
 
 def test_the_way_to_the_farthest_goals_that_are_drawn_ends_at_them() -> None:
-    corners = torch.tensor([U_MAZE.cell_centre(*U_MAZE.goal)]) + torch.tensor([[-0.6, -0.6], [0.6, -0.6]])
+    corners = torch.tensor([U_MAZE.cell_center(*U_MAZE.goal)]) + torch.tensor([[-0.6, -0.6], [0.6, -0.6]])
     assert TASK.goal_distance(corners, corners).tolist() == pytest.approx([0.0, 0.0], abs=0.1)
 
 
 def test_paths_to_the_goal_keep_the_clearance() -> None:
     maze = replace(U_MAZE, scale=1.0, fine_m=0.05)
     distance = Navigation(maze, horizon=1, spread_m=0.05, path_clearance_m=0.25).goal_distance
-    start, goal = (torch.tensor([maze.cell_centre(*cell)]) for cell in (maze.start, maze.goal))
+    start, goal = (torch.tensor([maze.cell_center(*cell)]) for cell in (maze.start, maze.goal))
     # Along tangents of circles of 0.25 m around the inner wall's corners, which are 1 m apart.
     away = np.hypot(1.5, 0.5)
     bend = np.pi / 2 - np.arctan(0.5 / 1.5) + np.arcsin(0.25 / away)

@@ -33,7 +33,7 @@ def test_a_wall_stops_one_axis_and_its_velocity() -> None:
     sim.reset_to(torch.tensor([[-4.0, 4.0, 0.0, 0.0]]))
     for _ in range(60):
         state = sim.step(torch.tensor([[0.5, 1.0]]))
-    # The wall's face is at y = 6, its centre may come to 0.1 m of it.
+    # The wall's face is at y = 6, its center may come to 0.1 m of it.
     assert state[0].tolist() == pytest.approx([-4.0 + 60 * 0.025, 5.9, 0.5, 0.0], abs=1e-3)
     assert bool(sim.blocked)
 
@@ -58,8 +58,8 @@ def test_states_handed_out_stay_as_they_were() -> None:
 
 def test_a_batch_steps_as_its_rows_do() -> None:
     generator = torch.Generator().manual_seed(0)
-    centres = torch.tensor(U_MAZE.free_centres(), dtype=torch.float32)
-    position = centres[torch.randint(len(centres), (64,), generator=generator)]
+    centers = torch.tensor(U_MAZE.free_centers(), dtype=torch.float32)
+    position = centers[torch.randint(len(centers), (64,), generator=generator)]
     # Most of them close to a wall.
     position = position + 1.89 * torch.tanh(3 * torch.randn(64, 2, generator=generator))
     state = torch.cat([position, torch.zeros(64, 2)], dim=-1)
@@ -96,7 +96,7 @@ def test_the_plain_point_mass_does_these_operations_in_this_order() -> None:
     """Recorded datasets hold its float32 states: no rounding may change."""
     torch.manual_seed(1)
     simulator = PointMass(U_MAZE, 100, timestep_s=0.192, speed_m_s=0.25)
-    position = torch.tensor(U_MAZE.free_centres()[:1], dtype=torch.float32).expand(100, 2)
+    position = torch.tensor(U_MAZE.free_centers()[:1], dtype=torch.float32).expand(100, 2)
     simulator.reset_to(torch.cat([position, torch.zeros(100, 2)], dim=-1))
     for _ in range(50):
         action = 2 * torch.randn(100, 2)

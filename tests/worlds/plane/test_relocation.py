@@ -21,7 +21,7 @@ from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 KICKING = TASKS["nao-kick"]
-AIM = np.array(TASK.maze.cell_centre(*TASK.maze.goal), np.float32)
+AIM = np.array(TASK.maze.cell_center(*TASK.maze.goal), np.float32)
 
 
 def relocation(**changes: Any) -> Relocation:  # noqa: ANN401
@@ -112,7 +112,7 @@ def test_without_rotation_the_bearing_stays() -> None:
 
 
 def test_what_fits_nowhere_is_given_up() -> None:
-    # Nine metres fit into a corridor, but not at right angles to it where they start.
+    # Nine meters fit into a corridor, but not at right angles to it where they start.
     path = straight((-4.5, 4.0), (4.5, 4.0), 60)
     change, _ = next(relocation(translations=False, tries=50).placements(path, np.random.default_rng(0)))
     assert change.rotation_rad == 0.0
@@ -224,7 +224,7 @@ def test_a_ball_begins_on_the_field_and_ends_the_copy_where_it_leaves_it() -> No
         assert columns[TERMINATED].tolist() == [*before, how != "field"]
         assert columns[TRUNCATED].tolist() == [*before, how == "field"]
         assert len(end) == 12 or how != "field"
-        # All but the end is paid by the metres that ball and robot come closer, less than 0.15 a step.
+        # All but the end is paid by the meters that ball and robot come closer, less than 0.15 a step.
         assert columns[REWARD][-1] == pytest.approx({"goal": 10, "out": -10, "field": 0}[how], abs=0.2)
     assert min(ends.values()) > 10
 

@@ -67,7 +67,7 @@ def test_a_radius_of_whole_cells_is_kept(fine_m: float, radius_m: float) -> None
 
 
 def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() -> None:
-    """The wall's face is at 6 m; the disc's centre comes as close as 0.1 m."""
+    """The wall's face is at 6 m; the disc's center comes as close as 0.1 m."""
     states = planar(3, 5)
     states.keep_clear(0.5)
     start = HERE.clone()
@@ -137,7 +137,7 @@ def test_corrections_slide_along_walls_and_keep_all_else() -> None:
     landed[0, 1], landed[1, 0], landed[:, 2:] = 5.95, -3.95, 0.5
     settled = states.settle(HERE, landed)
     assert states.blocked.tolist() == [True, False, False]
-    # The wall's face is at 6 m, the disc's centre stays 0.1 m away.
+    # The wall's face is at 6 m, the disc's center stays 0.1 m away.
     assert 5.8 < settled[0, 1] < 5.9001
     assert torch.equal(settled[1:], landed[1:])
     assert torch.equal(settled[:, 2:], landed[:, 2:])

@@ -9,7 +9,7 @@ import pytest
 import torch
 from failing_disk import failing
 
-from astra_data.core.artefact import CHECKPOINT, finished_folder
+from astra_data.core.artifact import CHECKPOINT, finished_folder
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.errors import BadInputError, DiskError
 from astra_data.core.manifest import MANIFEST, read_manifest
@@ -107,7 +107,7 @@ def test_what_another_finished_while_the_lock_was_awaited_is_not_replaced(
         folder.rename(out)
         yield True
 
-    monkeypatch.setattr("astra_data.core.artefact.held", late)
+    monkeypatch.setattr("astra_data.core.artifact.held", late)
     with pytest.raises(BadInputError, match="already finished"), finished_folder(out):
         pytest.fail("it was made again")
     assert [path.name for path in out.iterdir()] == ["model"]

@@ -7,7 +7,7 @@ from fake_runs import band, edit_json, outcomes, write_evaluation, write_json
 from safetensors.numpy import save_file
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.artefacts import (
+from astra_data.reports.artifacts import (
     CurveFile,
     Evaluation,
     Gap,
@@ -31,7 +31,7 @@ def test_means_are_over_episodes_under_the_names_in_the_file(path: Path) -> None
     )
 
 
-def test_a_malformed_artefact_is_named_with_every_fault(path: Path) -> None:
+def test_a_malformed_artifact_is_named_with_every_fault(path: Path) -> None:
     edit_json(path, episodes=5, wall_seconds="long", seed=None)
     with pytest.raises(BadInputError, match=r"evaluation.json is not .*wall_seconds: .*seed: "):
         read_json(Evaluation, path)
@@ -48,7 +48,7 @@ def test_a_malformed_artefact_is_named_with_every_fault(path: Path) -> None:
 
 def test_keys_that_later_versions_add_are_ignored(path: Path) -> None:
     before = read_json(Evaluation, path)
-    edit_json(path, colour="red")
+    edit_json(path, color="red")
     assert read_json(Evaluation, path) == before
 
 

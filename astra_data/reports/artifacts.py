@@ -27,7 +27,7 @@ class WrittenPart(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
-class Artefact(WrittenPart):
+class Artifact(WrittenPart):
     """A file that a stage wrote, with its time and origin if recorded."""
 
     wall_seconds: float | None = None
@@ -60,7 +60,7 @@ class Outcomes(WrittenPart):
         return {name: float(np.mean(values)) for name, values in measures.items()}
 
 
-class Evaluation(Artefact):
+class Evaluation(Artifact):
     """evaluation.json of one row and seed."""
 
     task: str
@@ -119,7 +119,7 @@ class CurvePoint(WrittenPart):
     """Their mean length in control steps; None without any, or if not recorded."""
 
 
-class CurveFile(Artefact):
+class CurveFile(Artifact):
     """curve.json of one row and seed."""
 
     steps_per_second: float | None = None
@@ -140,7 +140,7 @@ class Foresight(WrittenPart):
     """Predicted and observed rate, and number of steps, by predicted probability."""
 
 
-class Metrics(Artefact):
+class Metrics(Artifact):
     """metrics.json of one row and seed's grounding or alignment."""
 
     windows_per_second: float | None = None
@@ -158,7 +158,7 @@ class Band(WrittenPart):
     high: list[float | None]
 
 
-class Gap(Artefact):
+class Gap(Artifact):
     """gap.json: open-loop error by horizon, for each quantity."""
 
     horizons: list[int]
@@ -179,7 +179,7 @@ class Gap(Artefact):
         return self
 
 
-class DatasetFile(Artefact):
+class DatasetFile(Artifact):
     """meta/astra/dataset.json of a dataset."""
 
     name: str
@@ -189,13 +189,13 @@ class DatasetFile(Artefact):
     pairs_per_second: float | None = None
 
 
-def read_json[T: Artefact](model: type[T], path: Path) -> T:
+def read_json[T: Artifact](model: type[T], path: Path) -> T:
     """Read one of the files above.
 
     Raises:
         BadInputError: the file does not hold what its stage writes; the message lists mismatches.
     """
-    return read_written(model, path, by="its stage", cure="run that stage again")
+    return read_written(model, path, by="its stage", advice="run that stage again")
 
 
 def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
