@@ -55,7 +55,10 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """
     if not path.is_file():
         raise BadInputError(f"{path} does not exist: expected a safetensors file")
-    manifest = read_manifest(path.parent)
+    try:
+        manifest = read_manifest(path.parent)
+    except BadInputError as error:
+        raise BadInputError(f"{path.parent}: {error}") from None
     if manifest and path.name in manifest.files and manifest.files[path.name][1] != file_digest(path):
         raise BadInputError(
             f"{path} was altered since it was made: restore it from a copy, or remove {path.parent} and run "

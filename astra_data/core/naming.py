@@ -48,3 +48,8 @@ def artifact_key(stage: str, row: str, seed: int, percent: int | None = None) ->
 def stage_of_key(key: str) -> str:
     """Return the stage of an artifact's key, as "train" of "train/astra/seed_0"."""
     return key.partition("/")[0]
+
+
+def row_of_key(key: str) -> str:
+    """Return the row of the key of an artifact that has one, as "astra" of "train/astra/seed_0"."""
+    return key.partition("/")[2].partition("/")[0]

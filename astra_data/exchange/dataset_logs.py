@@ -19,7 +19,7 @@ def logs_of(data: Dataset) -> Logs:
         CorruptDatasetError: a file cannot be read, or values differ from their digests.
     """
     fields = [Field(TIMESTAMP, "time", "time", "s", 1.0, f"{data.info['fps']} rows a second")]
-    read = [STATE, ACTION, *(name for name in (GOAL,) if name in data.features)]
+    read = [STATE, ACTION, *([GOAL] if GOAL in data.features else [])]
     columns = data.specs(read)
     of_columns = [field for column in columns for field in _fields(column)]
     fields += of_columns

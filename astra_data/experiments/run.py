@@ -12,7 +12,7 @@ from rich.console import Console
 from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
-from astra_data.core.naming import RECORD, RUNS, stage_of_key
+from astra_data.core.naming import RECORD, RUNS, row_of_key, stage_of_key
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, examined, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
@@ -274,8 +274,9 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
     selected = [item for item in items if stage_of(item) == stage]
     if not selected and not methods:
         raise BadInputError(f"the recipe has no stage '{stage}'")
-    rows = dict.fromkeys(map(grounded_as, methods) if stage in ("ground", "align") else methods)
+    made = {row_of_key(item.key) for item in selected}
+    rows = [grounded_as(row) for row in methods] if stage in ("ground", "align") else methods
     for row in rows:
-        if not any(row in item.key.split("/") for item in selected):
+        if row not in made:
             raise BadInputError(f"{row} has no stage '{stage}'")
-    return [item for item in selected if not rows or not rows.keys().isdisjoint(item.key.split("/"))]
+    return [item for item in selected if not rows or row_of_key(item.key) in rows]

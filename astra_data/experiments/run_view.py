@@ -8,6 +8,7 @@ import torch
 
 from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import row_of_key
 from astra_data.dataset.columns import ABSTRACT_SIMULATED_NEXT_STATE
 from astra_data.dataset.edit import check_uids
 from astra_data.dataset.reader import Dataset
@@ -68,7 +69,7 @@ def view_run(
     if ABSTRACT_SIMULATED_NEXT_STATE not in dataset.features:
         view(dataset, uids or dataset.uids[:SHOWN].tolist(), save=save)
         return "all simulators (the dataset is not paired yet)"
-    groundings = {item.key.split("/")[1]: item for item in made if stage_of(item) == "ground"}
+    groundings = {row_of_key(item.key): item for item in made if stage_of(item) == "ground"}
     episodes = _chosen(PairedEpisodes.load(dataset.root), uids, [*groundings.values()])
     of: dict[str, Grounding] = {RAW: NO_GROUNDING}
     of |= {name: load_grounding(_result(run, item)) for name, item in groundings.items()}

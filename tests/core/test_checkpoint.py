@@ -86,6 +86,9 @@ def test_a_file_that_its_manifest_does_not_know_is_refused(tmp_path: Path) -> No
     path.write_bytes(whole)
     with pytest.raises(BadInputError, match=r"policy\.safetensors was altered since it was made: restore"):
         load_tensors(path)
+    (tmp_path / "manifest.json").write_text("{")
+    with pytest.raises(BadInputError, match=rf"^{tmp_path}: manifest\.json cannot be read"):
+        load_tensors(path)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,12 @@
-from astra_data.core.naming import artifact_key, base_method, is_plus, reference_of, seed_folder, stage_of_key
+from astra_data.core.naming import (
+    artifact_key,
+    base_method,
+    is_plus,
+    reference_of,
+    row_of_key,
+    seed_folder,
+    stage_of_key,
+)
 
 
 def test_a_row_is_a_method_or_its_plus() -> None:
@@ -25,3 +33,8 @@ def test_a_key_begins_with_its_stage() -> None:
     assert [stage_of_key(key) for key in ("train/astra/seed_0", "select", "pair/seed_1")] == [
         *("train", "select", "pair")
     ]
+
+
+def test_a_rows_key_goes_on_with_the_row_and_no_other_part_is_one() -> None:
+    keys = ["train/astra/seed_0", "train/train/percent_050/seed_0", "ground/nas/seed_1", "report"]
+    assert [row_of_key(key) for key in keys] == ["astra", "train", "nas", ""]
