@@ -11,7 +11,7 @@ from astra_data.core.config import faults_of
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.reports.schema import Results
-from astra_data.reports.sizes import SizesResults
+from astra_data.reports.sizes import SizesResults, by_size
 
 Found = Results | SizesResults
 Page = Callable[[Mapping[str, str]], str]
@@ -44,6 +44,35 @@ def published_figures(folder: Path, recipe: str) -> dict[str, bytes]:
     """Return the figures of a recipe that are in `folder`, by name."""
     paths = {name: folder / f"{recipe}_{name}.png" for name in FIGURES}
     return {name: path.read_bytes() for name, path in paths.items() if path.exists()}
+
+
+def check_none_lost(found: Found, folder: Path) -> None:
+    """Refuse to publish results in `folder` in place of ones that have more rows or seeds.
+
+    Raises:
+        BadInputError: rows or seeds would be lost.
+    """
+    path = folder / f"{found.recipe}.json"
+    if not path.exists():
+        return
+    kept = {
+        (percent, name, seed)
+        for percent, results in by_size(found).items()
+        for name, row in results.methods.items()
+        for seed in row.seeds
+    }
+    lost = {
+        f"{name} of seed {seed}": None
+        for percent, results in by_size(read_published(path)).items()
+        for name, row in results.methods.items()
+        for seed in row.seeds
+        if (percent, name, seed) not in kept
+    }
+    if lost:
+        raise BadInputError(
+            f"{path}: expected all of its rows and seeds in the results that replace it, got none for "
+            f"{', '.join(lost)}: use --add to keep them, or delete the file to publish without them"
+        )
 
 
 def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:

@@ -24,6 +24,7 @@ from astra_data.reports.eval_info import eval_info
 from astra_data.reports.files import (
     Found,
     Page,
+    check_none_lost,
     publish_results,
     published_figures,
     read_published,
@@ -89,7 +90,8 @@ def report(
     Raises:
         MissingStageError: no row has an evaluation, or one lacks other artifacts for some of its finished
             seeds.
-        BadInputError: an artifact is malformed, or rows differ in task, episodes, robot or data.
+        BadInputError: an artifact is malformed, rows differ in task, episodes, robot or data, or published
+            rows or seeds would be lost.
     """
     from astra_data.reports.figures import png, reliability
 
@@ -121,6 +123,8 @@ def report(
         found, page, figures = _of_sizes(recipe, sized, task, command, root)
     else:
         found, page, figures = _of_one(first, task, root, config)
+    if publish is not None:
+        check_none_lost(found, publish)
     images = {name: png(figure) for name, figure in figures.items()}
     progress(0.9, f"{len(images)} figures")
     groundings = dict.fromkeys(grounding for results in sizes.values() for grounding in results.gaps())

@@ -5,7 +5,13 @@ import pytest
 from fake_runs import bare_results
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.files import publish_results, published_figures, read_published, write_results
+from astra_data.reports.files import (
+    check_none_lost,
+    publish_results,
+    published_figures,
+    read_published,
+    write_results,
+)
 from astra_data.reports.schema import Results
 
 PUBLISHED = Path(__file__).parents[2] / "recipes/results"
@@ -48,6 +54,18 @@ def test_publishing_replaces_the_figures_that_were_there(tmp_path: Path) -> None
     ]
     text = (tmp_path / "new/toy.md").read_text()
     assert text == "figures: {'data_efficiency': 'toy_data_efficiency.png'}"
+
+
+def test_rows_and_seeds_that_are_published_are_not_lost(tmp_path: Path) -> None:
+    check_none_lost(TOY, tmp_path)
+    publish_results(TOY, page, {}, tmp_path)
+    check_none_lost(TOY, tmp_path)
+    check_none_lost(bare_results("toy", {"astra": [0, 1, 2], "nas": [0]}, {"x": [1.5, 2.0]}), tmp_path)
+    check_none_lost(bare_results("other", {"nas": [0]}, {"x": [1.5]}), tmp_path)
+    with pytest.raises(BadInputError, match=r"toy.json: .* got none for astra of seed 0: use --add"):
+        check_none_lost(bare_results("toy", {"astra": [1, 2]}, {"x": [1.5, 2.0]}), tmp_path)
+    with pytest.raises(BadInputError, match="got none for astra of seed 0, astra of seed 1: use --add"):
+        check_none_lost(bare_results("toy", {"nas": [0, 1]}, {"x": [1.5, 2.0]}), tmp_path)
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:

@@ -244,6 +244,17 @@ def test_results_are_added_to_published_ones(root: Path, tmp_path: Path) -> None
     assert "](trajectories.png)" not in (root / "report/results.md").read_text()
 
 
+def test_published_rows_are_not_lost_unsaid(root: Path, tmp_path: Path) -> None:
+    published = tmp_path / "results"
+    make(root, published, FakeRecipe(seeds=(0, 1)))
+    before = {path.name: path.read_bytes() for path in published.iterdir()}
+    shutil.rmtree(root / "report")
+    with pytest.raises(BadInputError, match=r"antmaze_u.json: .* of seed 1.*: use --add to keep them"):
+        make(root, published, FakeRecipe(seeds=(0, 2)))
+    assert {path.name: path.read_bytes() for path in published.iterdir()} == before
+    assert not (root / "report").exists()
+
+
 def test_there_must_be_results_to_add_to(root: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"expected published results in .*antmaze_u.json, found none"):
         make(root, add_to=tmp_path / "antmaze_u.json")

@@ -61,12 +61,18 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Return commands (B, A), in their units, for the states (B, S) and goals (B, G) of `batch`.
 
         Raises:
-            BadInputError: values are missing, too many or not finite.
+            BadInputError: values are missing, too many or not finite, or the number of robots has changed
+                since the last `reset`.
         """
         state = self._checked(batch, STATE, "state")
         goal = self._checked(batch, GOAL, "goal") if self._about["goal"]["names"] else state[:, :0]
         if self._hidden is None:
             self._hidden = torch.zeros(len(state), self._about["hidden"]["size"])
+        if not len(state) == len(goal) == len(self._hidden):
+            raise BadInputError(
+                f"expected states and goals of {len(self._hidden)} robots, as since the last reset, got "
+                f"{len(state)} states and {len(goal)} goals: call reset() before the number of robots changes"
+            )
         # The graph is of one robot.
         rows = [part.split(1) for part in (state, goal, self._hidden)]
         steps = [self._graph(*row) for row in zip(*rows, strict=True)]
@@ -92,9 +98,14 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _checked(self, batch: dict[str, Tensor], column: str, called: str) -> Tensor:
         names, given = self._about[called]["names"], batch.get(column)
-        if given is None or given.ndim != 2 or given.shape[1] != len(names) or not given.isfinite().all():
-            came = "none" if given is None else f"the shape {tuple(given.shape)}"
-            raise BadInputError(
-                f"{column}: expected finite values (B, {len(names)}), {called} {names}, got {came}"
-            )
-        return given.float().cpu()
+        if given is None:
+            came = "none"
+        elif given.ndim != 2 or given.shape[1] != len(names):
+            came = f"the shape {tuple(given.shape)}"
+        elif not given.isfinite().all():
+            came = "some that are not finite"
+        else:
+            return given.float().cpu()
+        raise BadInputError(
+            f"{column}: expected finite values (B, {len(names)}), {called} {names}, got {came}"
+        )

@@ -51,7 +51,10 @@ def test_commands_of_many_robots_are_those_of_the_package(made: Any, run: Path) 
     ("batch", "message"),
     [
         (shown(torch.zeros(1, 3), torch.zeros(1, 1)), r"observation\.state: expected .*\(B, 2\).*\(1, 3\)"),
-        (shown(torch.full((1, 2), torch.nan), torch.zeros(1, 1)), r"observation\.state: expected finite"),
+        (
+            shown(torch.full((1, 2), torch.nan), torch.zeros(1, 1)),
+            r"observation\.state: .*got some that are not finite",
+        ),
         (shown(torch.zeros(1, 2), torch.full((1, 1), torch.inf)), r"environment_state: expected finite"),
         ({"observation.state": torch.zeros(1, 2)}, r"observation\.environment_state: expected .*got none"),
     ],
@@ -59,6 +62,16 @@ def test_commands_of_many_robots_are_those_of_the_package(made: Any, run: Path) 
 def test_other_observations_are_refused(made: Any, batch: dict[str, Tensor], message: str) -> None:  # noqa: ANN401
     with pytest.raises(BadInputError, match=message):
         made.select_action(batch)
+
+
+def test_another_number_of_robots_needs_a_reset(made: Any) -> None:  # noqa: ANN401
+    made.reset()
+    made.select_action(shown(torch.zeros(3, 2), torch.zeros(3, 1)))
+    for robots, goals in ((2, 2), (4, 4), (3, 2)):
+        with pytest.raises(BadInputError, match=f"of 3 robots.* got {robots} states and {goals} goals"):
+            made.select_action(shown(torch.zeros(robots, 2), torch.zeros(goals, 1)))
+    made.reset()
+    assert made.select_action(shown(torch.zeros(2, 2), torch.zeros(2, 1))).shape[0] == 2
 
 
 def test_a_folder_without_a_policy_is_refused(made: Any, run: Path, tmp_path: Path) -> None:  # noqa: ANN401
