@@ -95,8 +95,12 @@ class Maze:
 
     @cached_property
     def clearance_field(self) -> Floats:
-        """Distance in m from each fine grid cell to the center of the nearest wall cell, indexed [y, x]."""
-        return np.asarray(scipy.ndimage.distance_transform_edt(~self.fine_walls)) * self.fine_m
+        """Distance in m from each fine grid cell to the center of the nearest wall cell, indexed [y, x].
+
+        All around the grid there is wall.
+        """
+        free = np.pad(~self.fine_walls, 1)
+        return np.asarray(scipy.ndimage.distance_transform_edt(free))[1:-1, 1:-1] * self.fine_m
 
     def fine_index(self, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the fine grid indices (y, x) of `points` (..., 2), clipped to the grid."""

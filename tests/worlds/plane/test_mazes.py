@@ -37,6 +37,18 @@ def test_the_fine_grid_repeats_the_walls() -> None:
     assert (U_MAZE.fine_walls[U_MAZE.fine_index(points)] == U_MAZE.walls.ravel()[nearest]).all()
 
 
+def test_around_the_grid_there_is_wall() -> None:
+    # As in `FreeSpace`, whose points do not leave the grid.
+    field = Maze(rows=("000", "010"), scale=1.0, start=(0, 0), goal=(1, 2), fine_m=0.5).clearance_field
+    assert field.tolist() == [[0.5, 0.5, 0.0, 0.0, 0.5, 0.5]] * 2 + [
+        [0.5, 0.5 * 2**0.5, 0.5, 0.5, 0.5 * 2**0.5, 0.5],
+        [0.5] * 6,
+    ]
+    bare = Maze(rows=("00", "00"), scale=1.0, start=(0, 0), goal=(1, 1), fine_m=0.25).clearance_field
+    ring = np.minimum(np.arange(1, 9), np.arange(8, 0, -1)) / 4
+    assert (bare == np.minimum(ring[:, None], ring)).all()
+
+
 def test_clearance_in_the_middle_and_beside_a_wall() -> None:
     points = np.array([[0.0, 4.0], [0.0, 5.5], [0.0, 4.0 + 1.75], [0.0, 0.0]])
     assert U_MAZE.clearance(points) == pytest.approx([2.0, 0.5, 0.25, 0.0], abs=U_MAZE.fine_m)
