@@ -120,5 +120,4 @@ NAS_GOLEMO = Method(
     fit=fit_residual,
     table=Table("nas_golemo", GolemoConfig),
     configures="ground",
-    fit_rates=("episodes_per_second",),
 )
