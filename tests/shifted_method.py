@@ -73,6 +73,7 @@ LOSSY = Method(
     name="lossy", title="Lossy", fit=lambda fitting: (Lossy(shift_of(fitting)), {}), grounding=Lossy
 )
 UNNAMED = replace(LOSSY, grounding=None)
+CLASHING = replace(METHOD, fit=lambda fitting: (Shifted(shift_of(fitting)), {"failures": 3, "machine": ""}))
 
 
 class NarrowSimulator(ShiftedSimulator):

@@ -50,7 +50,7 @@ def main(
 def reached(run: Path, row: str, seed: int) -> dict[str, list[float]]:
     """Return the success of the row's policy, and of the follower, in the three tests."""
     task = task_named(settings_of(run)["task"])
-    made = trained_policy(run, row, seed=seed, percent=None)
+    made = trained_policy(run, row, seed=seed)
     simulation = made.file.simulation
     assert simulation is not None  # it was trained in a simulator
     grounding = grounding_at(made.files.get("ground"))

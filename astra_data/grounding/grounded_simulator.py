@@ -53,7 +53,7 @@ class GroundedSimulator(EpisodeSimulator):
         self._own_hidden = self.hidden.clone() if members else None
         self._shares = _shares(members or (model,), count)
         self._last = self.latent, self._own_latent, torch.zeros(count, shape.action_size, device=device)
-        self._predictions = torch.zeros(1, count, shape.state_size, device=device)
+        self._predictions = torch.empty(0, count, shape.state_size, device=device)
         self.landed = simulator.state
         self._remembered = torch.zeros(count, 0 if failures is None else failures.memory_size, device=device)
         self._hazard: Tensor | None = None
@@ -78,10 +78,10 @@ class GroundedSimulator(EpisodeSimulator):
         """
         latent, _, action = self._last
         predictions = self._predictions
-        if self.members:
+        if self.members and len(predictions):
             predictions = torch.stack([self.model.correct(latent, action, self.landed), predictions.mean(0)])
-        if len(predictions) == 1:
-            return torch.zeros_like(predictions[0, :, 0])
+        if len(predictions) < 2:
+            return torch.zeros_like(self.landed[:, 0])
         apart = self._by_share(lambda model, rows: model.disagreement(predictions[:, rows]))
         return (apart - 1.0).clamp_min(0.0)
 

@@ -29,7 +29,7 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
     """Return the grounding and the figures that a fit `returned`.
 
     Raises:
-        BadInputError: they are no such pair, no class of groundings that is known, or no JSON values.
+        BadInputError: they are no such pair, no class of groundings that is known, or no JSON values by name.
     """
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise BadInputError(
@@ -43,6 +43,8 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
         )
     if not isinstance(figures, dict):
         raise BadInputError(f"fit returned a {type(figures).__name__} of figures: expected a dict")
+    if unnamed := [f"{key!r}" for key in figures if not isinstance(key, str)]:
+        raise BadInputError(f"the figures of fit are named {', '.join(unnamed)}: expected texts")
     if faults := [
         f"{key!r} is a {type(value).__name__}" for key, value in figures.items() if not _is_json(value)
     ]:

@@ -85,7 +85,7 @@ class PairedEpisodes:
         reward, termination and success become those of the step before.
 
         Raises:
-            BadInputError: the dataset has not been paired.
+            BadInputError: the dataset has not been paired, or has no step of the robot.
             CorruptDatasetError: it is incomplete.
         """
         dataset = open_dataset(root)
@@ -98,6 +98,10 @@ class PairedEpisodes:
         if (made_up := _made_up(dataset, columns)).any():
             columns, lengths = _merged(columns, lengths, made_up)
             left = lengths > 0
+            if not left.any():
+                raise BadInputError(
+                    f"{root}: no step is left: each episode has a single one, whose next state was made up"
+                )
             held_out = held_out[left] if len(held_out) else held_out
             uids, lengths, recordings = uids[left], lengths[left], recordings[left]
         bounds = dataset.description["simulator"].get("commands")

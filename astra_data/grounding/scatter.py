@@ -23,7 +23,7 @@ def fit_scatter(
 
     Returns:
         the scatter model, and its figures on held-out steps, of the entries that scatter: "gain_nats", of the
-        log-likelihood of a step over scatter of one size; "kurtosis", of the forms, 3 for a Gaussian, NaN
+        log-likelihood of a step over scatter of one size; "kurtosis", of the forms, 3 for a Gaussian, None
         where nothing scatters.
     """
     inputs, residual = _residuals(model, training)
@@ -45,7 +45,7 @@ def fit_scatter(
     scattered = usual > 0
     return scatters, {
         "gain_nats": float(gains[scattered].sum()),
-        "kurtosis": float(kurtosis[scattered].mean()),
+        "kurtosis": float(kurtosis[scattered].mean()) if scattered.any() else None,
     }
 
 

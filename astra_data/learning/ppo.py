@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from astra_data.core.config import Config, Count, NotNegative, Positive, Share
+from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting, Taken
 from astra_data.learning.learner import Learner, Resumable
@@ -88,7 +89,12 @@ class Ppo(Learner):
             config: settings.
             horizon: steps after which episodes are truncated.
             seed: of all randomness.
+
+        Raises:
+            BadInputError: a rollout is a single step, which has no advantage over others.
         """
+        if env.num_envs * config.rollout_steps == 1:
+            raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")
         self.policy, self.config = policy, config
         with torch.no_grad():
             policy.value_layer.weight.mul_(config.critic_gain)

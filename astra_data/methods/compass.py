@@ -219,7 +219,6 @@ COMPASS = Method(
     fit=identify,
     table=TABLE,
     configures="ground",
-    fit_rates=("replays_per_second",),
 )
 
 COMPASS_UNIFORM = Method(

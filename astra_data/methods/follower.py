@@ -1,6 +1,5 @@
 """Careful hand-written controllers, which show how well a task can be done (the ceiling)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,14 +7,13 @@ import torch
 from torch import Tensor
 
 from astra_data.methods.method import Method
+from astra_data.training.simulator_episodes import Act
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 
 FOLLOWER = Method(
     name="follower", title="Careful follower", color="#9A9A9A", role="ceiling", learn=None, planar=True
 )
-
-Act = Callable[[Tensor, Tensor], Tensor]
 
 
 def careful(task: Task, goal: Tensor) -> Act:

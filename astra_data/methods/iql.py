@@ -117,8 +117,6 @@ def _optimize(iql: Iql, training: Training) -> dict[str, Any]:
     return {"updates_per_second": iql.updates / stopwatch.seconds, **stopwatch.spent(), "points": points}
 
 
-_RATES = ("updates_per_second",)
-
 IQL = Method(
     name="iql",
     title="IQL",
@@ -126,7 +124,6 @@ IQL = Method(
     learn=learn_from_episodes,
     learns_from="episodes",
     table=Table("iql", IqlConfig),
-    learn_rates=_RATES,
 )
 
 BEHAVIOR_CLONING = replace(
@@ -141,7 +138,6 @@ DIRECT_TRANSFER_IQL = Method(
     learns_from="episodes",
     initial="direct_transfer",
     table=Table("direct_transfer_iql", IqlConfig, default=FINE_TUNING),
-    learn_rates=_RATES,
 )
 """Fits the critics while the policy is left as it is; then fine-tunes direct transfer's policy, gently by
 default, since it otherwise unlearns more than it learns."""

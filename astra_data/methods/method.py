@@ -60,7 +60,6 @@ class Method:
         grounded_as: the method whose grounding and alignment it uses; its own where empty.
         grounding: the class of what its fit returns, where this is none of the package's.
         table: its settings in a recipe, if it has any. configures: the stage that takes them.
-        fit_rates: the speeds that its fit records. learn_rates: those that its training records.
         planar: whether it is for tasks in a maze only.
     """
 
@@ -78,8 +77,6 @@ class Method:
     grounding: type[FittedGrounding] | None = None
     table: Table | None = None
     configures: Literal["ground", "train"] = "train"
-    fit_rates: tuple[str, ...] = ("windows_per_second",)
-    learn_rates: tuple[str, ...] = ("simulator_steps_per_second", "steps_per_second")
     planar: bool = False
 
     @property

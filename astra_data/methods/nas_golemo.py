@@ -9,6 +9,7 @@ import torch
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, Count, Positive, own_settings
+from astra_data.core.errors import BadInputError
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.diagnostics import correction_r2
@@ -37,6 +38,9 @@ def fit_residual(fitting: Fitting) -> tuple[ResidualGrounding, dict[str, Any]]:
     """Fit the residual model to whole episodes; return it and its telemetry.
 
     The loss is the squared error of residuals divided by their deviation in the training episodes.
+
+    Raises:
+        BadInputError: corrected states are not finite: the fit diverged.
     """
     config = own_settings(fitting.settings, GolemoConfig())
     training, windows = fitting.training, fitting.training.windows
@@ -50,6 +54,10 @@ def fit_residual(fitting: Fitting) -> tuple[ResidualGrounding, dict[str, Any]]:
     metrics = _optimize(model, config, fitting)
     held_out = fitting.held_out
     residual = held_out.windows.next_state - _corrected(model, held_out)
+    if not residual.isfinite().all():
+        raise BadInputError(
+            "the fit diverged: lower learning_rate in [nas_golemo], or look at the data's values"
+        )
     model.residual_factor.copy_(scatter_factor(held_out.steps(residual)))
     return ResidualGrounding(model), metrics
 
@@ -120,5 +128,4 @@ NAS_GOLEMO = Method(
     fit=fit_residual,
     table=Table("nas_golemo", GolemoConfig),
     configures="ground",
-    fit_rates=("episodes_per_second",),
 )

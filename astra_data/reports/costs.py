@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
-from astra_data.methods import METHODS
 from astra_data.reports.artifacts import Artifact
 from astra_data.reports.schema import Cost
 
@@ -14,8 +13,8 @@ THROUGHPUT = {
     **dict.fromkeys(DATASET_STAGES, ()),
     "collect": ("target_steps_per_second",),
     "pair": ("pairs_per_second",),
-    "ground": tuple(dict.fromkeys(rate for method in METHODS.values() for rate in method.fit_rates)),
-    "train": tuple(dict.fromkeys(rate for method in METHODS.values() for rate in method.learn_rates)),
+    "ground": ("windows_per_second", "episodes_per_second", "replays_per_second"),
+    "train": ("simulator_steps_per_second", "steps_per_second", "updates_per_second"),
     "align": ("windows_per_second",),
     "select": (),
     "evaluate": ("target_steps_per_second",),

@@ -36,7 +36,7 @@ from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.score import SUCCESS, Score
 
 _TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
-"""Times at which pictures of an episode are taken, in addition to its end."""
+"""Times at which pictures of an episode are taken, in addition to the time limit."""
 
 
 @dataclass(frozen=True)

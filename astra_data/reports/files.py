@@ -95,7 +95,7 @@ def write_results(
 
 
 def _json(results: Found) -> str:
-    """Return indented JSON in which a list of numbers takes one line."""
+    """Return indented JSON in which a list of numbers or texts takes one line."""
     values = json.loads(results.model_dump_json(by_alias=True))
     text = json.dumps(values, indent=2, ensure_ascii=False)
-    return re.sub(r"\[\n[^\[\]{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
+    return re.sub(r"\[\n[^\[\]{}]*\]", lambda found: re.sub(r"\n *", " ", found[0]), text) + "\n"

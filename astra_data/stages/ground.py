@@ -1,10 +1,14 @@
 """Ground: fit a correction of the abstract simulator, and report its open-loop error."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
 
 from astra_data.core.artifact import finished_folder
-from astra_data.core.config import Config, as_json
+from astra_data.core.config import Config, as_json, faults_of
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method
 from astra_data.core.progress import Progress, silent
@@ -16,7 +20,7 @@ from astra_data.grounding.open_loop_error import gap_report
 from astra_data.grounding.own_grounding import check_step, fitted
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import is_of_package, method_named
-from astra_data.reports.artifacts import GAP, METRICS
+from astra_data.reports.artifacts import GAP, METRICS, Metrics
 from astra_data.worlds.registry import task_named
 
 
@@ -69,12 +73,21 @@ def ground(
         fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
         stopwatch = Stopwatch()
         grounding, metrics = fitted(fit(fitting))
-        spent = stopwatch.spent()
+        figures = made | stopwatch.spent() | metrics
+        _check_figures(figures)
         progress(1.0, "gap report")
         save_grounding(folder / GROUNDING, grounding, episodes)
         written = load_grounding(folder / GROUNDING, device)  # what policies are trained in
         if not is_of_package(base_method(method)):
             check_step(world, written, held_out)
         gap = gap_report(world, written, held_out, seed=seed)
-        (folder / METRICS).write_text(json.dumps(made | spent | metrics, indent=1))
+        (folder / METRICS).write_text(json.dumps(figures, indent=1))
         (folder / GAP).write_text(json.dumps(gap, indent=1))
+
+
+def _check_figures(figures: Mapping[str, Any]) -> None:
+    """Check that reports can read them; a fit of the user's may return others under the same names."""
+    try:
+        Metrics.model_validate(figures)
+    except ValidationError as error:
+        raise BadInputError(f"the figures of fit: {faults_of(error)}: give them other names") from None

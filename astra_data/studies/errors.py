@@ -19,6 +19,9 @@ from astra_data.studies.walking import AXES, BODY_AXES
 MOST_STARTS = 4000
 REPLICATES = 1000
 
+Cell = dict[str, float | None]
+"""Figures of an axis by name; None for what is not known."""
+
 
 @dataclass(frozen=True)
 class Starts:
@@ -72,7 +75,7 @@ def summary(
     horizons_s: Sequence[float],
     axes: Sequence[str] = AXES,
     judged: Sequence[str] = BODY_AXES,
-) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+) -> dict[str, dict[str, dict[str, Cell]]]:
     """Summarize the errors of several models by model, horizon and axis.
 
     Args:
@@ -85,7 +88,8 @@ def summary(
     Returns:
         For each axis "rmse" with "low" and "high"; "less_than_raw", the reduction of RMSE relative to the raw
         simulator, with "_low" and "_high"; and "less_than_ridge" likewise, if ridge regression is among the
-        models. The axis "mean" holds the means of these reductions over `judged`.
+        models. The axis "mean" holds the means of these reductions over `judged`. A reduction of errors that
+        are all 0, as those of a joint at rest, is None.
     """
     pieces, number = np.unique(piece, return_inverse=True)
     # The bootstrap resamples pieces: starts within a piece are not independent.
@@ -94,13 +98,13 @@ def summary(
     weight = np.vstack([np.ones(len(pieces)), weight])
     rmse = {name: _rmse(values.mean(0), number, weight) for name, values in squared.items()}
     references = [name for name in ("raw", "ridge") if name in rmse]
-    found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    found: dict[str, dict[str, dict[str, Cell]]] = {}
     for name, values in rmse.items():
         # The first replicate is the sample itself.
         less = {reference: 1 - _ratio(values, rmse[reference]) for reference in references}
         found[name] = {}
         for k, horizon in enumerate(horizons_s):
-            rows: dict[str, dict[str, float]] = {}
+            rows: dict[str, Cell] = {}
             for a, axis in enumerate(axes):
                 rows[axis] = _interval(values[:, k, a], "rmse", "low", "high")
                 for reference in references:
@@ -128,12 +132,17 @@ def _ratio(values: Floats, divisor: Floats | NDArray[np.int64]) -> Floats:
     return np.divide(values, divisor, out=np.full_like(values, np.nan), where=divisor > 0)
 
 
-def _less(reference: str, values: Floats) -> dict[str, float]:
+def _less(reference: str, values: Floats) -> Cell:
     name = f"less_than_{reference}"
     return _interval(values, name, f"{name}_low", f"{name}_high")
 
 
-def _interval(values: Floats, *names: str) -> dict[str, float]:
-    """Return the first of `values` and the ends of the 95 % interval of the others, under three `names`."""
+def _interval(values: Floats, *names: str) -> Cell:
+    """Return the first of `values` and the ends of the 95 % interval of the others, under three `names`.
+
+    None where the first is NaN: then all are.
+    """
+    if np.isnan(values[0]):
+        return dict.fromkeys(names)
     low, high = np.nanquantile(values[1:], [0.025, 0.975])
     return {name: round(float(value), 5) for name, value in zip(names, (values[0], low, high), strict=True)}

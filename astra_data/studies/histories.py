@@ -91,9 +91,9 @@ class HistoryModel(Predictor):
     def loss(self, stretch: Stretch) -> Tensor:
         """Return λ1 L_trans + λ2 L_rew (paper, Section IV-A) over the history, each step given the true past.
 
-        L_state is part of open-loop prediction, see `rollouts`.
+        L_state is part of open-loop prediction, see `rollouts`. The loss is 0 in a history of one step.
         """
-        if self.weights.latent == self.weights.reward == 0.0:
+        if self.weights.latent == self.weights.reward == 0.0 or stretch.past_motion.shape[1] == 1:
             return stretch.motion.new_zeros(())
         motion, simulated = stretch.past_motion, stretch.past_simulated
         nearer = self._nearer(stretch)

@@ -184,8 +184,8 @@ def _error(cell: Mapping[str, float]) -> str:
     return f"{cell['rmse']:.3f} [{cell['low']:.3f}, {cell['high']:.3f}]"
 
 
-def _share(cell: Mapping[str, float], name: str) -> str:
-    if name not in cell:
+def _share(cell: Mapping[str, Any], name: str) -> str:
+    if cell.get(name) is None:
         return "-"
     value, low, high = (100 * cell[key] for key in (name, f"{name}_low", f"{name}_high"))
     return f"{value:.0f} % [{low:.0f}, {high:.0f}]"

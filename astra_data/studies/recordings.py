@@ -91,7 +91,8 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
         config: which body they are of, and which rows count.
 
     Raises:
-        BadInputError: a part of `place` is not usable, or there is none; the message says why.
+        BadInputError: a part of `place` is not usable, or two are the same, or there is none; the message
+            says why.
     """
     if not os.path.exists(place):
         try:
@@ -103,17 +104,22 @@ def read_recordings(place: Path, mapping: Path, home: Path, config: Reading) -> 
     settings = read_mapping(mapping)
     suffixes = log_suffixes(settings)
     found, faults = [], []
+    parts_of: dict[str, list[str]] = {}
     for part in _parts(place, suffixes, each=settings.split.files):
         try:
             found.append(_recording(part, mapping, suffixes, home, config))
         except BadInputError as error:
             faults.append(str(error))
+        else:
+            parts_of.setdefault(found[-1].content_hash, []).append(str(part))
     if not found:
         endings = " or ".join(suffixes)
         reasons = "; ".join(faults) or f"it has no datasets, no archives and no {endings} files"
         raise BadInputError(f"{place}: expected recordings of a robot, found none: {reasons}")
     if faults:
         raise BadInputError(f"{place}: {'; '.join(faults)}; move aside what is not a recording")
+    if copies := [" and ".join(parts) for parts in parts_of.values() if len(parts) > 1]:
+        raise BadInputError(f"{'; '.join(copies)} hold the same rows: move all but one aside")
     names = Counter(recording.name for recording in found)
     return [_apart(recording) if names[recording.name] > 1 else recording for recording in found]
 
@@ -154,7 +160,10 @@ def _recording(
             import_dataset([part], mapping, out=root)
     dataset = Dataset.open(root)
     fps = int(dataset.info["fps"])
-    return Recording(name, dataset.content_hash, fps, tuple(_pieces(name, dataset, fps, config)))
+    pieces = tuple(_pieces(name, dataset, fps, config))
+    if not pieces:
+        raise BadInputError(f"{part} has no step: expected an episode of a row and the one after it")
+    return Recording(name, dataset.content_hash, fps, pieces)
 
 
 def place_name(place: Path) -> str:

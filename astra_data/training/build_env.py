@@ -32,7 +32,8 @@ class EnvConfig(Config):
 
     Any method accepts them, but the raw simulator has no model to predict from: there `topple` and
     `disagreement_penalty` have no effect, the reward "blend" is the abstract one, and "predicted" is
-    refused. For policies trained in the target, only `data_start_share` has an effect.
+    refused. For policies trained in the target, only `data_start_share` has an effect; for those learned from
+    recorded episodes alone, none has.
     """
 
     model_config = ConfigDict(serialize_by_alias=True)

@@ -65,7 +65,11 @@ class PolicyFile:
     observed: Observed = "abstract"
 
     def save(self, path: Path) -> None:
-        """Write the policy to `path`."""
+        """Write the policy to `path`.
+
+        Raises:
+            BadInputError: it is of a class that `load` does not know.
+        """
         kind, networks, own = _taken_apart(self.policy)
         tensors = as_part(networks, _PART)
         metadata: dict[str, Any] = own | {
@@ -112,11 +116,14 @@ class PolicyFile:
 def _taken_apart(policy: Policy) -> tuple[str, Mapping[str, Tensor], dict[str, Any]]:
     """Return the kind of a policy, its tensors, and metadata if it is of another learner."""
     if not isinstance(policy, OwnPolicy):
-        return (
-            next(kind for kind, (made, _) in _KINDS.items() if type(policy) is made),
-            policy.state_dict(),
-            {},
-        )
+        kinds = {made: kind for kind, (made, _) in _KINDS.items()}
+        if type(policy) not in kinds:
+            known = ", ".join(made.__name__ for made in kinds)
+            raise BadInputError(
+                f"a {type(policy).__name__} cannot be read again: expected a {known}, or what an "
+                "OwnLearner learns"
+            )
+        return kinds[type(policy)], policy.state_dict(), {}
     saved: Any = policy.acting
     tensors, metadata = saved.to_file()
     return saved.kind, tensors, {"own": metadata}

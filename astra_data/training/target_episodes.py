@@ -19,7 +19,7 @@ class TargetEpisodes(NamedTuple):
 
     Attributes:
         outcome: theirs. filmed: the states (T + 1, S) of the first. rate: target steps/s.
-        start_goal: where they began, "start" (B, 2), and "goal" (B, G).
+        start_goal: where they began, "start" (B, 2) or with balls (B, 4), and "goal" (B, G).
     """
 
     outcome: Outcome

@@ -275,8 +275,7 @@ def optimize(
             known["success"] = None
         points.append({"steps": learner.steps, **known})
         rate = learner.steps / stopwatch.seconds
-        lately = _lately(points, "episode_steps" if is_lasting else "success")
-        note = f"{rate:,.0f} steps/s  {lately}"
+        note = f"{rate:,.0f} steps/s  {lately(points, 'episode_steps' if is_lasting else 'success')}"
         training.progress(learner.steps / learner.total_steps, note)
         if logbook.is_due or learner.done:
             logbook.keep({"learner": learner.state_dict(), "world": env.state_dict()})
@@ -289,7 +288,7 @@ def optimize(
     }
 
 
-def _lately(points: Sequence[Mapping[str, float | None]], figure: str) -> str:
+def lately(points: Sequence[Mapping[str, float | None]], figure: str) -> str:
     """Return a note of the mean of a `figure`, "success" or "episode_steps", over the last `points`."""
     recent = [value for point in points[-10:] if (value := point.get(figure)) is not None]
     if figure == "success":

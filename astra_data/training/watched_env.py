@@ -5,7 +5,7 @@ from typing import Any
 from astra_data.core.seeding import derive
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv
 from astra_data.training.simulator_env import SimulatorEnv
-from astra_data.training.train import Training
+from astra_data.training.train import Training, lately
 
 _POINTS = 50
 """Of a learning curve."""
@@ -26,16 +26,19 @@ class WatchedEnv(BatchedVectorEnv):
         self.points: list[dict[str, Any]] = []
         self._training, self._total = training, training.config.total_steps
         self._simulated, self._ramp = env, training.config.penalty_ramp
-        self._steps = self._ended = self._succeeded = 0
+        self._steps = self._ended = self._succeeded = self._lasted = 0
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Apply actions (B, A) for one control step."""
         self._simulated.penalty_scale = self._ramp.scale(self.points, self._steps, self._total)
+        ages = self._age.numpy() + 1
         stepped = super().step(actions)
         infos = stepped[-1]
         self._steps += self.num_envs
         if "final_info" in infos:
-            self._ended += int(infos["_final_info"].sum())
+            ended = infos["_final_info"]
+            self._ended += int(ended.sum())
+            self._lasted += int(ages[ended].sum())
             self._succeeded += int(infos["final_info"]["success"].sum())
         if self._steps * _POINTS >= (len(self.points) + 1) * self._total:
             self._note()
@@ -48,9 +51,13 @@ class WatchedEnv(BatchedVectorEnv):
 
     def _note(self) -> None:
         """Add a point to the curve, of the episodes that ended since the last one."""
-        lasts = self._training.task.objective.is_lasting
-        success = None if lasts or not self._ended else self._succeeded / self._ended
-        self.points.append({"steps": self._steps, "success": success})
-        self._ended = self._succeeded = 0
-        note = "unknown yet" if success is None else f"{success:.2f}"
-        self._training.progress(min(1.0, self._steps / self._total), f"success of training episodes {note}")
+        ended, is_lasting = self._ended, self._training.task.objective.is_lasting
+        point = {
+            "steps": self._steps,
+            "success": None if is_lasting or not ended else self._succeeded / ended,
+            "episode_steps": self._lasted / ended if ended else None,
+        }
+        self.points.append(point)
+        self._ended = self._succeeded = self._lasted = 0
+        note = lately([point], "episode_steps" if is_lasting else "success")
+        self._training.progress(min(1.0, self._steps / self._total), note)

@@ -168,10 +168,10 @@ def test_members_that_start_again_forget_and_the_others_do_not() -> None:
 def test_disagreement_is_that_of_a_rows_member_with_the_model() -> None:
     used, others = model(), members()
     one, action = divided(used, others), torch.full((5, 2), 0.4)
-    assert not one.disagreement.any()
     for number, other in enumerate(others):
         other.correction_std.fill_(0.2 + 0.1 * number)
         other.usual_disagreement.fill_(1e-3)
+    assert not one.disagreement.any()
     latent = one.latent
     raw = PointMass(U_MAZE, 5, timestep_s=0.05)
     raw.reset_to(HERE.expand(5, 4))

@@ -58,6 +58,10 @@ def test_a_pair_of_a_grounding_and_figures_is_as_it_was(known: None) -> None:
             (SHIFTED, {"a": 1, "loss": torch.zeros(()), "n": np.int64(3)}),
             "the figures of fit: 'loss' is a Tensor, 'n' is a int64: expected numbers, texts, lists or dicts",
         ),
+        (
+            (SHIFTED, {("train", "loss"): 0.5, 2: 0.1}),
+            r"the figures of fit are named \('train', 'loss'\), 2: expected texts",
+        ),
     ],
 )
 def test_what_is_no_such_pair_is_refused(returned: object, told: str, known: None) -> None:

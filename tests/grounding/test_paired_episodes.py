@@ -9,7 +9,7 @@ from damaged import as_in_0_1
 from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import DatasetWriter
+from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -27,6 +27,7 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.edit import delete
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.registry import TASKS
@@ -93,6 +94,18 @@ def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
     assert merged.windows.next_state[3, 28, 0] == label(3, 28)
     assert merged.windows.failed.nonzero().tolist() == [[3, 28]]  # the third still succeeds
     assert merged.held_out is not None and merged.held_out.tolist() == [False, True, False, True, False]
+
+
+def test_where_no_step_is_one_of_the_robot_there_is_nothing_to_load(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The third and the fourth episode end in the only step that they have."""
+    monkeypatch.setitem(globals(), "LENGTHS", (1, 1, 1, 1))
+    whole = write(tmp_path / "pairs", SIZES | {NEXT_STATE: 3}, made_up=True)
+    assert PairedEpisodes.load(whole).lengths.tolist() == [1, 1]
+    ended = delete(Dataset.open(whole), [0, 1], out=tmp_path / "ended")
+    with pytest.raises(BadInputError, match="no step is left: each episode has a single one, whose"):
+        PairedEpisodes.load(ended)
 
 
 @pytest.fixture(scope="module")

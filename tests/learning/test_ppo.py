@@ -10,6 +10,7 @@ from kept_states import came_back
 from torch import Tensor
 from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall
 
+from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.ppo import Ppo, PpoConfig
 from astra_data.worlds.batched import BatchedEnv
@@ -226,6 +227,15 @@ def test_without_finished_episodes_success_is_unknown() -> None:
 
 def test_fewer_environments_than_minibatches_are_enough() -> None:
     train(ppo(GoToZero(2), 2, horizon=5, minibatches=4))
+
+
+def test_a_single_step_has_no_advantage_over_others() -> None:
+    with pytest.raises(
+        BadInputError, match="rollout_steps: expected 2 or more in a single environment, got 1"
+    ):
+        ppo(GoToZero(1), 2, horizon=5, rollout_steps=1)
+    train(ppo(GoToZero(1), 1, horizon=5, rollout_steps=2))
+    train(ppo(GoToZero(2), 1, horizon=5, rollout_steps=1))
 
 
 def test_an_untrained_critic_may_begin_near_zero() -> None:

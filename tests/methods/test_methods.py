@@ -7,7 +7,6 @@ from astra_data.grounding.fit import GroundConfig, HistoryFit
 from astra_data.learning.iql import FINE_TUNING
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.methods import METHODS, method_named, method_role, method_title, tables
-from astra_data.reports.costs import THROUGHPUT
 from astra_data.reports.figures import method_color
 from astra_data.reports.figures.style import SPARE_COLORS
 from astra_data.training.train import InSimulator
@@ -69,18 +68,6 @@ def test_settings_are_read_from_one_table_by_the_stage_that_takes_them() -> None
     assert {name: table.default for name, table in tables().items() if table.default} == {
         "direct_transfer_iql": FINE_TUNING
     }
-
-
-def test_costs_show_the_speeds_that_methods_record() -> None:
-    assert THROUGHPUT["ground"] == ("windows_per_second", "episodes_per_second", "replays_per_second")
-    assert THROUGHPUT["train"] == ("simulator_steps_per_second", "steps_per_second", "updates_per_second")
-    recording: dict[str, list[str]] = {rate: [] for rate in (*THROUGHPUT["ground"], *THROUGHPUT["train"])}
-    for name, method in METHODS.items():
-        for rate in (*(method.fit_rates if method.grounds else ()), *method.learn_rates):
-            recording[rate].append(name)
-    assert recording["episodes_per_second"] == ["nas_golemo"]
-    assert recording["replays_per_second"] == ["compass"]
-    assert recording["updates_per_second"] == ["iql", "behavior_cloning", "direct_transfer_iql"]
 
 
 def test_what_the_rows_of_the_paper_differ_in() -> None:

@@ -8,6 +8,7 @@ from stopping import Stopped, stop_past
 from torch import Tensor
 from toy_episodes import toy_episodes
 
+from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive, generator
 from astra_data.grounding.diagnostics import correction_r2
@@ -165,3 +166,11 @@ def test_the_time_before_an_interruption_counts(tmp_path: Path) -> None:
     _, metrics = fit_residual(given)
     assert all(seconds < metrics[clock] < seconds + 500 for clock, seconds in SPENT.items())
     assert metrics["episodes_per_second"] == pytest.approx(2 * 24 / metrics["wall_seconds"], rel=0.01)
+
+
+def test_a_fit_that_diverged_is_told(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    both = episodes(30, torch.ones(30, STEPS, 4), torch.randn(30, STEPS, 2))
+    config = GolemoConfig(epochs=1, hidden_size=4, layers=1, learning_rate=1e30)
+    with pytest.raises(BadInputError, match=r"the fit diverged: lower learning_rate in \[nas_golemo\]"):
+        fit_residual(fitting(both, tmp_path, config))

@@ -1,7 +1,15 @@
 import pytest
 
-from astra_data.reports.artifacts import Artifact, CurveFile, Metrics
-from astra_data.reports.costs import THROUGHPUT, Files, seconds, seed_cost, throughput, with_first
+from astra_data.reports.artifacts import Artifact, CurveFile, DatasetFile, Evaluation, Metrics
+from astra_data.reports.costs import (
+    DATASET_STAGES,
+    THROUGHPUT,
+    Files,
+    seconds,
+    seed_cost,
+    throughput,
+    with_first,
+)
 from astra_data.reports.schema import Cost
 
 
@@ -38,6 +46,17 @@ def test_a_seed_costs_what_its_stages_recorded() -> None:
         "ground": Cost(wall_seconds=3, cpu_seconds=5),
         "align": Cost(wall_seconds=1, cpu_seconds=None),
     }
+
+
+@pytest.mark.parametrize(
+    ("stage", "model"),
+    [
+        *(("ground", Metrics), ("align", Metrics), ("train", CurveFile), ("evaluate", Evaluation)),
+        *((stage, DatasetFile) for stage in DATASET_STAGES),
+    ],
+)
+def test_every_speed_is_one_that_the_stages_file_may_have(stage: str, model: type[Artifact]) -> None:
+    assert {*THROUGHPUT[stage]} <= model.model_fields.keys()
 
 
 @pytest.mark.parametrize("figure", THROUGHPUT["ground"])

@@ -42,6 +42,13 @@ def test_a_list_of_numbers_takes_one_line(tmp_path: Path) -> None:
     assert Results.model_validate_json(text) == TOY
 
 
+def test_texts_in_a_list_are_kept_to_the_letter(tmp_path: Path) -> None:
+    settings = {"data": ["my  walks", "day\N{NO-BREAK SPACE}2"]}
+    results = TOY.model_copy(update={"settings": settings})
+    write_results(results, page, {}, tmp_path, "results")
+    assert Results.model_validate_json((tmp_path / "results.json").read_text()).settings == settings
+
+
 def test_publishing_replaces_the_figures_that_were_there(tmp_path: Path) -> None:
     publish_results(TOY, page, {"success": b"1", "gap": b"2"}, tmp_path / "new")
     (tmp_path / "new/other_success.png").write_bytes(b"3")

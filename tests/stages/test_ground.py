@@ -145,8 +145,15 @@ def test_the_gap_is_that_of_the_grounding_in_the_file(
     assert (grounded == pytest.approx(raw, rel=1e-4)) == is_raw
 
 
-@pytest.mark.parametrize(("method", "told"), [("UNNAMED", "expected grounding=Lossy"), ("NARROW", "got")])
-def test_a_grounding_that_no_policy_could_be_trained_in_is_not_written(
+@pytest.mark.parametrize(
+    ("method", "told"),
+    [
+        ("UNNAMED", "expected grounding=Lossy"),
+        ("NARROW", "got"),
+        ("CLASHING", "^the figures of fit: machine: .*; failures: .*: give them other names"),
+    ],
+)
+def test_a_grounding_that_no_policy_could_be_trained_in_or_no_report_be_made_of_is_not_written(
     method: str, told: str, task: str, paired: Path, tmp_path: Path, forgotten_methods: None
 ) -> None:
     add_method("mine", f"shifted_method:{method}")

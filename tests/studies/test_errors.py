@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -89,3 +91,15 @@ def test_intervals_hold_95_percent_of_the_resamples() -> None:
     errors = np.sqrt((squared_of * starts_of)[drawn].sum(1) / starts_of[drawn].sum(1))
     low, high = np.percentile(errors, [2.5, 97.5])
     assert [cell["low"], cell["high"]] == pytest.approx([low, high], abs=0.05 * (high - low))
+
+
+def test_what_is_not_known_of_an_axis_that_never_moves_is_null_as_json_has_no_nan() -> None:
+    squared = np.ones((1, 6, 1, len(AXES)))
+    squared[..., 1] = 0.0
+    cells = summary({"raw": squared, "nas": squared / 4}, np.arange(6), [1.0])["nas"]["1"]
+    still = cells["left_m"]
+    assert still["rmse"] == 0.0 and still["less_than_raw"] is still["less_than_raw_high"] is None
+    assert cells["mean"]["less_than_raw"] == pytest.approx(0.5)
+    json.dumps(cells, allow_nan=False)
+    nowhere = summary({"raw": 0 * squared}, np.arange(6), [1.0])["raw"]["1"]["mean"]
+    assert set(nowhere.values()) == {None}

@@ -6,6 +6,7 @@ from toy_walks import FPS, piece
 
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.studies.histories import HistoryModel
+from astra_data.studies.rollouts import rollout
 from astra_data.studies.sequences import Sequences, StepsConfig, Stretch
 from astra_data.studies.walking import WALKER, bounded
 
@@ -104,3 +105,16 @@ def test_steps_that_are_not_walking_are_not_learned_from(stretch: Stretch) -> No
     # A ball on the other side is as far away: of that, only step 0 is an input.
     assert changes("past_seen", slice(0, 1), turned=True)
     assert not changes("past_seen", slice(1, 2), turned=True)
+
+
+def test_a_history_of_one_step_has_nothing_to_learn_from() -> None:
+    sequences = Sequences.of_pieces([piece(200, 0)], FPS, StepsConfig(rows=10, history=1))
+    short = sequences.stretches(*sequences.starts(1, 3), 1, 3)
+    model = model_of(short)
+    assert model.loss(short) == 0.0
+    assert rollout(model, short).isfinite().all()
+
+
+def test_where_no_past_step_counts_there_is_nothing_to_learn_from(stretch: Stretch) -> None:
+    model = model_of(stretch)
+    assert model.loss(replace(stretch, past_motion=stretch.past_simulated)) == 0.0

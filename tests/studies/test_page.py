@@ -29,6 +29,18 @@ def test_without_other_sizes_or_ridge_regression_their_tables_are_empty() -> Non
     assert next(line for line in page.splitlines() if line.startswith("| Raw simulator")).endswith("| - |")
 
 
+def test_what_is_not_known_is_a_dash() -> None:
+    (case, *_) = FOUND["cases"]
+    size = case["sizes"][-1]
+    cells = {
+        axis: {key: None if key.startswith("less") else value for key, value in cell.items()}
+        for axis, cell in size["models"]["astra"]["1"].items()
+    }
+    found = FOUND | {"cases": [case | {"sizes": [size | {"models": {"raw": {"1": cells}}}]}]}
+    line = next(line for line in render(found, "toy", "", "").splitlines() if line.startswith("| Raw sim"))
+    assert line.endswith("| - | - |")
+
+
 def test_the_figure_draws_the_numbers_of_the_first_case() -> None:
     case = FOUND["cases"][0]
     drawn = figure(FOUND)

@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from toy_walks import actions, log, states, write_archive
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.exchange.importing import import_dataset
+from astra_data.studies.joints import JointsConfig
 from astra_data.studies.recordings import place_name, read_recordings
 from astra_data.studies.walking import WalkingConfig
 
@@ -81,6 +83,29 @@ def test_recordings_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert [one.name for one in walks] == [f"walk-{one.content_hash[:8]}" for one in walks]
     assert len({one.name for one in found}) == 3
     assert all(piece.recording == one.name for one in found for piece in one.pieces)
+
+
+def test_a_recording_that_is_there_twice_would_be_predicted_from_itself(tmp_path: Path) -> None:
+    first = write_archive(tmp_path / "walk.tar.gz", 300, seed=0)
+    (tmp_path / "day").mkdir()
+    for copy in ("copy.tar.gz", "day/walk.tar.gz"):
+        shutil.copy(first, tmp_path / copy)
+    write_archive(tmp_path / "other.tar.gz", 300, seed=1)
+    told = r"copy.tar.gz and .*day/walk.tar.gz and .*/walk.tar.gz hold the same rows: move all but one aside"
+    with pytest.raises(BadInputError, match=told):
+        read_recordings(tmp_path, MAPPING, tmp_path / "home", CONFIG)
+
+
+def test_a_recording_without_a_step_is_none(tmp_path: Path) -> None:
+    mapping, recorded = tmp_path / "m.toml", tmp_path / "run.json"
+    columns = "".join(
+        f'[columns."{column}"]\nfields = ["{field}"]\n'
+        for column, field in (("observation.state", "knee"), ("next.terminated", "broke"))
+    )
+    mapping.write_text(f'name = "toy"\ntask = "t"\nfps = 10\nterminal = "stand_still"\n{columns}')
+    recorded.write_text(json.dumps({"knee": [0.5], "broke": [True]}))
+    with pytest.raises(BadInputError, match=r"found none: .*run.json has no step: expected an episode"):
+        read_recordings(recorded, mapping, tmp_path / "home", JointsConfig())
 
 
 def test_a_piece_has_a_row_at_least(tmp_path: Path) -> None:

@@ -67,7 +67,9 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
     ended = [point["success"] for point in points if point["success"] is not None]
     assert set(ended) == {success} and told[-1][0] == 1.0
     # Backward all four end at steps 160 and 320, by the horizon of 40.
-    assert success or [point["steps"] for point in points if point["success"] == 0.0] == [160, 320]
+    lengths = {point["steps"]: point["episode_steps"] for point in points if point["success"] is not None}
+    assert lengths == {160: 40.0, 320: 40.0} or (success and all(1 <= last <= 5 for last in lengths.values()))
+    assert told[-1][1].startswith("success of training episodes ")
 
 
 @pytest.mark.parametrize(
@@ -148,7 +150,7 @@ def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
 
 def test_a_hand_written_policy_takes_no_step(tmp_path: Path) -> None:
     _, curve = driving(1.0, 0)(training(tmp_path))
-    assert curve == {"points": [{"steps": 0, "success": None}]}
+    assert curve == {"points": [{"steps": 0, "success": None, "episode_steps": None}]}
 
 
 def test_what_is_not_learned_is_told(tmp_path: Path) -> None:
@@ -172,10 +174,13 @@ def test_another_learners_kind_is_not_replaced() -> None:
 
 def test_where_it_is_to_last_no_success_is_told(tmp_path: Path) -> None:
     """Ends within the horizon are failures there, whatever the simulator says of them."""
-    given = training(tmp_path)
+    told = list[str]()
+    given = training(tmp_path, lambda share, note: told.append(note))
     object.__setattr__(given, "task", replace(TASK, objective=Last(horizon=40)))
-    _, curve = driving(1.0, steps=400)(given)
+    _, curve = driving(-1.0, steps=400)(given)
     assert {point["success"] for point in curve["points"]} == {None}
+    assert [point["steps"] for point in curve["points"] if point["episode_steps"] == 40.0] == [160, 320]
+    assert "steps of training episodes 40" in told
 
 
 def test_whoever_takes_more_steps_than_were_asked_for_is_done_all_the_same(tmp_path: Path) -> None:

@@ -99,3 +99,13 @@ def test_a_policy_of_an_older_version_is_told(lacks: str, found: str, tmp_path: 
     save_tensors(path, tensors, {key: value for key, value in metadata.items() if key != lacks})
     with pytest.raises(BadInputError, match=f"expected a policy .*found {found}: run that stage again$"):
         PolicyFile.load(path)
+
+
+def test_networks_that_could_not_be_read_again_are_not_written(tmp_path: Path) -> None:
+    class Mine(ActorCritic):
+        pass
+
+    made = PolicyFile(Mine(ActorCriticShape(3, 2)), None, None, None)
+    with pytest.raises(BadInputError, match=r"^a Mine cannot be read again: expected a .*SoftActor, or what"):
+        made.save(tmp_path / "policy.safetensors")
+    assert not [*tmp_path.iterdir()]

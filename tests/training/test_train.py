@@ -30,8 +30,8 @@ from astra_data.training.train import (
     PpoTrainConfig,
     SacTrainConfig,
     Training,
-    _lately,
     imitates,
+    lately,
     learner_of,
     optimize,
     train_in,
@@ -340,5 +340,5 @@ def test_what_was_recorded_is_imitated_where_the_learner_imitates(
 
 def test_what_is_told_on_the_way_is_of_the_last_ten_points() -> None:
     points = [{"success": value} for value in (*[0.0] * 5, *[1.0] * 9, None)]
-    assert _lately(points, "success").endswith("1.00")
-    assert _lately(points[:-1], "success").endswith("0.90")
+    assert lately(points, "success").endswith("1.00")
+    assert lately(points[:-1], "success").endswith("0.90")

@@ -292,4 +292,5 @@ class GroundingModel(nn.Module):
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    return (values * mask).sum() / mask.sum()
+    """Return the mean of the values where the mask is 1; 0 where it is nowhere, as in a small batch."""
+    return (values * mask).sum() / mask.sum().clamp_min(1.0)

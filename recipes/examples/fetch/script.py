@@ -39,5 +39,4 @@ METHOD = Method(
     role="ceiling",
     color="#555555",
     learn=OwnLearner(learn=lambda env, training: Script(), policy=Script),
-    learn_rates=(),
 )

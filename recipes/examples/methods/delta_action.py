@@ -129,5 +129,4 @@ METHOD = Method(
     grounding=DeltaAction,
     table=Table("delta_action", DeltaConfig),
     configures="ground",
-    fit_rates=(),
 )

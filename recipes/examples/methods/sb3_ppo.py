@@ -53,5 +53,4 @@ METHOD = Method(
     fit=NAS.fit,
     grounded_as="nas",
     learn=OwnLearner(learn=learn, policy=Sb3Policy),
-    learn_rates=(),
 )

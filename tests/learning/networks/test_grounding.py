@@ -161,6 +161,14 @@ def test_all_heads_learn_together() -> None:
     assert float(unexplained) < 0.2
 
 
+def test_an_update_in_which_no_head_learns_is_no_update() -> None:
+    """Of a single window, two heads draw no half in one of four updates."""
+    model, alone = untrained(heads=2), lagging_world(1, 8, seed=2)
+    torch.manual_seed(0)
+    losses = [float(model.losses(alone, NAS)[1]["state"].detach()) for _ in range(40)]
+    assert 0 < losses.count(0.0) < 20 and min(losses) == 0.0
+
+
 def test_where_the_ball_lies_from_the_robot_is_seen_to_the_centimeter_and_not_from_afar() -> None:
     model = GroundingModel(GroundingShape(8, 2, 2, position_octaves=0, ball_index=4))
     state = torch.tensor([[1.0, 2.0, 0, 0, 1.03, 1.96, 0, 0], [1.0, 2.0, 0, 0, -4.0, 2.0, 0, 0]])
