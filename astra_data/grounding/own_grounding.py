@@ -45,12 +45,10 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
         raise BadInputError(f"fit returned a {type(figures).__name__} of figures: expected a dict")
     if unnamed := [f"{key!r}" for key in figures if not isinstance(key, str)]:
         raise BadInputError(f"the figures of fit are named {', '.join(unnamed)}: expected texts")
-    if faults := [
-        f"{key!r} is a {type(value).__name__}" for key, value in figures.items() if not _is_json(value)
-    ]:
+    if faults := [f"{key!r} {fault}" for key, value in figures.items() if (fault := _fault(value))]:
         raise BadInputError(
             f"the figures of fit: {', '.join(faults)}: expected numbers, texts, lists or dicts, such as "
-            "those of value.tolist()"
+            "those of value.tolist(), or None for what is not known"
         )
     return grounding, figures
 
@@ -75,9 +73,12 @@ def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes)
         )
 
 
-def _is_json(value: object) -> bool:
+def _fault(value: object) -> str:
+    """Return why a figure cannot be written as JSON; nothing if it can."""
     try:
-        json.dumps(value)
-    except (TypeError, ValueError):
-        return False
-    return True
+        json.dumps(value, allow_nan=False)
+    except TypeError:
+        return f"is a {type(value).__name__}"
+    except ValueError:
+        return "is not finite"
+    return ""

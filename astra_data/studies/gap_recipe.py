@@ -48,6 +48,13 @@ class GapRecipe(Config):
                 raise ValueError(f"unknown model '{name}'{did_you_mean(name, FITS)}")
         return ("raw", *(name for name in dict.fromkeys(models) if name != "raw"))
 
+    @field_validator("seeds", "minutes")
+    @classmethod
+    def _are_no_repeats(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(values)) < len(values):
+            raise ValueError(f"expected each once, got {list(values)}")
+        return values
+
     @property
     def reading(self) -> WalkingConfig | JointsConfig:
         """How recordings are read."""

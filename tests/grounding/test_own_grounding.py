@@ -1,3 +1,4 @@
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,10 @@ def test_a_pair_of_a_grounding_and_figures_is_as_it_was(known: None) -> None:
         (
             (SHIFTED, {"a": 1, "loss": torch.zeros(()), "n": np.int64(3)}),
             "the figures of fit: 'loss' is a Tensor, 'n' is a int64: expected numbers, texts, lists or dicts",
+        ),
+        (
+            (SHIFTED, {"r2": math.nan, "losses": [1.0, -math.inf]}),
+            "the figures of fit: 'r2' is not finite, 'losses' is not finite: expected .* or None for what",
         ),
         (
             (SHIFTED, {("train", "loss"): 0.5, 2: 0.1}),
