@@ -24,12 +24,13 @@ def column_faults(source: Dataset, expected: Column, task: str) -> list[str]:
 
 
 def names_apart(source: Dataset, expected: Iterable[Column], task: str) -> str:
-    """Say which columns of a dataset, where they fit, have not one name of the task's; empty if none."""
+    """Say which columns of a dataset, where they fit, have no name that the task has; empty if none."""
     apart = []
     for column in expected:
         recorded = Column.from_feature(column.name, source.features[column.name])
-        if recorded.names and column.names and not set(recorded.names) & set(column.names):
-            apart.append(f"{', '.join(recorded.names)} of {column.name} as {', '.join(column.names)}")
+        if column.names and not {*(recorded.names or ())} & {*column.names}:
+            given = ", ".join(recorded.names or ["values without names"])
+            apart.append(f"{given} of {column.name} as {', '.join(column.names)}")
     if not apart:
         return ""
     return f"{source.reference}: takes {' and '.join(apart)} of {task}: check that they are, in this order"

@@ -104,9 +104,16 @@ def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
 
 def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]:
     columns = dict(converted)
-    if STATE in columns and NEXT_STATE not in columns:
+    if STATE in columns:
         following = next_state_of(columns[STATE])
-        if TERMINATED in columns and terminal == "stand_still":
+        if recorded := columns.get(NEXT_STATE):
+            following = replace(
+                following,
+                names=recorded.names or following.names,
+                meaning=recorded.meaning or following.meaning,
+                astra={**(following.astra or {}), **(recorded.astra or {})} or None,
+            )
+        elif TERMINATED in columns and terminal == "stand_still":
             made_up = "; where an episode terminates, not recorded: the state itself"
             following = replace(following, meaning=f"{following.meaning}{made_up}")
         columns[NEXT_STATE] = following

@@ -1,7 +1,10 @@
 """A dataset as logs: what `new` begins with, where logs are imported already or were recorded by LeRobot."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from astra_data.dataset.checkup.angles import LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP, Column
 from astra_data.dataset.reader import Dataset
 from astra_data.exchange.field_names import Role
@@ -37,6 +40,12 @@ def logs_of(data: Dataset) -> Logs:
     if TERMINATED in ends:
         why = f"{TERMINATED}, and no success: {failures} of {len(episodes)} episodes"
         fields.append(Field(_FAILED, "failure", "failure", "1", 1.0, why))
+    for number, field in enumerate(fields):
+        if field.role == "state" and field.unit == "1" and is_angle(field.short):
+            largest = max(float(np.abs(values[field.name]).max()) for values in episodes)
+            if largest <= LARGEST:
+                why = f"its column, an angle up to {largest:.3g}"
+                fields[number] = replace(field, unit="rad", why=why)
     return Logs(tuple(fields), tuple(episodes), {})
 
 

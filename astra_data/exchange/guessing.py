@@ -100,10 +100,16 @@ def _filled(table: dict[str, Floats]) -> list[str]:
 def _distinct(fields: list[Field]) -> tuple[Field, ...]:
     """Return the fields, with forces, or pedals and a wheel, as commands where there are no others.
 
+    `u` is a speed where `v` is one too and something else is commanded.
+
     Raises:
         BadInputError: two states, or two commands, come to the same name.
     """
-    if not any(field.role == "command" for field in fields):
+    named = {_without_unit(plain_name(field.name), ENDINGS)[0]: field for field in fields}
+    commands = [field for field in fields if field.role == "command"]
+    if len(commands) > 1 and "v" in named and (speed := named.get("u")) in commands:
+        fields[fields.index(speed)] = replace(speed, role="state", short="u", why="a speed, like v")
+    if not commands:
         fields = [
             replace(field, role="command", why=f"{why}, and no other command") if why else field
             for field, why in ((field, _may_command(field)) for field in fields)

@@ -62,6 +62,7 @@ def write_held_out(
         return None
     every = [gap for sizes in found.values() for gap in sizes.values()]
     horizons = shared_horizons([gap.horizons for gap in every])
+    by_size = {percent or 0: gap for sizes in found.values() for percent, gap in sizes.items()}
     foreseen = measured_foresight(root, groundings, seeds, percents)
     rates = failure_rates(foreseen)
     if rates:
@@ -75,7 +76,7 @@ def write_held_out(
         head=[*(["size"] if percents else []), "simulator"],
         horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
         tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
-        astray=astray(every[0]),
+        astray=astray(by_size[max(by_size)]),
         foresight=foresight_lines(foreseen),
         reliability=RELIABILITY if rates else None,
         enough=[

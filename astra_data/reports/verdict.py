@@ -125,7 +125,7 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         level = sum((one.lower, one.predicted) == (chosen.lower, chosen.predicted) for one in candidates)
         if level > 1:
             yield f"{level} policies, including this one, tie in the ranking."
-        if best is not row:
+        if worth[ahead] > worth[name]:
             score = f"predicted success {worth[ahead]:.2f}" if is_predicted else _score(results, best)
             yield f"By the mean over seeds, {best.title} is ahead: {score}."
         if results.choice.regret and chosen is candidates[0]:

@@ -120,7 +120,7 @@ def label(
 def remarks(source: Dataset, task: Task) -> list[str]:
     """Say what is to be checked of a dataset that fits a task."""
     named = names_apart(source, (task.state, task.action), task.name)
-    return [*_broken_steps(source), *filter(None, (named, _drawn_goals(source, task)))]
+    return [*_broken_steps(source), *filter(None, (named, _all_failures(source), _drawn_goals(source, task)))]
 
 
 def _broken_steps(source: Dataset) -> list[str]:
@@ -129,6 +129,19 @@ def _broken_steps(source: Dataset) -> list[str]:
     for episode in source.episodes([STATE, NEXT_STATE]):
         continuity.add(episode)
     return [f"{finding.what}: {finding.advice}" for finding in continuity.findings()]
+
+
+def _all_failures(source: Dataset) -> str:
+    """Say that every episode counts as a failure, where each terminates and no success is recorded."""
+    if TERMINATED not in source.features or SUCCESS in source.features:
+        return ""
+    if not all(episode.columns[TERMINATED][-1] for episode in source.episodes([TERMINATED])):
+        return ""
+    return (
+        f"{source.reference}: each of the {len(source)} episodes ends as {TERMINATED} and counts as a "
+        f"failure, as there is no {SUCCESS}: import that too if they succeeded, or leave {TERMINATED} out of "
+        "the mapping if it only marks where each recording ends"
+    )
 
 
 def _drawn_goals(source: Dataset, task: Task) -> str:

@@ -16,6 +16,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import machine
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.blocks import in_blocks
+from astra_data.dataset.checkup.angles import is_angle
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -140,7 +141,7 @@ def pair(
     wrapped = [
         f"{_name(pairing, entry)} in {jumps[entry]} of {steps} rows"
         for entry, unit in enumerate(pairing.abstract_state.units)
-        if unit == "rad" and jumps[entry]
+        if jumps[entry] and (unit == "rad" or (not unit and is_angle(_name(pairing, entry))))
     ]
     if wrapped:
         _log.warning(

@@ -44,6 +44,17 @@ def test_fields_stand_side_by_side_each_row_flattened() -> None:
     assert columns["c"].tolist() == [[10, 0, 1, 2, 3], [20, 4, 5, 6, 7]]
 
 
+def test_recorded_next_states_are_described_as_the_states_unless_the_mapping_says_more() -> None:
+    state = {"fields": ("f",), "names": ("x", "v"), "unit": ("m", "m/s"), "role": ("invariant",)}
+    block = Block({"f": np.ones((2, 2))}, "log")
+    for more, names, unit in (({}, ("x", "v"), ["m", "m/s"]), ({"unit": ("mm",)}, ("x", "v"), ["mm", "mm"])):
+        made = converter({STATE: state, NEXT_STATE: {"fields": ("f",), **more}})
+        made.convert(block)
+        found = {column.name: column for column in made.columns}[NEXT_STATE]
+        assert (found.names, found.astra) == (names, {"unit": unit, "role": ["invariant"] * 2})
+        assert found.meaning == "the state, one step later"
+
+
 def test_what_is_not_finite_is_not_clipped_but_rejected() -> None:
     values, finite = convert({"clip": (-1.0, 1.0)}, [5.0, NAN, np.inf, -0.5])
     assert finite == [True, False, False, True]

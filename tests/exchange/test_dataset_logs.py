@@ -58,6 +58,13 @@ def test_states_commands_and_failures_are_fields_of_logs(tmp_path: Path) -> None
     assert (logs.rate, logs.uneven, logs.left_out) == (20, "", {})
 
 
+def test_an_angle_without_a_unit_is_in_rad_where_it_may_be(tmp_path: Path) -> None:
+    poses = Column(STATE, size=2, names=("yaw", "pitch"))  # up to 12 and to 13
+    logs = logs_of(recorded(tmp_path / "data", poses, SPEED))
+    assert [(field.short, field.unit) for field in logs.of("state")] == [("yaw", "rad"), ("pitch", "1")]
+    assert logs.of("state")[0].why == "its column, an angle up to 12"
+
+
 def test_without_outcomes_nothing_fails(tmp_path: Path) -> None:
     logs = logs_of(recorded(tmp_path / "data", POSE, SPEED, fps=7))
     assert logs.failed == [False, False, False] and logs.rate == 7

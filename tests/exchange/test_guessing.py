@@ -224,6 +224,19 @@ def test_pedals_and_a_wheel_are_commands_where_there_are_no_others(tmp_path: Pat
     assert (placed["target_x"], placed["throttle"]) == ("goal", "command")
 
 
+@pytest.mark.parametrize(
+    ("others", "role"),
+    [(("v", "cmd_surge"), "state u"), (("v",), "command command"), (("cmd_surge",), "command command")],
+)
+def test_u_is_a_speed_beside_v_where_something_else_is_commanded(
+    tmp_path: Path, others: tuple[str, ...], role: str
+) -> None:
+    logs = guess(
+        [write(tmp_path / "log.csv", {"x": RAMP, "u_m_s": -RAMP, **dict.fromkeys(others, RAMP % 3)})]
+    )
+    assert logs.fields[1].taken_for == role
+
+
 def test_an_axis_is_no_unit(tmp_path: Path) -> None:
     columns = {"x": RAMP, "cmd_v": RAMP, "u_a": RAMP, "motor_v": RAMP, "cmd_deg": RAMP}
     logs = guess([write(tmp_path / "log.csv", columns)])

@@ -30,7 +30,9 @@ def write_logs(
 
     Next states are `ahead` of the states of the rows after them.
     """
-    columns = [Column(STATE, size=state_size), Column(NEXT_STATE, size=state_size), Column(ACTION, size=1)]
+    names = ("x", "speed", *"abcd")[:state_size]
+    columns = [Column(name, size=state_size, names=names) for name in (STATE, NEXT_STATE)]
+    columns += [Column(ACTION, size=1, names=("v",))]
     states = np.zeros((9, state_size), np.float32)
     actions = np.linspace(least, largest, 9, dtype=np.float32)
     with writer(folder, columns=columns, fps=10) as logs:

@@ -84,6 +84,18 @@ def test_a_simulator_that_is_no_better_than_standing_still_is_told(
     assert ("**In `x`, the simulator without grounding is no better" in page.read_text()) == is_astray
 
 
+@pytest.mark.parametrize(("percent", "is_told"), [(25, False), (100, True)])
+def test_a_simulator_is_judged_by_the_largest_size(tmp_path: Path, percent: int, is_told: bool) -> None:
+    for size in (25, 100):
+        write(tmp_path, size, 0, 0.1)
+        file = tmp_path / f"ground/nas/percent_{size:03d}/seed_0/gap.json"
+        bands = {"x": {end: [0.1, 1.0 if size == percent else 3.0] for end in ("mean", "low", "high")}}
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"still": bands}))
+    page = write_held_out("r", tmp_path, ("nas",), (0,), (25, 100), timestep_s=0.05)
+    assert page is not None
+    assert ("the simulator without grounding is no better" in page.read_text()) == is_told
+
+
 def test_rows_may_have_other_sizes(tmp_path: Path) -> None:
     for percent in (25, 100):
         write(tmp_path, percent, 0, 0.1)

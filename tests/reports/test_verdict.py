@@ -129,6 +129,14 @@ def test_a_chosen_policy_of_the_floor_is_the_one_to_deploy(
     assert not any("overlap" in remark or "compared over only" in remark for remark in verdict.remarks)
 
 
+def test_no_row_is_ahead_of_a_chosen_floor_that_is_better(results: Results) -> None:
+    candidates = [candidate("direct_transfer", 1, 0.8), candidate("astra", 2, 0.1)]
+    choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)
+    verdict = verdict_of(results.model_copy(update={"choice": choice, "tested_in": "simulators"}))
+    assert verdict.title == "Direct transfer, seed 1"
+    assert not any("ahead" in remark for remark in verdict.remarks)
+
+
 def test_where_all_are_predicted_to_fail_none_is_deployed(results: Results) -> None:
     candidates = [candidate("astra", 1, 0.0), candidate("astra", 2, 0.0)]
     choice = Choice(judge="nas", episodes=4, shares_episodes=False, candidates=candidates)

@@ -141,6 +141,24 @@ def test_names_that_are_not_the_tasks_are_told(tmp_path: Path, caplog: pytest.Lo
     assert told in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("ends", "more", "is_told"),
+    [((True, True), (), True), ((True, False), (), False), ((True, True), (SUCCESS,), False)],
+)
+def test_failures_of_all_episodes_are_told(
+    tmp_path: Path, ends: tuple[bool, bool], more: tuple[str, ...], is_told: bool
+) -> None:
+    last = np.arange(5) == 4
+    episodes = [drive(0.1, 5) | {TERMINATED: last & end, SUCCESS: last & False} for end in ends]
+    columns = [column for column in OUTCOME_COLUMNS if column.name in (TERMINATED, *more)]
+    kept = {column.name for column in (*COLUMNS, *columns)}
+    logs = write(
+        tmp_path / "logs", [{key: one[key] for key in one if key in kept} for one in episodes], (*columns,)
+    )
+    told = "logs@data-1.0.0: each of the 2 episodes ends as next.terminated and counts as a failure"
+    assert any(remark.startswith(told) for remark in remarks(Dataset.open(logs), task_named(CART))) == is_told
+
+
 @pytest.mark.parametrize(("distance", "is_told"), [(0.95, True), (1.9, False)])
 def test_who_terminates_at_the_goal_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, distance: float, is_told: bool

@@ -285,15 +285,15 @@ def test_the_step_that_is_told_is_that_of_the_dataset(
         pair(glider_that_gets_lost(tmp_path), PairConfig(), dataset=collected, out=out, progress=silent)
 
 
+@pytest.mark.parametrize("unit", [", astra={'unit': ('m', 'rad')}", ""])
 def test_a_heading_that_wraps_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, unit: str
 ) -> None:
     monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
     (tmp_path / "cart.py").write_text(
         "import torch\nfrom astra_data import Column\n"
         "class Turning:\n"
-        "    abstract_state = Column('abstract.state', size=2, names=('x', 'yaw'), "
-        "astra={'unit': ('m', 'rad')})\n"
+        f"    abstract_state = Column('abstract.state', size=2, names=('x', 'yaw'){unit})\n"
         "    parameters = {}\n"
         "    def __init__(self, num_envs):\n"
         "        self.state = torch.zeros(num_envs, 2)\n"

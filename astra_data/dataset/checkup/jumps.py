@@ -116,6 +116,8 @@ class Jumps:
         # Where large steps are many, a split at the smallest jump would leave no episodes.
         usual = np.quantile(np.concatenate(self._samples)[:, worst], 1 - RARE)
         above, most = max(float(usual), 0.9 * min(sizes[worst])), max(sizes[worst])
+        digit = 10.0 ** (np.floor(np.log10(above)) - 1)
+        above = digit * np.floor(above / digit)  # two digits; rounded up, it might be above all jumps
         what = (
             f"{count} single-step jump{'s' if count > 1 else ''} in {where}; the largest is {most:.3g} in "
             f"{labels(self._column)[worst]}, whose median step is {limits[worst] / LARGE:.2g}"

@@ -1,6 +1,7 @@
 """HDF5: one dataset per field; the layouts of D4RL, robomimic and d3rlpy are known. Read block by block."""
 
 import json
+import math
 import re
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
@@ -95,13 +96,23 @@ def layout(source: Source) -> dict[str, Any]:
         for name, folder in ((STATE, "obs/"), (NEXT_STATE, "next_obs/")):
             found = [field for field, d in demo.items() if field.startswith(folder) and d.ndim in (1, 2)]
             if found:
-                columns[name] = {"fields": sorted(found)}
+                columns[name] = {"fields": sorted(found), "names": _labels(demo, sorted(found))}
         keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
         if TRUNCATED not in columns:
             keys["min_steps"] = 2
         env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
         fps = env_args.get("env_kwargs", {}).get("control_freq")
         return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
+
+
+def _labels(demo: dict[str, Any], fields: list[str]) -> list[str]:
+    """Return a name for each value of the fields of `obs`, such as tilt, pos_0 and pos_1."""
+    widths = {field: math.prod(demo[field].shape[1:]) for field in fields}
+    return [
+        field.split("/", 1)[1] + (f"_{number}" if width > 1 else "")
+        for field, width in widths.items()
+        for number in range(width)
+    ]
 
 
 def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, origin: str) -> None:

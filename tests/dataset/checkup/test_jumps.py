@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,25 @@ def test_jumps_are_found_in_the_episodes_that_have_them(tmp_path: Path) -> None:
     assert finding.episodes == (3, 8)
     assert finding.what.startswith("3 single-step jumps in y of observation.state; the largest is 1.98 in y")
     assert 'column = "observation.state", values = [1], above = 0.6' in finding.advice
+
+
+def test_the_threshold_it_names_is_below_the_largest_jump(tmp_path: Path) -> None:
+    def carried(uid: int, columns: Columns) -> None:
+        for at in (20, 60):
+            columns[STATE][at:, 1] += 6.23
+            columns[NEXT_STATE][at - 1 :, 1] += 6.23
+
+    dataset = write_logs(tmp_path / "logs", carried)
+    (spec,) = dataset.specs([STATE])
+    found = Jumps(spec, int(dataset.lengths.sum()))
+    for episode in dataset.episodes([STATE, NEXT_STATE]):
+        found.add(episode)
+    (finding,) = found.findings(dataset, "walks")
+    above, largest = (
+        re.search(f"{before} ([0-9.]+)", text)
+        for before, text in (("above =", finding.advice), ("the largest is", finding.what))
+    )
+    assert above and largest and float(above[1]) < float(largest[1])
 
 
 def turning(root: Path, name: str, turn: float, unit: str = "") -> Dataset:

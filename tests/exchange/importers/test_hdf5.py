@@ -79,11 +79,13 @@ def test_robomimic_needs_no_mapping(tmp_path: Path) -> None:
                 "dones": (np.arange(length) == length - 1).astype(np.int64),
             }
             for field, values in demos[name].items():
-                data[f"{name}/{field}"] = values
+                data[f"{name}/{field}"] = values[:, None] if field.endswith("gripper") else values
         file["mask/train"] = [b"demo_0"]
     dataset, report = imported(tmp_path, tmp_path / "lift.hdf5", None, name="lift", task="lift the cube")
     assert dataset.lengths.tolist() == [4, 5, 6]
     assert dataset.info["fps"] == 20
+    for spec in dataset.specs([STATE, NEXT_STATE]):
+        assert spec.names == ("eef_pos_0", "eef_pos_1", "eef_pos_2", "gripper")
     assert report.tally.split_points == {"source": 2}
     assert dataset.metadata["source_row"] == [0, 0, 0]
     for episode, demo in zip(dataset.episodes(), ("demo_0", "demo_2", "demo_10"), strict=True):
