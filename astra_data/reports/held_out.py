@@ -77,6 +77,7 @@ def write_held_out(
         horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
         tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
         astray=astray(by_size[max(by_size)]),
+        worse=[line for method, sizes in found.items() for line in worse(method_title(method), sizes)],
         foresight=foresight_lines(foreseen),
         reliability=RELIABILITY if rates else None,
         enough=[
@@ -101,6 +102,21 @@ def astray(gap: GapMeans) -> list[str]:
         for name, band in (gap.still or {}).items()
         if gap.at(gap.raw[name], horizon)[0] >= gap.at(band, horizon)[0]
     ]
+
+
+def worse(title: str, sizes: Mapping[int | None, GapMeans]) -> list[str]:
+    """Say where a grounding, fitted to the most data, has larger errors than the simulator without one."""
+    gap = sizes[max(sizes, key=lambda percent: percent or 0)]
+    lines = []
+    for name, band in gap.grounded.items():
+        found = [
+            f"{horizon} step{'s' if horizon > 1 else ''} ahead ({ours:.3g}, without {its:.3g})"
+            for horizon in gap.horizons
+            if (ours := gap.at(band, horizon)[0]) > (its := gap.at(gap.raw[name], horizon)[0])
+        ]
+        if found:
+            lines.append(f"{title}, `{name}`: {', '.join(found)}")
+    return lines
 
 
 def measured_foresight(

@@ -10,13 +10,14 @@ from astra_data.reports.formatting import interval, spread
 from astra_data.reports.schema import MethodResults, Ranked, Results
 from astra_data.reports.statistics import share_interval
 from astra_data.reports.tested import where
+from astra_data.worlds.score import SUCCESS
 
 _PERCENT = "\N{NO-BREAK SPACE}%"
 _SURE = f"95{_PERCENT}"
 _ENOUGH_SEEDS = 4
 """With fewer, an interval over seeds is no wider than the seeds lie apart."""
 _MOSTLY = 0.5
-"""Share of episodes that fail from which on a verdict warns of it."""
+"""A verdict warns where more episodes fail, or fewer succeed in the policy's own simulator."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +157,12 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         of.title for key, of in results.methods.items() if of.role != "ceiling" and key not in worth
     ]:
         yield f"Not judged, so not compared: {', '.join(unjudged)}."
+    own = row.simulated_success if results.headline == SUCCESS else None
+    if own and (reached := own[row.seeds.index(chosen.seed)] if chosen else fmean(own)) < _MOSTLY:
+        yield (
+            f"In the simulator of its training, it succeeds in {100 * reached:.0f}{_PERCENT} of the "
+            "episodes: it did not learn to do the task there."
+        )
     failed = row.summary["failed"].mean
     if failed >= _MOSTLY:
         yield (

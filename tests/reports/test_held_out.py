@@ -69,6 +69,23 @@ def test_a_single_held_out_episode_settles_nothing(tmp_path: Path) -> None:
     assert any(line.startswith("| 100 % | NAS | 0.1 [0.09, 0.11] | 1 |") for line in lines)
 
 
+def test_a_correction_that_makes_the_simulator_worse_is_told(tmp_path: Path) -> None:
+    for percent, error in ((50, 0.1), (100, 0.2)):
+        write(tmp_path, percent, 0, error)
+    told = "**Here the correction makes the simulator worse.**"
+    page = write_held_out("r", tmp_path, ("nas",), (0,), (50, 100), timestep_s=0.05)
+    assert page is not None and told not in page.read_text()
+    for percent, after_ten in ((50, 9.0), (100, 4.5)):
+        file = tmp_path / f"ground/nas/percent_{percent:03d}/seed_0/gap.json"
+        gap = json.loads(file.read_text())
+        gap["grounded"]["x"]["mean"][1] = after_ten
+        file.write_text(json.dumps(gap))
+    write_held_out("r", tmp_path, ("nas",), (0,), (50, 100), timestep_s=0.05)
+    # By the most data: there it is 0.2 after a step, as half of what it is without, and 4 without after ten.
+    lines = page.read_text().splitlines()
+    assert told in page.read_text() and "- NAS, `x`: 10 steps ahead (4.5, without 4)" in lines
+
+
 @pytest.mark.parametrize(("still", "is_astray"), [(1.0, True), (2.0, True), (2.1, False)])
 def test_a_simulator_that_is_no_better_than_standing_still_is_told(
     tmp_path: Path, still: float, is_astray: bool

@@ -224,6 +224,25 @@ def test_ties_and_failures_are_told(results: Results) -> None:
     assert verdict_of(failing).remarks[-1].startswith("ASTRA+ fails in 50\N{NO-BREAK SPACE}% of its episodes")
 
 
+def test_a_training_that_did_not_learn_its_simulator_is_told(tmp_path: Path, results: Results) -> None:
+    told = "In the simulator of its training, it succeeds in 49\N{NO-BREAK SPACE}% of the episodes"
+
+    def remarks(found: Results, own: list[float]) -> str:
+        rows = {
+            name: row.model_copy(update={"simulated_success": own}) for name, row in found.methods.items()
+        }
+        return " ".join(verdict_of(found.model_copy(update={"methods": rows})).remarks)
+
+    assert told in remarks(results, [0.47, 0.0, 1.0])
+    assert "In the simulator of its training" not in remarks(results, [0.5, 0.0, 1.0])
+    # Of a chosen policy, it is what that one reaches.
+    chosen = made(tmp_path, select=True)
+    (best, *_) = chosen.choice.candidates if chosen.choice else ()
+    own = [0.49 if seed == best.seed else 1.0 for seed in SEEDS]
+    assert told in remarks(chosen, own)
+    assert "In the simulator of its training" not in remarks(chosen, [1.49 - value for value in own])
+
+
 def test_references_alone_are_not_deployed(results: Results) -> None:
     alone = {name: results.methods[name] for name in ("direct_transfer", "follower")}
     verdict = verdict_of(results.model_copy(update={"methods": alone}))
