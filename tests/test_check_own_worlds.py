@@ -15,6 +15,7 @@ from astra_data.training.own_world import reached_in_own_world
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.simulator_episodes import in_simulator
+from astra_data.worlds.registry import task_named
 
 
 def test_policies_are_tested_as_after_training_then_longer_then_without_scatter(
@@ -39,7 +40,7 @@ def test_policies_are_tested_as_after_training_then_longer_then_without_scatter(
         train(TASK, "nas", TRAIN, dataset=pairs, grounding=nas, out=tmp_path / "train/nas/seed_0")
         train(TASK, "direct_transfer", TRAIN, dataset=pairs, out=tmp_path / "train/direct_transfer/seed_0")
         check_own_worlds.main(tmp_path, ["nas", "direct_transfer"], [0])
-        task = check_own_worlds.task_named(TASK)
+        task = task_named(TASK)
         policy = PolicyFile.load(tmp_path / "train/nas/seed_0/policy.safetensors")
         own = reached_in_own_world(task, policy, grounding_at(nas / "grounding.safetensors"), 0)
     tests = [(25, True), (38, True), (25, False)]

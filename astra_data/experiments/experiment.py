@@ -8,24 +8,23 @@ task with the same target; then it shares the collected episodes.
 """
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.errors import RecipeError
 from astra_data.core.naming import RECORD, base_method, reference_of, stage_of_key
+from astra_data.experiments.changed_settings import differences, share_target
 from astra_data.experiments.own_files import changed_code
 from astra_data.experiments.points import RunPoint
-from astra_data.experiments.recipe import WHOLE, Recipe
+from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.recipe_file import read_tables, recorded_settings
-from astra_data.experiments.staleness import ROWS_TABLES, SIMULATOR, reads, stale_stages
+from astra_data.experiments.staleness import ROWS_TABLES, reads, stale_stages
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size
 from astra_data.stages.registry import STAGES
-from astra_data.worlds.registry import task_named
 
 ALWAYS_NEW = {"report"}
 """Made by every run: it is cheap, and shows the rows and seeds that the recipe has now."""
@@ -51,7 +50,7 @@ class Experiment:
         """The stages whose artifacts are taken from the base."""
         if self.base is None:
             return set()
-        changed = _differences(self.base.recipe.settings, self.recipe)
+        changed = {*differences(self.base.recipe.settings, self.recipe)}
         absent = set() if self.recipe.sweep.percent else {"subset"}
         asked = {stage.name: stage.asked_by for stage in STAGES.values() if stage.asked_by}
         absent |= {stage for stage, key in asked.items() if not getattr(self.recipe, key)}
@@ -130,7 +129,8 @@ class Experiment:
             now = getattr(self.recipe, key)
             if _is_same_place(recorded.get(key), now):
                 recorded[key] = now
-        changed = _differences(recorded, self.recipe)
+        told = differences(recorded, self.recipe)
+        changed = told.keys()
         code = changed_code(self.recipe, self.folder)
         whole = stale_stages((changed - ROWS_TABLES) | ({"task"} & code.keys()))
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
@@ -141,7 +141,8 @@ class Experiment:
                 folders += self._rows_of(table, stage)
         rows = [place for stage in sorted(own - whole) for place in sorted((self.folder / stage).iterdir())]
         folders += [row for row in rows if base_method(row.name) in code]
-        texts = [f"{' and '.join(sorted(changed))} changed in the recipe"] if changed else []
+        tables = " and ".join(f"{table} ({how})" for table, how in sorted(told.items()))
+        texts = [f"{tables} changed in the recipe"] if tables else []
         texts += [f"{what} changed" for what in dict.fromkeys(code.values())]
         return " and ".join(texts), [
             folder for folder in dict.fromkeys(folders) if folder.parent not in folders
@@ -166,7 +167,7 @@ class Experiment:
         """
         points = set()
         for percent, found in by_size(read_published(self.published_in)).items():
-            changed = _differences(found.settings, self.recipe) - ALWAYS_NEW - {"select"}
+            changed = differences(found.settings, self.recipe).keys() - ALWAYS_NEW - {"select"}
             tested = {*found.methods, *filter(None, [reference_of(self.recipe.methods)])}
             changed -= {table for table in ROWS_TABLES if not any(reads(row, table) for row in tested)}
             if changed:
@@ -217,21 +218,6 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     return Experiment(recipe, path, folder, base)
 
 
-def _differences(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
-    """Return the settings of `recipe` that differ from those recorded `before`.
-
-    Settings that did not exist then have their defaults, as they took effect.
-    """
-    with suppress(RecipeError):
-        before = validated(before, type(recipe), RECORD).settings
-    before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
-    elsewhere = {"methods", "own_methods", "seeds", "based_on"}
-    changed = {key for key in now.keys() - elsewhere if before.get(key) != now[key]}
-    if "task" in changed and _share_target(str(before.get("task")), recipe.task):
-        return changed - {"task"} | {SIMULATOR}
-    return changed - {"plus"} if "train" in changed else changed  # which "plus" takes over
-
-
 def _is_same_place(before: object, now: object) -> bool:
     """Return whether two names of a file or folder of the user's, told from different folders, may be of one.
 
@@ -240,19 +226,6 @@ def _is_same_place(before: object, now: object) -> bool:
     file, is_code, _ = str(now).partition(".py:")
     there = Path(f"{file}.py").is_file() if is_code else Path(file).is_dir()
     return there and Path(str(before)).name == Path(str(now)).name
-
-
-def _share_target(task: str, other: str) -> bool:
-    try:
-        return task_named(task).shares_target(task_named(other))
-    except BadInputError:
-        return False
-
-
-def _with_largest_size(settings: dict[str, Any]) -> dict[str, Any]:
-    """Replace `sweep` by the largest size, the only part of it that artifacts depend on."""
-    percents = settings.get("sweep", {}).get("percent", ())
-    return settings | {"sweep": max(percents, default=WHOLE)}
 
 
 def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -265,7 +238,7 @@ def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, 
 
 def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
     name, faults = base.path.stem, []
-    if recipe.task != base.recipe.task and not _share_target(base.recipe.task, recipe.task):
+    if recipe.task != base.recipe.task and not share_target(base.recipe.task, recipe.task):
         faults.append(
             f"task: expected that of {name}, '{base.recipe.task}', or one with the same target, "
             f"got '{recipe.task}'"

@@ -307,7 +307,9 @@ def test_a_choice_is_asked_for_by_its_table_which_changes_nothing_else(tmp_path:
     run(recipe, root=tmp_path, jobs=1)
     assert (folder / "select").is_dir() and not (folder / "set_aside").exists()
     recipe.write_text(rows + "[select]\nsteps = 3\n")
-    with pytest.raises(AstraDataError, match=f"select changed in the recipe.* remove {folder}/select$"):
+    with pytest.raises(
+        AstraDataError, match=rf"select \(steps: 2, now 3\) changed in the recipe.* remove {folder}/select$"
+    ):
         run(recipe, root=tmp_path, jobs=1)
 
 

@@ -49,8 +49,8 @@ def test_what_only_some_rows_read_leaves_the_others_alone(base: Path, tmp_path: 
         run(base, root=tmp_path)
     rows = [folder / stage / "astra_plus" for stage in ("evaluate", "train")]
     assert str(caught.value) == (
-        f"plus changed in the recipe since {folder} was made: give the recipe another name, or remove "
-        f"{rows[0]} {rows[1]}"
+        f"plus (rate: 0.5, now 2.0) changed in the recipe since {folder} was made: "
+        f"give the recipe another name, or remove {rows[0]} {rows[1]}"
     )
     made = attempts(folder)
     for row in rows:
@@ -204,18 +204,20 @@ def test_changes_are_told_in_the_base_and_here(base: Path, longer: Path, tmp_pat
     run(base, root=tmp_path, jobs=2)
     folder = run(longer, root=tmp_path, jobs=2)
     base.write_text(BASE + "[train]\nsteps = 9\n")
-    with pytest.raises(RecipeError, match=rf"^train changed in the recipe since {tmp_path}/base was"):
+    with pytest.raises(
+        RecipeError, match=rf"^train \(steps: 1, now 9\) changed in the recipe since {tmp_path}/base was"
+    ):
         run(longer, root=tmp_path)
     found = check(longer, root=tmp_path)
     assert found["train/astra/seed_0"].state == "stale" and found["ground/astra/seed_0"].is_finished
-    assert found["train/astra/seed_0"].why.startswith("train changed in the recipe since")
+    assert found["train/astra/seed_0"].why.startswith("train (steps: 1, now 9) changed in the recipe since")
     base.write_text(BASE)
     longer.write_text(LONGER.replace("2.0", "3.0"))
     with pytest.raises(RecipeError) as caught:
         run(longer, root=tmp_path)
     assert str(caught.value) == (
-        f"evaluate changed in the recipe since {folder} was made: give the recipe another name, or remove "
-        f"{folder / 'evaluate'}"
+        f"evaluate (rate: 2.0, now 3.0) changed in the recipe since {folder} was made: "
+        f"give the recipe another name, or remove {folder / 'evaluate'}"
     )
 
 
@@ -253,7 +255,11 @@ def test_a_link_of_the_user_s_own_is_a_folder_like_any(base: Path, tmp_path: Pat
     assert (folder / "collect").resolve() == collected.parent
     (folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
     base.write_text(BASE + "[collect]\nsteps = 7\n")
-    assert load_experiment(base, tmp_path).outdated("collect/seed_0").startswith("collect changed")
+    assert (
+        load_experiment(base, tmp_path)
+        .outdated("collect/seed_0")
+        .startswith("collect (steps: 1, now 7) changed")
+    )
 
 
 @pytest.mark.parametrize(
@@ -302,7 +308,9 @@ def test_a_table_that_the_folder_s_recipe_did_not_have_is_no_change(base: Path, 
     base.write_text(BASE + "[report]\nsteps = 9\n")
     assert check(base, root=tmp_path)["report"].is_finished, "every run makes it"
     record.write_text(json.dumps(kept | {"task": "moon"}))
-    assert check(base, root=tmp_path)["train/astra/seed_0"].why.startswith("report and task changed")
+    assert check(base, root=tmp_path)["train/astra/seed_0"].why.startswith(
+        'report (steps: 1, now 9) and task ("moon", now "maze") changed'
+    )
 
 
 def test_the_settings_of_a_method_reach_the_rows_that_read_them(base: Path, tmp_path: Path) -> None:

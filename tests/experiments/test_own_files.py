@@ -82,7 +82,7 @@ def test_rows_are_outdated_by_another_method(made: Path) -> None:
     edit(made / "rail.toml", "[0]", "[0]\n[evaluate]\nepisodes = 7")
     experiment = load(made)
     assert experiment.outdated("ground/mine/seed_0").startswith(
-        "evaluate changed in the recipe and mine.py changed"
+        "evaluate (episodes: 100, now 7) changed in the recipe and mine.py changed"
     )
     assert experiment.outdated("ground/nas/seed_0") == experiment.outdated("collect/seed_0") == ""
 
@@ -175,7 +175,7 @@ def test_a_recipe_is_the_same_from_every_folder(made: Path, monkeypatch: pytest.
             monkeypatch.chdir(folder)
             load_experiment(Path(path), made / "runs").check_unchanged()
     record.write_text(json.dumps(settings | {"task": "rail.py:LOGS_ALONE"}))
-    with pytest.raises(RecipeError, match="task changed in the recipe"):
+    with pytest.raises(RecipeError, match=r'task \(".*", now ".*\) changed in the recipe'):
         load(made).check_unchanged()
 
 

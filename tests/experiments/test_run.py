@@ -256,12 +256,12 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     stale = {key: found.why for key, found in check(recipe, root=tmp_path).items() if found.state == "stale"}
     assert stale == dict.fromkeys(
         ("train/astra_plus/seed_0", "evaluate/astra_plus/seed_0"),
-        "plus changed in the recipe since: give the recipe another name, or remove this",
+        "plus (steps: 5, now 6) changed in the recipe since: give the recipe another name, or remove this",
     )
     with pytest.raises(RecipeError) as caught:
         run(recipe, root=tmp_path)
     assert str(caught.value) == (
-        f"plus changed in the recipe since {folder} was made: "
+        f"plus (steps: 5, now 6) changed in the recipe since {folder} was made: "
         "give the recipe another name, or remove "
         f"{folder / 'evaluate/astra_plus'} {folder / 'train/astra_plus'}"
     )
@@ -322,10 +322,10 @@ def test_a_recipe_with_data_is_labeled_and_has_nothing_to_collect(recipe: Path, 
     assert asked(folder / "label/seed_0")["data"] == "me/walks"
     assert asked(folder / "pair/seed_0")["dataset"] == str(folder / "label/seed_0")
     recipe.write_text(recipe.read_text().replace('"me/walks"', '"runs"'))
-    with pytest.raises(RecipeError, match="data changed in the recipe since"):
+    with pytest.raises(RecipeError, match=r'data \("me/walks", now ".*runs"\) changed in the recipe since'):
         run(recipe, root=tmp_path, jobs=1, until="pair")
     (tmp_path / "runs/meta").mkdir(parents=True)
     (tmp_path / "runs/meta/info.json").touch()
-    with pytest.raises(RecipeError, match="data changed"):
+    with pytest.raises(RecipeError, match=r'data \("me/walks", now ".*runs"\) changed'):
         run(recipe, root=tmp_path, jobs=1, until="pair")
     assert load_experiment(recipe, tmp_path).recipe.data == str(tmp_path / "runs")

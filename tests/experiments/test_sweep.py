@@ -191,7 +191,7 @@ def test_sizes_may_be_added_below_the_largest(recipe: Path, tmp_path: Path) -> N
     sweep(recipe, methods=["follower"], seeds=[0], percents=[25], root=tmp_path, jobs=1)
     assert [line["percent"] for line in lines(tmp_path / "r")] == ["25", "150"]
     recipe.write_text(recipe.read_text().replace("[25, 150]", "[25, 200]"))
-    with pytest.raises(RecipeError, match=r"^sweep changed in the recipe since .*/collect"):
+    with pytest.raises(RecipeError, match=r"^sweep \(150, now 200\) changed in the recipe since .*/collect"):
         sweep(recipe, root=tmp_path)
 
 

@@ -1,0 +1,65 @@
+"""Which settings of a recipe differ from those that artifacts were made with."""
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+from astra_data.core.config import validated
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.naming import RECORD
+from astra_data.core.wording import first_few, shortened
+from astra_data.experiments.recipe import WHOLE, Recipe
+from astra_data.experiments.staleness import SIMULATOR
+from astra_data.worlds.registry import task_named
+
+_MOST_KEYS = 3
+_MOST_LETTERS = 60
+
+
+def differences(before: Mapping[str, Any], recipe: Recipe) -> dict[str, str]:
+    """Return the tables and keys of `recipe` that differ from those recorded `before`, and how.
+
+    Settings that did not exist then have their defaults, as they took effect.
+    """
+    with suppress(RecipeError):
+        before = validated(before, type(recipe), RECORD).settings
+    before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
+    elsewhere = {"methods", "own_methods", "seeds", "based_on"}
+    changed = {
+        key: _told(before.get(key), now[key])
+        for key in sorted(now.keys() - elsewhere)
+        if before.get(key) != now[key]
+    }
+    if "task" in changed and share_target(str(before.get("task")), recipe.task):
+        changed[SIMULATOR] = changed.pop("task")
+    if "train" in changed:
+        changed.pop("plus", None)  # which takes over "train"
+    return changed
+
+
+def share_target(task: str, other: str) -> bool:
+    """Return whether two tasks are known and have the same target."""
+    try:
+        return task_named(task).shares_target(task_named(other))
+    except BadInputError:
+        return False
+
+
+def _told(before: object, now: object) -> str:
+    """Say what was and is, for tables key by key."""
+    if not isinstance(before, dict) or not isinstance(now, dict):
+        return f"{_shown(before)}, now {_shown(now)}"
+    keys = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+    told = [f"{key}: {_shown(before.get(key))}, now {_shown(now.get(key))}" for key in keys]
+    return first_few(told, _MOST_KEYS)
+
+
+def _shown(value: object) -> str:
+    return "none" if value is None else shortened(json.dumps(value, default=str), _MOST_LETTERS)
+
+
+def _with_largest_size(settings: dict[str, Any]) -> dict[str, Any]:
+    """Replace `sweep` by the largest size, the only part of it that artifacts depend on."""
+    percents = settings.get("sweep", {}).get("percent", ())
+    return settings | {"sweep": max(percents, default=WHOLE)}
