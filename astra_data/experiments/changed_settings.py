@@ -27,7 +27,7 @@ def differences(before: Mapping[str, Any], recipe: Recipe) -> dict[str, str]:
     before, now = _with_largest_size(dict(before)), _with_largest_size(recipe.settings)
     elsewhere = {"methods", "own_methods", "seeds", "based_on"}
     changed = {
-        key: _told(before.get(key), now[key])
+        key: _change(before.get(key), now[key])
         for key in sorted(now.keys() - elsewhere)
         if before.get(key) != now[key]
     }
@@ -46,17 +46,21 @@ def share_target(task: str, other: str) -> bool:
         return False
 
 
-def _told(before: object, now: object) -> str:
+def _change(before: object, now: object) -> str:
     """Say what was and is, for tables key by key."""
     if not isinstance(before, dict) or not isinstance(now, dict):
         return f"{_shown(before)}, now {_shown(now)}"
     keys = [key for key in {**before, **now} if before.get(key) != now.get(key)]
-    told = [f"{key}: {_shown(before.get(key))}, now {_shown(now.get(key))}" for key in keys]
-    return first_few(told, _MOST_KEYS)
+    changes = [f"{key}: {_shown(before.get(key))}, now {_shown(now.get(key))}" for key in keys]
+    return first_few(changes, _MOST_KEYS)
 
 
 def _shown(value: object) -> str:
-    return "none" if value is None else shortened(json.dumps(value, default=str), _MOST_LETTERS)
+    """Return a value as text, lists shortened, but no names: they may be paths."""
+    if value is None:
+        return "none"
+    text = json.dumps(value, default=str)
+    return text if isinstance(value, str) else shortened(text, _MOST_LETTERS)
 
 
 def _with_largest_size(settings: dict[str, Any]) -> dict[str, Any]:

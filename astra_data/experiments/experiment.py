@@ -129,8 +129,8 @@ class Experiment:
             now = getattr(self.recipe, key)
             if _is_same_place(recorded.get(key), now):
                 recorded[key] = now
-        told = differences(recorded, self.recipe)
-        changed = told.keys()
+        changes = differences(recorded, self.recipe)
+        changed = changes.keys()
         code = changed_code(self.recipe, self.folder)
         whole = stale_stages((changed - ROWS_TABLES) | ({"task"} & code.keys()))
         own = STAGES.keys() - self.borrowed - ALWAYS_NEW
@@ -141,7 +141,7 @@ class Experiment:
                 folders += self._rows_of(table, stage)
         rows = [place for stage in sorted(own - whole) for place in sorted((self.folder / stage).iterdir())]
         folders += [row for row in rows if base_method(row.name) in code]
-        tables = " and ".join(f"{table} ({how})" for table, how in sorted(told.items()))
+        tables = " and ".join(f"{table} ({how})" for table, how in sorted(changes.items()))
         texts = [f"{tables} changed in the recipe"] if tables else []
         texts += [f"{what} changed" for what in dict.fromkeys(code.values())]
         return " and ".join(texts), [

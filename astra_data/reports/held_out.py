@@ -115,7 +115,7 @@ def worse(title: str, sizes: Mapping[int | None, GapMeans]) -> list[str]:
             if (ours := gap.at(band, horizon)[0]) > (its := gap.at(gap.raw[name], horizon)[0])
         ]
         if found:
-            lines.append(f"{title}, `{name}`: {', '.join(found)}")
+            lines.append(f"`{name}`, {title}: {', '.join(found)}")
     return lines
 
 

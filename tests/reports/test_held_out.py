@@ -83,7 +83,7 @@ def test_a_correction_that_makes_the_simulator_worse_is_told(tmp_path: Path) -> 
     write_held_out("r", tmp_path, ("nas",), (0,), (50, 100), timestep_s=0.05)
     # By the most data: there it is 0.2 after a step, as half of what it is without, and 4 without after ten.
     lines = page.read_text().splitlines()
-    assert told in page.read_text() and "- NAS, `x`: 10 steps ahead (4.5, without 4)" in lines
+    assert told in page.read_text() and "- `x`, NAS: 10 steps ahead (4.5, without 4)" in lines
 
 
 @pytest.mark.parametrize(("still", "is_astray"), [(1.0, True), (2.0, True), (2.1, False)])
