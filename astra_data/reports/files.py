@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from astra_data.core.config import faults_of
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.wording import first_few
 from astra_data.reports.schema import Results
 from astra_data.reports.sizes import SizesResults, by_size
 
@@ -55,24 +56,28 @@ def check_none_lost(found: Found, folder: Path) -> None:
     path = folder / f"{found.recipe}.json"
     if not path.exists():
         return
-    kept = {
+    kept = _points(found)
+    lost = [
+        f"{name} of seed {seed}"
+        for percent, name, seed in _points(read_published(path))
+        if (percent, name, seed) not in kept
+    ]
+    if lost:
+        raise BadInputError(
+            f"{path}: expected all of its rows and seeds in the results that replace it, got none for "
+            f"{first_few([*dict.fromkeys(lost)], 4)}: use --add to keep them, or delete the file to publish "
+            "without them"
+        )
+
+
+def _points(found: Found) -> list[tuple[int | None, str, int]]:
+    """Return the size of the dataset, the row and the seed of each result."""
+    return [
         (percent, name, seed)
         for percent, results in by_size(found).items()
         for name, row in results.methods.items()
         for seed in row.seeds
-    }
-    lost = {
-        f"{name} of seed {seed}": None
-        for percent, results in by_size(read_published(path)).items()
-        for name, row in results.methods.items()
-        for seed in row.seeds
-        if (percent, name, seed) not in kept
-    }
-    if lost:
-        raise BadInputError(
-            f"{path}: expected all of its rows and seeds in the results that replace it, got none for "
-            f"{', '.join(lost)}: use --add to keep them, or delete the file to publish without them"
-        )
+    ]
 
 
 def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:
