@@ -157,10 +157,11 @@ def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str
         of.title for key, of in results.methods.items() if of.role != "ceiling" and key not in worth
     ]:
         yield f"Not judged, so not compared: {', '.join(unjudged)}."
-    own = row.simulated_success if results.headline == SUCCESS else None
-    if own and (reached := own[row.seeds.index(chosen.seed)] if chosen else fmean(own)) < _MOSTLY:
+    own = zip(row.seeds, row.simulated_success or (), strict=False) if results.headline == SUCCESS else ()
+    reached = [success for seed, success in own if not chosen or seed == chosen.seed]
+    if reached and fmean(reached) < _MOSTLY:
         yield (
-            f"In the simulator of its training, it succeeds in {100 * reached:.0f}{_PERCENT} of the "
+            f"In the simulator of its training, it succeeds in {100 * fmean(reached):.0f}{_PERCENT} of the "
             "episodes: it did not learn to do the task there."
         )
     failed = row.summary["failed"].mean
@@ -250,9 +251,8 @@ def _trained(results: Results, percent: int | None) -> str:
 
 
 def _with_interval(share: float, low: float | None, high: float | None) -> str:
-    return f"{share:.2f} (" + (
-        f"{_SURE} interval {low:.2f} to {high:.2f})" if low is not None else "interval withheld)"
-    )
+    ends = "interval withheld" if low is None else f"{_SURE} interval {low:.2f} to {high:.2f}"
+    return f"{share:.2f} ({ends})"
 
 
 def _seeds(row: MethodResults) -> str:

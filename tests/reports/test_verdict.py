@@ -243,6 +243,18 @@ def test_a_training_that_did_not_learn_its_simulator_is_told(tmp_path: Path, res
     assert "In the simulator of its training" not in remarks(chosen, [1.49 - value for value in own])
 
 
+def test_a_chosen_policy_that_is_not_tested_yet_is_deployed_all_the_same(tmp_path: Path) -> None:
+    found = made(tmp_path, select=True)
+    assert found.choice
+    best = found.choice.candidates[0]
+    row = found.methods[best.row]
+    others = [seed for seed in row.seeds if seed != best.seed]
+    tested = row.model_copy(update={"seeds": others, "simulated_success": [0.0] * len(others)})
+    verdict = verdict_of(found.model_copy(update={"methods": found.methods | {best.row: tested}}))
+    assert verdict.row == best.row
+    assert "In the simulator of its training" not in " ".join(verdict.remarks)
+
+
 def test_references_alone_are_not_deployed(results: Results) -> None:
     alone = {name: results.methods[name] for name in ("direct_transfer", "follower")}
     verdict = verdict_of(results.model_copy(update={"methods": alone}))
