@@ -19,11 +19,10 @@ import torch
 import typer
 from door import run_tool
 from numpy.typing import NDArray
-from scipy.stats import mannwhitneyu
 from torch import Tensor
 
 from astra_data.core.seeding import derive, generator
-from astra_data.grounding.failures import AHEAD_STEPS
+from astra_data.grounding.failures import AHEAD_STEPS, ranked_above
 from astra_data.training.behaviors import RandomCommands, WallWatch, held_steps
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
@@ -184,8 +183,7 @@ def ceilings(fails: NDArray[np.int64], ahead: NDArray[np.int64]) -> list[float |
         within = ((fails >= first) & (fails <= last)).sum(axis=1)
         odds = (within + 0.5) / (go_on + 0.5)
         before, safe = odds[(ahead >= first) & (ahead <= last)], odds[ahead > FORESEEN_STEPS]
-        pairs = len(before) * len(safe)
-        found.append(float(mannwhitneyu(before, safe).statistic / pairs) if pairs else None)
+        found.append(ranked_above(before, safe))
     return found
 
 

@@ -9,6 +9,7 @@ from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import RECORD
 from astra_data.core.wording import first_few, shortened
+from astra_data.dataset.description import changed_values
 from astra_data.experiments.recipe import WHOLE, Recipe
 from astra_data.experiments.staleness import SIMULATOR
 from astra_data.worlds.registry import task_named
@@ -50,8 +51,7 @@ def _change(before: object, now: object) -> str:
     """Say what was and is, for tables key by key."""
     if not isinstance(before, dict) or not isinstance(now, dict):
         return f"{_shown(before)}, now {_shown(now)}"
-    keys = [key for key in {**before, **now} if before.get(key) != now.get(key)]
-    changes = [f"{key}: {_shown(before.get(key))}, now {_shown(now.get(key))}" for key in keys]
+    changes = [f"{key}: {_shown(old)}, now {_shown(new)}" for key, old, new in changed_values(before, now)]
     return first_few(changes, _MOST_KEYS)
 
 

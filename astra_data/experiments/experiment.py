@@ -23,7 +23,7 @@ from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.recipe_file import read_tables, recorded_settings
 from astra_data.experiments.staleness import ROWS_TABLES, reads, stale_stages
 from astra_data.reports.files import read_published
-from astra_data.reports.sizes import by_size
+from astra_data.reports.sizes import by_size, points_of
 from astra_data.stages.registry import STAGES
 
 ALWAYS_NEW = {"report"}
@@ -165,8 +165,8 @@ class Experiment:
             BadInputError: there are no such results.
             RecipeError: they were made with other settings.
         """
-        points = set()
-        for percent, found in by_size(read_published(self.published_in)).items():
+        published = read_published(self.published_in)
+        for found in by_size(published).values():
             changed = differences(found.settings, self.recipe).keys() - ALWAYS_NEW - {"select"}
             tested = {*found.methods, *filter(None, [reference_of(self.recipe.methods)])}
             changed -= {table for table in ROWS_TABLES if not any(reads(row, table) for row in tested)}
@@ -175,9 +175,7 @@ class Experiment:
                     f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "
                     f"{self.results} were made: run all rows again and publish the new results instead"
                 )
-            rows = found.methods.items()
-            points |= {RunPoint(method, seed, percent) for method, row in rows for seed in row.seeds}
-        return points
+        return {RunPoint(method, seed, percent) for percent, method, seed in points_of(published)}
 
     def _rows_of(self, table: str, stage: str) -> list[Path]:
         """Return the folders in `stage` of the rows that depend on `table`; its own where all do."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -216,8 +217,6 @@ def foresight(
         there is no such error. "reliability": predicted and observed rate, and number of steps, by predicted
         probability. All but the first None without failures.
     """
-    from scipy.stats import mannwhitneyu  # noqa: PLC0415 - half a second to import
-
     windows = episodes.windows
     mask = windows.mask.bool()
     fails = windows.fails_soon.bool() & mask
@@ -230,8 +229,7 @@ def foresight(
     auc: dict[str, float | None] = {}
     for first, last in ahead:
         before = probability[mask & (left >= first) & (left <= last)].numpy(force=True)
-        pairs = len(before) * len(safe)
-        auc[f"{first}-{last}"] = float(mannwhitneyu(before, safe).statistic / pairs) if pairs else None
+        auc[f"{first}-{last}"] = ranked_above(before, safe)
     predicted, happened = probability[mask].numpy(force=True), fails[mask].numpy(force=True)
     usual = np.square(happened - happened.mean()).mean()
     bins = np.digitize(predicted, BINS[1:-1])
@@ -248,3 +246,11 @@ def foresight(
             for one in np.unique(bins)
         ],
     }
+
+
+def ranked_above(before: NDArray[Any], safe: NDArray[Any]) -> float | None:
+    """Return the AUC: how probably one of `before` (N,) is above one of `safe` (M,); None without either."""
+    from scipy.stats import mannwhitneyu  # noqa: PLC0415 - half a second to import
+
+    pairs = len(before) * len(safe)
+    return float(mannwhitneyu(before, safe).statistic / pairs) if pairs else None

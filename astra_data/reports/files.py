@@ -12,7 +12,7 @@ from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.wording import first_few
 from astra_data.reports.schema import Results
-from astra_data.reports.sizes import SizesResults, by_size
+from astra_data.reports.sizes import SizesResults, points_of
 
 Found = Results | SizesResults
 Page = Callable[[Mapping[str, str]], str]
@@ -56,10 +56,10 @@ def check_none_lost(found: Found, folder: Path) -> None:
     path = folder / f"{found.recipe}.json"
     if not path.exists():
         return
-    kept = _points(found)
+    kept = points_of(found)
     lost = [
         f"{name} of seed {seed}"
-        for percent, name, seed in _points(read_published(path))
+        for percent, name, seed in points_of(read_published(path))
         if (percent, name, seed) not in kept
     ]
     if lost:
@@ -68,16 +68,6 @@ def check_none_lost(found: Found, folder: Path) -> None:
             f"{first_few([*dict.fromkeys(lost)], 4)}: use --add to keep them, or delete the file to publish "
             "without them"
         )
-
-
-def _points(found: Found) -> list[tuple[int | None, str, int]]:
-    """Return the size of the dataset, the row and the seed of each result."""
-    return [
-        (percent, name, seed)
-        for percent, results in by_size(found).items()
-        for name, row in results.methods.items()
-        for seed in row.seeds
-    ]
 
 
 def publish_results(found: Found, page: Page, images: dict[str, bytes], folder: Path) -> None:

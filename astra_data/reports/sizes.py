@@ -56,6 +56,16 @@ def by_size(found: Results | SizesResults) -> dict[int | None, Results]:
     return {size.percent: size.results for size in found.sizes}
 
 
+def points_of(found: Results | SizesResults) -> list[tuple[int | None, str, int]]:
+    """Return the size of the dataset, the row and the seed of each result."""
+    return [
+        (percent, name, seed)
+        for percent, results in by_size(found).items()
+        for name, row in results.methods.items()
+        for seed in row.seeds
+    ]
+
+
 def render_sizes(found: SizesResults, figures: Mapping[str, str]) -> str:
     """Return the page.
 

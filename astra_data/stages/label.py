@@ -27,7 +27,7 @@ from astra_data.dataset.columns import (
     Array,
     Episode,
 )
-from astra_data.dataset.endings import outcome_of
+from astra_data.dataset.endings import is_terminated, outcome_of
 from astra_data.dataset.expected_columns import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
@@ -135,7 +135,7 @@ def _all_failures(source: Dataset) -> str:
     """Say that every episode counts as a failure, where each terminates and no success is recorded."""
     if TERMINATED not in source.features or SUCCESS in source.features:
         return ""
-    if not all(episode.columns[TERMINATED][-1] for episode in source.episodes([TERMINATED])):
+    if not all(is_terminated(episode.columns) for episode in source.episodes([TERMINATED])):
         return ""
     return (
         f"{source.reference}: each of the {len(source)} episodes ends as {TERMINATED} and counts as a "

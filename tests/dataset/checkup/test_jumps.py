@@ -8,6 +8,7 @@ from toy_logs import Columns, write_logs
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.checkup import jumps as module
 from astra_data.dataset.checkup.checkup import check_up
+from astra_data.dataset.checkup.finding import Finding
 from astra_data.dataset.checkup.jumps import Jumps, jumps
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array, Column, Episode
 
@@ -138,15 +139,19 @@ def test_jumps_are_found_in_the_episodes_that_have_them(tmp_path: Path) -> None:
             columns[STATE][at:, 1] += far
             columns[NEXT_STATE][at - 1 :, 1] += far
 
-    dataset = write_logs(tmp_path / "logs", carried)
+    finding = only_finding(write_logs(tmp_path / "logs", carried))
+    assert finding.episodes == (3, 8)
+    assert finding.what.startswith("3 single-step jumps in y of observation.state; the largest is 1.98 in y")
+    assert 'column = "observation.state", values = [1], above = 0.6' in finding.advice
+
+
+def only_finding(dataset: Dataset) -> Finding:
     (spec,) = dataset.specs([STATE])
     found = Jumps(spec, int(dataset.lengths.sum()))
     for episode in dataset.episodes([STATE, NEXT_STATE]):
         found.add(episode)
     (finding,) = found.findings(dataset, "walks")
-    assert finding.episodes == (3, 8)
-    assert finding.what.startswith("3 single-step jumps in y of observation.state; the largest is 1.98 in y")
-    assert 'column = "observation.state", values = [1], above = 0.6' in finding.advice
+    return finding
 
 
 def test_the_threshold_it_names_is_below_the_largest_jump(tmp_path: Path) -> None:
@@ -155,12 +160,7 @@ def test_the_threshold_it_names_is_below_the_largest_jump(tmp_path: Path) -> Non
             columns[STATE][at:, 1] += 6.23
             columns[NEXT_STATE][at - 1 :, 1] += 6.23
 
-    dataset = write_logs(tmp_path / "logs", carried)
-    (spec,) = dataset.specs([STATE])
-    found = Jumps(spec, int(dataset.lengths.sum()))
-    for episode in dataset.episodes([STATE, NEXT_STATE]):
-        found.add(episode)
-    (finding,) = found.findings(dataset, "walks")
+    finding = only_finding(write_logs(tmp_path / "logs", carried))
     above, largest = (
         re.search(f"{before} ([0-9.]+)", text)
         for before, text in (("above =", finding.advice), ("the largest is", finding.what))
