@@ -109,6 +109,12 @@ def machine(origin: Origin) -> str:
     return f"{made_on.cpu}, {made_on.cores} cores, {made_on.memory_gib:g} GiB of memory{gpu}"
 
 
+def machines(origins: Iterable[Origin]) -> str:
+    """Return the text on each machine once, with its GPU where some origin used it."""
+    texts = dict.fromkeys(map(machine, origins))
+    return " and ".join(text for text in texts if not any(other.startswith(f"{text}, ") for other in texts))
+
+
 def _versions(origin: Origin) -> str:
     known = (f"{name} {version}" for name, version in origin.packages.items() if version is not None)
     return ", ".join(known) or "not recorded"

@@ -8,7 +8,7 @@ from astra_data.reports.choice_page import choice_values
 from astra_data.reports.cost_and_origin import (
     COSTED,
     dataset_lines,
-    machine,
+    machines,
     provenance,
     row_costs,
     stage_costs,
@@ -68,7 +68,7 @@ def render(results: Results, figures: Mapping[str, str]) -> str:
         headline=results.headline.measure,
         warning=warning(results),
         where=where(results),
-        machines=" and ".join(dict.fromkeys(map(machine, stages))),
+        machines=machines(stages),
         scores=score_table(results),
         has_plus=any(map(is_plus, rows)),
         hand_written=hand_written(results),

@@ -1,6 +1,13 @@
 from fake_runs import bare_results
 
-from astra_data.reports.cost_and_origin import dataset_lines, machine, provenance, row_costs, stage_costs
+from astra_data.reports.cost_and_origin import (
+    dataset_lines,
+    machine,
+    machines,
+    provenance,
+    row_costs,
+    stage_costs,
+)
 from astra_data.reports.schema import Cost, DatasetOrigin, DatasetUse, Machine, Origin
 
 MACHINE = Machine(cpu="Fast", cores=8, memory_gib=15.5)
@@ -37,6 +44,13 @@ def test_origins_that_differ_are_named_with_their_stages_once() -> None:
     assert machine(origins[1]) == "not recorded"
     with_gpu = MACHINE.model_copy(update={"gpu": "H200"})
     assert machine(origin(machine=with_gpu)).endswith("15.5 GiB of memory, H200")
+
+
+def test_a_machine_is_named_once_with_the_gpu_that_some_stages_used() -> None:
+    with_gpu = origin(machine=MACHINE.model_copy(update={"gpu": "H200"}))
+    other = origin(machine=MACHINE.model_copy(update={"cpu": "Faster"}))
+    both = "Fast, 8 cores, 15.5 GiB of memory, H200 and Faster, 8 cores, 15.5 GiB of memory"
+    assert machines([with_gpu, origin(), other, origin()]) == machines([origin(), with_gpu, other]) == both
 
 
 def test_each_stage_has_its_times_and_the_range_of_its_speeds() -> None:
