@@ -1,7 +1,8 @@
 """The gap between models of a robot's walk and its recordings: recipe and logs → results and page."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -85,9 +86,7 @@ def measure_gap(
         )
     label = "_from_".join(place_name(place) for place in (data, train) if place is not None)
     folder = home / label
-    # The networks are so small that one thread is fastest.
-    torch.set_num_threads(1)
-    with shown(f"{name}/{folder.name}") as progress:
+    with _one_thread(), shown(f"{name}/{folder.name}") as progress:
         found = run_study(recipe, tested, learned, folder, progress)
     command = f"uv run astra-data gap {recipe_path} --data {data.name}"
     command += f" --train {train.name}" if train else ""
@@ -98,3 +97,14 @@ def measure_gap(
         write_file(place / f"{stem}.png", image)
         write_file(place / f"{stem}.md", render(found, name, command, f"{stem}.png"))
     return folder / "results.md"
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch use one thread, which is fastest for networks as small as these."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,8 +1,10 @@
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 from toy_walks import write_archive
 from typer.testing import CliRunner
 
@@ -70,8 +72,13 @@ def test_one_folder_is_split_and_each_recording_predicted_from_the_other(
     assert [case["sizes"] for case in cases] == [case["sizes"] for case in found["cases"]]
 
 
-def test_another_recording_is_predicted_from_the_given_ones(recipe: Path, tmp_path: Path) -> None:
+def test_another_recording_is_predicted_from_the_given_ones(
+    recipe: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+    torch.set_num_threads(2)
     page = measure_gap(recipe, tmp_path / "c.tar.gz", tmp_path / "logs", seeds=[1], root=tmp_path / "runs")
+    assert torch.get_num_threads() == 2
     assert page.parent.name == "c_from_logs"
     (case,) = json.loads(page.with_suffix(".json").read_text())["cases"]
     assert case["title"] == "Learned from a and b, tested on c"
