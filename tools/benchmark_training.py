@@ -7,7 +7,8 @@
 Stable-Baselines3 and d3rlpy run in processes with environments of their own, which `uv` makes. The
 candidates take turns over the same stretch of time, each with one torch thread. Rates are told by the clock
 and by the processors' time, of all processes of a candidate together: the latter's ratios hold also on a
-machine that does other work.
+machine that does other work. The bound is what `bare_work` does: the simulator and the passes through the
+networks, which candidates with the same updates share.
 """
 
 import json
@@ -23,6 +24,7 @@ import gymnasium_robotics
 import numpy as np
 import torch
 import typer
+from bare_work import bare_iql, bare_ppo, bare_sac
 from single_file_iql import SingleFileIql
 from step_by_step import step_by_step
 from timing import OURS, Candidates, Rate, Stretch, complain, measure, peer, print_rates
@@ -55,6 +57,7 @@ WALKER = TASKS["humanoid-walker2d"]
 SHAPE = GroundingShape(state_size=4, action_size=2, goal_size=2)
 ASTRA = HistoryFit(latent=True, reward=True)
 PEERS = Path(__file__).parent / "peers"
+BOUND = "bound: simulator and networks alone"
 GYMNASIUM_ID = "AntMaze_UMaze-v5"
 ANTS = 128
 TORCH = torch.__version__.partition("+")[0]
@@ -108,6 +111,7 @@ def grounded_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, C
         "PPO in the grounded simulator, steps",
         {
             OURS: ppo_stretch(grounding, memory_size=0),
+            BOUND: bare_ppo(*ppo_parts(grounding, memory_size=0)),
             "Stable-Baselines3, one vector environment": stable_baselines(stack, "ppo", "vector"),
             "Stable-Baselines3, DummyVecEnv of 16": stable_baselines(stack, "ppo", "single"),
         },
@@ -120,6 +124,7 @@ def recurrent_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, 
         "PPO with a memory in the raw simulator, steps",
         {
             OURS: ppo_stretch(NO_GROUNDING, memory_size=SETTINGS.train.memory_size),
+            BOUND: bare_ppo(*ppo_parts(NO_GROUNDING, memory_size=SETTINGS.train.memory_size)),
             "sb3-contrib, LSTM, one vector environment": stable_baselines(stack, "recurrent_ppo", "vector"),
             "sb3-contrib, LSTM, DummyVecEnv of 16": stable_baselines(stack, "recurrent_ppo", "single"),
         },
@@ -128,6 +133,18 @@ def recurrent_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, 
 
 def ppo_stretch(grounding: Grounding, memory_size: int) -> Stretch:
     """Make one iteration of the recipe's training."""
+    env, policy, config = ppo_parts(grounding, memory_size)
+    ppo = Ppo(env, policy, config, horizon=TASK.objective.horizon, seed=0)
+
+    def stretch() -> int:
+        ppo.iterate()
+        return config.num_envs * config.rollout_steps
+
+    return stretch
+
+
+def ppo_parts(grounding: Grounding, memory_size: int) -> tuple[SimulatorEnv, ActorCritic, PpoTrainConfig]:
+    """Return what the recipe's training is made of."""
     config = SETTINGS.train
     assert isinstance(config, PpoTrainConfig)
     env = SimulatorEnv(TASK.objective, grounding.simulator(TASK, config.num_envs))
@@ -137,19 +154,13 @@ def ppo_stretch(grounding: Grounding, memory_size: int) -> Stretch:
         memory_size=memory_size,
         hidden_sizes=config.hidden_sizes,
     )
-    ppo = Ppo(env, ActorCritic(shape), config, horizon=TASK.objective.horizon, seed=0)
-
-    def stretch() -> int:
-        ppo.iterate()
-        return config.num_envs * config.rollout_steps
-
-    return stretch
+    return env, ActorCritic(shape), config
 
 
 def sac(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Train an actor without memory in an abstract simulator of the humanoid."""
     count, updates, steps = 32, 8, 8 if quick else 64
-    env = SimulatorEnv(WALKER.objective, NO_GROUNDING.simulator(WALKER, count))
+    env, bare = (SimulatorEnv(WALKER.objective, NO_GROUNDING.simulator(WALKER, count)) for _ in range(2))
     actor = SoftActor(PolicyShape(env.observation_size, env.action_size, hidden_sizes=(256, 256)))
     config = SacConfig(rollout_steps=steps, updates_per_step=updates, batch_size=256)
     learner = Sac(env, actor, config, horizon=WALKER.objective.horizon, seed=0)
@@ -162,7 +173,11 @@ def sac(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]
     command = ["--with", "stable-baselines3", "python", str(PEERS / "stable_baselines_sac.py"), *sizes]
     return (
         f"SAC in the walker, updates of 256 steps, {updates} for every {count} steps",
-        {OURS: ours, "Stable-Baselines3, one vector environment": peer(stack, *command)},
+        {
+            OURS: ours,
+            BOUND: bare_sac(bare, 256, updates, steps),
+            "Stable-Baselines3, one vector environment": peer(stack, *command),
+        },
     )
 
 
@@ -219,6 +234,7 @@ def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]
         "implicit Q-learning, updates of critics and policy",
         {
             OURS: ours,
+            BOUND: bare_iql(observation_size, action_size, 256, updates),
             "d3rlpy": peer(stack, *command),
             "plain torch in one file": lambda: single_file.learn(updates),
         },

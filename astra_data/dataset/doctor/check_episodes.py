@@ -192,4 +192,6 @@ def is_close(stored: object, expected: object, tolerance: float) -> bool:
     # Most are equal to the bit, and `allclose` takes five times as long.
     if np.array_equal(found, values):
         return True
-    return bool(np.allclose(found, values, tolerance, tolerance * np.abs(values).max()))
+    return bool(
+        np.isfinite(values).all() and np.allclose(found, values, tolerance, tolerance * np.abs(values).max())
+    )

@@ -98,6 +98,8 @@ def test_rows_and_episodes_without_each_other_are_found(root: Path, tmp_path: Pa
         (["x"], [1.0], EXACT, False),
         ([10**400], [1.0], EXACT, False),
         ([float("nan")], [1.0], EXACT, False),
+        ([1.0, 3.0], [1.0, float("nan")], EXACT, False),
+        ([5.0, float("inf")], [1.0, float("inf")], EXACT, False),
     ],
 )
 def test_statistics_are_close(stored: object, expected: list[float], tolerance: float, close: bool) -> None:
