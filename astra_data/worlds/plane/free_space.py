@@ -60,24 +60,26 @@ class FreeSpace:
         Returns:
             the points' new positions (B, 2), and which points were stopped (B,).
         """
-        here = self._cells(start)
-        there = self._cells(end)
-        depth = self._depth[here[:, 1], here[:, 0]]
-        depth_x = self._depth[here[:, 1], there[:, 0]]
+        here, there = self._cells(torch.stack([start, end]))
+        (from_x, from_y), (to_x, to_y) = here.unbind(-1), there.unbind(-1)
+        face_x, face_y = self._faces(here, there).unbind(-1)
+        end_x, end_y = end.unbind(-1)
+        depth, depth_x = self._depth[from_y, from_x], self._depth[from_y, to_x]
         stop_x = depth_x > depth
-        x = torch.where(stop_x, self._face(start[:, 0], here[:, 0], there[:, 0], 0), end[:, 0])
-        column = torch.where(stop_x, here[:, 0], there[:, 0])
-        stop_y = self._depth[there[:, 1], column] > torch.where(stop_x, depth, depth_x)
-        y = torch.where(stop_y, self._face(start[:, 1], here[:, 1], there[:, 1], 1), end[:, 1])
+        x = torch.where(stop_x, face_x, end_x)
+        column = torch.where(stop_x, from_x, to_x)
+        stop_y = self._depth[to_y, column] > torch.where(stop_x, depth, depth_x)
+        y = torch.where(stop_y, face_y, end_y)
         return torch.stack([x, y], dim=-1), stop_x | stop_y
 
     def _cells(self, position: Tensor) -> Tensor:
         cells = ((position + self.half_extent) / self.cell_m).floor().long()
         return torch.minimum(cells.clamp_min(0), self._limits)
 
-    def _face(self, start: Tensor, here: Tensor, there: Tensor, axis: int) -> Tensor:
+    def _faces(self, here: Tensor, there: Tensor) -> Tensor:
+        """Return where points that move between the cells (B, 2) are stopped on each axis, (B, 2) in m."""
         onward = there > here
-        face = (here + onward) * self.cell_m - self.half_extent[axis]
+        face = (here + onward) * self.cell_m - self.half_extent
         return torch.where(onward, face - _EDGE_M, face + _EDGE_M)
 
 
@@ -125,14 +127,16 @@ class GoalDistance:
 
         It is bilinear in the position.
         """
-        field = (goal[:, None] - self.lattice).square().sum(-1).argmin(dim=1)
+        # Axis by axis, since a sum over a last dimension of two is slow.
+        away_x, away_y = goal[:, :1] - self.lattice[:, 0], goal[:, 1:] - self.lattice[:, 1]
+        field = (away_x.square() + away_y.square()).argmin(dim=1)
         _, height, width = self.fields.shape
         # Values are those at cell centers.
-        grid = (position + self.half_extent) / self.cell_m - 0.5
-        x, y = grid.unbind(-1)
-        grid = torch.stack([x.clamp(0, width - 1.001), y.clamp(0, height - 1.001)], dim=-1)
-        corner = grid.floor()
-        (fx, fy), (column, row) = (grid - corner).unbind(-1), corner.long().unbind(-1)
-        lower = self.fields[field, row, column] * (1 - fx) + self.fields[field, row, column + 1] * fx
-        upper = self.fields[field, row + 1, column] * (1 - fx) + self.fields[field, row + 1, column + 1] * fx
+        x, y = ((position + self.half_extent) / self.cell_m - 0.5).unbind(-1)
+        x, y = x.clamp(0, width - 1.001), y.clamp(0, height - 1.001)
+        column, row = x.floor(), y.floor()
+        fx, fy = x - column, y - row
+        at, values = (field * height + row.long()) * width + column.long(), self.fields.flatten()
+        lower = values[at] * (1 - fx) + values[at + 1] * fx
+        upper = values[at + width] * (1 - fx) + values[at + width + 1] * fx
         return lower * (1 - fy) + upper * fy
