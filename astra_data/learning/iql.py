@@ -151,9 +151,13 @@ class Iql:
         torch.manual_seed(derive(seed, "critics"))
         observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
         self._critics = _Critics(observed, acted, config.critic_sizes).to(experience.observation.device)
-        learned = [*self._critics.value.parameters(), *self._critics.action_values.parameters()]
+        slow, fast = self._critics.slow_action_values, self._critics.action_values
+        # Listed once, since finding a network's parameters takes as long as updating them.
+        self._slow_and_fast = [*slow.parameters()], [*fast.parameters()]
+        self._policy_parameters = [*policy.parameters()]
+        learned = [*self._critics.value.parameters(), *fast.parameters()]
         self._critic_optimizer = torch.optim.Adam(learned, lr=config.critic_learning_rate, fused=True)
-        self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, fused=True)
+        self._optimizer = torch.optim.Adam(self._policy_parameters, lr=config.learning_rate, fused=True)
         self._weights: Tensor | None = None
 
     @property
@@ -195,8 +199,7 @@ class Iql:
         (value + action_value).backward()
         self._critic_optimizer.step()
         with torch.no_grad():
-            slow, fast = critics.slow_action_values.parameters(), critics.action_values.parameters()
-            torch._foreach_lerp_([*slow], [*fast], config.target_rate)
+            torch._foreach_lerp_(*self._slow_and_fast, config.target_rate)
         return {"value": float(value.detach()), "action_value": float(action_value.detach())}
 
     def _learn_policy(self, update: int) -> dict[str, float]:
@@ -206,17 +209,18 @@ class Iql:
             group["lr"] = config.learning_rate * (1 + math.cos(math.pi * update / config.policy_updates)) / 2
         if self._weights is None:
             self._weights = self._weigh()
-        steps, learned = self._experience.draw(config.batch_windows, config.window, config.burn_in)
+        steps, is_learned = self._experience.draw(config.batch_windows, config.window, config.burn_in)
         seen = self._experience.observation[..., : policy.shape.observation_size][steps]
-        start = torch.zeros(learned.shape, device=learned.device)
+        start = torch.zeros(is_learned.shape, device=is_learned.device)
         features = policy.remember_sequence(
             seen, self._experience.previous_action[steps], policy.initial_hidden(len(seen)), start
         )
+        learned = is_learned.nonzero(as_tuple=True)
         likelihood = policy.log_prob(features[learned], self._experience.action[steps][learned])
         loss = -(self._weights[steps][learned] * likelihood).mean()
         self._optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
+        nn.utils.clip_grad_norm_(self._policy_parameters, config.gradient_norm)
         self._optimizer.step()
         return {"policy": float(loss.detach())}
 
