@@ -4,7 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rerun.experimental import RrdReader
+
+try:
+    from rerun.chunk import RrdReader
+except ModuleNotFoundError:  # older ones
+    from rerun.experimental import RrdReader
 
 
 def read(path: Path) -> dict[str, dict[str, Any]]:
