@@ -1,9 +1,11 @@
 """Compare a dataset with what lerobot's own loader reads; the only import of lerobot in this room."""
 
 import json
+import logging
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,18 @@ OFFSETS = np.array([-2, -1, 0, 1])
 """Steps of a window, relative to its row."""
 
 
+@contextmanager
+def _unchanged_logging() -> Iterator[None]:
+    """Remove the handlers that the block adds to the root logger, which put a prefix before our messages."""
+    root = logging.getLogger()
+    before = list(root.handlers)
+    try:
+        yield
+    finally:
+        root.handlers[:] = before
+
+
+@_unchanged_logging()
 def compare_with_lerobot(root: Path, report: Report) -> None:
     """Open the dataset with `LeRobotDataset` and compare windows of observations and actions with the files.
 
