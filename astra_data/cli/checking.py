@@ -47,18 +47,13 @@ def validate(
 
 
 def repair(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FOLDER", help="The folder of a LeRobot dataset; it is not changed.", show_default=False
-        ),
-    ],
+    dataset: DatasetName,
     out: Annotated[Path, typer.Option(help="Folder of the new dataset.", show_default=False)],
     like: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="DATASET",
-            help="The dataset that LeRobot's tools made FOLDER from. Its origin and its episodes' metadata "
+            metavar="ORIGINAL",
+            help="The dataset that LeRobot's tools made DATASET from. Its origin and its episodes' metadata "
             "are copied to episodes with the same uid and values. After a merge, give each dataset merged.",
             show_default=False,
         ),
@@ -69,10 +64,10 @@ def repair(
 ) -> None:
     """Recover the intact episodes of a damaged dataset, of astra-data or LeRobot, into a new one."""
     from astra_data.dataset.doctor.repair import repair as save
-    from astra_data.dataset.versions import open_dataset
+    from astra_data.dataset.versions import locate, open_dataset
 
-    sources = [open_dataset(dataset) for dataset in like or ()]
-    repaired = save(folder, out=out, like=sources, new_uids=new_uids)
+    sources = [open_dataset(original) for original in like or ()]
+    repaired = save(locate(dataset), out=out, like=sources, new_uids=new_uids)
     for note in repaired.notes:
         typer.echo(f"note: {note}")
     typer.echo(f"finished: {out} ({repaired.episodes} episodes, {repaired.frames} steps)")

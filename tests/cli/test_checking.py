@@ -36,6 +36,19 @@ def test_validate_and_repair(
     assert run(monkeypatch, "validate", tmp_path / "saved") == 0
 
 
+def test_repair_takes_a_name_as_other_commands_do(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_fake(home / "walks" / "data-1.0.0").root
+    (root / "meta/stats.json").unlink()
+    for number, name in enumerate(("walks", "walks@data-1.0.0", str(root))):
+        saved = tmp_path / str(number)
+        assert run(monkeypatch, "repair", name, "--out", saved) == 0
+        assert capsys.readouterr().out.endswith(f"finished: {saved} (5 episodes, 55 steps)\n")
+    assert run(monkeypatch, "repair", "walk", "--out", tmp_path / "saved") == 1
+    assert "no dataset 'walk'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("content", "fault"),
     [
