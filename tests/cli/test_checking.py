@@ -49,6 +49,18 @@ def test_repair_takes_a_name_as_other_commands_do(
     assert "no dataset 'walk'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["validate", "repair"])
+def test_a_folder_of_versions_is_told_with_their_names(
+    command: str, home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for version in ("data-1.0.0", "data-1.1.0"):
+        write_fake(home / "walks" / version)
+    out = ("--out", home / "saved") if command == "repair" else ()
+    assert run(monkeypatch, command, home / "walks", *out) == 1
+    told = capsys.readouterr().err
+    assert told.endswith("walks contains versions of a dataset: name one of data-1.0.0, data-1.1.0.\n")
+
+
 @pytest.mark.parametrize(
     ("content", "fault"),
     [

@@ -25,7 +25,7 @@ from astra_data.dataset.format import (
     SUBSETS_PATH,
 )
 from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
-from astra_data.dataset.opening import refuse_run
+from astra_data.dataset.opening import refuse_run, refuse_versions
 from astra_data.dataset.plain import (
     MOST_FPS,
     PlainColumn,
@@ -48,9 +48,10 @@ def check(root: Path) -> Report:
     """Check the dataset in folder `root`: its files, every value and, if it is ours, its provenance.
 
     Raises:
-        BadInputError: there is no folder `root`, or it holds no dataset.
+        BadInputError: there is no folder `root`, or it holds no dataset, or versions of one.
     """
     if not (root / "meta").is_dir() and not (root / "data").is_dir():
+        refuse_versions(root)
         refuse_run(root)
         raise BadInputError(f"{root}: found no dataset; expected a folder with meta/ and data/")
     report = Report()

@@ -16,7 +16,7 @@ from astra_data.dataset.doctor.salvage import whole_runs
 from astra_data.dataset.format import INFO_PATH, POLICY_PATH
 from astra_data.dataset.lerobot_recording import Found, found_in, left_out
 from astra_data.dataset.lerobot_rows import Rows
-from astra_data.dataset.opening import refuse_run
+from astra_data.dataset.opening import refuse_run, refuse_versions
 from astra_data.dataset.plain import Run
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
@@ -59,11 +59,12 @@ def repair(
 
     Raises:
         CorruptDatasetError: meta/info.json is missing, or no episode is intact.
-        BadInputError: there is no `folder`, it is a run, `out` exists, or episodes cannot be joined with
-            `like`.
+        BadInputError: there is no `folder`, it is a run or holds versions of a dataset, `out` exists, or
+            episodes cannot be joined with `like`.
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder}: expected the folder of a dataset, got no folder")
+    refuse_versions(folder)
     refuse_run(folder)
     sources = [like] if isinstance(like, Dataset) else list(like or ())
     result = Repaired()
