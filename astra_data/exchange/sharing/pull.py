@@ -47,8 +47,9 @@ def pull(
         progress: called with the fraction done.
 
     Raises:
-        BadInputError: the source has no such version, or the folder holds something else.
-        CorruptDatasetError: the folder holds this dataset, altered.
+        BadInputError: the source has no such version or is a folder of datasets, or `out` holds something
+            else.
+        CorruptDatasetError: `out` holds this dataset, altered.
         SharingError: the source cannot be reached, denies access, is too large, or is not a valid dataset.
 
     Example:
@@ -68,6 +69,8 @@ def pull(
     store: Store = HubStore(where.repo) if isinstance(where, Hub) else UrlStore(where.url)
     known = store.versions()
     if not known:
+        if isinstance(store, UrlStore) and (inside := store.datasets()):
+            raise BadInputError(f"{where} is a folder of datasets: pull one of {', '.join(inside)}")
         raise SharingError(
             f"{where} has no dataset of astra-data: no tag or folder such as data-1.2.0. "
             "A plain LeRobot dataset is opened with lerobot; otherwise check the spelling."

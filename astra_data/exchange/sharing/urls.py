@@ -15,6 +15,8 @@ from astra_data.dataset.versions import Version
 from astra_data.exchange.sharing.store import RemoteFolder
 from astra_data.exchange.sharing.sums import SUMS_PATH, dataset_files
 
+MOST_FOLDERS = 20
+"""Folders in which datasets are looked for, each with a request of its own."""
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 """Protocol → the extra of this package that is needed for it."""
 
@@ -56,6 +58,17 @@ class UrlStore:
             tags = (str(path).rstrip("/").rpartition("/")[2] for path in found)
             versions = (version for tag in tags if (version := Version.from_tag(tag)))
             return sorted(version for version in versions if self._filesystem.exists(self._mark(version)))
+
+    def datasets(self) -> list[str]:
+        """Return the URLs of the datasets that the first of its folders are, where it holds several."""
+        with _explained(self._url):
+            try:
+                found = self._filesystem.ls(self._path, detail=True)
+            except FileNotFoundError:
+                return []
+        folders = sorted(str(facts["name"]) for facts in found if facts["type"] == "directory")
+        names = [folder.rstrip("/").rpartition("/")[2] for folder in folders[:MOST_FOLDERS]]
+        return [f"{self._url}/{name}" for name in names if UrlStore(f"{self._url}/{name}").versions()]
 
     def folder(self, version: Version) -> RemoteFolder:
         """Return the folder with the files of `version`."""

@@ -130,6 +130,21 @@ def test_an_upload_that_stopped_is_not_there_and_is_finished_by_the_next(
     assert contents(pull(f"{place}/fake", out=tmp_path / "out").root) == contents(fake.root)
 
 
+def test_a_folder_of_datasets_is_answered_with_their_addresses(
+    place: str, fake: Dataset, tmp_path: Path
+) -> None:
+    other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "walks"})
+    for dataset in (other, fake):
+        push(dataset.root, place)
+    filesystem, path = fsspec.core.url_to_fs(place)
+    filesystem.makedirs(f"{path}/notes", exist_ok=True)
+    filesystem.pipe_file(f"{path}/notes/read.me", b"no dataset")
+    with pytest.raises(BadInputError) as refused:
+        pull(place, out=tmp_path / "out")
+    assert str(refused.value) == f"{place} is a folder of datasets: pull one of {place}/fake, {place}/walks"
+    assert pull(f"{place}/walks", out=tmp_path / "out").reference == "walks@data-1.0.0"
+
+
 def test_what_else_is_in_the_folder_is_left_there(place: str, fake: Dataset, tmp_path: Path) -> None:
     filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0")
     filesystem.makedirs(path, exist_ok=True)
