@@ -21,6 +21,10 @@ from astra_data.dataset.versions import next_version
 
 MOST_UIDS = 8
 """Uids listed in a message."""
+_IMPORTED = (
+    "what LeRobot recorded gets the columns and the task of others by an import of its files: `astra-data "
+    "import FOLDER/data/*/*.parquet --mapping FILE`"
+)
 
 
 def subset(
@@ -192,7 +196,7 @@ def merge(
         raise BadInputError(
             f"the datasets do not match: expected the columns, fps, task, environment and simulator "
             f"of {first.reference} in all of them; merge only those that share them:\n  "
-            + "\n  ".join(faults)
+            + "\n  ".join(faults + [_IMPORTED] * any(source.recorded for source in sources))
         )
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}

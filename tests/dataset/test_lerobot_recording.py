@@ -122,6 +122,17 @@ def test_parts_of_it_are_parts_of_the_whole(arm: Dataset) -> None:
     assert whole["index"].tolist() == list(range(16))
 
 
+def test_where_it_does_not_fit_others_merge_says_how_it_is_imported(
+    arm: Dataset, recorded: Path, tmp_path: Path
+) -> None:
+    other = Dataset.open(recorded / "a")
+    for sources in ([other, arm], [arm, other]):
+        with pytest.raises(BadInputError, match=r"import FOLDER/data/\*/\*\.parquet --mapping FILE`$"):
+            merge(sources, out=tmp_path / "all")
+    with pytest.raises(BadInputError, match=r"fps: 20, then 10$"):
+        merge([other, write_fake(tmp_path / "slow", fps=10)], out=tmp_path / "all")
+
+
 def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.LogCaptureFixture) -> None:
     Dataset.open(recorded / "arm")
     [line] = caplog.messages
