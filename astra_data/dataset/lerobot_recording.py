@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.wording import first_few
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
@@ -47,6 +48,7 @@ class Found(NamedTuple):
     metadata: Mapping[str, Scalar]
     lost_success: bool
     lost_reward: float
+    is_done_early: bool
 
 
 def open_recording(root: Path) -> Contents:
@@ -160,8 +162,8 @@ def _survey(
 
 def found_in(run: Run, rows: Rows, tasks: Mapping[int, str], *, row: int, uid: int) -> Found:
     """Return the episode of the rows `run`, which begins in the given row of the files."""
-    lost = rows.lost_success(run), rows.lost_reward(run)
-    return Found(uid, row, len(run) - rows.dropped, _facts(run, tasks), *lost)
+    ends = rows.lost_success(run), rows.lost_reward(run), rows.is_done_early(run)
+    return Found(uid, row, len(run) - rows.dropped, _facts(run, tasks), *ends)
 
 
 def _facts(run: Run, tasks: Mapping[int, str]) -> dict[str, Scalar]:
@@ -198,8 +200,14 @@ def left_out(rows: Rows, episodes: Sequence[Found]) -> list[str]:
 def _announce(
     root: Path, info: Mapping[str, Any], rows: Rows, episodes: Sequence[Found], known: Collection[str]
 ) -> None:
-    """Say in one line what is left out."""
+    """Say in one line what is left out, and which ends are not those of episodes."""
     parts = left_out(rows, episodes)
+    if early := [episode.uid for episode in episodes if episode.is_done_early]:
+        parts.append(
+            f"{names.DONE} is set before the last row of {len(early)} episodes "
+            f"({first_few(early, MOST_FAULTS)}), which go on there: an import of the files can end them "
+            "(`ends` in [split] of a mapping)"
+        )
     others = sorted(info["features"].keys() - set(known))
     if others:
         parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")

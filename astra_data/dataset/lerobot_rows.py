@@ -97,6 +97,10 @@ class Rows:
         """Return the reward of the row that is left out."""
         return float(run.columns[names.REWARD][-1]) if self.dropped and names.REWARD in self.stored else 0.0
 
+    def is_done_early(self, run: Run) -> bool:
+        """Whether `next.done`, of which no end of an episode is made, is set before the last row."""
+        return names.DONE in self.stored and bool(run.columns[names.DONE][:-1].any())
+
     def _ends(self, run: Run, steps: int) -> tuple[Array, Array]:
         """Return terminated and truncated, (T,); an episode that is cut off is truncated.
 

@@ -157,6 +157,21 @@ def test_a_success_that_no_step_takes_over_is_told_with_what_to_do(
     assert not arm.columns([SUCCESS])[SUCCESS].any()
 
 
+def test_an_episode_that_is_done_before_its_last_row_is_told(
+    recorded: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(recorded / "arm", tmp_path / "set")
+    # Of rows 0 to 5, 6, 7 to 15 and 16 to 19, the last ones are done.
+    alter_rows(tmp_path / "set" / DATA, DONE, {9: True, 18: True})
+    arm = Dataset.open(tmp_path / "set")
+    [line] = caplog.messages
+    assert "next.done is set before the last row of 2 episodes (2, 3), which go on there" in line
+    assert arm.lengths.tolist() == [5, 8, 3]
+    caplog.clear()
+    Dataset.open(recorded / "arm")
+    assert "next.done" not in caplog.text
+
+
 def test_lineage_names_what_was_read_by_its_hash(arm: Dataset, tmp_path: Path) -> None:
     whole = Dataset.open(subset(arm, percent=100, out=tmp_path / "whole"))
     assert whole.description["parents"] == [arm.identity]
