@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.provenance import git_commit, package_versions
+from astra_data.core.provenance import origin
 from astra_data.dataset.columns import Array
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -69,7 +69,7 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
         faults.append(f"expected plain JSON ({error})")
     if faults:
         raise BadInputError(f"Dataset description: {'; '.join(faults)}.")
-    return full | {"packages": package_versions(), "git_commit": git_commit()}
+    return full | origin()
 
 
 class ContentHash:

@@ -12,7 +12,6 @@ from astra_data.core.config import AtOnce, Config, Count, NotNegative, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part, silent
-from astra_data.core.provenance import machine
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import OUTCOME_COLUMNS
@@ -172,7 +171,6 @@ def collect(
             "behavior": metadata,
             **stopwatch.spent(),
             "target_steps_per_second": rate,
-            "machine": machine(),
         }
     note = f"return {metadata['return_mean']:.2f}, success {metadata['success_rate']:.2f}"
     progress(1.0, f"{len(returns)} episodes, {note}, {rate:,.0f} target steps/s")

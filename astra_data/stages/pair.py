@@ -13,7 +13,6 @@ from astra_data.core.config import Config, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
-from astra_data.core.provenance import machine
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.blocks import in_blocks
 from astra_data.dataset.checkup.angles import is_angle
@@ -136,7 +135,6 @@ def pair(
             **spent,
             "pairs_per_second": steps / spent["wall_seconds"],
             "simulated_pairs_per_second": steps / simulating,
-            "machine": machine(),
         }
     wrapped = [
         f"{_name(pairing, entry)} in {jumps[entry]} of {steps} rows"

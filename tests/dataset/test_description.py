@@ -1,4 +1,5 @@
 import hashlib
+import os
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from astra_data.dataset.description import ContentHash, changed_values, complete
 PARENT = {"name": "raw", "version": "1.0.0", "hash": "0"}
 
 
-def test_a_description_is_completed_with_defaults_and_packages() -> None:
+def test_a_description_is_completed_with_defaults_packages_and_the_machine() -> None:
     full = complete_description(
         {"name": "walks", "stage": "pair", "parents": [PARENT], "config": {"a": (1, 2)}}
     )
@@ -17,6 +18,7 @@ def test_a_description_is_completed_with_defaults_and_packages() -> None:
     assert full["parents"] == [PARENT]
     assert full["config"] == {"a": [1, 2]}
     assert full["packages"]["numpy"] == np.__version__
+    assert full["machine"]["cores"] == len(os.sched_getaffinity(0))
     assert full["seeds"] == full["environment"] == full["simulator"] == {}
 
 
