@@ -150,8 +150,15 @@ def filter_(
 
 def _report(folder: Path) -> None:
     from astra_data.dataset.reader import Dataset
+    from astra_data.dataset.versions import home_of, versions_at_home
 
     written = Dataset.open(folder)
     typer.echo(
         f"finished: {folder} ({written.reference}, {len(written)} episodes, {written.lengths.sum()} steps)"
     )
+    name, version = written.description["name"], written.description["version"]
+    versions = [str(known) for known in versions_at_home(name)]
+    if folder == home_of(written.description) and versions[-1] == version and len(versions) > 1:
+        typer.echo(
+            f"note: {name} now means this version, no longer data-{versions[-2]}; --name keeps both apart"
+        )

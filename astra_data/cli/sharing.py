@@ -1,11 +1,14 @@
 """`astra-data card`, `push` and `pull`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from astra_data.cli.arguments import DatasetName, Out
+
+if TYPE_CHECKING:
+    from astra_data.dataset.reader import Dataset
 
 NotesPath = Annotated[
     Path | None,
@@ -54,12 +57,15 @@ def push(
     ] = False,
 ) -> None:
     """Share a version of a dataset, with its card; a shared version never changes."""
+    from astra_data.dataset.versions import open_dataset
     from astra_data.exchange.sharing.push import push as send
     from astra_data.experiments.display import shown
 
     with shown("push") as progress:
         source = send(dataset, url, notes=notes, private=private, progress=progress)
     typer.echo(f"shared: {source}")
+    if made := _made_from_namesake(open_dataset(dataset)):
+        typer.echo(f"note: it was {made}; who pulls without a version gets the newest that is there")
 
 
 def pull(
@@ -90,3 +96,14 @@ def pull(
             source, out=out, version=version, max_bytes=max_bytes or MOST_BYTES, progress=progress
         )
     typer.echo(f"{dataset.reference}: {dataset.root}")
+    if made := _made_from_namesake(dataset):
+        typer.echo(f"note: it was {made}; --version takes another")
+
+
+def _made_from_namesake(dataset: "Dataset") -> str:
+    """Say by which stage a dataset was made from one of the same name, as a subset is; "" if it was not."""
+    from astra_data.dataset.description import full_name
+
+    description = dataset.description
+    alike = [full_name(one) for one in description["parents"] if one["name"] == description["name"]]
+    return f"made by {description['stage']} from {alike[0]}" if alike else ""

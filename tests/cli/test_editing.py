@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 from command_line import call, output_of
-from fake_dataset import write_fake
+from fake_dataset import DESCRIPTION, write_fake
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.edit import subset
@@ -28,6 +28,17 @@ def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> No
     )
     assert open_dataset(tmp_path / "here").verify() == []
     assert len(versions_at_home("fake")) == 5
+
+
+def test_an_edit_tells_what_the_name_means_from_now_on(fake: str, tmp_path: Path) -> None:
+    note = "note: fake now means this version, no longer data-1.0.0; --name keeps both apart\n"
+    assert output_of("subset", fake, "--percent", "40").endswith(note)
+    for apart in (("--name", "part"), ("--out", str(tmp_path / "here"))):
+        assert "note" not in output_of("subset", fake, "--percent", "40", *apart)
+    write_fake(tmp_path / "fake/data-2.0.0", description=DESCRIPTION | {"version": "2.0.0"})
+    # Of an older version, it is not the newest.
+    assert "(fake@data-1.2.0, 2 episodes, " in (output := output_of("subset", fake, "--percent", "40"))
+    assert "note" not in output
 
 
 def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str, tmp_path: Path) -> None:

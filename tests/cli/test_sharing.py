@@ -7,6 +7,7 @@ from shared_files import contents
 
 from astra_data.core.errors import BadInputError, SharingError
 from astra_data.dataset import Dataset
+from astra_data.dataset.edit import subset
 
 
 @pytest.fixture
@@ -29,6 +30,17 @@ def test_a_version_goes_to_a_folder_and_back(fake: Dataset, tmp_path: Path) -> N
         output_of("pull", f"{place}/fake", "--version", "2.0.0")
     with pytest.raises(SharingError, match=r"bytes, of which at most 10 are taken"):
         output_of("pull", f"{place}/fake", "--out", str(tmp_path / "large"), "--max-bytes", "10")
+
+
+def test_a_version_that_is_a_subset_of_another_is_told(fake: Dataset, tmp_path: Path) -> None:
+    subset(fake, percent=40, out=tmp_path / "part")
+    place, note = f"file://{tmp_path}/shared", "note: it was made by subset from fake@data-1.0.0; "
+    output_of("push", str(fake.root), "./shared")
+    newest = "who pulls without a version gets the newest that is there"
+    assert output_of("push", "part", "./shared") == f"shared: {place}/fake@data-1.1.0\n{note}{newest}\n"
+    home = tmp_path / "home/fake/data-1.1.0"
+    shown = f"fake@data-1.1.0: {home}\n{note}--version takes another\n"
+    assert output_of("pull", f"{place}/fake") == shown
 
 
 def test_a_card_is_written_with_its_notes(fake: Dataset, tmp_path: Path) -> None:
