@@ -110,7 +110,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         digests={} if sources else _digests(folder, old, columns, notes),
         metadata={} if sources else _metadata(folder, altered, notes),
         description=_description(folder, info, sources, old),
-        subset_seed=sources[0].subset_seed if sources else _subset_seed(folder, altered),
+        subset_seed=sources[0].subset_seed if sources else _subset_seed(folder, altered, notes),
     )
 
 
@@ -200,7 +200,13 @@ def _description(
     return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]
 
 
-def _subset_seed(folder: Path, altered: Collection[str]) -> int:
-    subsets = "was altered" if SUBSETS_PATH in altered else read_object(folder / SUBSETS_PATH)
-    seed = 0 if isinstance(subsets, str) else subsets.get("seed")
-    return seed if isinstance(seed, int) else 0
+def _subset_seed(folder: Path, altered: Collection[str], notes: list[str]) -> int:
+    """Return the seed of the subsets' order, 0 where there is none to rely on."""
+    if SUBSETS_PATH in altered or not (folder / OUR_FOLDER).is_dir():
+        return 0
+    subsets = read_object(folder / SUBSETS_PATH)
+    if isinstance(subsets, dict) and isinstance(seed := subsets.get("seed"), int):
+        return seed
+    fault = subsets if isinstance(subsets, str) else "has no whole number as its seed"
+    notes.append(f"{SUBSETS_PATH} {fault}: {_IF_ALTERED[SUBSETS_PATH]}")
+    return 0
