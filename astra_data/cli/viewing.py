@@ -39,7 +39,7 @@ def view(
     from astra_data.core.errors import BadInputError
     from astra_data.core.naming import RECORD
     from astra_data.dataset.format import INFO_PATH
-    from astra_data.dataset.versions import open_dataset
+    from astra_data.dataset.versions import locate, open_dataset
     from astra_data.reports.rerun_view import view as show
 
     folder = Path(source)
@@ -49,7 +49,8 @@ def view(
         if lacking := view_run(folder, uids or (), seed=seed, save=save):
             typer.echo(f"left out: {lacking}")
     else:
-        if folder.is_dir() and not (folder / INFO_PATH).is_file():
+        # Beside a folder of that name, as `new` makes one, it may be the name of a dataset.
+        if locate(source) == folder and not (folder / INFO_PATH).is_file():
             raise BadInputError(
                 f"{source}: expected a dataset (a folder with {INFO_PATH}) or the folder of a run (with "
                 f"{RECORD}), got neither: name the folder that import, collect or run wrote"
