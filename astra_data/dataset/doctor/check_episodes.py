@@ -144,8 +144,9 @@ class EpisodeChecks:
             fault = f"meta/episodes: the file of episode {number} is {path}, expected {run.path.name}"
             self._report.fault("meta/episodes", fault)
         present = {self._tasks.get(int(task)) for task in np.unique(run.columns[names.TASK_INDEX])}
-        if set(row.get("tasks") or ()) != present:
-            fault = f"meta/episodes: tasks of episode {number} are {row.get('tasks')}, expected {present}"
+        listed = row.get("tasks")
+        if not isinstance(listed, list) or set(map(str, listed)) != set(map(str, present)):
+            fault = f"meta/episodes: tasks of episode {number} are {listed}, expected {present}"
             self._report.fault("meta/episodes", fault)
         self._check_statistics(number, run, row)
 
