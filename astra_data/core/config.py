@@ -98,7 +98,7 @@ def load_tables(path: Path) -> dict[str, Any]:
         RecipeError: the file is missing or not TOML.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors put a mark before the text
     except FileNotFoundError:
         nearby = [str(file) for file in sorted(path.parent.glob("*.toml"))]
         raise RecipeError(f"{path} does not exist{did_you_mean(str(path), nearby)}") from None

@@ -9,6 +9,7 @@ from astra_data.core.config import (
     did_you_mean,
     faults_of,
     load_recipe,
+    load_tables,
     only_given,
     own_settings,
     validated,
@@ -111,6 +112,11 @@ def test_a_missing_or_unreadable_recipe_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(RecipeError, match="cannot be read as a text file"):
         load_recipe(tmp_path / "binary.toml", Experiment)
+
+
+def test_a_mark_of_the_encoding_before_the_text_is_no_part_of_it(tmp_path: Path) -> None:
+    (tmp_path / "recipe.toml").write_bytes(b"\xef\xbb\xbfx = 1\r\n")
+    assert load_tables(tmp_path / "recipe.toml") == {"x": 1}
 
 
 def test_names_without_a_close_match_are_all_listed() -> None:
