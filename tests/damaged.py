@@ -27,6 +27,20 @@ def alter(name: str, column: str, row: int, value: object) -> Callable[[Path], N
     return lambda root: alter_rows(root / name, column, {row: value})
 
 
+def retype(name: str, column: str, value: object) -> Callable[[Path], None]:
+    """Give all rows of a parquet file the same value, of whatever type; drop the column where it is None."""
+
+    def damage(root: Path) -> None:
+        table = pq.read_table(root / name)
+        at = table.column_names.index(column)
+        others = table.remove_column(at)
+        if value is not None:
+            others = others.add_column(at, column, pa.array([value] * len(table)))
+        pq.write_table(others, root / name)
+
+    return damage
+
+
 def as_in_0_1(root: Path) -> None:
     """Take digests and sums away, which version 0.1 did not write."""
     path = root / DATASET_PATH

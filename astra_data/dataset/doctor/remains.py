@@ -177,10 +177,14 @@ def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[
     columns = table.to_pydict()
     uids = columns.pop(names.EPISODE_UID, [])
     columns.pop("length", None)
-    return {
+    found = {
         uid: {key: value for key, values in columns.items() if (value := values[row]) is not None}
         for row, uid in enumerate(uids)
+        if isinstance(uid, int)
     }
+    if not found:
+        notes.append(f"{METADATA_PATH} has no uids: {_LOST}")
+    return found
 
 
 def _description(

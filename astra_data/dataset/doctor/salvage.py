@@ -82,7 +82,7 @@ def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
             for block in read_blocks([path], ["episode_index", "length"]):
                 columns = block.to_pydict()
                 lengths |= zip(columns["episode_index"], columns["length"], strict=True)
-        except (CorruptDatasetError, KeyError) as error:
+        except (CorruptDatasetError, KeyError, TypeError) as error:
             notes.append(f"meta/episodes was rebuilt from the data: {error}")
     if not lengths and len(notes) == before:
         notes.append("meta/episodes was missing and was rebuilt from the data")

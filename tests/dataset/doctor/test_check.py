@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES, alter, as_in_0_1, drop, edit, truncate, write
+from damaged import DATA, EPISODES, alter, as_in_0_1, drop, edit, retype, truncate, write
 from fake_dataset import fake_columns, write_fake, writer
 
 from astra_data.core.errors import BadInputError
@@ -16,17 +16,6 @@ from astra_data.dataset.columns import Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.findings import MOST
 from astra_data.dataset.format import POLICY_PATH
-
-
-def retype_tasks(value: object) -> Callable[[Path], None]:
-    """Give all episodes tasks of another type."""
-
-    def damage(root: Path) -> None:
-        table = pq.read_table(root / EPISODES)
-        column = table.column_names.index("tasks")
-        pq.write_table(table.set_column(column, "tasks", pa.array([value] * len(table))), root / EPISODES)
-
-    return damage
 
 
 def change_statistics(root: Path) -> None:
@@ -109,8 +98,8 @@ def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
             alter(EPISODES, "data/file_index", 1, 4),
             ["the file of episode 1 is data/chunk-000/file-004.parquet, expected file-000.parquet"],
         ),
-        (retype_tasks(7), ["tasks of episode 0 are 7, expected {'run'}"]),
-        (retype_tasks([["run"]]), ["tasks of episode 0 are [['run']], expected {'run'}"]),
+        (retype(EPISODES, "tasks", 7), ["tasks of episode 0 are 7, expected {'run'}"]),
+        (retype(EPISODES, "tasks", [["run"]]), ["tasks of episode 0 are [['run']], expected {'run'}"]),
         (alter(EPISODES, "tasks", 0, ["walk"]), ["tasks of episode 0 are ['walk'], expected {'run'}"]),
         (alter(EPISODES, "stats/mode/max", 2, [5.0]), ["max of mode in episode 2 is [5.0]"]),
         (change_statistics, ["meta/stats.json: q99 of action is"]),

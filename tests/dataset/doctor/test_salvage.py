@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES, alter, drop
+from damaged import DATA, EPISODES, alter, drop, retype
 from fake_dataset import LENGTHS, fake_episodes, write_fake
 
 from astra_data.dataset.columns import STATE
@@ -43,6 +43,7 @@ def test_all_of_a_whole_dataset_is_read(tmp_path: Path) -> None:
         (alter(DATA, "index", 9, 70), [0, 1], "stopped before episode 2: index is 70"),
         (alter(DATA, "timestamp", 9, 7.0), [0, 1], "stopped before episode 2: timestamp is 7.0"),
         (alter(EPISODES, "length", 2, 11), [0, 1], "episode 2 has 12 frames, expected 11"),
+        (retype(EPISODES, "episode_index", [1]), [0, 1, 2, 3, 4], "meta/episodes was rebuilt from the data"),
         (drop(EPISODES), [0, 1, 2, 3, 4], "meta/episodes was missing and was rebuilt from the data"),
     ],
 )
