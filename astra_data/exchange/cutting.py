@@ -204,7 +204,7 @@ class Cutter:
         split, n = self._mapping.split, len(block)
         masks: dict[str, Mask] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
-        now: dict[str, Array] = {f"end {name}": fields[name] for name in split.ends}
+        now: dict[str, Array] = {f"ends {name}": fields[name] for name in split.ends}
         now |= {name: columns[name][:, None] for name in (TERMINATED, TRUNCATED) if name in columns}
         if split.field:
             now["field"] = fields[split.field]
@@ -216,9 +216,16 @@ class Cutter:
                 now["gap"][rejected, 2] = np.nan
         continues = not (is_apart or block.starts)
         for key, values in now.items():
-            series = np.concatenate([self._before[key] if continues else values[:1], values])
+            before = self._before[key] if continues else values[:1]
+            if before.shape[1:] != values.shape[1:]:
+                sizes = f"{values.shape[1]} values, before there were {before.shape[1]}"
+                raise BadInputError(f"{block.origin}: split.{key} has {sizes}")
+            series = np.concatenate([before, values])
             if key == "field":
-                masks[key] = (series[:-1] != values).any(axis=1)
+                earlier, later = series[:-1], series[1:]
+                # What is missing (NaN) is the same value again, as empty cells of CSV are.
+                are_missing = (earlier != earlier) & (later != later)
+                masks[key] = ((earlier != later) & ~are_missing).any(axis=1)
             elif key == "gap":
                 series[:, 1:] = _held(series[:, 1:])
                 steps_s, kept_s = np.diff(series[:, 1:], axis=0).T

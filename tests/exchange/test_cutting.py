@@ -535,3 +535,37 @@ def test_times_of_a_formats_own_episodes_may_begin_again() -> None:
         list(cutting.feed(block, 0, is_apart=number == 0))
     tally = cutting.tally
     assert (tally.split_points, tally.back_rows, tally.still_rows) == ({"source": 2}, 0, 0)
+
+
+@BLOCKS
+def test_rows_without_a_value_of_the_field_are_one_episode_as_empty_cells_are(block_rows: int) -> None:
+    field = [1.0, 1.0, np.nan, np.nan, np.nan, 2.0, 2.0]
+    made = cutter(split={"field": "trial"})
+    assert rows(cut(made, block_rows, x=np.arange(7), trial=field)) == [[0], [2, 3], [5]]
+    assert made.tally.split_points == {"field": 2}
+
+
+def test_a_field_may_be_a_text_after_a_number() -> None:
+    made = cutter(split={"field": "trial"})
+    arrays = [np.array(["a", "a", "b"]), np.array([7, 7, 7])]
+    episodes = []
+    for number, trial in enumerate(arrays):
+        fields = {"x": np.arange(3.0), "a": 3.0 * number + np.arange(3), "trial": trial}
+        episodes += [c for c, _ in made.feed(Block(fields, "log"), 3 * number, is_apart=number == 0)]
+    assert rows(episodes + [c for c, _ in made.finish()]) == [[0], [3, 4]]
+    assert made.tally.split_points == {"field": 2}
+
+
+@pytest.mark.parametrize(
+    ("split", "fault"),
+    [
+        ({"field": "f"}, "log: split.field has 2 values, before there were 1"),
+        ({"ends": ("f",)}, "log: split.ends f has 2 values, before there were 1"),
+    ],
+)
+def test_what_splits_keeps_its_size(split: dict[str, Any], fault: str) -> None:
+    made = cutter(split=split)
+    with pytest.raises(BadInputError, match=re.escape(fault)):
+        for number, size in enumerate((1, 2)):
+            fields = {"x": np.zeros(3), "a": np.zeros(3), "f": np.zeros((3, size))}
+            list(made.feed(Block(fields, "log"), 3 * number, is_apart=number == 0))
