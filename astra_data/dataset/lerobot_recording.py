@@ -80,7 +80,7 @@ def open_recording(root: Path) -> Contents:
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
-    _announce(root, info, rows, episodes, [*(spec.name for spec in specs), *names.RESERVED])
+    _announce(root, info, rows, columns, episodes, [*(spec.name for spec in specs), *names.RESERVED])
     uids = [episode.uid for episode in kept]
     lengths = np.array([episode.steps for episode in kept])
     first, last = episodes[0], episodes[-1]
@@ -198,9 +198,14 @@ def left_out(rows: Rows, episodes: Sequence[Found]) -> list[str]:
 
 
 def _announce(
-    root: Path, info: Mapping[str, Any], rows: Rows, episodes: Sequence[Found], known: Collection[str]
+    root: Path,
+    info: Mapping[str, Any],
+    rows: Rows,
+    columns: Sequence[Column],
+    episodes: Sequence[Found],
+    known: Collection[str],
 ) -> None:
-    """Say in one line what is left out, and which ends are not those of episodes."""
+    """Say in one line what is left out or rounded, and which ends are not those of episodes."""
     parts = left_out(rows, episodes)
     if early := [episode.uid for episode in episodes if episode.is_done_early]:
         parts.append(
@@ -208,6 +213,10 @@ def _announce(
             f"({first_few(early, MOST_FAULTS)}), which go on there: an import of the files can end them "
             "(`ends` in [split] of a mapping)"
         )
+    for column in columns:
+        stored = rows.stored.get(column.name)
+        if stored and not np.can_cast(stored.dtype, column.dtype):
+            parts.append(f"{column.name} is {column.dtype} here, recorded as {stored.dtype}")
     others = sorted(info["features"].keys() - set(known))
     if others:
         parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")

@@ -143,6 +143,8 @@ def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.Log
     assert "succeeded" not in line
     reward = sum(float(values("arm", number)[REWARD][-1]) for number in range(4))
     assert f"with the last rows a reward of {reward:g} in sum is left out" in line
+    assert line.count(" here, recorded as ") == 1
+    assert "; force is float32 here, recorded as float64; " in line
 
 
 def test_a_success_that_no_step_takes_over_is_told_with_what_to_do(
