@@ -84,7 +84,7 @@ def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
 
 def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
     observations = dict(_parts("observations", episode.observations))
-    infos = dict(_parts("infos", episode.infos))
+    infos = dict(_parts("infos", episode.infos or {}))  # None where none were recorded
     with_reset = {name: values for name, values in infos.items() if len(values) == len(episode.rewards) + 1}
     between = observations | with_reset
     steps = {

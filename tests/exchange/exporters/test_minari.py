@@ -10,6 +10,7 @@ from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Episode
 from astra_data.exchange.exporters import export
 from astra_data.exchange.exporters.minari import _attributes
+from astra_data.exchange.importing import import_dataset
 
 
 @pytest.mark.parametrize("has_goal", [True, False])
@@ -38,6 +39,18 @@ def test_minari_loads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_go
     told = list(loaded.storage.get_episode_metadata(range(5)))
     assert [metadata["total_steps"] for metadata in told] == list(LENGTHS)
     assert [metadata.get("seed") for metadata in told[:2]] == [None, 3]
+
+
+def test_a_dataset_without_columns_of_its_own_comes_back(tmp_path: Path) -> None:
+    """Minari keeps these as infos."""
+    kept = (STATE, NEXT_STATE, ACTION, REWARD, TERMINATED, TRUNCATED)
+    whole = write_transitions(tmp_path / "set")
+    with writer(tmp_path / "few", columns=whole.specs(kept)) as few:
+        for episode in whole.episodes(kept):
+            few.add(episode)
+    export(Dataset.open(tmp_path / "few"), tmp_path / "few-v0", format="minari")
+    import_dataset([tmp_path / "few-v0"], out=tmp_path / "back")
+    assert Dataset.open(tmp_path / "back").content_hash == Dataset.open(tmp_path / "few").content_hash
 
 
 def test_a_seed_of_zero_is_one() -> None:

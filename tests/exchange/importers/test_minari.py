@@ -53,6 +53,16 @@ fields = ["observations/achieved_goal"]
     )
 
 
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+def test_a_dataset_need_not_have_infos(tmp_path: Path, data_format: str) -> None:
+    """Minari's `DataCollector` records none by default."""
+    made = [{**episode, "infos": None} for episode in episodes(is_dict=False)]
+    path = write_minari(tmp_path / "minari", made, data_format=data_format)
+    dataset, _ = imported(tmp_path, path, None, name="ant", fps=10)
+    for got, episode in zip(dataset.episodes(), made, strict=True):
+        np.testing.assert_array_equal(got.columns[STATE], episode["observations"][:-1].astype(np.float32))
+
+
 def test_infos_are_of_the_step_with_or_without_that_of_the_reset(tmp_path: Path) -> None:
     """Minari's `DataCollector` records the info of the reset, too."""
     made = episodes(is_dict=True)
