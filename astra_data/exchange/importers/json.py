@@ -6,7 +6,7 @@ Lines, of at most as many bytes, are read block by block.
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import batched
 from typing import IO, Any
@@ -46,16 +46,16 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows of lines with an object each; a last line that is cut off is left out and counted."""
     last: Block | None = None
+    fields = mapping.all_fields
     with source.open() as stream:
         for lines in batched(enumerate(_lines(stream, source), start=1), BLOCK_ROWS):
             torn = int(_is_torn(lines[-1][1]))
             whole = [(number, line) for number, line in lines[: len(lines) - torn] if line.strip()]
-            rows = [_row(line, f"{source} line {number}", mapping) for number, line in whole]
+            rows = [_row(line, f"{source} line {number}", fields) for number, line in whole]
             if rows:
                 if last is not None:
                     yield last
-                fields = {field: [row[field] for row in rows] for field in mapping.all_fields}
-                last = _block(fields, mapping, str(source))
+                last = _block({name: [row[name] for row in rows] for name in fields}, mapping, str(source))
             if last is not None:
                 last = replace(last, torn=torn)
     if last is not None:
@@ -69,15 +69,15 @@ def _lines(stream: IO[bytes], source: Source) -> Iterator[bytes]:
         yield line
 
 
-def _row(line: bytes, origin: str, mapping: ImportMapping) -> dict[str, Any]:
+def _row(line: bytes, origin: str, fields: Sequence[str]) -> dict[str, Any]:
     try:
         row = json.loads(line, object_pairs_hook=_once)
     except (ValueError, BadInputError) as error:
         raise BadInputError(f"{origin}: expected an object of fields ({in_short(error)})") from error
     if not isinstance(row, dict):
         raise BadInputError(f"{origin}: expected an object of fields, got {type(row).__name__}")
-    if not row.keys() >= set(mapping.all_fields):
-        row_count(origin, mapping.all_fields, dict.fromkeys(row, (1,)))
+    if not all(name in row for name in fields):
+        row_count(origin, fields, dict.fromkeys(row, (1,)))
     return row
 
 
