@@ -68,6 +68,18 @@ def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
     assert (report.faults, report.frames) == ([], 300)
 
 
+def test_statistics_that_only_together_are_right_are_found(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    table = pq.read_table(root / EPISODES)
+    names = ["stats/next.reward/min", "stats/next.terminated/min"]  # side by side
+    reward, terminated = (table.column(name)[0].as_py() for name in names)
+    alter(EPISODES, names[0], 0, [])(root)
+    alter(EPISODES, names[1], 0, [*reward, *terminated])(root)
+    faults = "\n".join(check(root).faults)
+    assert "statistics: min of next.reward in episode 0 is [], expected" in faults
+    assert "statistics: min of next.terminated in episode 0 is [" in faults
+
+
 @pytest.mark.parametrize(
     ("damage", "parts"),
     [
