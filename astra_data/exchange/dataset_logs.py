@@ -1,13 +1,15 @@
 """A dataset as logs: what `new` begins with, where logs are imported already or were recorded by LeRobot."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.angles import LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP, Column
 from astra_data.dataset.reader import Dataset
-from astra_data.exchange.field_names import Role
+from astra_data.exchange.field_names import HEADING, Role
 from astra_data.exchange.logs import Field, Logs
 
 _FAILED = "failed"
@@ -18,13 +20,15 @@ def logs_of(data: Dataset) -> Logs:
     """Return the episodes of `data` as logs: its states, commands and goals by their own names, and failures.
 
     Raises:
-        BadInputError: it has no states or commands, or a value is not finite.
+        BadInputError: it has no states or commands, a heading or its commands are in degrees, or a value is
+            not finite.
         CorruptDatasetError: a file cannot be read, or values differ from their digests.
     """
     fields = [Field(TIMESTAMP, "time", "time", "s", 1.0, f"{data.info['fps']} rows a second")]
     read = [STATE, ACTION, *([GOAL] if GOAL in data.features else [])]
     columns = data.specs(read)
     of_columns = [field for column in columns for field in _fields(column)]
+    _refuse_degrees(of_columns, data.reference)
     fields += of_columns
     ends = [name for name in (TERMINATED, SUCCESS) if name in data.features]
     episodes, failures = [], 0
@@ -56,3 +60,14 @@ def _fields(column: Column) -> list[Field]:
         Field(f"{column.name} {name}", _ROLES[column.name], name, unit or "1", 1.0, "its column")
         for name, unit in zip(names, column.units, strict=True)
     ]
+
+
+def _refuse_degrees(fields: Sequence[Field], reference: str) -> None:
+    """Refuse headings in degrees, and commands in degrees beside a heading: nothing scales them."""
+    headings = [field for field in fields if field.role != "command" and HEADING.fullmatch(field.plain)]
+    turns = [field for field in fields if field.role == "command" and headings]
+    if wrong := [f"{f.name} in {f.unit}" for f in (*headings, *turns) if f.unit in ("deg", "deg/s")]:
+        raise BadInputError(
+            f"{reference} has {', '.join(wrong)}: expected rad and rad/s, as a dataset's values are taken as "
+            "they are: import the logs again with a `scale` of 0.0174533 there"
+        )

@@ -1,8 +1,10 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from fake_dataset import writer
 
+from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import (
     ACTION,
@@ -80,3 +82,28 @@ def test_goals_are_fields_of_logs(tmp_path: Path) -> None:
     logs = logs_of(Dataset.open(data))
     assert [(field.short, field.unit) for field in logs.of("goal")] == [("goal_x", "m"), ("goal_y", "m")]
     np.testing.assert_array_equal(logs.values(logs.of("goal"))[0], 2 * values)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "turn", "wrong"),
+    [
+        ("Base.heading", "deg", "rad/s", "observation.state Base.heading in deg"),
+        ("yaw", "rad", "deg/s", "action w in deg/s"),
+        ("yaw", "deg", "deg/s", "observation.state yaw in deg, action w in deg/s"),
+    ],
+)
+def test_a_heading_in_degrees_is_refused_since_nothing_scales_it(
+    name: str, unit: str, turn: str, wrong: str, tmp_path: Path
+) -> None:
+    pose = Column(STATE, size=2, names=("x", name), astra={"unit": ["m", unit]})
+    command = Column(ACTION, names=("w",), astra={"unit": [turn]})
+    data = recorded(tmp_path / "data", pose, command, *OUTCOME_COLUMNS)
+    with pytest.raises(BadInputError, match=f"fake@data-1.0.0 has {wrong}: expected rad and rad/s"):
+        logs_of(data)
+
+
+def test_joints_may_be_in_degrees(tmp_path: Path) -> None:
+    joints = Column(STATE, size=2, names=("shoulder", "elbow"), astra={"unit": ["deg", "deg"]})
+    command = Column(ACTION, names=("elbow",), astra={"unit": ["deg/s"]})
+    logs = logs_of(recorded(tmp_path / "data", joints, command, *OUTCOME_COLUMNS))
+    assert [field.unit for field in logs.fields] == ["s", "deg", "deg", "deg/s", "1"]
