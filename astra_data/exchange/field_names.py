@@ -11,7 +11,11 @@ WEAK_FAILURE = re.compile(r"bump(ed|er)?|e_?stop")
 """A failure where it ever comes, and where there is no other."""
 NAMES: tuple[tuple[Role, str], ...] = (
     ("time", r"t|(.+_)?(time|stamp|timestamp|secs?|seconds)"),
-    ("episode", r"(episode|trial|drive|run|rollout|traj(ectory)?|flight|lap|session|bag)(_?(id|index|nr))?"),
+    (
+        "episode",
+        r"(ep(isode)?|trial|drive|run|rollout|traj(ectory)?|flight|lap|session|bag)"
+        r"(_?(id|index|nr))?",
+    ),
     ("left out", r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?"),
     (
         "failure",

@@ -59,6 +59,14 @@ def test_roles_and_units_are_told_by_names_and_values(tmp_path: Path) -> None:
     np.testing.assert_allclose(logs.episodes[0]["heading"], math.pi / 2 * RAMP)
 
 
+@pytest.mark.parametrize("name", ["ep", "ep_id", "Episode", "episode_index", "trial nr"])
+def test_logs_are_cut_where_the_episode_changes(name: str, tmp_path: Path) -> None:
+    log = write(tmp_path / "log.csv", {name: RAMP // 4, "x": RAMP, "cmd": -RAMP})
+    logs = guess([log])
+    assert logs.fields[0].role == "episode"
+    assert [len(episode["x"]) for episode in logs.episodes] == np.bincount((RAMP // 4).astype(int)).tolist()
+
+
 @pytest.mark.parametrize(
     ("ending", "unit", "scale"),
     [
