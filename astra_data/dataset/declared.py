@@ -26,12 +26,12 @@ def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainC
     features, fps = info.get("features"), info.get("fps")
     columns = plain_columns(features)[0] if isinstance(features, dict) else []
     missing = sorted({c.name for c in DEFAULT_COLUMNS} - {column.name for column in columns})
-    if missing or not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
-        raise CorruptDatasetError(
-            f"{folder}: {INFO_PATH} has fps {fps!r} and lacks the columns {', '.join(missing) or 'none'}; "
-            "expected a whole number of frames per second and all of LeRobot's own columns"
-        )
-    assert isinstance(features, dict)
+    faults = [f"lacks the columns {', '.join(missing)}, which are LeRobot's own"] if missing else []
+    if not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
+        faults.append(f"has fps {fps!r}, expected a whole number of frames per second")
+    if faults:
+        raise CorruptDatasetError(f"{folder}: {INFO_PATH} {' and '.join(faults)}")
+    assert isinstance(features, dict) and isinstance(fps, int | float)
     specs = []
     for column in columns:
         if column.name in names.RESERVED:

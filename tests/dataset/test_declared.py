@@ -8,6 +8,10 @@ from astra_data.dataset.columns import STATE, Column
 from astra_data.dataset.declared import declared_columns, name_of
 from astra_data.dataset.format import DEFAULT_COLUMNS
 
+WHOLE = "expected a whole number of frames per second"
+LACKING = (
+    "lacks the columns episode_index, frame_index, index, task_index, timestamp, which are LeRobot's own"
+)
 OWN = {column.name: column.feature() for column in DEFAULT_COLUMNS}
 
 
@@ -48,18 +52,21 @@ def test_one_frame_per_second_is_a_rate() -> None:
 
 
 @pytest.mark.parametrize(
-    "info",
+    ("info", "faults"),
     [
-        {"fps": 10, "features": {}},
-        {"fps": 9.5, "features": OWN},
-        {"fps": 0.5, "features": OWN},
-        {"fps": 2**31, "features": OWN},
-        {},
+        ({"fps": 10, "features": {}}, [LACKING]),
+        ({"fps": 9.5, "features": OWN}, [f"has fps 9.5, {WHOLE}"]),
+        ({"fps": 0.5, "features": OWN}, [f"has fps 0.5, {WHOLE}"]),
+        ({"fps": 2**31, "features": OWN}, [f"has fps 2147483648, {WHOLE}"]),
+        ({}, [LACKING, f"has fps None, {WHOLE}"]),
     ],
 )
-def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(info: dict[str, Any]) -> None:
-    with pytest.raises(CorruptDatasetError, match="expected a whole number of frames per second"):
+def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(
+    info: dict[str, Any], faults: list[str]
+) -> None:
+    with pytest.raises(CorruptDatasetError) as refused:
         declared_columns(Path("set"), info)
+    assert str(refused.value) == f"set: meta/info.json {' and '.join(faults)}"
 
 
 def test_a_folder_gives_a_valid_name() -> None:
