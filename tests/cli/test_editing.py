@@ -35,7 +35,7 @@ def test_an_edit_tells_what_the_name_means_from_now_on(fake: str, tmp_path: Path
     assert output_of("subset", fake, "--percent", "40").endswith(note)
     for apart in (("--name", "part"), ("--out", str(tmp_path / "here"))):
         assert "note" not in output_of("subset", fake, "--percent", "40", *apart)
-    write_fake(tmp_path / "fake/data-2.0.0", description=DESCRIPTION | {"version": "2.0.0"})
+    write_fake(tmp_path / "fake/data-2.0.0", description={**DESCRIPTION, "version": "2.0.0"})
     # Of an older version, it is not the newest.
     assert "(fake@data-1.2.0, 2 episodes, " in (output := output_of("subset", fake, "--percent", "40"))
     assert "note" not in output
