@@ -48,19 +48,27 @@ def episodes(
 def importable(
     sources: Sequence[Source], module: ModuleType, mapping: ImportMapping
 ) -> tuple[list[Source], tuple[str, ...]]:
-    """Return the sources that can be imported each by itself, and what is wrong with the others.
+    """Return the sources that can be imported together, and what is wrong with the others.
 
-    Each is read to its end.
+    Each is read to its end. Columns must be of the same sizes as in the first that can be imported.
 
     Raises:
         BadInputError: there are no such sources.
     """
     good, faults = [], {}
+    sizes: dict[str, int] = {}
     for source in sources:
         cutter = Cutter(mapping)
         try:
             deque(episodes([source], module, mapping, cutter), maxlen=0)
             refuse_rejected(cutter.tally, mapping)
+            found = {column.name: column.size for column in cutter.columns}
+            for name in found:
+                if found[name] != sizes.get(name, found[name]):
+                    raise BadInputError(
+                        f"{source}: {name} has {found[name]} values, in the files before {sizes[name]}"
+                    )
+            sizes = sizes or found
             good.append(source)
         except BadInputError as error:
             faults[source] = str(error)

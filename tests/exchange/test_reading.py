@@ -69,6 +69,26 @@ def test_a_file_that_is_bad_in_its_midst_is_left_out_as_a_whole(tmp_path: Path) 
     assert "1 of 20 rows have values that are not finite; the first is 0.csv line 21" in report.left_out[0]
 
 
+def test_a_file_with_columns_of_other_sizes_is_left_out(tmp_path: Path) -> None:
+    """Each can be imported by itself, but not all together."""
+    mapping = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["state"]
+[columns.action]
+fields = ["command"]
+"""
+    paths = [
+        write_table(tmp_path / f"{number}.npz", {"state": np.zeros((4, size)), "command": np.zeros(4)})
+        for number, size in enumerate((2, 3, 2))
+    ]
+    dataset, report = imported(tmp_path, paths, mapping, skip_bad=True)
+    assert dataset.metadata["source"] == ["0.npz", "2.npz"]
+    assert report.left_out == ("1.npz: observation.state has 3 values, in the files before 2",)
+
+
 def test_nothing_is_imported_where_all_files_are_bad(tmp_path: Path) -> None:
     with pytest.raises(
         BadInputError, match=r"^1\.csv, 2\.csv: no field 'command'[^\n]*\n3\.csv: no field 'gait'"
