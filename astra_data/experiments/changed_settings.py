@@ -10,6 +10,7 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import RECORD
 from astra_data.core.wording import first_few, shortened
 from astra_data.dataset.description import changed_values
+from astra_data.experiments.own_methods import OwnMethod
 from astra_data.experiments.recipe import WHOLE, Recipe
 from astra_data.experiments.staleness import SIMULATOR
 from astra_data.worlds.registry import task_named
@@ -37,6 +38,22 @@ def differences(before: Mapping[str, Any], recipe: Recipe) -> dict[str, str]:
     if "train" in changed:
         changed.pop("plus", None)  # which takes over "train"
     return changed
+
+
+def restated(before: Mapping[str, Any], recipe: Recipe) -> set[str]:
+    """Return the methods of the user's whose settings in `recipe` are others than those recorded `before`."""
+    known = {name: OwnMethod.model_validate(own) for name, own in before.get("own_methods", {}).items()}
+    return {
+        name
+        for name, own in recipe.own_methods.items()
+        if name in known and not _is_set_alike(name, own, known[name])
+    }
+
+
+def _is_set_alike(name: str, own: OwnMethod, before: OwnMethod) -> bool:
+    with suppress(BadInputError):  # it has no such settings any more
+        return own.settings(name) == before.settings(name)
+    return False
 
 
 def share_target(task: str, other: str) -> bool:

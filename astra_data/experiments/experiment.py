@@ -16,12 +16,13 @@ from typing import Any
 from astra_data.core.config import did_you_mean, validated
 from astra_data.core.errors import RecipeError
 from astra_data.core.naming import RECORD, base_method, reference_of, stage_of_key
-from astra_data.experiments.changed_settings import differences, share_target
+from astra_data.experiments.changed_settings import differences, restated, share_target
 from astra_data.experiments.own_files import changed_code
 from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.recipe_file import read_tables, recorded_settings
 from astra_data.experiments.staleness import ROWS_TABLES, reads, stale_stages
+from astra_data.methods import method_named
 from astra_data.reports.files import read_published
 from astra_data.reports.sizes import by_size, points_of
 from astra_data.stages.registry import STAGES
@@ -55,8 +56,10 @@ class Experiment:
         asked = {stage.name: stage.asked_by for stage in STAGES.values() if stage.asked_by}
         absent |= {stage for stage, key in asked.items() if not getattr(self.recipe, key)}
         sizes, theirs = (set(one.sweep.percent) for one in (self.recipe, self.base.recipe))
-        resized = {"subset"} if bool(sizes) != bool(theirs) or not sizes <= theirs else set()
-        return STAGES.keys() - ALWAYS_NEW - absent - stale_stages(changed, resized)
+        begun = {"subset"} if bool(sizes) != bool(theirs) or not sizes <= theirs else set[str]()
+        own = restated(self.base.recipe.settings, self.recipe)
+        begun |= {method_named(name).configures for name in own}
+        return STAGES.keys() - ALWAYS_NEW - absent - stale_stages(changed, begun)
 
     def maker(self, stage: str) -> "Experiment":
         """Return the experiment that makes the artifacts of `stage`."""
@@ -170,6 +173,8 @@ class Experiment:
             changed = differences(found.settings, self.recipe).keys() - ALWAYS_NEW - {"select"}
             tested = {*found.methods, *filter(None, [reference_of(self.recipe.methods)])}
             changed -= {table for table in ROWS_TABLES if not any(reads(row, table) for row in tested)}
+            own = restated(found.settings, self.recipe) & {*map(base_method, tested)}
+            changed |= {f"own_methods.{name}" for name in own}
             if changed:
                 raise RecipeError(
                     f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "

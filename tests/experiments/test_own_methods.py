@@ -1,11 +1,13 @@
 """Methods of one's own, as recipes name them."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments import run
+from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.own_methods import OwnMethod, add_all, looked_up, with_offered
 from astra_data.methods import METHODS
 
@@ -84,3 +86,47 @@ def test_those_that_packages_offer_are_named_as_if_the_recipe_gave_their_places(
         assert with_offered(as_it_is, ("methods", "own_methods")) == as_it_is
     given = {"methods": ["theirs"], "own_methods": {"theirs": DELTA}}
     assert with_offered(given, ("methods", "own_methods")) == given
+
+
+OWN = """task = "antmaze-umaze"
+methods = ["delta", "nas"]
+seeds = [0]
+[own_methods]
+delta = {{ method = "{place}", memory = {memory} }}
+"""
+
+
+def test_a_recipe_that_changes_their_settings_borrows_nothing_made_with_those_of_its_base(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "base.toml").write_text(OWN.format(place=DELTA, memory=32))
+    other = tmp_path / "other.toml"
+    for memory, borrowed in ((32, {"collect", "pair", "ground", "train", "align", "evaluate"}), (8, None)):
+        other.write_text(f'based_on = "base"\n{OWN.format(place=DELTA, memory=memory)}')
+        assert load_experiment(other, tmp_path).borrowed == (borrowed or {"collect", "pair"})
+    # That its default is written out is no change.
+    (tmp_path / "base.toml").write_text(OWN.format(place=DELTA, memory=32).replace(", memory = 32", ""))
+    other.write_text(f'based_on = "base"\n{OWN.format(place=DELTA, memory=32)}')
+    assert "ground" in load_experiment(other, tmp_path).borrowed
+
+
+def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_recipe_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tmp_path / "own.toml"
+    recipe.write_text(OWN.format(place=DELTA, memory=32))
+    settings = load_experiment(recipe, tmp_path).recipe.settings
+    place = "astra_data.experiments.experiment"
+    monkeypatch.setattr(f"{place}.read_published", lambda path: path)
+    monkeypatch.setattr(f"{place}.points_of", lambda published: [])
+    found = SimpleNamespace(settings=settings, methods=["delta"])
+    monkeypatch.setattr(f"{place}.by_size", lambda published: {None: found})
+    assert load_experiment(recipe, tmp_path).published() == set()
+    recipe.write_text(OWN.format(place=DELTA, memory=8))
+    with pytest.raises(RecipeError, match=r"^own_methods\.delta changed in .* since its results"):
+        load_experiment(recipe, tmp_path).published()
+    found.settings = settings | {"own_methods": {"delta": {"method": DELTA, "no_setting": 3}}}
+    with pytest.raises(RecipeError, match=r"^own_methods\.delta changed"):
+        load_experiment(recipe, tmp_path).published()
+    found.methods = ["nas"]
+    assert load_experiment(recipe, tmp_path).published() == set()
