@@ -249,6 +249,7 @@ def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
     for key in ("methods", "seeds"):
         theirs, ours = getattr(base.recipe, key), getattr(recipe, key)
         unknown = [value for value in ours if value not in theirs]
-        faults += [f"{key}: {name} has no '{value}', it has {list(theirs)}" for value in unknown]
+        advice = f"add it to those of {base.path} and run that, or leave out based_on"
+        faults += [f"{key}: {name} has no '{value}', it has {list(theirs)}: {advice}" for value in unknown]
     if faults:
         raise RecipeError(f"{path} does not fit what it is based on: {'; '.join(faults)}")

@@ -272,7 +272,7 @@ def test_a_link_of_the_user_s_own_is_a_folder_like_any(base: Path, tmp_path: Pat
         (
             'based_on = "base"\nmethods = ["nas", "astra"]\nseeds = [0, 5]',
             " does not fit what it is based on: methods: base has no 'nas', it has ['astra', 'astra_plus', "
-            "'follower']; seeds: base has no '5', it has [0, 1]",
+            "'follower']: {0}; seeds: base has no '5', it has [0, 1]: {0}",
         ),
         ('based_on = "base"\nevaluate = 3', ": evaluate: expected a table, got 3"),
         (LONGER + "step = 3", ": evaluate.step: unknown key: did you mean 'steps'?"),
@@ -282,7 +282,8 @@ def test_faults_are_told(longer: Path, text: str, expected: str) -> None:
     longer.write_text(text)
     with pytest.raises(RecipeError) as caught:
         load_experiment(longer, longer.parent)
-    assert str(caught.value) == f"{longer}{expected}"
+    advice = f"add it to those of {longer.with_name('base.toml')} and run that, or leave out based_on"
+    assert str(caught.value) == f"{longer}{expected.replace('{0}', advice)}"
 
 
 def test_there_is_no_chain(longer: Path) -> None:
