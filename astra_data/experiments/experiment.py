@@ -92,7 +92,7 @@ class Experiment:
             if stage not in self.borrowed:
                 continue
             source = self.maker(stage).folder
-            if link.exists():
+            if link.exists() or link.is_symlink():
                 raise RecipeError(
                     f"{link} is in the way: {self.path} is based on {source.name}, whose {stage} it uses; "
                     f"give the recipe another name, or remove {link}"

@@ -243,6 +243,15 @@ def test_a_stage_that_is_borrowed_no_more_is_made_here(base: Path, longer: Path,
     )
 
 
+def test_a_link_that_leads_nowhere_is_in_the_way_of_what_is_borrowed(longer: Path, tmp_path: Path) -> None:
+    link = tmp_path / "longer/train"
+    link.parent.mkdir()
+    link.symlink_to(tmp_path / "disk that is not there")
+    with pytest.raises(RecipeError, match=f"^{re.escape(str(link))} is in the way: "):
+        load_experiment(longer, tmp_path).link_borrowed()
+    assert link.is_symlink()
+
+
 def test_a_link_of_the_user_s_own_is_a_folder_like_any(base: Path, tmp_path: Path) -> None:
     collected = tmp_path / "disk/collect/seed_0"
     collected.mkdir(parents=True)
