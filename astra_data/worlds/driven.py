@@ -66,7 +66,7 @@ class DrivenSimulator:
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use `parameters` by name, (B, 1) each, from the next step on; those without effect are ignored."""
         if hasattr(self.simulator, "vary"):
-            self.simulator.vary(parameters)
+            self.simulator.vary({name: values.to(self._there) for name, values in parameters.items()})
 
 
 class VariedCommands(VariedSimulator):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -266,7 +267,9 @@ class Task:
     def simulator(self, num_envs: int, device: str = "cpu") -> TaskSimulator:
         """Build `num_envs` abstract simulators, driven by actions of ±1."""
         simulator = self.own_simulator(num_envs, device)
-        if self.limits.are_normal and all(hasattr(simulator, name) for name in ("blocked", "settle", "vary")):
+        is_whole = all(hasattr(simulator, name) for name in ("blocked", "settle", "vary"))
+        is_there = simulator.state.device.type == torch.device(device).type
+        if self.limits.are_normal and is_whole and is_there:
             return cast(TaskSimulator, simulator)
         return DrivenSimulator(simulator, self.limits, device)
 

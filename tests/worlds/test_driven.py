@@ -60,6 +60,19 @@ def test_walls_and_parameters_of_the_simulator_are_its_own() -> None:
     driven().keep_clear(0.3)  # no walls, nothing to keep clear of
 
 
+def test_parameters_are_given_where_the_simulator_is() -> None:
+    places: list[str] = []
+
+    class Elsewhere(Rail):
+        def vary(self, parameters: dict[str, torch.Tensor]) -> None:
+            places.extend(values.device.type for values in parameters.values())
+
+    rail = Elsewhere(2)
+    rail.state = rail.state.to("meta")
+    DrivenSimulator(rail, DRIVE, "cpu").vary({"friction": torch.ones(2, 1)})
+    assert places == ["meta"]
+
+
 def test_commands_vary_from_episode_to_episode() -> None:
     longer = CommandVariation(action_scale=(0.5, 0.5))
     simulator = TASK.varied_simulator(2, longer)

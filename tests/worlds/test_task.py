@@ -1,4 +1,4 @@
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -146,6 +146,23 @@ def test_simulators_of_a_task_take_actions_and_commands() -> None:
     torch.testing.assert_close(TASK.simulator(2).step(action), torch.tensor([[0.4], [-0.1]]))
     torch.testing.assert_close(TASK.own_simulator(2).step(action), torch.tensor([[0.1], [-0.1]]))
     assert ANT.simulator(2) is not None and not isinstance(ANT.simulator(2), DrivenSimulator)
+
+
+class AloneOnTheCpu(Rail):
+    """A rail that has all that a task needs of a simulator, and takes no device."""
+
+    blocked = torch.zeros(2, dtype=torch.bool)
+
+    def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
+        return landed
+
+    def vary(self, parameters: Mapping[str, torch.Tensor]) -> None: ...
+
+
+def test_states_are_on_the_device_of_the_task_though_the_simulator_takes_none() -> None:
+    task = replace(TASK, make_simulator=AloneOnTheCpu, commands={"v": (-1.0, 1.0)})
+    assert isinstance(task.simulator(2), AloneOnTheCpu)
+    assert task.simulator(2, "meta").state.device.type == "meta"
 
 
 def test_a_task_without_a_target_says_so() -> None:
