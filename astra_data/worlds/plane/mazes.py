@@ -38,7 +38,8 @@ class Maze:
 
         Raises:
             BadInputError: rows differ in length or have other characters, the start or the goal is no free
-                cell, or the fine grid does not divide the cells; lists every fault.
+                cell, no way leads from one to the other, or the fine grid does not divide the cells; lists
+                every fault.
         """
         faults = []
         if not self.rows or not self.rows[0] or len({len(row) for row in self.rows}) != 1:
@@ -51,6 +52,8 @@ class Maze:
                 for name, cell in (("start", self.start), ("goal", self.goal))
                 if cell not in self.free_cells()
             ]
+            if not faults and self.goal not in self._cells_around(self.start):
+                faults.append(f"goal: expected a cell to which a way leads from the start, got {self.goal}")
         per_cell = self.scale / self.fine_m if self.fine_m > 0 else 0.0
         if self.scale <= 0 or round(per_cell) < 2 or abs(per_cell - round(per_cell)) > 1e-6:
             faults.append(
@@ -58,6 +61,18 @@ class Maze:
             )
         if faults:
             raise BadInputError(f"maze: {'; '.join(faults)}")
+
+    def _cells_around(self, cell: tuple[int, int]) -> set[tuple[int, int]]:
+        """Return the free cells to which a way leads from a free `cell`."""
+        # Without scipy.ndimage, whose import would take everybody who names a task half a second.
+        free, found, todo = {*self.free_cells()}, {cell}, [cell]
+        while todo:
+            row, column = todo.pop()
+            beside = {(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)}
+            new = beside & free - found
+            found |= new
+            todo += new
+        return found
 
     @cached_property
     def walls(self) -> NDArray[np.bool_]:
@@ -116,8 +131,8 @@ class Maze:
         """Return the length in m of the shortest free path from each fine cell to `goal` (2,), [y, x].
 
         Cells within `radius` m of a wall are not free. Paths keep `margin` m from walls where they can:
-        within it, cells cost more the closer they are to a wall. Cells that are not free take the value of
-        the nearest free one plus the distance to it.
+        within it, cells cost more the closer they are to a wall. Cells that are not free, or closed off,
+        take the value of the nearest one with a path plus the distance to it.
 
         Raises:
             BadInputError: the goal's cell is not free.
@@ -148,10 +163,10 @@ class Maze:
         lengths = (
             np.asarray(scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=source)) * self.fine_m
         )
-        into_wall, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)
-        field = np.zeros(free.shape)
+        field = np.full(free.shape, np.inf)
         field[free] = lengths
-        return np.asarray(field[tuple(nearest)] + into_wall * self.fine_m)
+        away, nearest = scipy.ndimage.distance_transform_edt(np.isinf(field), return_indices=True)
+        return np.asarray(field[tuple(nearest)] + away * self.fine_m)
 
 
 def _shifted(shape: tuple[int, ...], dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

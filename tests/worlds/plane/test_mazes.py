@@ -122,6 +122,8 @@ def test_who_goes_downhill_keeps_the_margin_all_the_way() -> None:
         ({"rows": ("111", "1x1", "111")}, "rows: expected 1 for a wall and 0 for free space"),
         ({"start": (0, 1)}, r"start: expected \(row, column\) of a free cell, got \(0, 1\)"),
         ({"goal": (1, 9)}, r"goal: expected \(row, column\) of a free cell, got \(1, 9\)"),
+        ({"rows": ("1111111", "1001001", "1111111")}, "goal: expected a cell to which a way leads from the"),
+        ({"rows": ("1111", "1011", "1101", "1111"), "goal": (2, 2)}, r"goal: .* the start, got \(2, 2\)"),
         ({"fine_m": 0.3}, "fine_m: expected a half of the scale, 4.0 m, or a smaller part, got 0.3"),
         ({"fine_m": 8.0}, "fine_m: expected a half of the scale"),
         ({"fine_m": 4.0}, "fine_m: expected a half of the scale"),
@@ -149,6 +151,15 @@ def test_cells_of_a_maze_that_is_not_square_are_where_they_are_drawn() -> None:
     assert CORRIDOR.half_extent.tolist() == [14.0, 6.0]
     assert (CORRIDOR.cell_center(0, 0), CORRIDOR.cell_center(1, 5)) == ((-12.0, 4.0), (8.0, 0.0))
     assert CORRIDOR.fine_walls.shape == (120, 280)
+
+
+def test_a_room_that_is_closed_off_is_as_far_as_a_wall() -> None:
+    maze = Maze(rows=("1111111", "1000101", "1111111"), scale=1.0, start=(1, 1), goal=(1, 1))
+    field = maze.distance_field(np.array(maze.cell_center(1, 1)))
+    row, columns = 15, np.array([35, 45, 55])  # middles of the last cell of the corridor, the wall, the room
+    assert np.isfinite(field).all()
+    # From the goal to the corridor's last cell, then straight on.
+    np.testing.assert_allclose(field[row, columns], [2.0, 3.0, 4.0], atol=0.11)
 
 
 def test_there_is_no_distance_to_a_goal_in_a_wall() -> None:
