@@ -1,7 +1,9 @@
 """Train: learn the policy of a row with its method."""
 
 import json
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, as_json
@@ -16,7 +18,7 @@ from astra_data.methods import method_named
 from astra_data.reports.artifacts import CURVE
 from astra_data.training.policy_file import POLICY, PolicyFile
 from astra_data.training.restarts import with_restarts
-from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
+from astra_data.training.train import Learn, PpoTrainConfig, SacTrainConfig, Training
 from astra_data.worlds.registry import task_named
 
 
@@ -116,9 +118,27 @@ def train(
             progress=progress,
             num_threads=num_threads,
         )
+        learn = partial(_learned, base.learn)
         if base.in_simulator:
-            policy, curve = with_restarts(base.learn, training, grounding_file)
+            policy, curve = with_restarts(learn, training, grounding_file)
         else:
-            policy, curve = base.learn(training)
+            policy, curve = learn(training)
         policy.save(folder / POLICY)
         (folder / CURVE).write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
+
+
+def _learned(learn: Learn, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+    """Return the policy and the learning curve that `learn`, which may be a function of the user's, returns.
+
+    Raises:
+        BadInputError: it returns something else.
+    """
+    match returned := learn(training):
+        case (PolicyFile() as policy, dict() as curve):
+            return policy, curve
+    parts = returned if isinstance(returned, tuple) else (returned,)
+    raise BadInputError(
+        f"learn returned {' and '.join(type(part).__name__ for part in parts) or 'nothing'}: expected a "
+        "PolicyFile and a dict of the learning curve; one that returns a policy of another learner is given "
+        "to an OwnLearner"
+    )

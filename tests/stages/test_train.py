@@ -328,6 +328,32 @@ def test_trainings_without_a_simulator_are_made_once(
     assert [(one.seed, one.num_threads) for one in given] == [(4, 3)]
 
 
+@pytest.mark.parametrize("method", ["behavior_cloning", "direct_transfer"])
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        (ActorCritic(ActorCriticShape(6, 2)), "ActorCritic"),
+        ((ActorCritic(ActorCriticShape(6, 2)), {"points": []}), "ActorCritic and dict"),
+        (({"points": []},), "dict"),
+        ((), "nothing"),
+        ((PolicyFile(ActorCritic(ActorCriticShape(6, 2)), None, None, None), []), "PolicyFile and list"),
+    ],
+)
+def test_what_a_function_of_the_user_s_learns_is_a_policy_file_and_a_curve(
+    task: str,
+    paired: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    returned: Any,  # noqa: ANN401 - whatever it returns
+    told: str,
+    method: str,
+) -> None:
+    monkeypatch.setitem(METHODS, method, replace(METHODS[method], learn=lambda training: returned))
+    config = TRAIN.model_copy(update={"tries": 2})
+    with pytest.raises(BadInputError, match=f"^learn returned {told}: expected a PolicyFile and a dict"):
+        train(task, method, config, dataset=paired, out=tmp_path / "learned")
+
+
 def test_a_policy_of_short_commands_is_no_start_of_fine_tuning(
     task: str, paired: Path, tmp_path: Path
 ) -> None:
