@@ -20,6 +20,8 @@ _SIDE = re.compile(r"left|right|(?<![a-z])[vw]?[lr](?![a-z])")
 _COMMAND = {"turn": 0.0, "right": 2.0}
 """Of which a written test takes a step; others are 1."""
 _SPEED_AXIS = re.compile(r"(.+_)?(v|vel|velocity|linear)_?[xy]")
+_ALONG_BODY = re.compile(r"(.+_)?(?P<axis>surge|sway)(_?(vel|velocity|speed|rate))?")
+"""Speeds of vessels, which are along the robot by their names."""
 
 
 @dataclass(frozen=True)
@@ -166,18 +168,22 @@ class Holonomic(Planar):
         along, across = ("east", "north") if self.is_in_world else ("forward", "left")
         commands = self.logs.of("command")
         return [
-            "turn" if field.is_turn_rate else along if field.plain.endswith("x") else across
+            "turn" if field.is_turn_rate else along if _along_axis(field).endswith("x") else across
             for field in commands
         ]
 
     @classmethod
     def of(cls, logs: Logs) -> Self | None:
-        """Return how it fits, with speeds of the frame that predicts the logs better; None if it does not."""
+        """Return how it fits, with speeds of the frame that predicts the logs better; None if it does not.
+
+        Surge and sway are of the robot's frame, whatever the logs say.
+        """
         pose, commands = pose_of(logs), logs.of("command")
         straight = [field for field in commands if not field.is_turn_rate]
         if pose is None or len(commands) - len(straight) != 1 or not _are_along_axes(straight):
             return None
-        kinds = [cls(logs, *pose, is_in_world) for is_in_world in (False, True)]
+        frames = (False,) if any(map(is_along_body, straight)) else (False, True)
+        kinds = [cls(logs, *pose, is_in_world) for is_in_world in frames]
         return min(kinds, key=lambda kind: float(errors(kind, 1)[0][:2].sum()))
 
     def _speeds(self, given: dict[str, Floats], cos: Floats, sin: Floats) -> tuple[Floats, Floats]:
@@ -211,11 +217,23 @@ def _moves(logs: Logs, fields: Sequence[Field]) -> bool:
 def _are_along_axes(commands: Sequence[Field]) -> bool:
     """Return whether they are two speeds, by their names or units, one along x and one along y."""
     names = {
-        field.plain
+        _along_axis(field)
         for field in commands
-        if field.unit == "m/s" or (field.unit == "1" and _SPEED_AXIS.fullmatch(field.plain))
+        if field.unit == "m/s"
+        or (field.unit == "1" and (_SPEED_AXIS.fullmatch(field.plain) or is_along_body(field)))
     }
     return len(commands) == 2 and any(names == {f"{name[:-1]}x", f"{name[:-1]}y"} for name in names)
+
+
+def is_along_body(field: Field) -> bool:
+    """Return whether it is a speed along the robot by its name, surge or sway."""
+    return _ALONG_BODY.fullmatch(field.plain) is not None
+
+
+def _along_axis(field: Field) -> str:
+    """Return the plain name of a field, with x in place of surge and y in place of sway."""
+    found = _ALONG_BODY.fullmatch(field.plain)
+    return f"{found[1] or ''}{'x' if found['axis'] == 'surge' else 'y'}" if found else field.plain
 
 
 def are_sides(one: Field, other: Field) -> bool:

@@ -11,9 +11,10 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.exchange.field_names import HEADING, QUATERNION
+from astra_data.exchange.field_names import HEADING, LENGTH, QUATERNION
 from astra_data.exchange.logs import Field, Logs
 from astra_data.experiments.kind_errors import errors, judged_steps
+from astra_data.experiments.planar_kinds import is_along_body
 from astra_data.experiments.written_values import numbers, texts, typical
 
 _SPEED = re.compile(r"^(vel_|velocity_|v|d)(?=[a-z])")
@@ -51,6 +52,9 @@ class Direct:
             f"values that {what} as commanded: {', '.join(pairs)}" for what, pairs in listed.items() if pairs
         ]
         clauses += [f"{heading} as cosine and sine" for heading in self._headings]
+        pairs = zip(self.logs.of("command"), self.moved, strict=False)
+        if turning := [command.short for command, at in pairs if is_along_body(command) and _is_place(at)]:
+            clauses.append(f"CHECK: {' and '.join(turning)} go along the robot: turn them by its heading")
         if parts := _quaternions(self.logs):
             clauses.append(
                 f"{', '.join(field.short for field in parts)} are a quaternion: make yaw of it in φ"
@@ -206,6 +210,10 @@ def _may_move(command: Field, state: Field) -> bool:
     """Return whether the units, where both are known, are the same but for a time; a turn rate's is."""
     unit = "rad/s" if command.is_turn_rate else command.unit
     return "1" in (unit, state.unit) or unit.removesuffix("/s") == state.unit
+
+
+def _is_place(state: Field) -> bool:
+    return LENGTH.fullmatch(state.plain) is not None
 
 
 def _length(filled: list[Field | None]) -> int:

@@ -97,7 +97,32 @@ def test_two_speeds_and_a_turn_rate_have_many_names(tmp_path: Path, names: Seque
 @pytest.mark.parametrize(
     "names",
     [
+        ("cmd_yaw_rate", "cmd_sway", "cmd_surge"),
+        ("yaw_rate_cmd", "sway_cmd", "surge_cmd"),
+        ("cmd_w_rad_s", "cmd_sway_m_s", "cmd_surge_m_s"),
+        ("cmd_wz", "cmd_body_sway_velocity", "cmd_body_surge_velocity"),
+    ],
+)
+@pytest.mark.parametrize("in_world", [False, True])
+def test_surge_and_sway_are_speeds_along_the_vessel_whatever_its_logs_say(
+    tmp_path: Path, names: Sequence[str], in_world: bool
+) -> None:
+    poses, commands = drive(in_world=in_world)
+    log = write(tmp_path / "log.csv", ["x", "y", "heading", *names], poses, commands[:, ::-1])
+    kind = Holonomic.of(guess([log]))
+    assert kind is not None and kind.meanings == ["turn", "left", "forward"] and not kind.is_in_world
+    along, _ = drive()
+    landed = kind.step(along[:-1], commands[:-1, ::-1])
+    np.testing.assert_allclose(landed, along[1:], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
         ("cmd_vx", "cmd_vy", "cmd_grip"),
+        ("cmd_surge", "cmd_heave", "cmd_wz"),
+        ("cmd_surge", "cmd_sway", "cmd_yaw"),
+        ("cmd_surge_n", "cmd_sway_n", "cmd_wz"),  # forces
         ("cmd_vx", "cmd_vy", "cmd_yaw"),  # where to look
         ("cmd_vx", "cmd_vz", "cmd_wz"),
         ("cmd_x_m", "cmd_y_m", "cmd_wz"),  # where to be

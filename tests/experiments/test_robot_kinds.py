@@ -172,6 +172,17 @@ def test_no_command_moves_a_part_of_a_quaternion(tmp_path: Path, stem: str) -> N
     assert "make yaw of it" not in Direct.of(logs(tmp_path, **pose, **commands)).simulator
 
 
+def test_speeds_along_a_vessel_that_move_its_place_are_told(tmp_path: Path) -> None:
+    pose, swims = {"x": T, "y": T % 9, "z": T % 4, "yaw": T % 3 / 9}, {"cmd_surge": T % 5, "cmd_sway": T % 2}
+    told = "; CHECK: surge and sway go along the robot: turn them by its heading"
+    turns = {"cmd_heave": T % 7, "cmd_yaw_rate": T % 3}
+    assert Direct.of(logs(tmp_path, **pose, **swims, **turns)).simulator.endswith(told)
+    flies = {"cmd_vx": T % 5, "cmd_vy": T % 2}
+    assert "CHECK" not in Direct.of(logs(tmp_path, **pose, **flies, **turns)).simulator
+    speeds = {"surge": T % 5 / 2, "sway": T % 2 / 2}  # what is commanded, and no place
+    assert "CHECK" not in Direct.of(logs(tmp_path, **pose, **speeds, **swims)).simulator
+
+
 def test_speeds_are_no_position(tmp_path: Path) -> None:
     speeds = {"odom_linear_x": T % 7, "odom_linear_y": T % 4}
     kind = Planar.of(logs(tmp_path, **speeds, x=T, y=T % 9, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
