@@ -40,6 +40,7 @@ class FakeConfig(Config):
     ramp_while: float = 0.0
     held_out_share: float = 0.1
     reward: str | None = None
+    topple: bool = False
     correction_heads: int = 1
     members: int = 0
 

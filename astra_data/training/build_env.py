@@ -41,9 +41,11 @@ class EnvConfig(Config):
     reward: RewardSource | None = None
     """Source of the reward: "abstract", "predicted" or "blend"; by default that of the method."""
     topple: bool = False
-    """Sample topples from the topple head: they end the episode and cost as much as a failure."""
+    """Sample topples from the topple head: they end the episode and cost as much as a failure. Then the
+    reward "blend" is the abstract one: a risk that is drawn is not priced as well."""
     risk_weight: NotNegative = 1.0
-    """How many topples a predicted one counts as in "blend": a topple also costs the rest of the episode."""
+    """How many topples a predicted one counts as in "blend", without `topple`: a topple also costs the rest
+    of the episode."""
     residual_noise: NotNegative = 0.0
     """Noise added to the state after each step, in units of the target's scatter around the simulator."""
     support_penalty: NotNegative = 0.0

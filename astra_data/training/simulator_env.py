@@ -45,10 +45,10 @@ class SimulatorEnv:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", the target's as R_pred predicts it
-    (Algorithm 2); "blend", the task's own plus the predicted risk of toppling. Where the abstract state
-    itself decides the step (goal reached, ball out, body fallen, a wall touched that must not be),
-    "predicted" pays the task's own reward as well. With `topple`, topples are drawn from the topple head and
-    end the episode. All randomness comes from torch's global generator.
+    (Algorithm 2); "blend", the task's own minus the predicted risk of toppling, unless topples are drawn.
+    Where the abstract state itself decides the step (goal reached, ball out, body fallen, a wall touched that
+    must not be), "predicted" pays the task's own reward as well. With `topple`, topples are drawn from the
+    topple head and end the episode. All randomness comes from torch's global generator.
 
     Attributes:
         latent_size: Z, of the latents in the observations; 0 where there are none.

@@ -329,3 +329,32 @@ def test_a_recipe_with_data_is_labeled_and_has_nothing_to_collect(recipe: Path, 
     with pytest.raises(RecipeError, match=r'data \("me/walks", now ".*runs"\) changed'):
         run(recipe, root=tmp_path, jobs=1, until="pair")
     assert load_experiment(recipe, tmp_path).recipe.data == str(tmp_path / "runs")
+
+
+@pytest.mark.parametrize(
+    ("tables", "rows", "named"),
+    [
+        ('[plus]\ntopple = true\nreward = "blend"\n', '"astra", "astra_plus"', ["plus"]),
+        ('[train]\ntopple = true\nreward = "blend"\n', '"astra", "astra_plus"', ["train", "plus"]),
+        ('[train]\ntopple = true\n[plus]\nreward = "blend"\n', '"astra", "astra_plus"', ["plus"]),
+        ('[plus]\ntopple = true\nreward = "blend"\n', '"astra"', []),
+        ('[train]\ntopple = true\nreward = "blend"\n', '"follower"', []),
+        ("[plus]\ntopple = true\n", '"astra_plus"', []),
+        ('[plus]\nreward = "blend"\n', '"astra_plus"', []),
+    ],
+)
+def test_a_reward_that_prices_no_risk_beside_drawn_topples_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, tables: str, rows: str, named: list[str]
+) -> None:
+    recipe = tmp_path / "drawn.toml"
+    recipe.write_text(f'task = "maze"\nmethods = [{rows}]\nseeds = [0]\n{tables}')
+    told = [
+        f'{recipe}: {table}: with topple = true, reward = "blend" is the task\'s own and prices no risk, as '
+        "topples that are drawn cost what failures do: leave out one of the two"
+        for table in named
+    ]
+    check(recipe, root=tmp_path)
+    assert [record.getMessage() for record in caplog.records] == told
+    caplog.clear()
+    run(recipe, root=tmp_path, jobs=1, until="collect")
+    assert [record.getMessage() for record in caplog.records] == told
