@@ -188,7 +188,7 @@ def _common(name: str, logs: Logs) -> dict[str, str]:
         "command_names": texts(field.short for field in commands),
         "command_units": texts(field.unit for field in commands),
         "row": json.dumps([significant(value) for value in logs.values(states)[0][0]]),
-        "bounds": repr(bounds).replace("'", '"'),
+        "bounds": f"{{{', '.join(f'{_toml(name)}: {ends!r}' for name, ends in bounds.items())}}}",
         "still": f"; {logs.still}" if logs.still else "",
         "horizon": str(horizon),
         "guesses": "\n".join(lines),
@@ -237,7 +237,7 @@ def _recorded_goals(logs: Logs) -> str:
 
 
 def _toml(value: str | Sequence[str] | Sequence[float]) -> str:
-    """Return a text, or a list, as TOML."""
+    """Return a text, or a list, as TOML, which is also Python."""
     return json.dumps(value, ensure_ascii=False)
 
 

@@ -433,9 +433,12 @@ def driven(
         ROS,
         ((*ROS[0], "/odom:twist.twist.linear.x", "/odom:twist.twist.angular.z"), ROS[1]),
         (("pose.x", "pose.y", "Orientation.z", "Orientation.w"), ("v", "/cmd_vel:angular.z")),
+        (("robot's x", "robot's y", "Orientation.z", "Orientation.w"), ("robot's v", '"w"')),
     ],
 )
-def test_names_with_dots_are_understood_and_kept(states: Sequence[str], commands: Sequence[str]) -> None:
+def test_names_with_dots_and_quotes_are_understood_and_kept(
+    states: Sequence[str], commands: Sequence[str]
+) -> None:
     values = driven(Path("ros"), states, commands)
     kind = write_robot("base", Path("base"), [Path("ros")])
     moved = ", ".join(states[:4])
