@@ -232,11 +232,16 @@ def _is_same_place(before: object, now: object) -> bool:
 
 
 def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of a recipe over those of its base; `data` and `[collect]` replace each other."""
+    other = {"data": "collect", "collect": "data"}
+    replaced = {other[key] for key in other.keys() & above.keys()} - above.keys()
+    below = {key: value for key, value in below.items() if key not in replaced}
+
     def both(key: str) -> Any:  # noqa: ANN401 - any value of a recipe
         old, new = below[key], above[key]
         return old | new if isinstance(old, dict) and isinstance(new, dict) else new
 
-    return dict(below) | {key: both(key) if key in below else value for key, value in above.items()}
+    return below | {key: both(key) if key in below else value for key, value in above.items()}
 
 
 def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:

@@ -112,6 +112,23 @@ def test_sizes_that_the_base_has_not_are_made_of_its_pairs(
     assert borrowed == (every if is_borrowed else {"collect", "pair"})
 
 
+def test_data_replace_what_the_base_collects_and_the_other_way_around(base: Path) -> None:
+    collects, given = "[collect]\nsteps = 7\n", 'data = "walks"\n'
+    path = base.with_name("other.toml")
+    for theirs, ours in ((BASE + collects, given), (given + BASE, collects)):
+        base.write_text(theirs)
+        path.write_text(f'based_on = "base"\n{ours}')
+        experiment = load_experiment(path, base.parent)
+        assert experiment.borrowed == set()
+        found = experiment.recipe
+        assert (found.data, found.collect and found.collect.steps) == (
+            ("walks", None) if ours == given else (None, 7)
+        )
+        path.write_text(f'based_on = "base"\n{given}{collects}')
+        with pytest.raises(RecipeError, match=r"data replaces \[collect\]: leave out one of them$"):
+            load_experiment(path, base.parent)
+
+
 def sketch(base: Path, monkeypatch: pytest.MonkeyPatch, *targets: str | None) -> Path:
     """Write a recipe based on `base` of another task; both have these targets."""
     maze = TASKS["antmaze-umaze"]
