@@ -145,6 +145,9 @@ class Task:
             faults.append(f"objective: action_size {size}, expected that of commands, {len(commands)}")
         if self.action and {*self.action.labels} == {*commands} and self.action.labels != (*commands,):
             faults.append(f"action: names {', '.join(self.action.labels)}, expected {', '.join(commands)}")
+        for name, size in (("action", len(commands)), ("goal", self.objective.goal_size)):
+            if (column := getattr(self, name)) and column.size != size:
+                faults.append(f"{name}: {column.size} values, expected {size}")
         if (horizon := self.objective.horizon) < 1:
             faults.append(f"objective: horizon {horizon}, expected 1 step or more")
         if not 0 < self.timestep_s < 2:

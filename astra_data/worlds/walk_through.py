@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
-from astra_data.worlds.expecting import expect, first, judged, paid, stepped
+from astra_data.worlds.expecting import expect, expect_tensor, first, judged, paid, stepped
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.robot import RobotEnv
@@ -53,6 +53,8 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
     tried(_rate)
     starts, goals, simulator = tried(_starts), tried(_goals), tried(_simulator, device)
     tried(_abstraction)
+    tried(_quantities)
+    tried(_beyond)
     tried(_robot)
     if starts is None or simulator is None:
         return faults
@@ -118,6 +120,22 @@ def _abstraction(task: Task) -> None:
                 f"of {shape}; abstract_state has {wanted[1]} values"
             )
         expect(what, torch.as_tensor(found), wanted)
+
+
+def _quantities(task: Task) -> None:
+    size = task.abstract_state.size
+    with explained("quantities"):
+        wrong = [name for name, of in task.quantities.items() if not {*of} <= {*range(-size, size)}]
+    if wrong:
+        raise BadInputError(f"quantities: {', '.join(wrong)}: expected indices below {size}, of states")
+
+
+def _beyond(task: Task) -> None:
+    state = torch.from_numpy(generator(0, "states").normal(size=(_COUNT, task.state.size))).float()
+    with explained(what := f"beyond of states {tuple(state.shape)}"):
+        found = expect_tensor(what, task.beyond(state))
+    if found.dim() != 2 or len(found) != _COUNT:
+        raise BadInputError(f"{what}: expected shape ({_COUNT}, any), got {tuple(found.shape)}")
 
 
 def _robot(task: Task) -> None:

@@ -182,6 +182,8 @@ def test_a_task_without_a_target_says_so() -> None:
             },
             "action: names w, v, expected v, w$",
         ),
+        ({"action": Column("action", size=2)}, "action: 2 values, expected 1"),
+        ({"goal": Column("observation.environment_state", size=2)}, "goal: 2 values, expected 1"),
         ({"timestep_s": 0.0}, "timestep_s: expected above 0 and below 2 s.*: got 0.0"),
         ({"timestep_s": 2.0}, "timestep_s: expected above 0 and below 2 s.*: got 2.0"),
         ({"name": "my rail"}, "name: expected letters, digits"),

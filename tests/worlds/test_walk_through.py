@@ -197,6 +197,20 @@ WRONG: list[tuple[Task, str]] = [
         replace(abstraction(lambda state: np.asarray(state)[:, :1]), robot=None),
         "abstraction (φ) of states (3, 2): expected a Tensor of shape (3, 1), got a ndarray of (3, 1)",
     ),
+    (
+        replace(TASK, quantities={"x": (0,), "y": (0, 1), "z": (-2,)}),
+        "quantities: y, z: expected indices below 1, of states",
+    ),
+    (replace(TASK, quantities={"x": 0}), "quantities fails with TypeError: "),  # type: ignore[dict-item]
+    (
+        replace(TASK, beyond=lambda state: state[..., 0]),
+        "beyond of states (3, 2): expected shape (3, any), got (3,)",
+    ),
+    (
+        replace(TASK, beyond=lambda state: state[:1]),
+        "beyond of states (3, 2): expected shape (3, any), got (1, 2)",
+    ),
+    (replace(TASK, beyond=lambda state: state[..., 2]), "beyond of states (3, 2) fails with IndexError: "),
 ]
 
 
