@@ -56,7 +56,8 @@ class CollectConfig(Config):
     """Record only as many episodes as it takes to reach this many steps in total, so that datasets of
     different behaviors have the same size."""
     max_steps: Count = 500
-    """Maximum steps per episode; longer episodes are truncated. A plan has its own lengths."""
+    """Maximum steps per episode; longer episodes are truncated. With a plan, all are as long as its longest,
+    and hold their last command until then."""
     num_envs: AtOnce = 200
     """Episodes recorded in one batch; also affects which random numbers each episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
