@@ -68,7 +68,7 @@ def run(
 
     The last command is `stop`, what stops the robot: also after an error, and after Ctrl-C. With None no
     other follows the policy's last, which holds a robot whose commands are positions. A period that took
-    too long is not made up for: the next command is due a period after the late one.
+    too long is not made up for: the next one begins when it ends.
     """
     last = None if stop is None else finite("stop", stop, policy.about["command"]["names"])
     policy.start()

@@ -101,7 +101,7 @@ def test_the_loop_sleeps_what_the_policy_leaves_of_a_period(
     policy = RobotPolicy(**GIVEN, folder=folder)
     policy.about["rate_hz"] = 10.0
     run(policy, measure, lambda command: None, [1.0], steps=3, stop=[0.0])
-    # The period that took too long is not made up for: commands never come closer than a period.
+    # The period that took too long is not made up for: the state is never measured twice within a period.
     assert slept == pytest.approx([0.08, 0.0, 0.08])
 
 
