@@ -181,6 +181,19 @@ def test_a_drive_ends_and_an_error_stops_the_robot(ros: Ros, folder: Path) -> No
     assert ros.sent[-1] == (0.0, 0.0) and not ros.is_up
 
 
+def test_a_drive_whose_odometry_stays_out_ends_as_well(ros: Ros, folder: Path) -> None:
+    def events() -> Iterator[None]:
+        ros.odometry(1.0)
+        for _ in range(20):
+            yield ros.step()
+            ros.now += 7.0
+        raise AssertionError("still driving after 140 s")
+
+    ros.events = events()
+    drive(folder, 3, -1)
+    assert ros.sent == [(0.1, -0.5), *[(0.0, 0.0)] * 9] and not ros.is_up
+
+
 def test_what_is_asked_wrongly_is_told_before_anything_moves(
     ros: Ros, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

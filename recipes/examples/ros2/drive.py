@@ -55,12 +55,14 @@ class Driver(Node):
         self.state, self.heard_s = state_of(odometry), time.monotonic()
 
     def step(self):
-        if self.state is None or time.monotonic() - self.heard_s > STALE_S:
+        if time.monotonic() > self.ends_s:
+            self.is_over = True
+        elif self.state is None or time.monotonic() - self.heard_s > STALE_S:
             self.send(0.0, 0.0)
             if self.drives:
                 self.get_logger().warning(f"no odometry for {STALE_S} s: the robot is stopped")
             self.drives = False
-        elif reached(self.state, self.goal) or time.monotonic() > self.ends_s:
+        elif reached(self.state, self.goal):
             self.is_over = True
         else:
             if not self.drives:
