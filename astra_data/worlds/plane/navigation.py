@@ -85,8 +85,17 @@ class Navigation(PlanarObjective):
         return self._around(self.maze.goal, rng, count)
 
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls."""
+        """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls.
+
+        Raises:
+            BadInputError: no place is as far from walls as `start_clearance_m` says.
+        """
         rows, columns = np.nonzero(self.maze.clearance_field > self.start_clearance_m)
+        if not len(rows):
+            raise BadInputError(
+                f"start_clearance_m: expected less than {self.maze.clearance_field.max():.3g} m, the largest "
+                f"clearance in the maze, got {self.start_clearance_m:g}"
+            )
         chosen = rng.integers(len(rows), size=count)
         cell = self.maze.half_extent * 2 / self.maze.fine_walls.shape[::-1]
         within = rng.random((count, 2))

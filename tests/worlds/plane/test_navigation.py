@@ -165,3 +165,14 @@ def test_a_failure_is_paid_for_its_way_too() -> None:
 def test_draws_repeat() -> None:
     first = TASK.draw_anywhere(np.random.default_rng(7), 5)
     np.testing.assert_array_equal(first, TASK.draw_anywhere(np.random.default_rng(7), 5))
+
+
+def test_a_maze_too_narrow_for_starts_anywhere_is_told() -> None:
+    narrow = Maze(rows=("11111", "10001", "11111"), scale=1.0, start=(1, 1), goal=(1, 3))
+    with pytest.raises(
+        BadInputError, match=r"start_clearance_m: expected less than 0\.5 m, the largest .*, got 0\.8$"
+    ):
+        Navigation(narrow, horizon=9, spread_m=0.05).draw_anywhere(np.random.default_rng(0), 2)
+    wider = Navigation(narrow, horizon=9, spread_m=0.05, start_clearance_m=0.4)
+    starts = wider.draw_anywhere(np.random.default_rng(0), 100)
+    assert (np.abs(starts[:, 1]) <= 0.1).all()  # along the middle
