@@ -42,14 +42,30 @@ def made(env_id: str | Callable[..., Env], **options: Any) -> Env:  # noqa: ANN4
     """Return the environment `env_id`, or of that class, with its `options`, without wrappers.
 
     Raises:
-        BadInputError: it cannot be made.
+        BadInputError: it cannot be made, or a wrapper changes actions or observations.
     """
     if callable(env_id):
         with explained(f"making {_name(env_id)}"):
-            return env_id(**options).unwrapped
+            return _without_wrappers(env_id(**options))
     with explained(f"gymnasium.make({env_id!r})"):
         # The horizon is the task's, and what is wrong with states is told by the task.
         env: Env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **options)
+    return _without_wrappers(env)
+
+
+def _without_wrappers(env: Env) -> Env:
+    inner = env
+    while isinstance(inner, gymnasium.Wrapper):
+        spaces, within = (
+            [getattr(one, f"{space}_space", None) for space in ("action", "observation")]
+            for one in (inner, inner.env)
+        )
+        if spaces != within or isinstance(inner, gymnasium.ActionWrapper | gymnasium.ObservationWrapper):
+            raise BadInputError(
+                f"{env}: wrappers are left out, and {type(inner).__name__} changes actions or observations: "
+                "make the environment without it, and do the same in command or read_state"
+            )
+        inner = inner.env
     return env.unwrapped
 
 
@@ -87,7 +103,8 @@ class GymnasiumRobot:
 
         Args:
             env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0"; or the
-                class itself, or a function that makes the environment.
+                class itself, or a function that makes the environment. Wrappers are left out; one that
+                changes actions or observations is refused.
             read_state: makes the state (S,) of the environment, without its wrappers, and an observation.
             command: makes an action of the environment of a command (A,) and the state that it is given in.
             failed: whether the robot failed, from the state after a step and whether the environment
