@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from threading import Thread
+from threading import Thread, current_thread, main_thread
 from types import FrameType
 
 from astra_data.core.errors import AstraDataError
@@ -70,9 +70,10 @@ def execute(
 def _interruptible() -> Iterator[None]:
     """Interrupt the block at SIGINT or SIGTERM, once.
 
-    Also where a shell that started the run in the background has it ignore SIGINT.
+    Also where a shell that started the run in the background has it ignore SIGINT. Python tells these signals
+    to the main thread alone: in another, nothing is changed.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         for number in numbers:
@@ -95,11 +96,13 @@ class _Worker:
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,))
         # Ctrl-C reaches every process of the terminal; children ignore it and are stopped by this one.
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        numbers = [signal.SIGINT] if current_thread() is main_thread() else []
+        handlers = [signal.signal(number, signal.SIG_IGN) for number in numbers]
         try:
             self._process.start()
         finally:
-            signal.signal(signal.SIGINT, handler)
+            for number, handler in zip(numbers, handlers, strict=True):
+                signal.signal(number, handler)
         theirs.close()
         self.key: str | None = None
 

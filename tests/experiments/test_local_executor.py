@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +38,16 @@ def test_independent_items_run_at_the_same_time(tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     items = [Item("one", (), partial(rendezvous, one, two)), Item("two", (), partial(rendezvous, two, one))]
     execute(items, jobs=2, logs=tmp_path / "logs", watch=Record())
+
+
+def test_items_run_from_any_thread(tmp_path: Path) -> None:
+    place, record, before = tmp_path / "place", Record(), signal.getsignal(signal.SIGINT)
+    items = [Item("a", (), partial(touch, place, ()))]
+    run = partial(execute, items, jobs=1, logs=tmp_path / "logs", watch=record)
+    with ThreadPoolExecutor() as threads:
+        threads.submit(run).result(PATIENCE_S)
+    assert record.events == [(event, "a") for event in ("started", "0.5 half", "finished")]
+    assert place.exists() and signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
