@@ -3,14 +3,7 @@
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from pydantic import (
-    Field,
-    JsonValue,
-    ValidationInfo,
-    create_model,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, JsonValue, ValidationInfo, create_model, field_validator, model_validator
 
 from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
@@ -223,7 +216,10 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _fits_the_task(self) -> Self:
-        if task_named(self.task).plane is not None:
+        task = task_named(self.task)
+        if task.plane is not None:
+            if "leg_scale" not in task.facts and self.evaluate.leg_scale != 1.0:
+                raise ValueError(f"evaluate.leg_scale: {self.task} has legs of one length: expected 1")
             return self
         faults = [f"methods: {row}" for row in self.methods if method_named(row).planar]
         asked = {

@@ -107,3 +107,17 @@ def test_what_needs_a_maze_is_refused_where_there_is_none(
     path.write_text(HUMANOID.format(more) + end)
     with pytest.raises(RecipeError, match=f"humanoid-walker2d has no maze, which these need: {asked};"):
         load_experiment(path, tmp_path)
+
+
+@pytest.mark.parametrize("task", ["nao-navigation", "antmaze-umaze"])
+def test_legs_of_another_length_are_for_tasks_that_have_them(tmp_path: Path, task: str) -> None:
+    path = tmp_path / "legs.toml"
+    recipe = f'task = "{task}"\nmethods = ["astra"]\nseeds = [0]\n[evaluate]\nleg_scale = '
+    path.write_text(f"{recipe}1.0\n")
+    assert load_experiment(path, tmp_path).recipe.evaluate.leg_scale == 1.0
+    path.write_text(f"{recipe}1.25\n")
+    if task == "antmaze-umaze":
+        assert load_experiment(path, tmp_path).recipe.evaluate.leg_scale == 1.25
+        return
+    with pytest.raises(RecipeError, match=r"evaluate\.leg_scale: nao-navigation has legs of one length"):
+        load_experiment(path, tmp_path)
