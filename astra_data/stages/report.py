@@ -7,12 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key
 from astra_data.core.progress import Progress, silent
 from astra_data.methods import method_named
@@ -64,6 +65,16 @@ class ReportConfig(Config):
 
     bootstrap_replicates: int = Field(default=REPLICATES, ge=100)
     """Bootstrap resamples per confidence interval."""
+
+    @field_validator("trajectory_methods", "paper_success", "compare")
+    @classmethod
+    def _name_known_methods[R: (tuple[str, ...], dict[str, float])](cls, rows: R) -> R:
+        try:
+            for row in rows:
+                method_named(row)
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return rows
 
 
 def report(
