@@ -209,8 +209,12 @@ class Recipe(Config):
     @model_validator(mode="after")
     def _has_the_target_that_it_needs(self) -> Self:
         needing = [f"methods: {row}" for row in self.methods if method_named(row).steps_target]
+        task = task_named(self.task)
+        if needing and task.has_target and task.make_target is None and self.train.data_start_share:
+            fault = f"train.data_start_share: robots of {self.task} cannot be put into recorded states, where"
+            raise ValueError(f"{fault} these would start: {', '.join(needing)}: expected 0")
         needing += ['[collect] (give `data = "…"` in its place)'] if self.data is None else []
-        if needing and not task_named(self.task).has_target:
+        if needing and not task.has_target:
             raise ValueError(f"{self.task} has no target, which these need: {', '.join(needing)}")
         return self
 

@@ -121,3 +121,19 @@ def test_legs_of_another_length_are_for_tasks_that_have_them(tmp_path: Path, tas
         return
     with pytest.raises(RecipeError, match=r"evaluate\.leg_scale: nao-navigation has legs of one length"):
         load_experiment(path, tmp_path)
+
+
+def test_robots_start_no_training_in_recorded_states(tmp_path: Path) -> None:
+    path, cart = tmp_path / "cart.toml", HOUSE / "recipes/examples/cart/robot.py"
+    recipe = (
+        f'task = "{cart}:TASK"\nmethods = ["nas", {{}}]\nseeds = [0]\n[collect]\nstart = "task"\n[train]\n'
+    )
+    started = f"{recipe}data_start_share = 0.5\n"
+    for text in (started.format('"direct_transfer"'), recipe.format('"target"')):
+        path.write_text(text)
+        load_experiment(path, tmp_path)
+    path.write_text(started.format('"target"'))
+    with pytest.raises(RecipeError, match=r"data_start_share: .*would start: methods: target: expected 0$"):
+        load_experiment(path, tmp_path)
+    path.write_text(started.format('"target"').replace(f"{cart}:TASK", "antmaze-umaze"))
+    load_experiment(path, tmp_path)
