@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
-from astra_data.core.config import did_you_mean
+from astra_data.core.config import did_you_mean, in_full
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key, base_method, reference_of, stage_of_key
 from astra_data.experiments.execution import Item
@@ -62,7 +62,7 @@ def plan(
         task=recipe.task,
         methods=selection.methods,
         seeds=selection.seeds,
-        settings=recipe.settings,
+        settings=in_full(recipe),
         percents=selection.percents,
     )
     choice = _choice(recipe, reported, folder)

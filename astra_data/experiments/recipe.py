@@ -63,7 +63,7 @@ class Recipe(Config):
 
     @property
     def settings(self) -> dict[str, JsonValue]:
-        """All settings, including defaults, as JSON values."""
+        """All settings as JSON values, as a run records them; later settings only where they take effect."""
         return self.model_dump(mode="json")
 
     @property

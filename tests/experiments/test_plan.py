@@ -233,7 +233,10 @@ def test_a_recipe_with_data_labels_that_and_collects_nothing(
     label, subset = (items[key].call.keywords for key in ("label/seed_7", "subset/percent_050/seed_7"))  # type: ignore[attr-defined]
     assert (label["data"], label["seed"], label["out"]) == ("walks@data-1.0.0", 7, tmp_path / "label/seed_7")
     assert items["pair/seed_7"].inputs == ("label/seed_7",)
-    assert subset["of"] is None and "data" not in load(tmp_path, fake_recipe, HEAD).settings
+    without = load(tmp_path, fake_recipe, HEAD)
+    assert subset["of"] is None and "data" not in without.settings
+    reported = plan(without, tmp_path / "r.toml", tmp_path)[-1].call.args[0]  # type: ignore[attr-defined]
+    assert reported.settings["data"] is None and reported.settings["train"]["disagreement_penalty"] == 0.0
     for more, expected in (
         ("[collect]\nepisodes = 9\n", r"data replaces \[collect\]: leave out one of them"),
         ("[sweep]\npercent = [150]\n", "sweep.percent: expected at most 100 % of data, got 150"),
