@@ -104,6 +104,9 @@ def test_a_recipe_that_changes_their_settings_borrows_nothing_made_with_those_of
     for memory, borrowed in ((32, {"collect", "pair", "ground", "train", "align", "evaluate"}), (8, None)):
         other.write_text(f'based_on = "base"\n{OWN.format(place=DELTA, memory=memory)}')
         assert load_experiment(other, tmp_path).borrowed == (borrowed or {"collect", "pair"})
+    # Another method that the base does not know of changes nothing of it.
+    other.write_text(f'based_on = "base"\n[own_methods]\nplain = "{ENSEMBLE}"\n')
+    assert "ground" in load_experiment(other, tmp_path).borrowed
     # That its default is written out is no change.
     (tmp_path / "base.toml").write_text(OWN.format(place=DELTA, memory=32).replace(", memory = 32", ""))
     other.write_text(f'based_on = "base"\n{OWN.format(place=DELTA, memory=32)}')

@@ -135,6 +135,12 @@ def test_a_maze_that_cannot_be_is_refused(changes: dict[str, Any], fault: str) -
         replace(CORRIDOR, **changes)
 
 
+@pytest.mark.parametrize("ends", [((1, 1), (1, 3)), ((1, 3), (1, 1))])
+def test_a_way_may_lead_down_and_up_again(ends: tuple[tuple[int, int], tuple[int, int]]) -> None:
+    rows = ("11111", "10101", "10001", "11111")
+    assert Maze(rows=rows, scale=1.0, start=ends[0], goal=ends[1]).walls.sum() == 15
+
+
 def test_every_fault_of_a_maze_is_told_at_once() -> None:
     faults = r"maze: start: expected .* got \(0, 0\); goal: expected .* got \(9, 9\); fine_m: expected a half"
     with pytest.raises(BadInputError, match=faults):
