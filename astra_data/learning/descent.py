@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from astra_data.core.config import Config, Count, Positive
 from astra_data.core.logbook import Logbook
+from astra_data.learning.divergence import refuse_divergence
 
 
 class DescentConfig(Config):
@@ -75,16 +76,26 @@ class Descent:
         return self.done / self._config.updates
 
     def update(self, loss: Tensor) -> None:
-        """Take one step down the gradient of `loss`."""
+        """Take one step down the gradient of `loss`.
+
+        Raises:
+            BadInputError: the fit diverged.
+        """
         self._optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, self._config.gradient_norm)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self._config.gradient_norm)
+        refuse_divergence(f"in update {self.done + 1}", {"gradient": float(norm)})
         self._optimizer.step()
         self._schedule.step()
         self.done += 1
 
     def keep(self, **measured: float | None) -> None:
-        """Add the figures `measured` now to the points, and write the checkpoint."""
+        """Add the figures `measured` now to the points, and write the checkpoint.
+
+        Raises:
+            BadInputError: the fit diverged.
+        """
+        refuse_divergence(f"by update {self.done}", measured)
         self.points.append({"step": self.done, **measured})
         self._logbook.keep(
             {

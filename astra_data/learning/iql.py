@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from astra_data.core.config import AtOnce, Config, Count, CountFromZero, NotNegative, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
+from astra_data.learning.divergence import refuse_divergence
 from astra_data.learning.generators import seed_generators
 from astra_data.learning.networks.history import mlp
 from astra_data.learning.networks.policy import Policy
@@ -171,7 +172,11 @@ class Iql:
         return self.updates >= self.total_updates
 
     def iterate(self) -> dict[str, float]:
-        """Make one update and return its losses: "value" and "action_value", or the "policy"'s."""
+        """Make one update and return its losses: "value" and "action_value", or the "policy"'s.
+
+        Raises:
+            BadInputError: the training diverged.
+        """
         seed_generators(derive(self.seed, f"update {self.updates}"), self._transitions.reward.device)
         losses = (
             self._learn_values()
@@ -179,6 +184,7 @@ class Iql:
             else self._learn_policy(self.updates - self.config.critic_updates)
         )
         self.updates += 1
+        refuse_divergence(f"in update {self.updates}", losses)
         return losses
 
     def _learn_values(self) -> dict[str, float]:

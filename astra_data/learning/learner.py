@@ -9,6 +9,7 @@ from torch import Tensor
 
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
+from astra_data.learning.divergence import refuse_divergence
 
 
 class Resumable(Protocol):
@@ -72,11 +73,15 @@ class Learner(ABC):
 
         Returns:
             the metrics of `Acting`, and the learner's own.
+
+        Raises:
+            BadInputError: the training diverged.
         """
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
         figures = self._iterate()
         self.steps += self.env.num_envs * self.rollout_steps
         self._iteration += 1
+        refuse_divergence(f"by step {self.steps}", figures)
         return self.acting.figures() | figures
 
     @abstractmethod

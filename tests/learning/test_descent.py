@@ -43,6 +43,21 @@ def test_it_is_adam_down_a_half_cosine_with_clipped_gradients() -> None:
     torch.testing.assert_close(ours.weight, theirs.weight, rtol=1e-4, atol=1e-5)
 
 
+def test_a_fit_that_diverged_ends_before_it_is_kept(tmp_path: Path) -> None:
+    one = model()
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    descent = Descent(one, CONFIG, checkpoint=checkpoint)
+    fit(one, descent, until=2)
+    advice = "make learning_rate smaller"
+    with pytest.raises(
+        BadInputError, match=f"diverged by update 2, with a loss that is not finite: {advice}"
+    ):
+        descent.keep(error=1.0, loss=float("nan"))
+    with pytest.raises(BadInputError, match=rf"diverged in update 3, with a gradient .*: {advice}"):
+        descent.update(one.weight.sum() * float("inf"))
+    assert not checkpoint.exists() and bool(one.weight.isfinite().all())
+
+
 def test_from_a_checkpoint_it_goes_on_to_the_bit(tmp_path: Path) -> None:
     whole, begun, resumed = model(), model(), model()
     fit(whole, Descent(whole, CONFIG))

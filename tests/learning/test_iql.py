@@ -251,6 +251,12 @@ def test_what_lies_beyond_the_episodes_is_not_learned_from(memory: int) -> None:
         assert torch.equal(ours, theirs)
 
 
+def test_a_training_that_diverges_says_so() -> None:
+    iql = learner(walks(), config(critic_updates=20, policy_updates=1, critic_learning_rate=1e30))
+    with pytest.raises(BadInputError, match=r"diverged in update \d+, with a .*: make learning_rate smaller"):
+        trained(iql)
+
+
 def test_the_policy_rests_while_the_critics_learn() -> None:
     iql = learner(walks(), config(critic_updates=5, policy_updates=1), memory=8)
     before = [parameter.detach().clone() for parameter in iql.policy.parameters()]

@@ -229,6 +229,14 @@ def test_fewer_environments_than_minibatches_are_enough() -> None:
     train(ppo(GoToZero(2), 2, horizon=5, minibatches=4))
 
 
+def test_a_training_that_diverges_says_so() -> None:
+    learner = ppo(GoToZero(4), 8, horizon=20, learning_rate=1e30)
+    with pytest.raises(
+        BadInputError, match=r"diverged by step .* std that is not finite: make learning_rate sm"
+    ):
+        train(learner)
+
+
 def test_a_single_step_has_no_advantage_over_others() -> None:
     with pytest.raises(
         BadInputError, match="rollout_steps: expected 2 or more in a single environment, got 1"
