@@ -32,6 +32,9 @@ Out = Annotated[
 NewName = Annotated[
     str | None,
     typer.Option(
-        "--name", help="Start a dataset with this name, at version 1.0.0.", show_default="a new version"
+        "--name",
+        help="Name of the new dataset, which starts at version 1.0.0; where there are datasets of that name, "
+        "it is their next version.",
+        show_default="a new version",
     ),
 ]
