@@ -3,7 +3,9 @@
 Grids have square cells of the maze's `fine_m` and are indexed [y, x] from the maze's lower left corner.
 """
 
+from copy import copy
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy
@@ -37,14 +39,7 @@ class FreeSpace:
     @classmethod
     def of_maze(cls, maze: Maze, *, radius_m: float, device: str = "cpu") -> "FreeSpace":
         """Return the free space of a disc of `radius_m`, to the nearest cell of the grid."""
-        reach = round(radius_m / maze.fine_m)
-        square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
-        blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)
-        return cls(
-            torch.from_numpy(blocked).to(device),
-            torch.tensor(maze.half_extent, dtype=torch.float32, device=device),
-            maze.fine_m,
-        )
+        return copy(_free_space(maze, round(radius_m / maze.fine_m), device))
 
     def cells(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the row and the column (...) of the fine grid's cell of each `position` (..., 2)."""
@@ -81,6 +76,15 @@ class FreeSpace:
         onward = there > here
         face = (here + onward) * self.cell_m - self.half_extent
         return torch.where(onward, face - _EDGE_M, face + _EDGE_M)
+
+
+@lru_cache(maxsize=16)
+def _free_space(maze: Maze, reach: int, device: str) -> FreeSpace:
+    """Return the free space of a disc that reaches as many cells; kept, for who builds simulators often."""
+    square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
+    blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)
+    half_extent = torch.tensor(maze.half_extent, dtype=torch.float32, device=device)
+    return FreeSpace(torch.from_numpy(blocked).to(device), half_extent, maze.fine_m)
 
 
 @dataclass(frozen=True)

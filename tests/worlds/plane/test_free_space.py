@@ -63,6 +63,12 @@ def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float
     assert free.blocked[free.cells(points)].tolist() == [False, False, True, True]
 
 
+def test_discs_of_one_size_share_a_grid_but_are_no_single_space() -> None:
+    first, again, wider = (FreeSpace.of_maze(U_MAZE, radius_m=radius_m) for radius_m in (0.5, 0.5, 0.9))
+    assert first.blocked is again.blocked and first is not again
+    assert wider.blocked.sum() > first.blocked.sum()
+
+
 def test_a_long_walk_never_leaves_the_free_space() -> None:
     free = FreeSpace.of_maze(U_MAZE, radius_m=0.1)
     generator = torch.Generator().manual_seed(0)
