@@ -195,7 +195,7 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
     for table in tables:
         if faults := schema_faults(table.schema, columns):
             raise CorruptDatasetError(f"{path.parent.name}/{path.name}: {'; '.join(faults)}")
-        block = {c.name: _values(table.column(c.name), c) for c in columns}
+        block = block_values(table, columns)
         rest = {name: np.concatenate([rest[name], block[name]]) for name in block} if rest else block
         changes = np.diff(rest[names.EPISODE_INDEX]) != 0
         starts = [0, *(np.flatnonzero(changes & (rest[names.FRAME_INDEX][1:] == 0)) + 1).tolist()]
@@ -216,6 +216,15 @@ def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str
         if not column.fits(kind):
             faults.append(f"has {column.name} as {kind}, expected {column.arrow_type}")
     return faults
+
+
+def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, Array]:
+    """Return `columns` of `table` by name, (n,) or (n, size).
+
+    Raises:
+        CorruptDatasetError: values are missing.
+    """
+    return {column.name: _values(table.column(column.name), column) for column in columns}
 
 
 def _values(stored: pa.ChunkedArray, column: PlainColumn) -> Array:

@@ -42,10 +42,10 @@ def repair(
 ) -> Repaired:
     """Write the intact episodes of `folder` to a new dataset `out`.
 
-    Episodes with wrong values, or with other values than were written, are left out, and all that follow once
-    it is unclear where episodes begin, or a file cannot be read. Data files without a footer, which a killed
-    writer leaves, are read page by page. Statistics and meta/episodes are rebuilt. What LeRobot recorded
-    without next states becomes what `Dataset.open` makes of it.
+    Episodes with wrong values, with other values than were written, or with rows in a part of a file that
+    cannot be read are left out, and all that follow once it is unclear where episodes begin. Data files
+    without a footer, which a killed writer leaves, are read page by page. Statistics and meta/episodes are
+    rebuilt. What LeRobot recorded without next states becomes what `Dataset.open` makes of it.
 
     Args:
         folder: the damaged dataset; it is not changed.

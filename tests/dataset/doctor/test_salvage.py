@@ -7,6 +7,7 @@ import pytest
 from damaged import DATA, EPISODES, alter, drop, retype
 from fake_dataset import LENGTHS, fake_episodes, write_fake
 
+from astra_data.dataset import parquet
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.digests import Digests
 from astra_data.dataset.doctor.salvage import whole_runs
@@ -92,3 +93,68 @@ def test_with_digests_an_altered_episode_costs_no_other(
     uids, [note] = salvaged(dataset.root, digests)
     assert uids == [uid for number, uid in enumerate(UIDS) if number != 2]
     assert f"other values than were written in {DATA} rows 8 to 19 (episode 2)" in note
+
+
+def deface(path: Path, group: int, column: str) -> None:
+    """Overwrite what a row group of a parquet file has of a column."""
+    metadata = pq.read_metadata(path).row_group(group)
+    parts = [metadata.column(number) for number in range(metadata.num_columns)]
+    [part] = [part for part in parts if part.path_in_schema.split(".list")[0] == column]
+    data = bytearray(path.read_bytes())
+    first, size = part.dictionary_page_offset or part.data_page_offset, part.total_compressed_size
+    data[first : first + size] = b"\xff" * size
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("column", ["action", "episode_index", "frame_index"])
+@pytest.mark.parametrize("is_digested", [False, True])
+def test_an_unreadable_row_group_costs_its_episode_alone(
+    tmp_path: Path, column: str, *, is_digested: bool
+) -> None:
+    dataset = write_fake(tmp_path / "set")
+    digests = measure(dataset)[1] if is_digested else None
+    deface(dataset.root / DATA, 2, column)
+    uids, notes = salvaged(dataset.root, digests)
+    assert uids == [uid for number, uid in enumerate(UIDS) if number != 2]
+    assert notes[0].startswith("chunk-000/file-000.parquet rows 8 to 19 cannot be read (")
+    assert notes[1:] == ["left out episode 2: rows that belong there cannot be read"]
+
+
+@pytest.mark.parametrize(
+    ("size", "group", "left"),
+    [
+        (10, 0, [3, 4]),  # episodes 0 and 1, and a part of 2
+        (10, 1, [0, 1, 3, 4]),  # the rest of 2
+        (20, 0, [3, 4]),
+        (20, 1, [0, 1, 2, 4]),  # a part of 3
+        (20, 2, [0, 1, 2]),
+        (25, 1, [0, 1, 2, 4]),  # the most of 3
+    ],
+)
+def test_episodes_with_rows_in_an_unreadable_row_group_are_left_out(
+    tmp_path: Path, size: int, group: int, left: list[int]
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    pq.write_table(pq.read_table(root / DATA), root / DATA, row_group_size=size)
+    deface(root / DATA, group, "index")
+    assert salvaged(root)[0] == [UIDS[index] for index in left]
+
+
+def test_without_meta_episodes_the_rows_tell_which_episode_follows(tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    drop(EPISODES)(root)
+    deface(root / DATA, 1, "action")
+    uids, notes = salvaged(root)
+    # Whether episode 0 went on in the rows that are lost, nothing tells.
+    assert uids == UIDS[2:]
+    assert notes[-1] == "left out episodes 0 to 1: rows that belong there cannot be read"
+
+
+def test_episodes_of_the_next_file_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
+    root = write_fake(tmp_path / "set").root
+    for file in (1, 2):
+        deface(root / DATA.replace("file-000", f"file-00{file}"), 0, "action")
+    uids, notes = salvaged(root)
+    assert uids == [UIDS[0], *UIDS[3:]]
+    assert notes[-1] == "left out episodes 1 to 2: rows that belong there cannot be read"
