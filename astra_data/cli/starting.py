@@ -7,6 +7,9 @@ import typer
 
 from astra_data.cli.showing import show_table
 
+_NAMED = 5
+"""Files that are named in a line."""
+
 
 def new(
     name: Annotated[
@@ -31,6 +34,7 @@ def new(
     """Start a project for your own robot: a task, a recipe, a mapping of its logs, a test and a page."""
     from rich.table import Table
 
+    from astra_data.core.wording import first_few
     from astra_data.experiments.kind_errors import JUDGED_STEPS, badly_predicted
     from astra_data.experiments.new_robot import write_robot
 
@@ -56,4 +60,7 @@ def new(
         typer.echo(f"{found.still} (CHECK)")
     for name, count in found.left_out.items():
         typer.echo(f"{name} is not a number in {count} rows, which are left out: see logs.toml (CHECK)")
+    if found.cut_off:
+        files = first_few(found.cut_off, _NAMED)
+        typer.echo(f"{files}: the last line is cut off and is left out, as it is by an import")
     typer.echo(f"finished: {folder}; see {folder}/README.md for the next steps; CHECK marks guesses")

@@ -1,7 +1,7 @@
 """The fields of CSV logs as numbers, before it is known what they are."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,8 +10,16 @@ import pyarrow as pa
 from pyarrow import csv
 
 from astra_data.core.arrays import Floats
-from astra_data.core.errors import BadInputError, in_short
-from astra_data.exchange.importers.csv import check_separator, delimiter_of, without_blanks
+from astra_data.core.errors import BadInputError
+from astra_data.exchange.importers.csv import (
+    check_header,
+    delimiter_of,
+    explained,
+    torn_bytes,
+    without_blanks,
+    without_end,
+)
+from astra_data.exchange.recording import Source
 
 MOSTLY = 0.9
 """Share of a field's rows with a number above which the others are faults."""
@@ -24,20 +32,23 @@ def read_numbers(path: Path, numbered: re.Pattern[str]) -> dict[str, Floats]:
     Texts and dates are NaN, but where the name of their field is one of those `numbered`: there equal ones
     have the same number.
 
+    A last line that is cut off is left out.
+
     Raises:
-        BadInputError: it is no CSV, is parted by other marks, has no numbers, or a field of numbers has a
-            text or the name of another.
+        BadInputError: it is no CSV in UTF-8, is parted by other marks, has no numbers, or a field of numbers
+            has a text or the name of another.
     """
     delimiter, mark = delimiter_of(path.name)
+    source = Source(path, None, path)
     try:
-        with path.open("rb") as stream:
-            check_separator(str(path), stream)
-        table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
+        with explained(str(path), source):
+            with path.open("rb") as stream:
+                check_header(str(path), stream)
+            with without_end(source, torn_bytes(source)) as stream:
+                table = csv.read_csv(stream, parse_options=csv.ParseOptions(delimiter=delimiter))
+            named = list(zip(table.column_names, table.columns, strict=True))
     except FileNotFoundError:
         raise BadInputError(f"{path}: there is no such file") from None
-    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path}: expected CSV with a header ({in_short(error)})") from None
-    named = zip(table.column_names, table.columns, strict=True)
     fields = [(name, values) for name, values in named if name or not pa.types.is_null(values.type)]
     for name, values in fields:
         if pa.types.is_string(values.type) and (wrong := _no_number(values.to_pylist())):
@@ -57,6 +68,11 @@ def read_numbers(path: Path, numbered: re.Pattern[str]) -> dict[str, Floats]:
             f"{path}: expected a header of different names, and rows of numbers below it, parted by {mark}"
         )
     return numbers
+
+
+def torn_files(paths: Iterable[Path]) -> tuple[str, ...]:
+    """Return which CSV files end within a row, as where a battery went empty."""
+    return tuple(str(path) for path in paths if torn_bytes(Source(path, None, path)))
 
 
 def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.angles import ANGLE, LARGEST
-from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers
+from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers, torn_files
 from astra_data.exchange.cutting import RATE_TOLERANCE
 from astra_data.exchange.field_names import (
     COMMAND,
@@ -75,7 +75,7 @@ def guess(paths: Sequence[Path]) -> Logs:
         cut = [field.name for field in fields if field.role == "episode"]
         why = f"{' and '.join(cut)} changes in every row: leave it out" if cut else "record longer"
         raise BadInputError(f"{files[0]}: expected episodes of two rows or more, found none: {why}")
-    found = Logs(fields, episodes, {name: gaps[name] for name in needed if gaps[name]})
+    found = Logs(fields, episodes, {name: gaps[name] for name in needed if gaps[name]}, torn_files(files))
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if not found.of(role):  # type: ignore[arg-type]
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)

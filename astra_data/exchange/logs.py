@@ -55,11 +55,13 @@ class Logs:
         episodes: of each, the scaled values (T,) by a field's name, of the rows with a number in each state
             and command.
         left_out: rows without one: how many by the name of the state or command.
+        cut_off: the files whose last line is cut off, which is left out.
     """
 
     fields: tuple[Field, ...]
     episodes: tuple[dict[str, Floats], ...]
     left_out: dict[str, int]
+    cut_off: tuple[str, ...] = ()
 
     @property
     def rate(self) -> int:

@@ -299,6 +299,49 @@ def test_what_is_of_no_use_is_told(tmp_path: Path, text: str, expected: str) -> 
         guess([tmp_path / "log.csv"])
 
 
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (
+            b"x,neigung_\xb0,cmd\n0,0,0\n1,1,1\n",
+            ": expected text in UTF-8, got the byte 0xb0: save it as UTF-8",
+        ),
+        ("x,cmd\n0,0\n1,1\n".encode("utf-16"), ": expected text in UTF-8, got UTF-16: save it as UTF-8"),
+        (
+            b"x,cmd\n0,0\n\n1\n2,2\n",
+            " cannot be read as csv: line 4: Expected 2 columns, got 1: write as many fields there as in the "
+            "header, or leave the line out",
+        ),
+        (
+            b"# log of today\nx,cmd\n0,0\n1,1\n",
+            " cannot be read as csv: line 2: Expected 1 columns, got 2: leave out what is above the header, "
+            "'# log of today'",
+        ),
+        (
+            b"# x, y\nx,y,cmd\n0,0,0\n",
+            " cannot be read as csv: line 2: Expected 2 columns, got 3: leave out what is above the header, "
+            "'# x'",
+        ),
+    ],
+)
+def test_why_a_file_is_no_csv_is_told_in_one_line(tmp_path: Path, content: bytes, expected: str) -> None:
+    log = tmp_path / "log.csv"
+    log.write_bytes(content)
+    with pytest.raises(BadInputError) as caught:
+        guess([log])
+    assert str(caught.value) == f"{log}{expected}"
+
+
+def test_a_last_line_that_is_cut_off_is_left_out(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "1.csv", tmp_path / "2.csv"
+    whole.write_text("x,y,cmd\n0,0,0\n1,1,1\n2,2,2")
+    cut.write_text("x,y,cmd\n0,0,0\n1,1,1\n2,2")
+    logs = guess([whole, cut])
+    assert [len(values) for values in logs.values(logs.of("state"))] == [3, 2]
+    assert logs.cut_off == (str(cut),)
+    assert logs.left_out == {}
+
+
 def test_a_dataset_is_no_logs(tmp_path: Path) -> None:
     (tmp_path / "arm/meta").mkdir(parents=True)
     (tmp_path / "arm/meta/info.json").write_text('{"codebase_version": "v3.0"}')

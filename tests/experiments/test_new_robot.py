@@ -277,6 +277,16 @@ def test_a_hole_in_the_logs_is_marked_and_imported(tmp_path: Path) -> None:
     assert len(Dataset.open("imported")) == 3  # two trials, one of them in two
 
 
+def test_a_log_whose_last_line_is_cut_off_is_taken_as_by_an_import(tmp_path: Path) -> None:
+    log = arm(tmp_path / "log.csv")
+    log.write_text(log.read_text().rstrip("\n").rpartition(",")[0])
+    shown = CliRunner().invoke(app, ["new", "arm", "--from", str(log)])
+    assert f"{log}: the last line is cut off and is left out, as it is by an import" in shown.output
+    assert "not_finite" not in Path("arm/logs.toml").read_text()
+    command("import log.csv --mapping arm/logs.toml --out imported")
+    assert len(Dataset.open("imported")) == 2
+
+
 def test_what_is_written_is_as_exact_as_the_logs(tmp_path: Path) -> None:
     """At 30 Hz, in places far from the origin, with a command of small values and one of large."""
     rows = np.arange(90)

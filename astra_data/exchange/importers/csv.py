@@ -1,9 +1,11 @@
 """CSV: one row per step, a header with the fields' names; read block by block."""
 
+import codecs
+import csv as python_csv
 import io
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import IO
 
@@ -12,7 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, in_short
+from astra_data.core.wording import shortened
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import Block, Part, Source, row_count
@@ -20,6 +23,9 @@ from astra_data.exchange.recording import Block, Part, Source, row_count
 SUFFIXES = (".csv", ".tsv")
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
 _LONGEST_HEADER = 2**20
+_SAVE = "save it as UTF-8"
+_SHOWN = 80
+"""Characters of a line above the header that are shown."""
 
 
 def delimiter_of(name: str) -> tuple[str, str]:
@@ -27,19 +33,64 @@ def delimiter_of(name: str) -> tuple[str, str]:
     return ("\t", "tabs") if name.lower().endswith(".tsv") else (",", "commas")
 
 
-def check_separator(name: str, stream: IO[bytes]) -> None:
-    """Refuse the file `name`, read from its beginning, if its header is parted by other marks.
+def check_header(name: str, stream: IO[bytes]) -> None:
+    """Refuse the file `name`, read from its beginning, if its header is no UTF-8 or is parted by other marks.
 
     Raises:
         BadInputError: it is; says by which.
     """
+    line = stream.readline(_LONGEST_HEADER)
+    if line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise BadInputError(f"{name}: expected text in UTF-8, got UTF-16: {_SAVE}")
     delimiter, mark = delimiter_of(name)
-    first = stream.readline(_LONGEST_HEADER).decode("utf-8", "replace")
+    first = line.decode("utf-8", "ignore" if len(line) == _LONGEST_HEADER else "strict")
     if delimiter not in first and (others := [other for part, other in _MARKS.items() if part in first]):
         raise BadInputError(
             f"{name}: expected fields parted by {mark}, got {others[0]} in its header: "
             "write it with commas, or with tabs as .tsv"
         )
+
+
+@contextmanager
+def explained(name: str, source: Source) -> Iterator[None]:
+    """Say of the file `name` what makes it no CSV, in which line, and what to do.
+
+    Raises:
+        BadInputError: what was raised in place of it.
+    """
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        found = f"the byte 0x{error.object[error.start]:02x}"
+        raise BadInputError(f"{name}: expected text in UTF-8, got {found}: {_SAVE}") from None
+    except pa.ArrowInvalid as error:
+        if "UTF8" in str(error):
+            raise BadInputError(f"{name}: expected text in UTF-8 ({in_short(error)}): {_SAVE}") from None
+        if fault := _uneven_line(source):
+            raise BadInputError(f"{name} cannot be read as csv: {fault}") from None
+        raise BadInputError(f"{name}: expected CSV with a header ({in_short(error)})") from None
+
+
+def _uneven_line(source: Source) -> str:
+    """Say which line has more or fewer fields than the header, and what to do; nothing where none does."""
+    with suppress(python_csv.Error), _lines(source) as lines:
+        header = next(lines, (1, []))[1]
+        for number, cells in lines:
+            if len(cells) == len(header):
+                continue
+            advice = "write as many fields there as in the header, or leave the line out"
+            if len(header) == 1 or header[0].startswith("#"):
+                advice = f"leave out what is above the header, {shortened(repr(header[0]), _SHOWN)}"
+            return f"line {number}: Expected {len(header)} columns, got {len(cells)}: {advice}"
+    return ""
+
+
+@contextmanager
+def _lines(source: Source) -> Iterator[Iterator[tuple[int, list[str]]]]:
+    """Open a file as its lines that are not empty: their numbers, from 1, and their cells."""
+    with source.open() as stream, io.TextIOWrapper(stream, "utf-8", "replace", newline="") as text:
+        reader = python_csv.reader(text, delimiter=delimiter_of(str(source))[0])
+        yield ((reader.line_num, cells) for cells in reader if cells)
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -50,9 +101,9 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     if _is_cut_in_header(source):
         return
-    torn = _torn_bytes(source)
+    torn = torn_bytes(source)
     last: Block | None = None
-    with _without_end(source, torn) as stream:
+    with explained(str(source), source), without_end(source, torn) as stream:
         # As text first, since the type of a column may change after its first block.
         reader = csv.open_csv(
             stream,
@@ -79,7 +130,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         yield replace(last, torn=int(torn > 0))
 
 
-def _torn_bytes(source: Source) -> int:
+def torn_bytes(source: Source) -> int:
     """Return how long a last line is that ends within a row, as where a battery went empty; 0 if it is whole.
 
     It has no end, and fewer fields than the header; with quotes it is left to the parser.
@@ -87,7 +138,7 @@ def _torn_bytes(source: Source) -> int:
     with source.open() as stream:
         first = stream.readline(_LONGEST_HEADER)
         end = stream.seek(0, os.SEEK_END)
-        stream.seek(max(len(first), end - _LONGEST_HEADER) - 1)
+        stream.seek(max(1, len(first), end - _LONGEST_HEADER) - 1)
         _, line_end, tail = stream.read().replace(b"\r", b"\n").rpartition(b"\n")
     delimiter = delimiter_of(str(source))[0].encode()
     is_short = tail.count(delimiter) < first.count(delimiter)
@@ -95,7 +146,7 @@ def _torn_bytes(source: Source) -> int:
 
 
 @contextmanager
-def _without_end(source: Source, size: int) -> Iterator[IO[bytes]]:
+def without_end(source: Source, size: int) -> Iterator[IO[bytes]]:
     """Open a file for reading, without its last `size` bytes."""
     with source.open() as stream:
         if size:
@@ -115,8 +166,8 @@ def _is_cut_in_header(source: Source) -> bool:
 
 def _checked(source: Source, mapping: ImportMapping, torn: int) -> list[str]:
     with source.open() as stream:
-        check_separator(str(source), stream)
-    with _without_end(source, torn) as stream:
+        check_header(str(source), stream)
+    with without_end(source, torn) as stream:
         options = csv.ParseOptions(delimiter=delimiter_of(str(source))[0])
         header = csv.open_csv(stream, parse_options=options).schema.names
     row_count(str(source), mapping.all_fields, dict.fromkeys(header, (0,)))

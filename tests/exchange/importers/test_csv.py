@@ -1,3 +1,4 @@
+import re
 import tarfile
 from pathlib import Path
 
@@ -131,6 +132,33 @@ def test_fields_of_a_log_without_names_are_listed_once(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as caught:
         imported(tmp_path, log)
     assert str(caught.value).count("known: 10, 20, 30") == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"x,y,\xb0\n0,0,0\n1,1,1\n", "log.csv: expected text in UTF-8, got the byte 0xb0: save it as UTF-8"),
+        ("x,y\n0,0\n1,1\n".encode("utf-16"), "log.csv: expected text in UTF-8, got UTF-16: save it as UTF-8"),
+        (
+            b'x,y\n\n0,0\n1,"1\n\n",2\n2,2\n',
+            "log.csv cannot be read as csv: line 6: Expected 2 columns, got 3: ",
+        ),
+        (
+            b"# today\nx,y\n0,0\n",
+            "line 2: Expected 1 columns, got 2: leave out what is above the header, '# to",
+        ),
+    ],
+)
+def test_why_a_file_is_no_csv_is_told(tmp_path: Path, content: bytes, expected: str) -> None:
+    (tmp_path / "log.csv").write_bytes(content)
+    with pytest.raises(BadInputError, match=re.escape(expected)):
+        imported(tmp_path, tmp_path / "log.csv", TORN)
+
+
+def test_a_text_in_another_encoding_is_told(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_bytes(b"x,y,trial\n0,0,\xe4\n1,1,\xe4\n")
+    with pytest.raises(BadInputError, match=r"log\.csv: expected text in UTF-8 \(.*\): save it as UTF-8$"):
+        imported(tmp_path, tmp_path / "log.csv", TORN + '[split]\nfield = "trial"\n')
 
 
 TORN = (
