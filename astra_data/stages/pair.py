@@ -1,7 +1,6 @@
 """Pair: reset the abstract simulator to φ(s), step it with the recorded action, and store its next state."""
 
 import logging
-import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.blocks import in_blocks
-from astra_data.dataset.checkup.angles import is_angle
+from astra_data.dataset.checkup.angles import LARGEST, TURNS, is_angle
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -95,7 +94,8 @@ def pair(
     }
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
     steps, simulating, reset_error = 0, 0.0, 0.0
-    jumps = np.zeros(added[0].size, np.int64)
+    jumps = {unit: np.zeros(added[0].size, np.int64) for unit in TURNS}
+    farthest = np.zeros(added[0].size)
     with next_version(
         source,
         "columns",
@@ -118,7 +118,9 @@ def pair(
             simulating += time.perf_counter() - before
             reset_error = max(reset_error, error)
             apart = paired[ABSTRACT_NEXT_STATE] - paired[ABSTRACT_SIMULATED_NEXT_STATE]
-            jumps += (np.abs(apart) > math.pi).sum(axis=0)
+            for unit, turn in TURNS.items():
+                jumps[unit] += (np.abs(apart) > turn / 2).sum(axis=0)
+            farthest = np.maximum(farthest, np.abs(paired[ABSTRACT_STATE]).max(axis=0))
             first = 0
             for episode in episodes:
                 values = {
@@ -136,16 +138,17 @@ def pair(
             "pairs_per_second": steps / spent["wall_seconds"],
             "simulated_pairs_per_second": steps / simulating,
         }
-    wrapped = [
-        f"{_name(pairing, entry)} in {jumps[entry]} of {steps} rows"
-        for entry, unit in enumerate(pairing.abstract_state.units)
-        if jumps[entry] and (unit == "rad" or (not unit and is_angle(_name(pairing, entry))))
-    ]
-    if wrapped:
-        _log.warning(
-            f"{pairing.id} lands more than π from where the robot was: {', '.join(wrapped)}; "
-            "a heading that wraps: make cos and sin of it in φ"
-        )
+    for unit, half in (("rad", "π"), ("deg", "180°")):
+        wrapped = [
+            f"{_name(pairing, entry)} in {rows} of {steps} rows"
+            for entry, rows in enumerate(jumps[unit])
+            if rows and _angle_unit(pairing, entry, farthest[entry]) == unit
+        ]
+        if wrapped:
+            _log.warning(
+                f"{pairing.id} lands more than {half} from where the robot was: {', '.join(wrapped)}; "
+                "a heading that wraps: make cos and sin of it in φ"
+            )
     return writer.root
 
 
@@ -221,6 +224,14 @@ def pair_steps(
 def _name(pairing: Pairing, entry: int) -> str:
     names = pairing.abstract_state.names
     return names[entry] if names else f"value {entry}"
+
+
+def _angle_unit(pairing: Pairing, entry: int, farthest: float) -> str:
+    """Return the unit of an abstract state, where it has none that of an angle up to `farthest`."""
+    unit = pairing.abstract_state.units[entry]
+    if unit in ("", "1") and is_angle(_name(pairing, entry)):
+        return "rad" if farthest <= LARGEST else "deg"
+    return unit
 
 
 def _check(source: Dataset, pairing: Pairing) -> None:

@@ -285,9 +285,24 @@ def test_the_step_that_is_told_is_that_of_the_dataset(
         pair(glider_that_gets_lost(tmp_path), PairConfig(), dataset=collected, out=out, progress=silent)
 
 
-@pytest.mark.parametrize("unit", [", astra={'unit': ('m', 'rad')}", ""])
+@pytest.mark.parametrize(
+    ("unit", "half", "scale"),
+    [
+        (", astra={'unit': ('m', 'rad')}", "π", 1.0),
+        ("", "π", 1.0),
+        (", astra={'unit': ('m', '1')}", "π", 1.0),
+        (", astra={'unit': ('m', 'deg')}", "180°", 57.29578),
+        (", astra={'unit': ('m', '1')}", "180°", 57.29578),
+        ("", "180°", 57.29578),
+    ],
+)
 def test_a_heading_that_wraps_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, unit: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    unit: str,
+    half: str,
+    scale: float,
 ) -> None:
     monkeypatch.setattr("astra_data.stages.pair._BLOCK", 1)
     (tmp_path / "cart.py").write_text(
@@ -298,11 +313,13 @@ def test_a_heading_that_wraps_is_told(
         "    def __init__(self, num_envs):\n"
         "        self.state = torch.zeros(num_envs, 2)\n"
         "    def abstraction(state):\n"
-        "        return state[..., [0, 2]]\n"
+        "        abstract = state[..., [0, 2]]\n"
+        f"        abstract[..., 1] *= {scale}\n"
+        "        return abstract\n"
         "    def reset_to(self, state, rows=None):\n"
         "        self.state = state.clone()\n"
         "    def step(self, command):\n"
-        "        self.state = self.state + command[:, [0, 1]] * torch.tensor([100.0, 0.05])\n"
+        f"        self.state = self.state + command[:, [0, 1]] * torch.tensor([100.0, {0.05 * scale}])\n"
         "        return self.state\n"
     )
     logs = write_logs(tmp_path / "logs")
@@ -312,6 +329,6 @@ def test_a_heading_that_wraps_is_told(
     pair(f"{tmp_path}/cart.py:Turning", dataset=logs.root, out=tmp_path / "out")
     (told,) = [record.getMessage() for record in caplog.records if "φ" in record.getMessage()]
     assert told == (
-        f"Turning lands more than π from where the robot was: yaw in {wraps} of 3000 rows; "
+        f"Turning lands more than {half} from where the robot was: yaw in {wraps} of 3000 rows; "
         "a heading that wraps: make cos and sin of it in φ"
     )
