@@ -20,8 +20,8 @@ def logs_of(data: Dataset) -> Logs:
     """Return the episodes of `data` as logs: its states, commands and goals by their own names, and failures.
 
     Raises:
-        BadInputError: it has no states or commands, a heading or its commands are in degrees, or a value is
-            not finite.
+        BadInputError: it has no states or commands, a heading or its commands are in degrees, a heading
+            without a unit is too large for rad, or a value is not finite.
         CorruptDatasetError: a file cannot be read, or values differ from their digests.
     """
     fields = [Field(TIMESTAMP, "time", "time", "s", 1.0, f"{data.info['fps']} rows a second")]
@@ -47,6 +47,12 @@ def logs_of(data: Dataset) -> Logs:
     for number, field in enumerate(fields):
         if field.role == "state" and field.unit == "1" and is_angle(field.short):
             largest = max(float(np.abs(values[field.name]).max()) for values in episodes)
+            if largest > LARGEST and HEADING.fullmatch(field.plain):
+                raise BadInputError(
+                    f"{data.reference} has {field.name} up to {largest:.4g} without a unit: expected rad, as "
+                    "a dataset's values are taken as they are: import the logs again with a `scale` of "
+                    '0.0174533 there, or with the `unit` "rad" if it is in rad'
+                )
             if largest <= LARGEST:
                 why = f"its column, an angle up to {largest:.3g}"
                 fields[number] = replace(field, unit="rad", why=why)

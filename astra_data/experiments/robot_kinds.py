@@ -48,7 +48,8 @@ class Direct:
             listed["change" if is_rate else "are where they are put"].append(
                 f"{state.short} by {command.short}"
             )
-        clauses = [
+        clauses = [f"CHECK: {self._without_effect}"] if self._without_effect else []
+        clauses += [
             f"values that {what} as commanded: {', '.join(pairs)}" for what, pairs in listed.items() if pairs
         ]
         clauses += [f"{heading} as cosine and sine" for heading in self._headings]
@@ -59,7 +60,22 @@ class Direct:
             clauses.append(
                 f"{', '.join(field.short for field in parts)} are a quaternion: make yaw of it in φ"
             )
+        if self._outside:
+            clauses.append(f"{self._outside} not in φ")
         return "; ".join(clauses)
+
+    @property
+    def _without_effect(self) -> str:
+        """Which commands move nothing, and that they do; nothing where all move a state."""
+        idle = [command.short for command in self.logs.of("command")[len(self.moved) :]]
+        return f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect" if idle else ""
+
+    @property
+    def _outside(self) -> str:
+        """Which headings no command moves, and `is` or `are`; nothing where there is none."""
+        fields = [field for field in self.logs.of("state") if field not in self.moved]
+        names = [field.short for field in fields if HEADING.fullmatch(field.plain)]
+        return f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'}" if names else ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,6 +178,8 @@ class Direct:
             "close": f"{close:.2g}",
             "range": numbers(span, "()"),
             "sentence": sentence,
+            "outside": f", in which {self._outside} not" if self._outside else "",
+            "effect": f"; {self._without_effect}" if self._without_effect else "",
             "indices": str([fields.index(self.moved[number].name) for number in order]),
             "step": step,
             "actions": str(actions),

@@ -102,6 +102,17 @@ def test_a_heading_in_degrees_is_refused_since_nothing_scales_it(
         logs_of(data)
 
 
+@pytest.mark.parametrize("unit", ["", "1", "rad"])
+def test_a_heading_without_a_unit_that_is_too_large_for_rad_is_refused(tmp_path: Path, unit: str) -> None:
+    pose = Column(STATE, size=2, names=("pos_0", "base.yaw"), astra={"unit": ["m", unit]})  # up to 13
+    data = recorded(tmp_path / "data", pose, Column(ACTION, names=("c0",)))
+    if unit == "rad":
+        assert logs_of(data).of("state")[1].unit == "rad"
+        return
+    with pytest.raises(BadInputError, match=r"has observation.state base.yaw up to 13 without a unit: exp"):
+        logs_of(data)
+
+
 def test_joints_may_be_in_degrees(tmp_path: Path) -> None:
     joints = Column(STATE, size=2, names=("shoulder", "elbow"), astra={"unit": ["deg", "deg"]})
     command = Column(ACTION, names=("elbow",), astra={"unit": ["deg/s"]})

@@ -287,6 +287,18 @@ def test_a_log_whose_last_line_is_cut_off_is_taken_as_by_an_import(tmp_path: Pat
     assert len(Dataset.open("imported")) == 2
 
 
+def test_a_command_without_effect_and_a_heading_that_is_left_out_are_told(tmp_path: Path) -> None:
+    rows = np.arange(30.0)
+    table = np.column_stack([rows / 9, rows % 4, rows % 3, rows % 2])
+    np.savetxt("log.csv", table, "%.6g", ",", header="x_m,yaw,cmd_x_m_s,cmd_fan_m_s2", comments="")
+    write_robot("lift", Path("lift"), [Path("log.csv")])
+    written = Path("lift/lift.py").read_text(encoding="utf-8")
+    assert "# CHECK: what a command does; fan has no effect\n" in written
+    assert "# φ, of NumPy arrays and of tensors, in which yaw is not: CHECK\n" in written
+    told = "CHECK: fan has no effect; values that change as commanded: x by x; yaw is not in φ. The fields"
+    assert told in Path("lift/README.md").read_text(encoding="utf-8")
+
+
 def test_what_is_written_is_as_exact_as_the_logs(tmp_path: Path) -> None:
     """At 30 Hz, in places far from the origin, with a command of small values and one of large."""
     rows = np.arange(90)

@@ -183,6 +183,15 @@ def test_speeds_along_a_vessel_that_move_its_place_are_told(tmp_path: Path) -> N
     assert "CHECK" not in Direct.of(logs(tmp_path, **pose, **speeds, **swims)).simulator
 
 
+def test_commands_and_headings_that_a_simulator_leaves_out_are_told(tmp_path: Path) -> None:
+    kind = Direct.of(logs(tmp_path, x_m=T, cmd_x_m_s=T % 3, cmd_w_rad_s=T % 2, cmd_u_rad_s=T % 5))
+    assert kind.simulator == "CHECK: w and u have no effect; values that change as commanded: x by x"
+    assert (kind.values()["effect"], kind.values()["outside"]) == ("; w and u have no effect", "")
+    kind = Direct.of(logs(tmp_path, x_m=T, z_m=T % 9, yaw=T % 4, cmd_x_m_s=T % 3, cmd_z_m_s=T % 2))
+    assert kind.simulator == "values that change as commanded: x by x, z by z; yaw is not in φ"
+    assert (kind.values()["effect"], kind.values()["outside"]) == ("", ", in which yaw is not")
+
+
 def test_speeds_are_no_position(tmp_path: Path) -> None:
     speeds = {"odom_linear_x": T % 7, "odom_linear_y": T % 4}
     kind = Planar.of(logs(tmp_path, **speeds, x=T, y=T % 9, yaw=T % 3, cmd_v=T % 5, cmd_w=T % 2))
