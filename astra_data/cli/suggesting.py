@@ -1,5 +1,6 @@
 """`astra-data suggest`."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -48,4 +49,5 @@ def suggest(
     )
     typer.echo(f"written: {folder / 'suggest.md'}, {folder / 'plan.json'}, {folder / 'map.png'}")
     if task_named(task).has_target:
-        typer.echo(f"record them: astra-data collect {task} --plan {folder / 'plan.json'}")
+        plan = shlex.quote(str(folder / "plan.json"))
+        typer.echo(f"record them: astra-data collect {shlex.quote(task)} --plan {plan} --name more")

@@ -56,6 +56,9 @@ def test_the_way_from_a_run_to_its_next_episodes(folder: Path, tmp_path: Path) -
     task = json.loads((folder / "recipe.json").read_text())["task"]
     plan, out = str(folder / "suggest/plan.json"), str(tmp_path / "more")
     assert f"astra-data collect {task} --plan {plan}" in shown.output
+    printed = shown.output.partition("record them: ")[2].splitlines()[0]
+    page = (folder / "suggest/suggest.md").read_text()
+    assert printed in page.replace("FOLDER", str(folder / "suggest")).splitlines()
     shown = CliRunner().invoke(app, ["collect", task, "--plan", plan, "--out", out])
     assert shown.exit_code == 0, shown.output
     assert len(Dataset.open(out)) == 3 and Dataset.open(out).lengths.max() <= 40

@@ -53,7 +53,7 @@ def test_the_page_says_where_to_start_what_to_hold_and_how_to_record_it(suggesti
     maps = maps_of(TASK, suggestion)
     page = suggestion_page(TASK, suggestion, maps, named="rail.py:TASK", origin=["ground/nas/seed_0"])
     assert "| 0 | 23.5 | 5.0 | 0.2 |" in page and "| 0 | 0.00 | 0.40 | 4.000 |" in page
-    assert "astra-data collect rail.py:TASK --plan plan.json" in page
+    assert "astra-data collect rail.py:TASK --plan FOLDER/plan.json --name more\n" in page
     alone = suggestion_page(LOGS_ALONE, suggestion, maps, named="rail.py:LOGS_ALONE", origin=["a", "b"])
     assert "bring it to each start" in alone and "astra-data collect" not in alone
 
