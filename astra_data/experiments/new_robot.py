@@ -56,7 +56,9 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
             and `logs_of`.
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
-        raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart")
+        raise BadInputError(
+            f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart, that begins with a letter"
+        )
     if name in _TAKEN or keyword.iskeyword(name) or _is_installed(name):
         raise BadInputError(f"'{name}': expected a name that Python does not use, such as my_{name}")
     with atomic_folder(out) as folder:

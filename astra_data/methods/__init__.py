@@ -77,7 +77,10 @@ def add_method(name: str, place: str) -> None:
     if known is not None:
         raise BadInputError(f"method '{name}' is {known} already: give {place} another name")
     if not _NAME.fullmatch(name) or is_plus(name):
-        raise BadInputError(f"method '{name}': expected a name of a-z, 0-9 and _ that does not end in {PLUS}")
+        raise BadInputError(
+            f"method '{name}': expected a name of a-z, 0-9 and _ that does not end in {PLUS} and begins with "
+            "a letter"
+        )
     if is_of_package(name):
         raise BadInputError(f"method '{name}' is one of the package: give {place} another name")
     method = own_object(place)

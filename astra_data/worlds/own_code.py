@@ -160,7 +160,8 @@ def explained(what: str) -> Iterator[None]:
             'such as a script behind `if __name__ == "__main__":`'
         ) from error
     except Exception as error:
-        raise BadInputError(f"{what} fails with {type(error).__name__}: {error}{_place(error)}") from error
+        message = " ".join(filter(None, map(str.strip, str(error).splitlines())))
+        raise BadInputError(f"{what} fails with {type(error).__name__}: {message}{_place(error)}") from error
 
 
 def _place(error: BaseException) -> str:

@@ -235,7 +235,8 @@ def test_a_rate_that_is_no_whole_number_is_marked_and_imported(tmp_path: Path) -
 
 @pytest.mark.parametrize("name", ["", "My", "a-b", "1st", "a.py", "../a"])
 def test_a_name_is_one_of_a_file_and_a_task(name: str) -> None:
-    with pytest.raises(BadInputError, match="expected a name of a-z, 0-9 and _, such as my_cart"):
+    told = "expected a name of a-z, 0-9 and _, such as my_cart, that begins with a letter$"
+    with pytest.raises(BadInputError, match=told):
         write_robot(name, Path("out"))
     assert not Path("out").exists()
 

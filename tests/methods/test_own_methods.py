@@ -216,6 +216,7 @@ def test_a_file_is_looked_up_beside_the_recipe(tmp_path: Path) -> None:
     [
         ("nas", "delta_action.py:METHOD", "method 'nas' is one of the package: give .* another name"),
         ("Mine", "delta_action.py:METHOD", "method 'Mine': expected a name of a-z"),
+        ("1st", "delta_action.py:METHOD", "method '1st': expected a name .* and begins with a letter"),
         ("mine_plus", "delta_action.py:METHOD", "that does not end in _plus"),
         ("mine", "delta_action.py:fit", "delta_action.py:fit is a function, expected a Method"),
         ("mine", "delta_actoin.py:METHOD", "delta_actoin.py does not exist"),

@@ -161,6 +161,12 @@ def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) 
         roll()
 
 
+def test_a_message_of_several_lines_is_told_in_one() -> None:
+    told = r"^rolling fails with RuntimeError: motor stalled: twice \(test_own_code.py, line \d+\)$"
+    with pytest.raises(BadInputError, match=told), explained("rolling"):
+        raise RuntimeError("motor\r\nstalled:\n\n  twice\n")
+
+
 def test_a_file_that_exits_is_an_error_and_not_an_end(tmp_path: Path) -> None:
     file = tmp_path / "script.py"
     file.write_text("import sys\nsys.exit(0)\n")
