@@ -14,6 +14,8 @@ from astra_data.worlds.task import Task
 
 _WRITTEN = ("kind", "scatter", "to_file", "from_file")
 """The parts that a grounding does not inherit."""
+_ROUNDING = 1e-6
+"""Between states that are the same, relative to their size and absolute."""
 
 
 def missing_parts(grounding: type) -> list[str]:
@@ -58,7 +60,7 @@ def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes)
     """Step the corrected simulator of `task` once, from where the first of `episodes` begin.
 
     Raises:
-        BadInputError: it fails, or it returns something else than states (B, X).
+        BadInputError: it fails, it returns something else than states (B, X), or its simulator is not there.
     """
     windows = episodes.windows
     state, goal, action = (values[:2, 0] for values in (windows.state, windows.goal, windows.action))
@@ -66,10 +68,18 @@ def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes)
         simulator = grounding.simulator(task, len(state), str(state.device))
         simulator.start(state, torch.arange(len(state), device=state.device), goal)
         landed: object = simulator.step(action)
+        reached = simulator.state
     got = tuple(landed.shape) if isinstance(landed, torch.Tensor) else f"a {type(landed).__name__}"
-    if got != tuple(state.shape):
+    if not isinstance(landed, torch.Tensor) or landed.shape != state.shape:
         raise BadInputError(
             f"{type(simulator).__name__}.step: expected states of shape {tuple(state.shape)}, got {got}"
+        )
+    if not torch.allclose(reached, landed, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True):
+        apart = f"{(reached - landed).abs().max():.3g}"
+        raise BadInputError(
+            f"{type(simulator).__name__}.step: returned states up to {apart} from its simulator's, which "
+            "would go on uncorrected: expected `return self._settle(before, corrected)`, which moves the "
+            "simulator to the corrected states, as far as walls allow"
         )
 
 

@@ -116,6 +116,40 @@ def test_a_step_that_is_no_states_is_refused(
         check_step(task_named(RAIL), SHIFTED, windows_of(4))
 
 
+@pytest.mark.parametrize("shift_m", [0.01, 1e-5])
+def test_a_step_that_leaves_its_simulator_uncorrected_is_refused(
+    shift_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        ShiftedSimulator, "step", lambda self, action: self.simulator.step(action) + self.shift
+    )
+    told = (
+        rf"^ShiftedSimulator.step: returned states up to {shift_m:.3g}\d* from its simulator's, which would "
+        r"go on uncorrected: expected `return self._settle\(before, corrected\)`"
+    )
+    with pytest.raises(BadInputError, match=told):
+        check_step(task_named(RAIL), Shifted(torch.tensor([shift_m])), windows_of(4))
+
+
+def test_a_step_returns_where_a_wall_stopped_its_correction(monkeypatch: pytest.MonkeyPatch) -> None:
+    task, windows = task_named("antmaze-umaze"), windows_of(2)
+    rng = np.random.default_rng(0)
+    windows.windows.state = torch.tensor(task.objective.draw_starts(rng, 2)).float()[:, None]
+    windows.windows.goal = torch.tensor(task.objective.draw_goals(rng, 2)).float()[:, None]
+    windows.windows.action = torch.zeros(2, 1, 2)
+    through_walls = Shifted(torch.tensor([50.0, 50.0, 0.0, 0.0]))
+    check_step(task, through_walls, windows)
+
+    def beyond(self: ShiftedSimulator, action: torch.Tensor) -> torch.Tensor:
+        landed = self.simulator.step(action) + self.shift
+        self._settle(self.state, landed)
+        return landed
+
+    monkeypatch.setattr(ShiftedSimulator, "step", beyond)
+    with pytest.raises(BadInputError, match=r"up to 50 from .* as far as walls allow$"):
+        check_step(task, through_walls, windows)
+
+
 def test_a_step_that_fails_is_told_with_its_place() -> None:
     file = Path(shifted_method.__file__).name
     with pytest.raises(
