@@ -1,5 +1,6 @@
 """The entries of a task's columns, one row each."""
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -37,6 +38,23 @@ def column(name: str, entries: Sequence[ColumnEntry], meaning: str) -> Column:
     if any(mirror):
         astra["mirror"] = [*mirror]
     return Column(name, size=len(entries), names=names, meaning=meaning, astra=astra)
+
+
+def names_with_units(column: Column) -> list[str]:
+    """Return the names of a column's values, with units where these are known: "speed_m_s"."""
+    words = [
+        "_".join(re.findall("[a-z0-9]+", unit.replace("²", "2").replace("°", "deg"))) for unit in column.units
+    ]
+    return [
+        name if word in ("", "1") or name.endswith(f"_{word}") else f"{name}_{word}"
+        for name, word in zip(column.labels, words, strict=True)
+    ]
+
+
+def repeated_names(column: Column | None) -> list[str]:
+    """Return the names that several values of a column have, each once; none of no column."""
+    names = (column.names if column else None) or ()
+    return sorted({name for name in names if names.count(name) > 1})
 
 
 def free_body(joints: Sequence[str], mirrored: Sequence[str] = ()) -> list[ColumnEntry]:

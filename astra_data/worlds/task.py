@@ -1,10 +1,10 @@
 """A task: target environment, abstract simulator, the map between their states, and the objective."""
 
 import inspect
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +17,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.dataset.description import NAME
 from astra_data.worlds.batched import TargetEnv
+from astra_data.worlds.column_entries import names_with_units, repeated_names
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.driven import DrivenSimulator, VariedCommands
 from astra_data.worlds.objective import Objective
@@ -145,11 +146,19 @@ class Task:
             faults.append(f"objective: action_size {size}, expected that of commands, {len(commands)}")
         if self.action and {*self.action.labels} == {*commands} and self.action.labels != (*commands,):
             faults.append(f"action: names {', '.join(self.action.labels)}, expected {', '.join(commands)}")
+        simulated = self.abstract_state or getattr(self.make_simulator, "abstract_state", None)
+        named = {"state": self.state, "action": self.action, "goal": self.goal, "abstract_state": simulated}
+        faults += [
+            f"{name}: names has {', '.join(repeated)} more than once"
+            for name, column in named.items()
+            if (repeated := repeated_names(column))
+        ]
         for name, size in (("action", len(commands)), ("goal", self.objective.goal_size)):
             if (column := getattr(self, name)) and column.size != size:
                 faults.append(f"{name}: {column.size} values, expected {size}")
-        if (horizon := self.objective.horizon) < 1:
-            faults.append(f"objective: horizon {horizon}, expected 1 step or more")
+        if not isinstance(horizon := self.objective.horizon, Integral) or horizon < 1:
+            expected = "expected 1 step or more, a whole number, such as round(8 / timestep_s)"
+            faults.append(f"objective: horizon {horizon}, {expected}")
         if not 0 < self.timestep_s < 2:
             expected = (
                 "expected above 0 and below 2 s, since datasets have a whole number of steps per second"
@@ -168,7 +177,7 @@ class Task:
             "goal": Column(GOAL, size=size) if (size := self.objective.goal_size) else None,
             "abstraction": getattr(self.make_simulator, "abstraction", None),
             "abstract_state": replace(abstract, name=ABSTRACT_STATE),
-            "quantities": {name: (index,) for index, name in enumerate(_with_units(abstract))},
+            "quantities": {name: (index,) for index, name in enumerate(names_with_units(abstract))},
             "simulator_id": _named(self.make_simulator),
         }
         derived = {name: value for name, value in usual.items() if not getattr(self, name)}
@@ -280,17 +289,6 @@ class Task:
         """Build `num_envs` abstract simulators whose parameters vary; those without a range are plain."""
         ranges = type(self.varied.wide)(**variation.model_dump())
         return self.varied.kind(self.simulator(num_envs, device), ranges)
-
-
-def _with_units(column: Column) -> list[str]:
-    """Return the names of a column's values, with units where these are known: "speed_m_s"."""
-    words = [
-        "_".join(re.findall("[a-z0-9]+", unit.replace("²", "2").replace("°", "deg"))) for unit in column.units
-    ]
-    return [
-        name if word in ("", "1") or name.endswith(f"_{word}") else f"{name}_{word}"
-        for name, word in zip(column.labels, words, strict=True)
-    ]
 
 
 def _named(made: object) -> str:

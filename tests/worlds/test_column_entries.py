@@ -1,7 +1,14 @@
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.column_entries import ColumnEntry, column, free_body
+from astra_data.dataset.columns import Column
+from astra_data.worlds.column_entries import (
+    ColumnEntry,
+    column,
+    free_body,
+    names_with_units,
+    repeated_names,
+)
 
 
 def test_entries_become_a_column() -> None:
@@ -32,3 +39,16 @@ def test_a_free_body_is_mirrored_by_its_joints() -> None:
 def test_a_mirror_image_that_no_entry_has_is_refused() -> None:
     with pytest.raises(BadInputError, match="mirror '-right' of left"):
         column("state", free_body(("left",), ("-right",)), "qpos and qvel")
+
+
+def test_names_end_with_units_where_they_do_not_yet() -> None:
+    units = ["m/s", "°", "1", "", "m"]
+    state = Column("state", size=5, names=("v", "tilt", "share", "n", "x_m"), astra={"unit": units})
+    assert names_with_units(state) == ["v_m_s", "tilt_deg", "share", "n", "x_m"]
+    assert names_with_units(Column("state", size=2)) == ["0", "1"]
+
+
+def test_names_that_several_values_have_are_told_once() -> None:
+    assert repeated_names(Column("state", size=5, names=("x", "v", "x", "v", "x"))) == ["v", "x"]
+    assert repeated_names(Column("state", size=2, names=("x", "v"))) == []
+    assert repeated_names(Column("state", size=2)) == repeated_names(None) == []

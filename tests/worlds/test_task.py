@@ -3,6 +3,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from fake_dataset import COLUMNS, write_fake
@@ -188,9 +189,48 @@ def test_a_task_without_a_target_says_so() -> None:
         ({"timestep_s": 2.0}, "timestep_s: expected above 0 and below 2 s.*: got 2.0"),
         ({"name": "my rail"}, "name: expected letters, digits"),
         ({"objective": Reach(horizon=0)}, "objective: horizon 0, expected 1 step or more"),
+        (
+            {"objective": Reach(horizon=8 / 0.05)},
+            r"objective: horizon 160.0, expected 1 step or more, a whole number, such as round\(8 / ",
+        ),
+        (
+            {"objective": Reach(horizon="40")},
+            "objective: horizon 40, expected 1 step or more, a whole number",
+        ),
+        (
+            {"state": Column("observation.state", size=4, names=("x", "v", "v", "x"))},
+            "state: names has v, x more than once$",
+        ),
+        (
+            {
+                "commands": {"v": (0.0, 1.0), "w": (0.0, 1.0)},
+                "action": Column("action", size=2, names=("v", "v")),
+            },
+            "action: names has v more than once$",
+        ),
+        (
+            {"goal": Column("observation.environment_state", size=2, names=("x", "x"))},
+            "goal: names has x more than once; goal: 2 values, expected 1$",
+        ),
+        (
+            {"abstract_state": Column("abstract.state", size=2, names=("x", "x"))},
+            "abstract_state: names has x more than once$",
+        ),
+        (
+            {
+                "make_simulator": type(
+                    "Twice", (Rail,), {"abstract_state": Column("abstract.state", size=2, names=("x", "x"))}
+                )
+            },
+            "abstract_state: names has x more than once$",
+        ),
         ({"make_simulator": dict}, "dict has no abstraction.*; make_simulator: dict has no abstract_state"),
     ],
 )
 def test_fields_that_contradict_each_other_are_refused(wrong: dict[str, Any], told: str) -> None:
     with pytest.raises(BadInputError, match=told):
         Task(**GIVEN | wrong)
+
+
+def test_a_horizon_may_be_an_integer_of_numpy() -> None:
+    assert Task(**GIVEN | {"objective": Reach(horizon=np.int64(40))}).objective.horizon == 40
