@@ -8,6 +8,9 @@ from astra_data.worlds.objective import Objective
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 
+_TOLERANCE = 1e-4
+"""Between states, relative to their size: simulators compute in single precision."""
+
 
 def expect(
     what: str,
@@ -37,6 +40,22 @@ def expect(
     if not found.isfinite().all():
         raise BadInputError(f"{what}: expected finite numbers, got {first(found[~found.isfinite()])}")
     return found
+
+
+def expect_same(what: str, shown: object, expected: Tensor, where: str = "") -> None:
+    """Refuse states (B, X), `shown`, that are not the `expected` ones but for rounding.
+
+    Raises:
+        BadInputError: they are others; tells those that are furthest apart.
+    """
+    shown = expect(what, shown, tuple(expected.shape))
+    if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
+        row, entry = ((shown - expected).abs() == (shown - expected).abs().max()).nonzero()[0].tolist()
+        raise BadInputError(
+            f"{what} {where}".rstrip()
+            + f": expected {first(expected[row, entry]):g} in row {row}, entry {entry}, got "
+            f"{first(shown[row, entry]):g}"
+        )
 
 
 def expect_tensor(what: str, found: object) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
-from astra_data.worlds.expecting import expect, expect_tensor, first, judged, paid, stepped
+from astra_data.worlds.expecting import expect, expect_same, expect_tensor, judged, paid, stepped
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.robot import RobotEnv
@@ -25,8 +25,6 @@ _RESETS = 5
 """Of a robot, to see where it starts."""
 _DRAWN = 200
 """Starts, to see in which range the objective draws them."""
-_TOLERANCE = 1e-4
-"""Between states, relative to their size: simulators compute in single precision."""
 _log = logging.getLogger(__name__)
 
 
@@ -67,6 +65,7 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
         if landed is not None and goals is not None:
             before, after, goals = (values.to(device) for values in (starts, landed, goals))
             tried(_observation, after, goals)
+            tried(_places, after)
             if tried(_ends, after, goals):
                 tried(_reward, before, after, goals)
     return faults
@@ -164,11 +163,11 @@ def _reset(task: Task, simulator: AbstractSimulator, starts: Tensor) -> bool:
     with explained("make_simulator: reset_to(state)"):
         simulator.reset_to(starts.clone())
         shown = simulator.state
-    _same("make_simulator: after reset_to(state), state", shown, starts)
+    expect_same("make_simulator: after reset_to(state), state", shown, starts)
     with explained("make_simulator: reset_to(state, rows)"):
         simulator.reset_to(starts[[0, 1]], torch.tensor([2, 0], device=starts.device))
         shown = simulator.state
-    _same("make_simulator: after reset_to(state, rows), state", shown, starts[[1, 1, 0]])
+    expect_same("make_simulator: after reset_to(state, rows), state", shown, starts[[1, 1, 0]])
     return True
 
 
@@ -189,7 +188,7 @@ def _step(task: Task, simulator: AbstractSimulator, starts: Tensor, device: str)
     if torch.equal(landed, landing(slice(None))):
         for row in range(_COUNT):
             alone = landing(slice(row, row + 1))
-            _same(f"{what}: row {row} by itself and", alone, landed[row : row + 1], "in the batch")
+            expect_same(f"{what}: row {row} by itself and", alone, landed[row : row + 1], "in the batch")
     elif _remembers(lambda: task.own_simulator(_COUNT, device), starts, command):
         raise BadInputError(
             f"{what}: expected a result that depends on the state alone, but it depends on commands before "
@@ -271,22 +270,22 @@ def _commands(task: Task) -> Tensor:
     return task.limits.in_units(torch.from_numpy(drawn).float())
 
 
-def _same(what: str, shown: Tensor, expected: Tensor, where: str = "") -> None:
-    expect(what, shown, tuple(expected.shape))
-    if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
-        row, entry = ((shown - expected).abs() == (shown - expected).abs().max()).nonzero()[0].tolist()
-        raise BadInputError(
-            f"{what} {where}".rstrip()
-            + f": expected {first(expected[row, entry]):g} in row {row}, entry {entry}, got "
-            f"{first(shown[row, entry]):g}"
-        )
-
-
 def _observation(task: Task, state: Tensor, goal: Tensor) -> None:
     what = "objective.observe(state, goal)"
     with explained(what):
         found = task.objective.observe(state, goal)
     expect(what, found, (_COUNT, -1), device=state.device)
+
+
+def _places(task: Task, state: Tensor) -> None:
+    what = "objective.places(state)"
+    with explained(what):
+        found = task.objective.places(state)
+    _, size = expect(what, found, (_COUNT, -1), device=state.device).shape
+    if size % 2:
+        raise BadInputError(
+            f"{what}: expected x and y of K bodies, shape ({_COUNT}, 2 K), got ({_COUNT}, {size})"
+        )
 
 
 def _ends(task: Task, state: Tensor, goal: Tensor) -> bool:

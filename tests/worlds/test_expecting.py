@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.expecting import expect, first, judged, paid
+from astra_data.worlds.expecting import expect, expect_same, first, judged, paid
 from astra_data.worlds.objective import Objective
 
 STATE = torch.zeros(3, 2)
@@ -33,6 +33,16 @@ def test_anything_else_is_refused_with_what_it_is(found: object, said: str) -> N
     """One line says what was expected and what came."""
     with pytest.raises(BadInputError, match=f"^{said}"):
         expect("step", found, (-1, 2), torch.float32)
+
+
+def test_states_are_the_same_but_for_rounding() -> None:
+    """The entry that is furthest apart is told."""
+    expected = torch.tensor([[1.0, 2.0], [1000.0, 0.0]])
+    expect_same("state", expected + torch.tensor([[1e-5, 0.0], [0.05, 9e-5]]), expected)
+    with pytest.raises(BadInputError, match=r"^state here: expected 1000 in row 1, entry 0, got 1003$"):
+        expect_same("state", expected + torch.tensor([[2.0, 0.0], [3.0, 1.0]]), expected, "here")
+    with pytest.raises(BadInputError, match=r"^state: expected shape \(2, 2\), got \(1, 2\)$"):
+        expect_same("state", expected[:1], expected)
 
 
 def test_the_first_value_of_any_shape() -> None:

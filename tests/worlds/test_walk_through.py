@@ -166,6 +166,19 @@ WRONG: list[tuple[Task, str]] = [
         "objective.observe(state, goal): expected shape (3, any), got (3,)",
     ),
     (
+        objective(places=lambda self, state: state[..., 0]),
+        "objective.places(state): expected shape (3, any), got (3,)",
+    ),
+    (
+        objective(places=lambda self, state: state.expand(-1, 3)),
+        "objective.places(state): expected x and y of K bodies, shape (3, 2 K), got (3, 3)",
+    ),
+    (
+        objective(places=lambda self, state: state.numpy().repeat(2, -1)),
+        "objective.places(state): expected a torch tensor, got a ndarray",
+    ),
+    (objective(places=lambda self, state: state[:, 7]), "objective.places(state) fails with IndexError: "),
+    (
         objective(draw_starts=lambda self, rng, count: np.zeros(count)),
         "objective.draw_starts(rng, 3): expected shape (3, 1), got (3,)",
     ),
