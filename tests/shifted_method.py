@@ -95,3 +95,15 @@ class Narrow(Shifted):
 NARROW = Method(
     name="narrow", title="Narrow", fit=lambda fitting: (Narrow(shift_of(fitting)), {}), grounding=Narrow
 )
+
+
+class Wide(Shifted):
+    """Tells a scatter of other states than these."""
+
+    kind = "shifted, wide"
+
+    def scatter(self, episodes: PairedEpisodes) -> Tensor:
+        return torch.eye(len(self.shift) + 1)
+
+
+WIDE = Method(name="wide", title="Wide", fit=lambda fitting: (Wide(shift_of(fitting)), {}), grounding=Wide)

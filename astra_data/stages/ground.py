@@ -17,7 +17,7 @@ from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import GROUNDING, load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.open_loop_error import gap_report
-from astra_data.grounding.own_grounding import check_step, fitted
+from astra_data.grounding.own_grounding import check_scatter, check_step, fitted
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import is_of_package, method_named
 from astra_data.reports.artifacts import GAP, METRICS, Metrics
@@ -80,6 +80,7 @@ def ground(
         written = load_grounding(folder / GROUNDING, device)  # what policies are trained in
         if not is_of_package(base_method(method)):
             check_step(world, written, held_out)
+            check_scatter(written, episodes)
         gap = gap_report(world, written, held_out, seed=seed)
         (folder / METRICS).write_text(json.dumps(figures, indent=1))
         (folder / GAP).write_text(json.dumps(gap, indent=1))

@@ -150,6 +150,7 @@ def test_the_gap_is_that_of_the_grounding_in_the_file(
     [
         ("UNNAMED", "expected grounding=Lossy"),
         ("NARROW", "got"),
+        ("WIDE", r"^Wide.scatter\(episodes\), .*: expected shape \(4, 4\), got \(5, 5\)$"),
         ("CLASHING", "^the figures of fit: machine: .*; failures: .*: give them other names"),
     ],
 )
