@@ -13,6 +13,7 @@ from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.residual import ResidualGrounding
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel
+from astra_data.worlds.own_saving import parts_of, restored
 
 KINDS: dict[str, type[FittedGrounding]] = {
     kind.kind: kind for kind in (HistoryGrounding, ResidualGrounding, IdentifiedParameters)
@@ -25,8 +26,12 @@ _TARGET_ENCODER = "target encoder"
 
 
 def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
-    """Write `grounding`, which was fitted to `episodes`, to `path`."""
-    tensors, metadata = grounding.to_file()
+    """Write `grounding`, which was fitted to `episodes`, to `path`.
+
+    Raises:
+        BadInputError: its `to_file` fails, or returns something else than tensors and JSON values.
+    """
+    tensors, metadata = parts_of(grounding)
     save_tensors(path, tensors, episodes.named | {"kind": grounding.kind} | metadata)
 
 
@@ -37,7 +42,7 @@ def load_grounding(path: Path | str, device: str = "cpu") -> FittedGrounding:
         BadInputError: the file is missing, holds something else, or is from an older version.
     """
     with understood(Path(path), "a grounding", KINDS, device) as (tensors, metadata):
-        return KINDS[metadata["kind"]].from_file(tensors, metadata, device)
+        return restored(KINDS[metadata["kind"]], tensors, metadata, device)
 
 
 def grounding_at(path: Path | None, device: str = "cpu") -> Grounding:

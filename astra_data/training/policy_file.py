@@ -19,6 +19,7 @@ from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.training.build_env import EnvConfig, Simulation
 from astra_data.training.own_policy import KINDS, OwnPolicy, SavedPolicy
 from astra_data.training.running_policy import Observed, RunningPolicy
+from astra_data.worlds.own_saving import parts_of, restored
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
@@ -68,7 +69,8 @@ class PolicyFile:
         """Write the policy to `path`.
 
         Raises:
-            BadInputError: it is of a class that `load` does not know.
+            BadInputError: it is of a class that `load` does not know, or its `to_file` returns something else
+                than tensors and JSON values.
         """
         kind, networks, own = _taken_apart(self.policy)
         tensors = as_part(networks, _PART)
@@ -125,14 +127,14 @@ def _taken_apart(policy: Policy) -> tuple[str, Mapping[str, Tensor], dict[str, A
             )
         return kinds[type(policy)], policy.state_dict(), {}
     saved: Any = policy.acting
-    tensors, metadata = saved.to_file()
+    tensors, metadata = parts_of(saved)
     return saved.kind, tensors, {"own": metadata}
 
 
 def _put_together(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> Policy:
     shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
     if "own" in metadata:
-        acting = KINDS[metadata["kind"]].from_file(tensors, metadata["own"])
+        acting = restored(KINDS[metadata["kind"]], tensors, metadata["own"])
         return OwnPolicy(acting, shape["observation_size"], shape["action_size"])
     made, shaped = _KINDS[metadata["kind"]]
     policy = made(shaped(**shape))

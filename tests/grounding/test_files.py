@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from shifted_method import Shifted
 from toy_episodes import no_episodes
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
@@ -153,3 +154,21 @@ def test_what_is_no_target_encoder_is_refused(missing: str, message: str, tmp_pa
     save_tensors(path, tensors, metadata)
     with pytest.raises(BadInputError, match=f"expected a target encoder .*{message}"):
         load_target_encoder(path)
+
+
+def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, shifted = tmp_path / "grounding.safetensors", Shifted(torch.ones(2))
+    monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
+    monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift.numpy()}, {}))
+    with pytest.raises(BadInputError, match=r"^Shifted.to_file: 'offset' is a ndarray, expected a torch"):
+        save_grounding(path, shifted, no_episodes())
+    assert not path.exists()
+    monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift}, {}))
+    save_grounding(path, shifted, no_episodes())
+    told = (
+        r"^Shifted.from_file asks for 'shift', which its to_file did not write: the file has .* offset, and"
+    )
+    with pytest.raises(BadInputError, match=told):
+        load_grounding(path)

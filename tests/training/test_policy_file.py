@@ -1,7 +1,9 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from constant_policy import Constant
 from toy_episodes import no_episodes
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
@@ -15,6 +17,7 @@ from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.build_env import EnvConfig, Simulation
+from astra_data.training.own_policy import KINDS, OwnPolicy
 from astra_data.training.policy_file import PolicyFile, running
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
@@ -109,3 +112,22 @@ def test_networks_that_could_not_be_read_again_are_not_written(tmp_path: Path) -
     with pytest.raises(BadInputError, match=r"^a Mine cannot be read again: expected a .*SoftActor, or what"):
         made.save(tmp_path / "policy.safetensors")
     assert not [*tmp_path.iterdir()]
+
+
+def test_what_a_policy_of_another_learner_saves_and_asks_for_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, made = tmp_path / "policy.safetensors", PolicyFile(OwnPolicy(Constant(0.5), 3, 1), None, None, None)
+    monkeypatch.setitem(KINDS, Constant.kind, Constant)
+    monkeypatch.setattr(Constant, "to_file", lambda self: ({"command": np.ones(1)}, {"unit": "none"}))
+    with pytest.raises(BadInputError, match=r"^Constant.to_file: 'command' is a ndarray, expected a torch"):
+        made.save(path)
+    assert not path.exists()
+    monkeypatch.setattr(Constant, "to_file", lambda self: ({"speed": torch.ones(1)}, {"unit": "none"}))
+    made.save(path)
+    told = (
+        r"^Constant.from_file asks for 'command', which its to_file did not write: the file has the tensors "
+        r"speed, and unit beside them: correct it or to_file, and run that stage again$"
+    )
+    with pytest.raises(BadInputError, match=told):
+        PolicyFile.load(path)

@@ -190,11 +190,11 @@ def test_a_task_without_a_target_says_so() -> None:
         ({"name": "my rail"}, "name: expected letters, digits"),
         ({"objective": Reach(horizon=0)}, "objective: horizon 0, expected 1 step or more"),
         (
-            {"objective": Reach(horizon=8 / 0.05)},
+            {"objective": Reach(horizon=8 / 0.05)},  # type: ignore[arg-type]
             r"objective: horizon 160.0, expected 1 step or more, a whole number, such as round\(8 / ",
         ),
         (
-            {"objective": Reach(horizon="40")},
+            {"objective": Reach(horizon="40")},  # type: ignore[arg-type]
             "objective: horizon 40, expected 1 step or more, a whole number",
         ),
         (
@@ -233,4 +233,5 @@ def test_fields_that_contradict_each_other_are_refused(wrong: dict[str, Any], to
 
 
 def test_a_horizon_may_be_an_integer_of_numpy() -> None:
-    assert Task(**GIVEN | {"objective": Reach(horizon=np.int64(40))}).objective.horizon == 40
+    reach = Reach(horizon=np.int64(40))  # type: ignore[arg-type]
+    assert Task(**GIVEN | {"objective": reach}).objective.horizon == 40
