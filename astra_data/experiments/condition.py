@@ -1,8 +1,8 @@
 """The condition of a run's artifacts: whether each is finished, missing, damaged or stale, and why.
 
 An artifact is damaged if it is not what its manifest says, or a dataset that cannot be opened; it is stale if
-it was made from something else than what lies there now, or with other settings. Version 0.1 wrote no
-manifests: what it finished counts as finished, if its result is there.
+it was made from something else than what lies there now, or was made or begun with other settings. Version
+0.1 wrote no manifests: what it finished counts as finished, if its result is there.
 """
 
 from collections.abc import Callable, Collection, Iterator
@@ -56,7 +56,8 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
     """Return the condition of the artifact of `item`; with `verify`, every byte of it is read."""
     key = item.key
     if not experiment.has(key):
-        return Condition("missing")
+        why = experiment.outdated(key)  # of one that was begun
+        return Condition("stale", why) if why else Condition("missing")
     faults, manifest = examined(key, experiment, verify=verify)
     if why := faults or (verify and _unreadable(key, experiment)):
         return Condition("damaged", why)

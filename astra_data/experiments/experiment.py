@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.config import did_you_mean, validated
+from astra_data.core.durable import begun_beside, made_in
 from astra_data.core.errors import RecipeError
 from astra_data.core.naming import RECORD, base_method, reference_of, stage_of_key
 from astra_data.experiments.changed_settings import differences, restated, share_target
@@ -115,16 +116,17 @@ class Experiment:
             )
 
     def outdated(self, key: str) -> str:
-        """Return which settings changed since the artifact `key` was made, empty if none."""
+        """Return which settings changed since the artifact `key` was made, or begun; empty if none."""
         changed, folders = self.maker(stage_of_key(key))._outdated
-        place = self.place(key)
-        if not any(place.is_relative_to(folder) for folder in folders):
+        places = [self.place(key)] if self.has(key) else begun_beside(self.place(key))
+        if not any(place.is_relative_to(folder) for place in places for folder in folders):
             return ""
-        return f"{changed} since: give the recipe another name, or remove this"
+        this = "this" if self.has(key) else " ".join(map(str, places))
+        return f"{changed} since: give the recipe another name, or remove {this}"
 
     @cached_property
     def _outdated(self) -> tuple[str, list[Path]]:
-        """What changed since the artifacts were made, and the folders made with the old."""
+        """What changed since the artifacts were made, and the folders made or begun with the old."""
         if not (self.folder / RECORD).is_file():
             return "", []
         recorded = recorded_settings(self.folder)
@@ -147,9 +149,8 @@ class Experiment:
         tables = " and ".join(f"{table} ({how})" for table, how in sorted(changes.items()))
         texts = [f"{tables} changed in the recipe"] if tables else []
         texts += [f"{what} changed" for what in dict.fromkeys(code.values())]
-        return " and ".join(texts), [
-            folder for folder in dict.fromkeys(folders) if folder.parent not in folders
-        ]
+        outermost = [folder for folder in dict.fromkeys(folders) if folder.parent not in folders]
+        return " and ".join(texts), [made for folder in outermost for made in made_in(folder, "seed_*")]
 
     @property
     def results(self) -> Path:

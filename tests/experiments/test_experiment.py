@@ -238,6 +238,48 @@ def test_changes_are_told_in_the_base_and_here(base: Path, longer: Path, tmp_pat
     )
 
 
+def begun_again(folder: Path, key: str) -> Path:
+    """Turn a finished artifact into the work on it of a killed run."""
+    finished = folder / key
+    return finished.rename(finished.with_name(f".{finished.name}.partial"))
+
+
+def test_what_was_begun_with_other_settings_is_told_alike_by_check_and_run(
+    base: Path, tmp_path: Path
+) -> None:
+    folder = run(base, root=tmp_path, jobs=2)
+    for made in ("evaluate", "train/astra_plus", "train/astra/seed_1"):
+        shutil.rmtree(folder / made)
+    partial = begun_again(folder, "train/astra/seed_0")
+    found = check(base, root=tmp_path)
+    assert found["train/astra/seed_0"].state == found["train/astra/seed_1"].state == "missing"
+    base.write_text(BASE + "[train]\nsteps = 9\n")
+    found = check(base, root=tmp_path)
+    changed = "train (steps: 1, now 9) changed in the recipe since"
+    advice = f"give the recipe another name, or remove {partial}"
+    assert (found["train/astra/seed_0"].state, found["train/astra/seed_1"].state) == ("stale", "missing")
+    assert found["train/astra/seed_0"].why == f"{changed}: {advice}"
+    with pytest.raises(RecipeError) as caught:
+        run(base, root=tmp_path)
+    assert str(caught.value) == f"{changed} {folder} was made: {advice}"
+    shutil.rmtree(partial)
+    assert check(base, root=tmp_path)["train/astra/seed_0"].state == "missing"
+    run(base, root=tmp_path, jobs=2)
+    assert asked(folder / "train/astra/seed_0")["steps"] == 9
+
+
+def test_where_others_are_finished_what_was_begun_is_removed_with_them(base: Path, tmp_path: Path) -> None:
+    folder = run(base, root=tmp_path, jobs=2)
+    partial = begun_again(folder, "train/astra/seed_0")
+    shutil.rmtree(folder / "evaluate")
+    base.write_text(BASE + "[train]\nsteps = 9\n")
+    found = check(base, root=tmp_path)
+    assert found["train/astra/seed_0"].why.endswith(f"or remove {partial}")
+    assert found["train/astra/seed_1"].why.endswith("or remove this")
+    with pytest.raises(RecipeError, match=rf"or remove {folder / 'train'}$"):
+        run(base, root=tmp_path)
+
+
 def test_a_stage_that_is_borrowed_no_more_is_made_here(base: Path, longer: Path, tmp_path: Path) -> None:
     run(base, root=tmp_path, jobs=2)
     folder = run(longer, root=tmp_path, jobs=2)
