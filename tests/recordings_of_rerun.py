@@ -1,14 +1,13 @@
 """What recordings of Rerun hold."""
 
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-try:
-    from rerun.chunk import RrdReader
-except ModuleNotFoundError:  # older ones
-    from rerun.experimental import RrdReader
+RrdReader = import_module("rerun.chunk" if find_spec("rerun.chunk") else "rerun.experimental").RrdReader
 
 
 def read(path: Path) -> dict[str, dict[str, Any]]:

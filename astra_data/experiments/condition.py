@@ -56,8 +56,8 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
     """Return the condition of the artifact of `item`; with `verify`, every byte of it is read."""
     key = item.key
     if not experiment.has(key):
-        why = experiment.outdated(key)  # of one that was begun
-        return Condition("stale", why) if why else Condition("missing")
+        begun_otherwise = experiment.outdated(key)
+        return Condition("stale", begun_otherwise) if begun_otherwise else Condition("missing")
     faults, manifest = examined(key, experiment, verify=verify)
     if why := faults or (verify and _unreadable(key, experiment)):
         return Condition("damaged", why)

@@ -154,7 +154,8 @@ class Iql:
         self._critics = _Critics(observed, acted, config.critic_sizes).to(experience.observation.device)
         slow, fast = self._critics.slow_action_values, self._critics.action_values
         # Listed once, since finding a network's parameters takes as long as updating them.
-        self._slow_and_fast = [*slow.parameters()], [*fast.parameters()]
+        self._slow: list[Tensor] = [*slow.parameters()]
+        self._fast: list[Tensor] = [*fast.parameters()]
         self._policy_parameters = [*policy.parameters()]
         learned = [*self._critics.value.parameters(), *fast.parameters()]
         self._critic_optimizer = torch.optim.Adam(learned, lr=config.critic_learning_rate, fused=True)
@@ -205,7 +206,7 @@ class Iql:
         (value + action_value).backward()
         self._critic_optimizer.step()
         with torch.no_grad():
-            torch._foreach_lerp_(*self._slow_and_fast, config.target_rate)
+            torch._foreach_lerp_(self._slow, self._fast, config.target_rate)
         return {"value": float(value.detach()), "action_value": float(action_value.detach())}
 
     def _learn_policy(self, update: int) -> dict[str, float]:
