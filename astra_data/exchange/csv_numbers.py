@@ -15,6 +15,7 @@ from astra_data.exchange.importers.csv import (
     check_header,
     delimiter_of,
     explained,
+    line_of,
     torn_bytes,
     without_blanks,
     without_end,
@@ -52,7 +53,8 @@ def read_numbers(path: Path, numbered: re.Pattern[str]) -> dict[str, Floats]:
     fields = [(name, values) for name, values in named if name or not pa.types.is_null(values.type)]
     for name, values in fields:
         if pa.types.is_string(values.type) and (wrong := _no_number(values.to_pylist())):
-            raise BadInputError(f"{path} line {wrong[0] + 2}: {name}: expected a number, got {wrong[1]!r}")
+            line = line_of(source, wrong[0])
+            raise BadInputError(f"{path} line {line}: {name}: expected a number, got {wrong[1]!r}")
     numbers = {
         name: _as_numbers(values, is_numbered=bool(numbered.fullmatch(plain_name(name))))
         for name, values in fields

@@ -25,7 +25,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.endings import is_terminated
 from astra_data.exchange.conversion import Converter, Mask
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block, row_name
+from astra_data.exchange.recording import Block
 from astra_data.exchange.tally import Tally
 
 REASONS = ("file", "source", "field", "end", "gap", "back", "jump", "rejected")
@@ -89,7 +89,8 @@ class Cutter:
             first = int(np.argmax(rejected))
             self.tally.rejected_first = self.tally.rejected_first or block.place(first, row + first)
             self.tally.rejected_rows += int(rejected.sum())
-        self.tally.count_torn(block.torn, row_name(block.origin, row + len(block)))
+        if block.torn:
+            self.tally.count_torn(block.torn, block.row_name(row + len(block)))
         counters = self._count(block, row, columns, rejected, is_apart=is_apart)
         self._keep_ends(columns, counters[:-1], finite)
         if not finite.any():
@@ -233,7 +234,7 @@ class Cutter:
                 known = np.isfinite(series[:, 0])
                 stands = (steps_s == 0) & known[:-1] & known[1:]
                 stands[0] &= continues
-                self.tally.count_times(masks["back"], stands, lambda at: row_name(block.origin, row + at))
+                self.tally.count_times(masks["back"], stands, lambda at: block.row_name(row + at))
                 now[key] = series[1:]
             else:
                 masks["end"] |= (np.nan_to_num(series[:-1]) != 0).any(axis=1)

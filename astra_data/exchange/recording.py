@@ -4,7 +4,7 @@ import io
 import re
 import shlex
 import tarfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
@@ -113,6 +113,7 @@ class Block:
         notes: what the import's report tells of them, in a line each.
         is_back: whether that episode begins since time goes back.
         places: where the values of some rows were recorded, if the number of the row does not tell.
+        line: gives the line of a row of the file by its number, where lines may be empty.
     """
 
     values: Mapping[str, Array]
@@ -122,6 +123,7 @@ class Block:
     notes: tuple[str, ...] = ()
     is_back: bool = False
     places: Mapping[int, str] = field(default_factory=dict)
+    line: Callable[[int], int] | None = None
 
     def __len__(self) -> int:
         """Return n."""
@@ -129,7 +131,13 @@ class Block:
 
     def place(self, row: int, number: int) -> str:
         """Name a row of the block that has a `number` in its part of the file."""
-        return self.places.get(row) or row_name(self.origin, number)
+        return self.places.get(row) or self.row_name(number)
+
+    def row_name(self, number: int) -> str:
+        """Name the row, or the cut off one after the last, that has a `number` in its part of the file."""
+        if self.line is None:
+            return row_name(self.origin, number)
+        return f"{self.origin} line {self.line(number)}"
 
 
 def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:

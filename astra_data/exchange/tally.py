@@ -57,12 +57,11 @@ class Tally:
     topics: dict[str, list[str]] = field(default_factory=dict)
 
     def count_torn(self, rows: int, place: str) -> None:
-        """Count `rows` that are cut off, at the `place` of the first, where there are any."""
-        if rows:
-            self.rows += rows
-            self.rejected_rows += rows
-            self.torn_rows += rows
-            self.torn_first = self.torn_first or place
+        """Count `rows` that are cut off, at the `place` of the first."""
+        self.rows += rows
+        self.rejected_rows += rows
+        self.torn_rows += rows
+        self.torn_first = self.torn_first or place
 
     def count_times(self, back: Mask, stands: Mask, row_name: Callable[[int], str]) -> None:
         """Count the rows (n,) at which time goes back, or stands still; `row_name` tells where one is."""

@@ -397,6 +397,9 @@ def test_a_text_among_numbers_is_refused_with_its_line(tmp_path: Path) -> None:
     log.write_text("\n".join(["x,cmd_x", *rows, ""]))
     with pytest.raises(BadInputError, match=r"log.csv line 9: x: expected a number, got 'oops'$"):
         guess([log])
+    log.write_text("\n\n".join(["x,cmd_x", *rows, ""]))
+    with pytest.raises(BadInputError, match=r"log.csv line 17: x: expected a number, got 'oops'$"):
+        guess([log])
 
 
 def test_texts_and_dates_are_left_out_with_the_reason(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
+from itertools import islice
 from typing import IO
 
 import numpy as np
@@ -39,7 +41,7 @@ def check_header(name: str, stream: IO[bytes]) -> None:
     Raises:
         BadInputError: it is; says by which.
     """
-    line = stream.readline(_LONGEST_HEADER)
+    line = _first_line(stream)
     if line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise BadInputError(f"{name}: expected text in UTF-8, got UTF-16: {_SAVE}")
     delimiter, mark = delimiter_of(name)
@@ -49,6 +51,13 @@ def check_header(name: str, stream: IO[bytes]) -> None:
             f"{name}: expected fields parted by {mark}, got {others[0]} in its header: "
             "write it with commas, or with tabs as .tsv"
         )
+
+
+def _first_line(stream: IO[bytes]) -> bytes:
+    """Read the first line that is not empty, with its end."""
+    while (line := stream.readline(_LONGEST_HEADER)) in (b"\n", b"\r\n"):
+        pass
+    return line
 
 
 @contextmanager
@@ -83,6 +92,13 @@ def _uneven_line(source: Source) -> str:
                 advice = f"leave out what is above the header, {shortened(repr(header[0]), _SHOWN)}"
             return f"line {number}: Expected {len(header)} columns, got {len(cells)}: {advice}"
     return ""
+
+
+def line_of(source: Source, row: int) -> int:
+    """Return the number of the line, from 1, of a row below the header, from 0; empty lines are no rows."""
+    with suppress(python_csv.Error), _lines(source) as lines:
+        return next(islice(lines, row + 1, None), (row + 2, []))[0]
+    return row + 2
 
 
 @contextmanager
@@ -125,7 +141,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             row += len(batch)
             if last is not None:
                 yield last
-            last = Block(values, str(source)) if len(batch) else None
+            last = Block(values, str(source), line=partial(line_of, source)) if len(batch) else None
     if last is not None:
         yield replace(last, torn=int(torn > 0))
 
@@ -136,9 +152,9 @@ def torn_bytes(source: Source) -> int:
     It has no end, and fewer fields than the header; with quotes it is left to the parser.
     """
     with source.open() as stream:
-        first = stream.readline(_LONGEST_HEADER)
-        end = stream.seek(0, os.SEEK_END)
-        stream.seek(max(1, len(first), end - _LONGEST_HEADER) - 1)
+        first = _first_line(stream)
+        begin, end = stream.tell(), stream.seek(0, os.SEEK_END)
+        stream.seek(max(1, begin, end - _LONGEST_HEADER) - 1)
         _, line_end, tail = stream.read().replace(b"\r", b"\n").rpartition(b"\n")
     delimiter = delimiter_of(str(source))[0].encode()
     is_short = tail.count(delimiter) < first.count(delimiter)
@@ -193,8 +209,8 @@ def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Arr
     odd = [cell for cell in cells if not any(_is(cell[1], kind) for kind in (pa.float64(), pa.bool_()))]
     number, text = (odd or [cell for cell in cells if not _is(cell[1], pa.float64())])[0]
     raise BadInputError(
-        f"{source} line {row + number + 2}: field '{field}': expected numbers, or true and false, "
-        f"got '{text}'"
+        f"{source} line {line_of(source, row + number)}: field '{field}': "
+        f"expected numbers, or true and false, got '{text}'"
     )
 
 

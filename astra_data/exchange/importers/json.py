@@ -8,7 +8,8 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import batched
+from functools import partial
+from itertools import batched, islice
 from typing import IO, Any
 
 import numpy as np
@@ -55,11 +56,19 @@ def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             if rows:
                 if last is not None:
                     yield last
-                last = _block({name: [row[name] for row in rows] for name in fields}, mapping, str(source))
+                block = _block({name: [row[name] for row in rows] for name in fields}, mapping, str(source))
+                last = replace(block, line=partial(_line_of, source))
             if last is not None:
                 last = replace(last, torn=torn)
     if last is not None:
         yield last
+
+
+def _line_of(source: Source, row: int) -> int:
+    """Return the number of the line, from 1, of a row, from 0; blank lines are no rows."""
+    with source.open() as stream:
+        lines = enumerate(_lines(stream, source), start=1)
+        return next(islice((number for number, line in lines if line.strip()), row, None))
 
 
 def _lines(stream: IO[bytes], source: Source) -> Iterator[bytes]:

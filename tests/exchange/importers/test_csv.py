@@ -92,6 +92,22 @@ def test_a_line_is_counted_from_the_beginning_of_the_file(tmp_path: Path) -> Non
         list(csv.read(Source(path, None, path), mapping))
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_lines_that_are_empty_are_counted(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "log.csv"
+    rows = "0,0,0\n\n\nnan,1,0.1\n\n2,2,0.2\n3,3,0.3\n\n4,4,0\n5,5,0.1\n\n6,"
+    path.write_bytes(f"\nx,y,t\n\n{rows}".replace("\n", end).encode())
+    timed = 'time = "t"\nnot_finite = "drop"\n' + TORN
+    _, report = imported(tmp_path, path, timed)
+    tally = report.tally
+    assert tally.rejected_first == "log.csv line 7"
+    assert tally.back_first == "log.csv line 12"
+    assert tally.torn_first == "log.csv line 15"
+    path.write_bytes(path.read_bytes().replace(b"nan", b"oops"))
+    with pytest.raises(BadInputError, match=r"log\.csv line 7: field 'x': expected numbers, .*, got 'oops'"):
+        imported(tmp_path / "again", path, timed)
+
+
 def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows())
     path.write_text(path.read_text().replace("True", "perhaps"))

@@ -125,3 +125,14 @@ def test_a_rejected_row_is_named_by_its_line(tmp_path: Path) -> None:
         tmp_path, write_table(tmp_path / "log.jsonl", fields), 'not_finite = "split"\n' + MAPPING
     )
     assert report.tally.rejected_first == "log.jsonl line 4"
+
+
+def test_lines_that_are_blank_are_counted(tmp_path: Path) -> None:
+    fields = rows()
+    fields["x"][3] = np.nan
+    path = write_table(tmp_path / "log.jsonl", fields)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(["", *lines[:2], "", "  ", *lines[2:], "", '{"x": 1']))
+    _, report = imported(tmp_path, path, 'not_finite = "split"\n' + MAPPING)
+    assert report.tally.rejected_first == "log.jsonl line 7"
+    assert report.tally.torn_first == f"log.jsonl line {len(lines) + 5}"
