@@ -85,7 +85,7 @@ def as_json(**settings: Config | str | int | None) -> str:
 def in_full(settings: object) -> Any:  # noqa: ANN401 - as json takes them
     """Return settings as JSON values by their present names, with what a record omits as usual, too."""
     if isinstance(settings, BaseModel):
-        known = {name: getattr(settings, name) for name in type(settings).model_fields}
+        known = {name: vars(settings)[name] for name in type(settings).model_fields}  # old keys warn
         return in_full(known | (settings.model_extra or {}))
     if isinstance(settings, dict):
         return {key: in_full(value) for key, value in settings.items()}

@@ -13,6 +13,7 @@ from astra_data.core.config import Config, Count, NotNegative, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting, Taken
+from astra_data.learning.divergence import refuse_divergence
 from astra_data.learning.learner import Learner, Resumable
 from astra_data.learning.networks.actor_critic import ActorCritic
 from astra_data.learning.networks.policy import gaussian_log_prob
@@ -125,7 +126,9 @@ class Ppo(Learner):
                 self.policy.log_std.clamp_(
                     max=math.log(self._first_std) + faded * math.log(final / self._first_std)
                 )
-        return {"std": float(self.policy.log_std.detach().exp().mean())}
+        figures = {"std": float(self.policy.log_std.detach().exp().mean())}
+        refuse_divergence(f"after step {self.steps}", figures)
+        return figures
 
     @torch.no_grad()
     def _collect(self) -> dict[str, Tensor]:

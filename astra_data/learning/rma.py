@@ -15,6 +15,7 @@ from torch.nn import functional
 from astra_data.core.config import Config, Count, Positive
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
+from astra_data.learning.divergence import refuse_divergence
 from astra_data.learning.learner import Learner
 from astra_data.learning.networks.adaptation import SHORTEST_HISTORY, Student, Teacher
 from astra_data.worlds.batched import BatchedEnv
@@ -91,6 +92,7 @@ class Adaptation(Learner):
             with torch.no_grad():
                 self.acting.take(self.student.act(features), hidden)
         error = float(torch.cat(errors).square().mean(0).sum())
+        refuse_divergence(f"after step {self.steps}", {"squared error": error})
         variance = float(torch.cat(true).var(0, correction=0).sum())
         return {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
 

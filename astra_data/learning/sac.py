@@ -19,6 +19,7 @@ from astra_data.core.config import Config, Count, CountFromZero, NotNegative, Po
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
+from astra_data.learning.divergence import refuse_divergence
 from astra_data.learning.learner import Learner
 from astra_data.learning.networks.policy import PolicyShape, features_of
 from astra_data.learning.networks.soft_actor import SoftActor
@@ -178,6 +179,7 @@ class Sac(Learner):
         if self._recorded is not None:
             size = costs.detach().abs()  # almost entirely action values
             total = total + config.imitation_weight * size * self._distance(self._recorded)
+        refuse_divergence(f"after step {self.steps}", {"loss": float(total.detach())})
         self._optimizer.zero_grad()
         total.backward()
         self._optimizer.step()

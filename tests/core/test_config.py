@@ -29,6 +29,7 @@ class Late(Config):
     members: int = Field(default=0, exclude_if=lambda members: not members)
     sizes: tuple[tuple[int, ...], ...] = ((4, 4),)
     place: Path = Path("a/b")
+    old: int = Field(default=1, deprecated="no longer used")
 
 
 class Later(Config):
@@ -38,7 +39,7 @@ class Later(Config):
 
 
 def test_settings_in_full_have_what_records_omit_and_their_present_names() -> None:
-    usual = {"doubt": 0.5, "members": 0, "sizes": [[4, 4]], "place": "a/b"}
+    usual = {"doubt": 0.5, "members": 0, "sizes": [[4, 4]], "place": "a/b", "old": 1}
     assert in_full(Later(by_name={"mine": Late(gain=[2])})) == {  # type: ignore[call-arg]
         "late": usual,
         "by_name": {"mine": usual | {"gain": [2]}},

@@ -232,7 +232,7 @@ def test_fewer_environments_than_minibatches_are_enough() -> None:
 def test_a_training_that_diverges_says_so() -> None:
     learner = ppo(GoToZero(4), 8, horizon=20, learning_rate=1e30)
     with pytest.raises(
-        BadInputError, match=r"diverged by step .* std that is not finite: make learning_rate sm"
+        BadInputError, match=r"diverged after step .* std that is not finite: make learning_rate sm"
     ):
         train(learner)
 

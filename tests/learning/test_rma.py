@@ -6,6 +6,7 @@ from kept_states import came_back
 from pydantic import ValidationError
 from toy_worlds import Slope
 
+from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student, Teacher
 from astra_data.learning.rma import Adaptation, RmaConfig
 
@@ -110,6 +111,16 @@ def test_the_learning_rate_falls_to_zero_along_a_line() -> None:
         learner.iterate()
         rates.append(learner._optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([3e-3 * left for left in (1.0, 0.75, 0.5, 0.25)])
+
+
+def test_a_training_that_diverges_says_so() -> None:
+    learner = begin(4, 8)
+    with torch.no_grad():
+        next(learner.student.adaptation.parameters()).fill_(math.inf)
+    with pytest.raises(
+        BadInputError, match=r"diverged after step 0, with a squared error that is not finite"
+    ):
+        learner.iterate()
 
 
 def test_where_nothing_varies_there_is_nothing_to_explain(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -340,6 +340,12 @@ def test_metrics_count_finished_episodes() -> None:
     assert metrics["reward"] == pytest.approx(1.0)
 
 
+def test_a_training_that_diverges_says_so() -> None:
+    learner = sac(GoToZero(4), 40, horizon=20, learning_rate=1e30)
+    with pytest.raises(BadInputError, match=r"diverged after step .* with a loss that is not finite: make"):
+        train(learner)
+
+
 def test_a_window_has_to_hold_steps_to_learn_from() -> None:
     with pytest.raises(ValueError, match=r"burn_in: expected less than the window of 8, got 8"):
         SacConfig(window=8, burn_in=8)
