@@ -70,22 +70,34 @@ def execute(
 def _interruptible() -> Iterator[None]:
     """Interrupt the block at SIGINT or SIGTERM, once.
 
-    Also where a shell that started the run in the background has it ignore SIGINT. Python tells these signals
-    to the main thread alone: in another, nothing is changed.
+    Also where a shell that started the run in the background has it ignore SIGINT.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+    numbers = (signal.SIGINT, signal.SIGTERM)
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         for number in numbers:
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    before = [signal.signal(number, interrupt) for number in numbers]
+    with _handled(numbers, interrupt):
+        yield
+
+
+@contextmanager
+def _handled(
+    numbers: Collection[signal.Signals], handler: Callable[[int, FrameType | None], None] | signal.Handlers
+) -> Iterator[None]:
+    """Handle signals so within the block.
+
+    Python tells signals to the main thread alone: in another, nothing is changed.
+    """
+    ours = numbers if current_thread() is main_thread() else ()
+    before = [signal.signal(number, handler) for number in ours]
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
+        for number, earlier in zip(ours, before, strict=True):
+            signal.signal(number, earlier)
 
 
 class _Worker:
@@ -96,13 +108,8 @@ class _Worker:
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,))
         # Ctrl-C reaches every process of the terminal; children ignore it and are stopped by this one.
-        numbers = [signal.SIGINT] if current_thread() is main_thread() else []
-        handlers = [signal.signal(number, signal.SIG_IGN) for number in numbers]
-        try:
+        with _handled([signal.SIGINT], signal.SIG_IGN):
             self._process.start()
-        finally:
-            for number, handler in zip(numbers, handlers, strict=True):
-                signal.signal(number, handler)
         theirs.close()
         self.key: str | None = None
 
