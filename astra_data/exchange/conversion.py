@@ -17,9 +17,17 @@ Mask = NDArray[np.bool_]
 EXACT = 2**53
 """Floats represent whole numbers below this exactly."""
 _LARGE = 2**16
-"""From here on float32 tells apart steps of 1/128 or more, which positions of an offset fall below."""
+"""Numbers beyond it that float32 cannot hold are refused: times, and positions far from their origin."""
+_ROUNDED = 0.05
+"""Mean error of a step, as a share of a typical step, from which on rounding is warned of ..."""
+_LOST = 0.5
+"""... and from which on large numbers are refused."""
+_TYPICAL = 0.9
+"""Quantile of the steps that is typical: robots often stand still, and their sensors do not."""
 _ENOUGH = 10
-"""Changes of a value, in rows that come together, of which one can say that most are lost."""
+"""Fewer steps tell nothing of rounding."""
+_SAMPLES, _MOST_SAMPLES = 2**9, 2**15
+"""Steps that are looked at in a block, and in all."""
 _KINDS = {"U": "text", "S": "text", "O": "values that are not numbers, such as missing ones"}
 
 
@@ -35,6 +43,7 @@ class Converter:
         self.columns: tuple[Column, ...] = ()
         self._mapping = mapping
         self._converted: dict[str, Column] = {}
+        self._rounding: dict[str, _Rounding] = {}
 
     def convert(self, block: Block) -> tuple[dict[str, Array], Mask]:
         """Return the columns of `block` with n rows, (n,) or (n, size), and which rows are finite, (n,).
@@ -57,6 +66,8 @@ class Converter:
                 if values.shape[1] != column.size:
                     raise BadInputError(f"{values.shape[1]} values, before there were {column.size}")
                 cast, ok = _cast(values, column)
+                if column.dtype == "float32" and not np.can_cast(values.dtype, np.float32):
+                    self._rounding.setdefault(name, _Rounding(column, spec)).add(values[ok], cast[ok])
             except BadInputError as error:
                 faults.append(f"columns.{name}: {error}")
                 continue
@@ -69,6 +80,17 @@ class Converter:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
         self.columns = self.columns or _complete(self._converted, self._mapping.terminal)
         return columns, finite
+
+    def rounded(self) -> list[str]:
+        """Return a warning for each column whose steps float32 holds badly, with the offset that helps.
+
+        Raises:
+            BadInputError: most of the steps of large numbers are lost.
+        """
+        found = [each for rounding in self._rounding.values() if (each := rounding.found())]
+        if lost := [warning for warning, is_lost in found if is_lost]:
+            raise BadInputError("; ".join(lost))
+        return [warning for warning, _ in found]
 
     def _size_faults(self) -> list[str]:
         sizes = {name: column.size for name, column in self._converted.items()}
@@ -161,7 +183,6 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
             )
         with np.errstate(over="ignore"):
             cast = np.ascontiguousarray(values, np.float32)
-        _check_distinct(sound, cast[finite], column)
         return cast, finite & np.isfinite(cast).all(axis=1)
     if column.dtype == "bool" and not np.isin(sound, (0, 1)).all():
         raise BadInputError("expected true and false, or 1 and 0")
@@ -179,26 +200,60 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
     return np.where(finite[:, None], values, 0).astype(column.dtype), finite
 
 
-def _check_distinct(values: Array, cast: Array, column: Column) -> None:
-    """Refuse large `values` (n, size) most of whose changes are lost as they are `cast` to float32."""
-    exact = values.astype(np.float64)
-    size = np.abs(exact).max(axis=0, initial=0.0)
-    large = size > _LARGE
-    if not large.any():
-        return
-    changes = np.diff(values, axis=0) != 0
-    steps = np.diff(exact, axis=0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        held = np.diff(cast.astype(np.float64), axis=0)
-        small = (np.abs(steps) < np.spacing(size.astype(np.float32))) & (held != steps)
-    # Counts that go on by less than float32 tells apart still do so in every second row.
-    lost = changes & ((held == 0) | (small & (exact != np.floor(exact)).any(axis=0))) & large
-    enough = changes.sum(axis=0) >= _ENOUGH
-    [entries] = np.nonzero(enough & (2 * lost.sum(axis=0) > changes.sum(axis=0)))
-    if len(entries):
-        named = column.names or [f"entry {entry}" for entry in range(column.size)]
-        raise BadInputError(
-            f"{', '.join(named[entry] for entry in entries)}: numbers as large as {size[entries].max():.3g} "
-            "change by less than float32 can hold; leave out what is a time, set an offset that makes them "
-            'small, or dtype = "int64"'
+class _Rounding:
+    """Compares the steps of a column's values (n, size) with those that float32 holds."""
+
+    def __init__(self, column: Column, spec: ColumnMapping) -> None:
+        self._column, self._offset = column, spec.offset
+        self._low, self._high = np.full(column.size, np.inf), np.full(column.size, -np.inf)
+        self._steps: list[Array] = []
+        self._errors: list[Array] = []
+
+    def add(self, values: Array, held: Array) -> None:
+        """Look at consecutive rows, all finite."""
+        exact = values.astype(np.float64)
+        self._low = np.minimum(self._low, exact.min(axis=0, initial=np.inf))
+        self._high = np.maximum(self._high, exact.max(axis=0, initial=-np.inf))
+        rows = np.arange(0, len(exact) - 1, max(1, len(exact) // _SAMPLES))
+        # Between integers first: those of uint64 may be equal as float64.
+        steps = np.where(values[rows + 1] == values[rows], 0.0, exact[rows + 1] - exact[rows])
+        errors = held[rows + 1].astype(np.float64) - held[rows] - steps
+        # Less is the noise of a computation with float64.
+        steps[np.abs(steps) < 64 * np.spacing(np.abs(exact[rows]))] = 0.0
+        self._steps.append(np.abs(steps))
+        self._errors.append(np.abs(errors))
+        if sum(map(len, self._steps)) > _MOST_SAMPLES:
+            self._steps = [np.concatenate(self._steps)[::2]]
+            self._errors = [np.concatenate(self._errors)[::2]]
+
+    def found(self) -> tuple[str, bool] | None:
+        """Return a warning, and whether most steps are lost; None where all are held well enough."""
+        steps, errors = np.concatenate(self._steps), np.concatenate(self._errors)
+        lost, helps, said = False, True, []
+        offset = np.broadcast_to(self._offset or 0.0, self._column.size).tolist()
+        for entry, (low, high) in enumerate(zip(self._low.tolist(), self._high.tolist(), strict=True)):
+            moved = steps[:, entry] > 0
+            if moved.sum() < _ENOUGH:
+                continue
+            step = float(np.quantile(steps[moved, entry], _TYPICAL))
+            share = float(errors[moved, entry].mean()) / step
+            if share < _ROUNDED:
+                continue
+            largest = max(-low, high)
+            spacing = float(np.spacing(np.float32(largest)))
+            is_count = spacing <= 2 and step == round(step)
+            lost |= share >= _LOST and largest > _LARGE and not is_count
+            digit = 10.0 ** np.floor(np.log10(high - low))
+            offset[entry] = round(offset[entry] - digit * round((low + high) / 2 / digit), 12)
+            helps &= float(np.spacing(np.float32(high - low))) / 3 < _ROUNDED * step
+            name = self._column.names[entry] if self._column.names else f"entry {entry}"
+            said.append(f"{name} (up to {largest:.6g}) in steps of {spacing:.2g}, but it moves by {step:.2g}")
+        if not said:
+            return None
+        listed = ", ".join(
+            f"{number:.1f}" if number == round(number) else f"{number:.15g}" for number in offset
         )
+        advice = f"set offset = [{listed}]" if helps else "leave out what is a time"
+        if lost:
+            advice += ', leave out what is a time, or store counts with dtype = "int64"' if helps else ""
+        return f"columns.{self._column.name}: float32 holds {'; '.join(said)}: {advice}", lost

@@ -80,6 +80,8 @@ class Cutter:
         """
         columns, finite = self._converter.convert(block)
         self.tally.rows += len(block)
+        used = {*self._mapping.all_fields, *self.tally.unused_fields}
+        self.tally.unused_fields += [name for name in block.known if name not in used]
         for note in block.notes:
             self.tally.topics.setdefault(note.removeprefix(f"{block.origin}: "), []).append(block.origin)
         if is_apart or not self._spent or self._spent[-1][0] != block.origin:
@@ -147,6 +149,8 @@ class Cutter:
         truncated[-1] |= not terminated[-1]
         episode |= {TRUNCATED: truncated, DONE: terminated | truncated}
         self.tally.endings.add(episode)
+        if REWARD in episode:
+            self._metadata["return"] = float(episode[REWARD].sum(dtype=np.float64))
         yield episode, self._metadata
 
     def _with_next_states(self, episode: dict[str, Array]) -> dict[str, Array]:
@@ -157,23 +161,30 @@ class Cutter:
             return episode | {NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
         self.tally.last_rows += 1
         self.tally.last_terminated += terminated
-        self.tally.last_successes += not terminated and SUCCESS in episode and bool(episode[SUCCESS][-1])
-        self.tally.last_reward += float(episode[REWARD][-1]) if REWARD in episode else 0.0
-        kept = {name: values[:-1] for name, values in episode.items()}
-        if terminated:
-            for name in {TERMINATED, SUCCESS} & kept.keys():
-                kept[name] = np.concatenate([kept[name][:-1], episode[name][-1:]])[: len(state) - 1]
+        kept = {name: values[:-1].copy() for name, values in episode.items()}
+        steps = len(state) - 1
+        if steps and SUCCESS in kept:
+            # The row's state is the one that the step before leads to.
+            kept[SUCCESS][-1] = episode[SUCCESS][-1] or (kept[SUCCESS][-1] and not terminated)
+        if steps and terminated:
+            kept[TERMINATED][-1] = True
+        if REWARD in kept and steps and terminated:
+            kept[REWARD][-1] += episode[REWARD][-1]
+        elif REWARD in kept:
+            self.tally.last_reward += float(episode[REWARD][-1])
         return kept | {NEXT_STATE: state[1:]}
 
-    def check_rate(self) -> None:
-        """Compare fps to the rates measured from the times, and tally what the clock tells.
+    def check(self) -> None:
+        """Compare fps to the rates measured from the times; tally these, and which steps float32 rounds.
 
-        They are the mean rate, and the usual one without pauses, of all files and of each, or of each episode
-        of formats that have their own.
+        The rates are the mean rate, and the usual one without pauses, of all files and of each, or of each
+        episode of formats that have their own.
 
         Raises:
-            BadInputError: both differ by more than `RATE_TOLERANCE` over all files; names those that differ.
+            BadInputError: most steps of large numbers are lost; or both rates differ by more than
+                `RATE_TOLERANCE` over all files; names those that differ.
         """
+        self.tally.notes += self._converter.rounded()
         origins = [origin for origin, spent in self._spent if spent.any()]
         if not origins:
             return

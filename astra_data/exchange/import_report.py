@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from astra_data.core.wording import first_few
-from astra_data.dataset.columns import TERMINATED
 from astra_data.dataset.endings import Endings
 from astra_data.exchange.tally import Tally
 
@@ -25,6 +24,7 @@ class ImportReport:
         unused: the files of which no episode was made.
         unread: the files of folders and archives that have other endings than the format's.
         left_out: what is wrong with each file that was left out.
+        taken: which fields became which columns, where no mapping says so.
     """
 
     root: Path
@@ -35,6 +35,7 @@ class ImportReport:
     unused: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    taken: str = ""
 
     def __str__(self) -> str:
         """Summarize it in a few lines."""
@@ -45,6 +46,9 @@ class ImportReport:
             first += (
                 f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
             )
+        taken = f"taken without a mapping: {self.taken}\n" if self.taken else ""
+        if tally.unused_fields:
+            taken += f"fields left out: {first_few(tally.unused_fields, _SHOWN)}\n"
         ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
         rate = f"rate: {tally.clock}\n" if tally.clock else ""
         lines = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
@@ -66,7 +70,7 @@ class ImportReport:
         return (
             f"{self.root}: {self.episodes} episodes, {self.frames} frames "
             f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
-            f"split points: {points}\n"
+            f"{taken}split points: {points}\n"
             f"{ends}{rate}{notes}{still}{unused}"
             f"rejected rows: {tally.rejected_rows}{first}\n"
             f"last rows without a next state: {_last_rows(tally)}; "
@@ -88,11 +92,10 @@ def _after_ends(tally: Tally) -> str:
 
 def _last_rows(tally: Tally) -> str:
     parts = [
-        f"{tally.last_terminated} of them terminated" if tally.last_terminated else "",
-        f"{tally.last_successes} succeeded, which is lost unless {TERMINATED} is set there"
-        if tally.last_successes
+        f"{tally.last_terminated} of them terminated: the step before takes over how, and the reward"
+        if tally.last_terminated
         else "",
-        f"with them a reward of {tally.last_reward:g} in sum" if tally.last_reward else "",
+        f"with the others a reward of {tally.last_reward:g} in sum" if tally.last_reward else "",
     ]
     lost = ", ".join(filter(None, parts))
     return f"{tally.last_rows} dropped ({lost})" if lost else f"{tally.last_rows} dropped"

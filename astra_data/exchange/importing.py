@@ -117,7 +117,9 @@ def import_dataset(
         return _restored_export(sources[0], format_, records[sources[0]], options, out, began)
     for source, record in records.items():
         deque(_restored(source, format_, record), maxlen=0)  # verifies the sums
-    settings = settings or _standard(sources[0], chosen, options)
+    taken = ""
+    if settings is None:
+        settings, taken = _standard(sources[0], chosen, options)
     cutter = Cutter(settings)
     cuts = episodes(sources, format_, settings, cutter)
     first = next(cuts, None)
@@ -146,7 +148,7 @@ def import_dataset(
             origins.add(str(metadata["source"]))
             frames += len(columns[TRUNCATED])
         refuse_rejected(cutter.tally, settings)
-        cutter.check_rate()
+        cutter.check()
         seconds = time.perf_counter() - began
         writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
         writer.made |= {"left_out": left_out} if left_out else {}
@@ -156,7 +158,7 @@ def import_dataset(
     unused = tuple(name for name in names if are_files and name not in origins)
     unread = () if chosen == "minari" else other_files(recordings, _suffixes(format_))
     seconds = time.perf_counter() - began
-    return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, left_out)
+    return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, left_out, taken)
 
 
 def _refuse_parts(sources: Sequence[Source]) -> None:
@@ -247,7 +249,8 @@ def _sources(recording: Path, file_format: str) -> list[Source]:
     return find_sources(recording, _suffixes(FORMATS[file_format]))
 
 
-def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> ImportMapping:
+def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> tuple[ImportMapping, str]:
+    """Return the mapping of a file with standard fields, and what it takes as what."""
     module = FORMATS[file_format]
     if not hasattr(module, "layout"):
         written = ", which `astra-data new NAME --from LOGS` writes" if file_format == "csv" else ""
@@ -259,7 +262,10 @@ def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> I
     missing = [f"--{key}" for key in ("name", "fps") if key not in keys]
     if missing:
         raise BadInputError(f"{source}: pass {' and '.join(missing)}, or --mapping FILE.toml")
-    return validated({"task": keys["name"]} | keys, ImportMapping, str(source))
+    remark = keys.pop("remark", "")
+    settings = validated({"task": keys["name"]} | keys, ImportMapping, str(source))
+    taken = [f"{name} from {', '.join(column.fields)}" for name, column in settings.columns.items()]
+    return settings, "; ".join([*taken, *([remark] if remark else [])])
 
 
 def _why_none(tally: Tally, settings: ImportMapping) -> str:

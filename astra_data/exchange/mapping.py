@@ -143,14 +143,17 @@ class ImportMapping(Config):
     out, and their neighbors become consecutive. "split": they are left out and begin new episodes."""
     terminal: Literal["drop", "stand_still"] = "drop"
     """What to do with a terminated last row whose next state was not recorded. "drop": it is left out, and
-    its next.terminated and next.success move to the step before, which led to it. "stand_still": it is kept,
-    with its own state as the (made-up) next state."""
+    its next.terminated, next.success and next.reward go to the step before, which led to it. "stand_still":
+    it is kept, with its own state as the (made-up) next state."""
     min_steps: Count = 1
     """Episodes with fewer steps are left out."""
     episodes: str | None = None
     """HDF5: groups that are episodes, such as "data/demo_*"; fields are then relative to the group. Or
     "{field}_{number}", if the names of fields end with the number of the episode, as in d3rlpy's files; a
     single value then belongs to the last row."""
+    stacked: bool | None = None
+    """Whether fields are (episodes, steps, ...), as batches for learning are; where they may be, it has to be
+    given."""
     transposed: bool = False
     """HDF5: rows lie along the last dimension, as in MATLAB's files."""
 

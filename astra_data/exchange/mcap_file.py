@@ -59,13 +59,18 @@ class McapFile:
             elif isinstance(record, records.Schema):
                 self._schemas[record.id] = record
 
+    @property
+    def topics(self) -> set[str]:
+        """The topics that the file's index or its messages have named so far."""
+        return {channel.topic for channel in self._channels.values()}
+
     def check_topics(self) -> None:
         """Refuse a file that lacks wanted topics, once its index or its messages were read.
 
         Raises:
             BadInputError: it does; lists all of them.
         """
-        known = sorted({channel.topic for channel in self._channels.values()})
+        known = sorted(self.topics)
         if self.is_cut and not known:
             raise BadInputError(f"{self._source} is cut off before its first message ends: leave it out")
         missing = [

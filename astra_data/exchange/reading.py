@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
+import numpy as np
+
 from astra_data.core.errors import AstraDataError, BadInputError, in_short
 from astra_data.core.wording import first_few
 from astra_data.exchange.cutting import Cut, Cutter
@@ -31,7 +33,7 @@ def episodes(
         for number, source in enumerate(sources):
             is_apart = mapping.split.files or source.recording != recording
             origin, row = "", 0
-            for block in _blocks_or_faults(sources[number:], module, mapping):
+            for block in _unstacked(_blocks_or_faults(sources[number:], module, mapping), mapping):
                 size += VALUE_BYTES * sum(values.size for values in block.values.values())
                 source.refuse_beyond(size)
                 recording = source.recording
@@ -99,6 +101,38 @@ def refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
             f'{tally.rejected_first}; set not_finite in the mapping to leave them out: "split" ends '
             'the episode there, "drop" goes on with the next row as if one step had passed'
         )
+
+
+def _unstacked(blocks: Iterator[Block], mapping: ImportMapping) -> Iterator[Block]:
+    """Yield `blocks`; where fields are (episodes, steps, ...), a block for each episode.
+
+    Raises:
+        BadInputError: fields may be so, and the mapping does not say whether they are.
+    """
+    row, origin = 0, ""
+    for block in blocks:
+        row, origin = (row if block.origin == origin else 0), block.origin
+        shapes = [values.shape[1:] for values in map(np.asarray, block.values.values())]
+        steps = shapes[0][0] if shapes[0] else 1
+        may_be = steps > 1 and {shape[:1] for shape in shapes} == {(steps,)} and max(map(len, shapes)) > 1
+        if not mapping.stacked:
+            if may_be and mapping.stacked is None and (len(shapes) > 1 or len(block) < steps):
+                raise BadInputError(
+                    f"{origin}: all fields have {steps} rows in each of their rows, such as "
+                    f"{next(iter(block.values))} of shape {(len(block), *shapes[0])}: set stacked = true in "
+                    f"the mapping if these are the steps of {len(block)} episodes, else stacked = false"
+                )
+            yield block
+            continue
+        if not may_be:
+            raise BadInputError(
+                f"{origin}: stacked = true, but the fields' rows have the shapes "
+                f"{', '.join(map(str, shapes))}; expected (steps, ...) with as many steps in each"
+            )
+        for episode in range(len(block)):
+            values = {field: np.asarray(stack)[episode] for field, stack in block.values.items()}
+            yield Block(values, f"{origin}/{row + episode}", starts=True, known=block.known)
+        row += len(block)
 
 
 def _blocks_or_faults(

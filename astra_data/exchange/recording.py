@@ -4,7 +4,7 @@ import io
 import re
 import shlex
 import tarfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
@@ -114,6 +114,7 @@ class Block:
         is_back: whether that episode begins since time goes back.
         places: where the values of some rows were recorded, if the number of the row does not tell.
         line: gives the line of a row of the file by its number, where lines may be empty.
+        known: the fields, or topics, that this part of the file has.
     """
 
     values: Mapping[str, Array]
@@ -124,6 +125,7 @@ class Block:
     is_back: bool = False
     places: Mapping[int, str] = field(default_factory=dict)
     line: Callable[[int], int] | None = None
+    known: Collection[str] = ()
 
     def __len__(self) -> int:
         """Return n."""

@@ -23,14 +23,14 @@ class Tally:
         split_points: number of boundaries between episodes, by reason.
         last_rows: last rows of episodes, dropped because their next state was not recorded.
         last_terminated: those of them that were terminated.
-        last_successes: those of them that succeeded without being terminated.
-        last_reward: the sum of their rewards.
+        last_reward: the sum of the rewards of the others.
         back_rows: those at which time goes back, within a file. back_first: where the first of them is.
         still_rows: those with the time of the row before. still_first: where the first of them is.
         short_rows: rows of episodes that were too short.
         rows_after_end: terminated rows right after a terminated one: the log went on, the episode did not.
         endings: how the episodes end.
         clock: the recorded rate, gaps and jitter, where the mapping names the times.
+        unused_fields: fields, or topics, that no column takes.
         notes: what is strange about the rates of files, in a line each.
         topics: what is strange about topics, in a line each, with the files that it is true of.
     """
@@ -43,7 +43,6 @@ class Tally:
     split_points: dict[str, int] = field(default_factory=dict)
     last_rows: int = 0
     last_terminated: int = 0
-    last_successes: int = 0
     last_reward: float = 0.0
     back_rows: int = 0
     back_first: str = ""
@@ -53,6 +52,7 @@ class Tally:
     rows_after_end: int = 0
     endings: Endings = field(default_factory=Endings)
     clock: str = ""
+    unused_fields: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     topics: dict[str, list[str]] = field(default_factory=dict)
 

@@ -66,12 +66,6 @@ def test_what_does_not_fit_float32_is_rejected() -> None:
     assert (finite, values[1]) == ([False, True], 2.0)
 
 
-def test_counts_of_which_float32_skips_every_second_are_kept() -> None:
-    counts = [2**24 + number for number in range(21)]
-    values, _ = convert({}, counts)
-    assert np.abs(values - counts).max() == 1 and np.count_nonzero(np.diff(values)) == 10
-
-
 def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
     made = converter({"c": {"fields": ("f",)}}, time="t", split={"ends": ("e",)})
     fields = {"f": np.zeros(4), "t": np.array([0, NAN, 2, 3]), "e": np.array([0, 0, np.inf, 0])}
@@ -216,37 +210,67 @@ def test_only_next_states_that_are_made_up_are_called_so(flag: str, terminal: st
     assert meanings[NEXT_STATE] == "the state, one step later"
 
 
-@pytest.mark.parametrize("dtype", [np.int64, np.float64])
-def test_numbers_that_float32_cannot_tell_apart_are_refused(dtype: type) -> None:
-    """Times in ms since 1970, say; not large ones that it does, small changes of small ones, or a few."""
-    stamps: Array = (1_700_000_000_000 + 100 * np.arange(11)).astype(dtype)
-    with pytest.raises(BadInputError, match=r"columns\.c: entry 1: numbers as large as 1.7e\+12 change"):
-        convert({}, np.stack([np.arange(11.0), stamps], axis=1).tolist())
-    few = np.arange(11)
-    counter: Array = (2**24 + np.arange(100)).astype(dtype)
-    for sound in (1e6 * few, np.full(11, 1.7e12), 1.0 + 1e-12 * few, 2.0**24 + 2 * few, counter, counter[:2]):
-        convert({}, sound.tolist())
+def rounding(spec: dict[str, Any], values: Array) -> list[str]:
+    """Return what is said of the steps of a column of these `values`, converted in two blocks."""
+    made = converter({"c": {"fields": ("f",), **spec}})
+    for block in (values[: len(values) // 2], values[len(values) // 2 :]):
+        made.convert(Block({"f": block}, "log"))
+    return made.rounded()
 
 
-@pytest.mark.parametrize(("offset", "step"), [(5.3e6, 0.02), (5.3e6, 0.3), (-4.2e6, 0.1), (1e5, 0.004)])
-def test_positions_far_from_their_origin_are_refused(offset: float, step: float) -> None:
-    """Such as northings, and positions from the center of the Earth; not what float32 came with."""
-    away = offset + step * np.arange(40)
-    with pytest.raises(BadInputError, match=r"columns\.c: entry 0: .* set an offset that makes them small"):
-        convert({}, away.tolist())
-    values, _ = convert({"offset": (-offset,)}, away.tolist())
-    np.testing.assert_allclose(values, step * np.arange(40), atol=1e-6)
-    convert({}, away.astype(np.float32).tolist())
+ROWS = np.arange(60)
+WAVE = np.cumsum(np.sin(ROWS))
 
 
-def test_large_numbers_whose_steps_float32_holds_are_taken() -> None:
-    rows = np.arange(40)
-    for sound in (
-        100_000 + rows,
-        5.3e6 + 0.5 * rows,
-        5.3e6 + 3.3 * rows,
-        2.0**23 + rows,
-        65_000 + 0.01 * rows,
-    ):
-        values, _ = convert({}, sound.tolist())
-        np.testing.assert_allclose(np.diff(values.astype(float)), np.diff(sound), atol=0.5)
+@pytest.mark.parametrize(
+    ("values", "offset"),
+    [
+        (119.1624 + 2.2e-6 * WAVE, -119.1624),  # degrees of longitude, 0.25 m a step
+        (4_429_530.0 + 0.63 * ROWS, -4_429_550.0),  # UTM, of which float32 holds steps of 0.5 and 1.0
+        (65_000 + 0.01 * ROWS, -65_000.3),
+        (-1.0 - 1e-7 * WAVE, 1.0),
+    ],
+)
+def test_steps_that_float32_rounds_are_warned_of_with_the_offset_that_helps(
+    values: Array, offset: float
+) -> None:
+    both = np.stack([ROWS / 8, values], axis=1)
+    [warning] = rounding({"scale": (2.0,), "offset": (3.0, 0.0), "names": ("t", "x")}, both / 2)
+    assert warning.startswith("columns.c: float32 holds x (up to")
+    found = [float(number) for number in warning.rpartition("[")[2].rstrip("]").split(", ")]
+    assert found[0] == 3.0 and found[1] == pytest.approx(offset, abs=float(np.ptp(values)))
+    assert rounding({"scale": (2.0,), "offset": tuple(found)}, both / 2) == []
+
+
+@pytest.mark.parametrize(
+    ("start", "step"),
+    [(1_700_000_000_000, 100), (1.7e12, 1e2), (5.3e6, 0.02), (5.3e6, 0.3), (-4.2e6, 0.1), (1e5, 0.004)],
+)
+def test_large_numbers_most_of_whose_steps_are_lost_are_refused(start: float, step: float) -> None:
+    """Times in ms since 1970, northings, and positions from the center of the Earth."""
+    told = r"columns\.c: float32 holds entry 1 .* moves by .*: set offset = \[0"
+    with pytest.raises(BadInputError, match=told):
+        rounding({}, np.stack([ROWS, start + step * ROWS], axis=1))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        5.3e6 + 0.5 * ROWS,  # exact
+        100_000 + ROWS,
+        1e6 * ROWS,
+        np.full(60, 1.7e12),
+        3.0 + 1e-3 * WAVE,
+        1.0 + 2.0**-52 * (ROWS % 2),  # the noise of a computation
+        np.where(ROWS < 50, 100 + 1e-7 * WAVE, 100 + 0.1 * ROWS),  # stands still for most of the time
+        (5.3e6 + 0.02 * ROWS).astype(np.float32),
+        (1_700_000_000_000 + 100 * ROWS[:9]).astype(float),  # too few
+    ],
+)
+def test_steps_that_float32_holds_are_not_warned_of(values: Array) -> None:
+    assert rounding({}, values) == []
+
+
+def test_counts_of_which_float32_skips_every_second_are_kept_with_a_warning() -> None:
+    [warning] = rounding({}, 2**24 + ROWS)
+    assert "up to 1.67773e+07) in steps of 2, but it moves by 1" in warning

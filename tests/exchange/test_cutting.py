@@ -100,22 +100,22 @@ def test_columns_that_are_flags_end_episodes_too(block_rows: int) -> None:
 
 
 @BLOCKS
-def test_a_terminated_row_without_a_next_state_hands_its_flags_to_the_step_before(block_rows: int) -> None:
+def test_a_terminated_row_without_a_next_state_hands_its_outcome_to_the_step_before(block_rows: int) -> None:
     columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
     columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("there",)}}
     cutting = cutter(columns=columns)
     over, there = [0, 0, 1, 0, 1, 1, 0, 0], [0, 0, 1, 0, 0, 0, 0, 1]
     episodes = cut(cutting, block_rows, x=np.arange(8) * 2, over=over, there=there)
-    # Row 5 is alone; row 7 is cut off, and what it says of a success is about a state that nobody saw left.
+    # Row 5 is alone; row 7 is cut off, and step 6 leads to where it succeeds.
     assert rows(episodes) == [[0, 1], [3], [6]]
+    assert [episode[REWARD].tolist() for episode in episodes] == [[0, 1 + 2], [3 + 4], [6]]
     assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4], [8], [14]]
     assert [episode[TERMINATED].tolist() for episode in episodes] == [[False, True], [True], [False]]
-    assert [episode[SUCCESS].tolist() for episode in episodes] == [[False, True], [False], [False]]
+    assert [episode[SUCCESS].tolist() for episode in episodes] == [[False, True], [False], [True]]
     assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False, False], [False], [True]]
     assert cutting.tally.endings == Endings(terminated=2, cut_off=1)
     tally = cutting.tally
-    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (3, 2, 2 + 4 + 7)
-    assert tally.last_successes == 1
+    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (3, 2, 7)
     assert tally.rows_after_end == 1
 
 
@@ -145,7 +145,7 @@ def test_gaps_and_steps_back_in_time_begin_episodes(block_rows: int) -> None:
     episodes = cut(cutting, block_rows, x=np.zeros(8), t=[0, 0.1, 0.2, 1.0, 1.1, 0.3, 0.4, 0.5])
     assert rows(episodes) == [[0, 1], [3], [5, 6]]
     assert cutting.tally.split_points == {"gap": 1, "back": 1}
-    cutting.check_rate()
+    cutting.check()
 
 
 @BLOCKS
@@ -164,7 +164,7 @@ def test_gaps_are_measured_between_the_rows_that_are_kept(block_rows: int) -> No
     cutting = cutter(time="t", split=split, not_finite="drop")
     assert rows(cut(cutting, block_rows, x=x, t=t)) == [[0], [4, 5, 6]]
     assert cutting.tally.split_points == {"gap": 1}
-    cutting.check_rate()
+    cutting.check()
     alone = [0, nan, nan, 0.0]
     assert rows(cut(cutter(time="t", split=split, not_finite="drop"), block_rows, x=alone, t=t[:4])) == []
     small = cutter(time="t", split={"gap_s": 1.0}, not_finite="drop")
@@ -183,7 +183,7 @@ def test_a_gap_to_a_rejected_row_is_told_and_not_the_step_back_from_it(block_row
 def test_a_rate_is_that_of_the_rows_that_are_kept(block_rows: int) -> None:
     cutting = cutter(time="t", not_finite="drop")
     cut(cutting, block_rows, x=np.where(np.arange(60) % 2, np.nan, 1.0), t=np.arange(60) / 20)
-    cutting.check_rate()
+    cutting.check()
     assert cutting.tally.clock.startswith("10 Hz declared, 10 Hz by t")
 
 
@@ -202,7 +202,7 @@ def test_gaps_that_are_not_cut_and_jitter_are_tallied(block_rows: int) -> None:
     seconds[150:] += 3.0
     cutting = cutter(time="t", split={"gap_s": 1.0})
     cut(cutting, block_rows, x=np.zeros(200), t=seconds)
-    cutting.check_rate()
+    cutting.check()
     assert cutting.tally.split_points == {"gap": 1}
     assert (
         cutting.tally.clock
@@ -214,7 +214,7 @@ def test_a_rate_that_is_not_fps_is_told() -> None:
     cutting = cutter(time="t", time_scale=0.001)
     cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)
     with pytest.raises(BadInputError, match="'t' gives 50 rows per second, but fps is 10"):
-        cutting.check_rate()
+        cutting.check()
 
 
 def timed(*files: Array, names: Sequence[str] = ()) -> Cutter:
@@ -234,14 +234,14 @@ def fed(rates: Sequence[tuple[str, float]]) -> Cutter:
 
 def test_files_of_a_few_rows_tell_no_rate() -> None:
     cutting = timed(np.arange(20) / 5, np.arange(21) / 5, np.arange(1000) / 10)
-    cutting.check_rate()
+    cutting.check()
     assert cutting.tally.notes == ["1.csv: 5 Hz, 10 Hz declared"]
 
 
 def test_files_of_other_rates_among_many_are_named() -> None:
     good = [(f"{number}.csv", rate) for number, rate in enumerate(np.linspace(9.2, 10.8, 30))]
     cutting = fed([("fast.csv", 20.0), *good, ("slow.csv", 5.0)])
-    cutting.check_rate()
+    cutting.check()
     assert cutting.tally.notes == ["fast.csv: 20 Hz, 10 Hz declared", "slow.csv: 5 Hz, 10 Hz declared"]
 
 
@@ -250,19 +250,19 @@ def test_episodes_of_other_rates_are_named_where_a_format_has_its_own() -> None:
     for number, rate in enumerate([10.0] * 20 + [5.0]):
         values = {"x": np.zeros(50), "a": np.zeros(50), "t": np.arange(50) / rate}
         list(cutting.feed(Block(values, f"demo_{number}", starts=True), 0, is_apart=number == 0))
-    cutting.check_rate()
+    cutting.check()
     assert cutting.tally.notes == ["demo_20: 5 Hz, 10 Hz declared"]
 
 
 def test_a_refusal_of_a_rate_names_the_files_that_are_off() -> None:
     with pytest.raises(BadInputError, match=r"fps is 10: .*; fast\.csv: 20 Hz, faster\.csv: 40 Hz$"):
-        fed([("fast.csv", 20.0), ("good.csv", 10.0), ("faster.csv", 40.0)]).check_rate()
+        fed([("fast.csv", 20.0), ("good.csv", 10.0), ("faster.csv", 40.0)]).check()
 
 
 def test_files_of_one_name_are_measured_one_by_one() -> None:
     """As those of `runs/*/log.csv`."""
     cutting = fed([("log.csv", 10.0)] * 20 + [("log.csv", 5.0)] + [("log.csv", 10.0)] * 20)
-    cutting.check_rate()
+    cutting.check()
     assert cutting.tally.notes == ["log.csv: 5 Hz, 10 Hz declared"]
 
 
@@ -276,14 +276,14 @@ PAUSES = np.arange(50) / 20 + np.arange(50) // 25 * 3.0
 
 def test_a_file_is_of_another_rate_only_where_both_its_mean_and_its_usual_rate_are() -> None:
     cutting = timed(MISSING, BURSTS, PAUSES, np.arange(1000) / 10)
-    cutting.check_rate()
+    cutting.check()
     assert cutting.tally.notes == ["2.csv: 20 Hz, 10 Hz declared"]
 
 
 @pytest.mark.parametrize("files", [(MISSING, BURSTS), (np.arange(50) / 20,)])
 def test_a_refusal_of_a_rate_names_no_file_where_none_stands_out(files: tuple[Array, ...]) -> None:
     with pytest.raises(BadInputError, match=r"or resample the recording$"):
-        timed(*files).check_rate()
+        timed(*files).check()
 
 
 @BLOCKS
@@ -362,7 +362,7 @@ def test_a_rejected_row_that_ends_its_episode_is_no_gap_and_changes_no_rate(bloc
     episodes = cut(cutting, block_rows, x=x, t=np.arange(60) / 10)
     assert rows(episodes) == [[first] for first in range(0, 60, 3)]
     assert cutting.tally.split_points == {"rejected": 19}
-    cutting.check_rate()
+    cutting.check()
 
 
 def test_what_is_not_finite_is_not_clipped_into_range() -> None:
@@ -447,7 +447,7 @@ def test_a_log_that_is_slower_than_fps_is_told_as_one_that_is_faster(rate: float
     cutting = cutter(time="t")
     cut(cutting, x=np.zeros(50), t=np.arange(50) / rate)
     with pytest.raises(BadInputError, match=f"'t' gives {rate:g} rows per second, but fps is 10"):
-        cutting.check_rate()
+        cutting.check()
 
 
 @BLOCKS
@@ -483,11 +483,16 @@ def test_the_order_of_the_columns_makes_no_episode_of_a_terminated_row_alone() -
     assert rows(episodes) == [[0, 1], [4]]
 
 
-def test_only_dropped_rows_that_succeeded_are_counted_as_successes() -> None:
+def test_a_success_in_the_last_row_is_that_of_the_step_that_leads_to_it() -> None:
     columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, SUCCESS: {"fields": ("there",)}}
     cutting = cutter(columns=columns, split={"field": "k"})
-    cut(cutting, x=np.arange(9.0), there=[0, 1, 0, 0, 1, 1, 0, 1, 0], k=[0, 0, 0, 1, 1, 1, 2, 2, 2])
-    assert (cutting.tally.last_rows, cutting.tally.last_successes) == (3, 1)
+    there = [0, 1, 0, 0, 0, 1, 1, 0, 0]
+    episodes = cut(cutting, x=np.arange(9.0), there=there, k=[0, 0, 0, 1, 1, 1, 2, 2, 2])
+    assert [episode[SUCCESS].tolist() for episode in episodes] == [
+        [False, True],
+        [False, True],
+        [True, False],
+    ]
 
 
 def test_a_jump_is_longer_than_its_bound_not_as_long() -> None:

@@ -203,7 +203,9 @@ def test_rewards_of_rows_that_are_dropped_are_told(tmp_path: Path) -> None:
     reward[[5, 14, 19]] = (1, 1, 0.5)
     dataset, report = imported(tmp_path, write_table(tmp_path / "log.csv", rows() | {"reward": reward}))
     assert dataset.columns([REWARD])[REWARD].sum() == 1
-    assert "last rows without a next state: 2 dropped (with them a reward of 1.5 in sum); rows" in str(report)
+    assert "last rows without a next state: 2 dropped (with the others a reward of 1.5 in sum); rows" in str(
+        report
+    )
 
 
 def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -109,4 +109,56 @@ def test_a_good_import_tells_of_nothing_left_out(tmp_path: Path) -> None:
         dataset, report = imported(
             folder, write_table(tmp_path / "log.csv", rows()), MAPPING, skip_bad=skip_bad
         )
-        assert "left out" not in str(report) and "left_out" not in dataset.description
+        assert "imported, left out" not in str(report) and "left_out" not in dataset.description
+
+
+STACKED = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["state"]
+[columns.action]
+fields = ["command"]
+"""
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5", ".json", ".parquet", ".jsonl"])
+def test_arrays_of_episodes_are_refused_or_taken_as_such(tmp_path: Path, suffix: str) -> None:
+    rng = np.random.default_rng(0)
+    fields = {"state": rng.normal(size=(8, 50, 3)), "command": rng.normal(size=(8, 50, 2))}
+    path = write_table(tmp_path / f"log{suffix}", fields)
+    with pytest.raises(
+        BadInputError, match=r"all fields have 50 rows in each .*: set stacked = true .* 8 epis"
+    ):
+        imported(tmp_path, path, STACKED)
+    dataset, _ = imported(tmp_path / "yes", path, "stacked = true\n" + STACKED)
+    assert dataset.lengths.tolist() == [49] * 8
+    assert dataset.metadata["source"] == [f"log{suffix}/{number}" for number in range(8)]
+    for episode, states in zip(dataset.episodes(), fields["state"], strict=True):
+        np.testing.assert_array_equal(episode.columns["observation.state"], states[:-1].astype(np.float32))
+    dataset, _ = imported(tmp_path / "no", path, "stacked = false\n" + STACKED)
+    assert (dataset.lengths.tolist(), dataset.schema[0].size) == ([7], 150)
+
+
+@pytest.mark.parametrize("command", [(200, 2), (200,), (200, 12)])
+def test_rows_of_matrices_are_no_episodes(tmp_path: Path, command: tuple[int, ...]) -> None:
+    """Such as the positions of four feet."""
+    path = write_table(tmp_path / "log.npz", {"state": np.zeros((200, 4, 3)), "command": np.zeros(command)})
+    dataset, _ = imported(tmp_path, path, STACKED)
+    assert (dataset.lengths.tolist(), dataset.schema[0].size) == ([199], 12)
+    with pytest.raises(
+        BadInputError, match=r"stacked = true, but the fields' rows have the shapes \(4, 3\), \("
+    ):
+        imported(tmp_path / "stacked", path, "stacked = true\n" + STACKED)
+
+
+def test_a_batch_in_d4rls_layout_is_episodes(tmp_path: Path) -> None:
+    fields = {
+        "observations": np.zeros((8, 50, 3)),
+        "actions": np.zeros((8, 50, 2)),
+        "rewards": np.ones((8, 50)),
+    }
+    dataset, _ = imported(tmp_path, write_table(tmp_path / "log.h5", fields), None, name="log", fps=10)
+    assert dataset.lengths.tolist() == [49] * 8
+    assert dataset.metadata["return"] == [49.0] * 8

@@ -120,6 +120,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     torn = torn_bytes(source)
     last: Block | None = None
     with explained(str(source), source), without_end(source, torn) as stream:
+        known = _checked(source, mapping, torn)
         # As text first, since the type of a column may change after its first block.
         reader = csv.open_csv(
             stream,
@@ -127,7 +128,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             convert_options=csv.ConvertOptions(
                 column_types=dict.fromkeys(mapping.all_fields, pa.string()),
                 strings_can_be_null=True,
-                include_columns=_checked(source, mapping, torn),
+                include_columns=mapping.all_fields,
             ),
         )
         row = 0
@@ -141,7 +142,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             row += len(batch)
             if last is not None:
                 yield last
-            last = Block(values, str(source), line=partial(line_of, source)) if len(batch) else None
+            line = partial(line_of, source)
+            last = Block(values, str(source), line=line, known=known) if len(batch) else None
     if last is not None:
         yield replace(last, torn=int(torn > 0))
 
@@ -190,7 +192,7 @@ def _checked(source: Source, mapping: ImportMapping, torn: int) -> list[str]:
     doubled = sorted({name for name in mapping.all_fields if header.count(name) > 1})
     if doubled:
         raise BadInputError(f"{source}: the header has {', '.join(doubled)} more than once")
-    return mapping.all_fields
+    return [name for name in header if name]
 
 
 def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Array:

@@ -11,13 +11,15 @@ import numpy as np
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.dataset.columns import NEXT_STATE, STATE, TRUNCATED, Array
+from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED, Array
 from astra_data.exchange.hdf5_storage import check_storage, stored_datasets, unpacked_bytes
 from astra_data.exchange.layouts import D3RLPY, D4RL, NUMBERED, RECORD, ROBOMIMIC
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, natural, row_count
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
+_COMMANDS = re.compile(r"(?<![a-z])actions?(?![a-z])")
+"""Observations that are, or were, commands."""
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -28,28 +30,31 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """
     h5py = optional("h5py")
     with h5py.File(source.path, "r") as file:
-        for origin, datasets in _episodes(h5py, file, mapping.episodes, str(source)):
+        for origin, datasets, attributes in _episodes(h5py, file, mapping.episodes, str(source)):
             if mapping.episodes is None:
                 _refuse_groups(datasets, mapping, origin)
             order = slice(None, None, -1 if mapping.transposed else 1)
             shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
-            single = [name for name, shape in shapes.items() if not shape and mapping.episodes == NUMBERED]
-            rowed = [field for field in mapping.all_fields if field not in single]
+            single = {name: datasets[name] for name, shape in shapes.items() if not shape} | attributes
+            of_episodes = single if mapping.episodes else {}
+            rowed = [field for field in mapping.all_fields if field not in of_episodes]
             n = row_count(origin, rowed, shapes)
-            used = {field: datasets[field] for field in mapping.all_fields}
+            used = {field: datasets[field] for field in rowed}
+            ends = {
+                field: np.asarray(of_episodes[field][()]) for field in mapping.all_fields if field not in used
+            }
+            known = [name for name, shape in shapes.items() if shape]
             check_storage(used, origin)
             source.refuse_beyond(unpacked_bytes(used))
             for first in range(0, n, BLOCK_ROWS):
                 rows = slice(first, min(first + BLOCK_ROWS, n))
                 values = {
-                    field: _at_the_end(dataset[()], rows, n)
-                    if field in single
-                    else dataset[..., rows].T
-                    if mapping.transposed
-                    else dataset[rows]
+                    field: dataset[..., rows].T if mapping.transposed else dataset[rows]
                     for field, dataset in used.items()
                 }
-                yield Block(values, origin, starts=mapping.episodes is not None and first == 0)
+                values |= {field: _at_the_end(value, rows, n) for field, value in ends.items()}
+                starts = mapping.episodes is not None and first == 0
+                yield Block(values, origin, starts, known=known)
 
 
 def record(source: Source) -> str | None:
@@ -69,19 +74,22 @@ def record(source: Source) -> str | None:
 def layout(source: Source) -> dict[str, Any]:
     """Return the keys of a mapping for a file in the layout of D4RL, d3rlpy or robomimic.
 
-    Of robomimic, the state is all of `obs` with one or two dimensions (images are left out), in the order of
-    their names; `dones` is taken as terminated, as robomimic's own learners do. It may stay set while
-    success lasts: rows after its first are episodes of one step, left out unless truncation is recorded too.
+    Of robomimic, the state is all of `obs` with one or two dimensions (images are left out) but actions, in
+    the order of their names; `dones` is taken as terminated, as robomimic's own learners do. It may stay set
+    while success lasts: rows after its first are episodes of one step, left out unless truncation is recorded
+    too. The demonstrations' attribute `success` is that of their last steps.
 
     Raises:
-        BadInputError: it is none of them.
+        BadInputError: it is none of them, or has no observations.
     """
     h5py = optional("h5py")
     with h5py.File(source.path, "r") as file:
         fields = stored_datasets(h5py, file)
         if {"observations", "actions"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
-            return {"columns": columns}
+            stacked = {fields[field].shape[:2] for field in ("observations", "actions")}
+            is_stacked = len(stacked) == 1 and fields["actions"].ndim == 3
+            return {"columns": columns, "stacked": is_stacked}
         if {"num_episodes", "observations_0", "actions_0"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D3RLPY.items() if f"{field}_0" in fields}
             return {"columns": columns, "episodes": NUMBERED}
@@ -93,11 +101,24 @@ def layout(source: Source) -> dict[str, Any]:
             )
         demo = stored_datasets(h5py, file[f"data/{demos[0]}"])
         columns = {name: {"fields": [field]} for name, field in ROBOMIMIC.items() if field in demo}
+        commands = [field for field in demo if field.startswith("obs/") and _COMMANDS.search(field)]
         for name, folder in ((STATE, "obs/"), (NEXT_STATE, "next_obs/")):
-            found = [field for field, d in demo.items() if field.startswith(folder) and d.ndim in (1, 2)]
-            if found:
-                columns[name] = {"fields": sorted(found), "names": _labels(demo, sorted(found))}
+            rows = [field for field, d in demo.items() if field.startswith(folder) and d.ndim in (1, 2)]
+            if found := sorted(field for field in rows if not _COMMANDS.search(field)):
+                columns[name] = {"fields": found, "names": _labels(demo, found)}
+        if STATE not in columns:
+            raise BadInputError(
+                f"{source}: data/{demos[0]} has no obs of numbers, which are the state (its fields: "
+                f"{', '.join(demo)}): run robomimic's dataset_states_to_obs.py, or map states by --mapping"
+            )
         keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
+        if commands:
+            keys["remark"] = f"without {', '.join(commands)}, which would show a policy the command to find"
+        told = [name for name in demos if "success" in file[f"data/{name}"].attrs]
+        if len(told) == len(demos):
+            columns[SUCCESS] = {"fields": ["@success"]}
+        elif told:
+            keys["remark"] = f"without the attribute success, which {len(told)} of {len(demos)} have"
         if TRUNCATED not in columns:
             keys["min_steps"] = 2
         env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
@@ -133,23 +154,24 @@ def _episodes(
     file: Any,  # noqa: ANN401 - of h5py
     pattern: str | None,
     origin: str,
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the name of each episode's part of the file and its fields."""
+) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Yield the name of each episode's part of the file, its fields, and its attributes as "@name"."""
     if pattern != NUMBERED:
         for group in _groups(h5py, file, pattern, origin):
-            yield f"{origin}{group.name}".rstrip("/"), stored_datasets(h5py, group)
+            attributes = {f"@{name}": np.asarray(value) for name, value in group.attrs.items()}
+            yield f"{origin}{group.name}".rstrip("/"), stored_datasets(h5py, group), attributes
         return
     numbered: dict[int, dict[str, Any]] = {}
     for name, dataset in stored_datasets(h5py, file).items():
         if found := re.fullmatch(r"(.+)_([0-9]+)", name):
             numbered.setdefault(int(found[2]), {})[found[1]] = dataset
     for number in sorted(numbered):
-        yield f"{origin}/{number}", numbered[number]
+        yield f"{origin}/{number}", numbered[number], {}
 
 
 def _at_the_end(value: Array, rows: slice, n: int) -> Array:
     """Return the values of `rows` of n: `value` in the last, and 0 before it."""
-    values = np.zeros(n, np.asarray(value).dtype)
+    values = np.zeros((n, *value.shape), value.dtype)
     values[-1] = value
     return values[rows]
 

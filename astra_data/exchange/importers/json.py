@@ -57,7 +57,7 @@ def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
                 if last is not None:
                     yield last
                 block = _block({name: [row[name] for row in rows] for name in fields}, mapping, str(source))
-                last = replace(block, line=partial(_line_of, source))
+                last = replace(block, line=partial(_line_of, source), known=rows[0])
             if last is not None:
                 last = replace(last, torn=torn)
     if last is not None:
@@ -101,7 +101,7 @@ def _block(fields: dict[str, list[Any]], mapping: ImportMapping, origin: str) ->
         if values.dtype == object and all(isinstance(value, int | float | None) for value in values.flat):
             values = values.astype(float)
         columns[field] = values
-    return Block(columns, origin)
+    return Block(columns, origin, known=fields)
 
 
 def _is_torn(line: bytes) -> bool:

@@ -66,17 +66,17 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     gaps_s = [mapping.split.gap_s or 0, *(column.gap_s or 0 for column in mapping.columns.values())]
     timeline = Timeline(file, gaps_s[0], max(gaps_s))
     resampler = Resampler(mapping, str(source), timeline.moments)
-    rows = _Rows()
+    rows, known = _Rows(), sorted(file.topics - fields.keys())
     for begins, is_back, row, times in _rows(source, resampler, timeline, fields):
         if rows.values and (begins or len(rows.values) == BLOCK_ROWS):
-            yield _block(source, rows)
+            yield _block(source, rows, known)
             rows = _Rows()
         rows.starts |= begins
         rows.is_back |= is_back
         rows.values.append(row)
         rows.times.append(times)
     if rows.values:
-        yield replace(_block(source, rows), torn=int(file.is_cut), notes=resampler.unevenness())
+        yield replace(_block(source, rows, known), torn=int(file.is_cut), notes=resampler.unevenness())
 
 
 def check(source: Source, mapping: ImportMapping) -> None:
@@ -139,7 +139,7 @@ def _rows(
         _log.warning("%s", silence)
 
 
-def _block(source: Source, rows: _Rows) -> Block:
+def _block(source: Source, rows: _Rows, known: list[str]) -> Block:
     values = {name: np.stack([row[name] for row in rows.values]) for name in rows.values[0]}
     places = {
         row: f"{source}, {name} at {rows.times[row][name.partition(':')[0]]} ns"
@@ -147,7 +147,7 @@ def _block(source: Source, rows: _Rows) -> Block:
         if column.dtype.kind == "f"
         for row in np.flatnonzero(~np.isfinite(column.reshape(len(column), -1)).all(axis=1)).tolist()
     }
-    return Block(values, str(source), rows.starts, is_back=rows.is_back, places=places)
+    return Block(values, str(source), rows.starts, is_back=rows.is_back, places=places, known=known)
 
 
 def _check_mapping(mapping: ImportMapping, origin: str) -> None:

@@ -1,8 +1,9 @@
 """Minari: a dataset's folder, read by Minari itself, one episode at a time.
 
 Fields are `observations`, `next_observations`, `actions`, `rewards`, `terminations`, `truncations` and
-`infos`, and `next_infos` where the info of the reset was recorded; where a space is a dictionary or a tuple,
-its parts: `observations/desired_goal`, `actions/0`.
+`infos`; where a space is a dictionary or a tuple, its parts: `observations/desired_goal`, `actions/0`. Where
+the info of the reset was recorded, `infos` are those before a step in columns of observations and those after
+it in all others, and `next_infos` those after it in any.
 """
 
 import json
@@ -37,9 +38,13 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     for episode in _open(source).iterate_episodes():
         fields = _fields(episode)
         origin = f"{source}/episode_{episode.id}"
+        notes = _after_steps(fields, mapping, origin)
         shapes = {name: values.shape for name, values in fields.items()}
         if row_count(origin, mapping.all_fields, shapes):
-            yield Block({field: fields[field] for field in mapping.all_fields}, origin, starts=True)
+            used = {field: fields[field] for field in mapping.all_fields}
+            known = [name for name in fields if not {name, f"next_{name}"} & used.keys()]
+            known = [name for name in known if not name.startswith("next_")]
+            yield Block(used, origin, starts=True, notes=notes, known=known)
 
 
 def layout(source: Source) -> dict[str, Any]:
@@ -96,6 +101,29 @@ def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
     for name in ("rewards", "terminations", "truncations"):
         steps[name] = np.asarray(getattr(episode, name))
     return steps
+
+
+def _after_steps(fields: dict[str, Array], mapping: ImportMapping, origin: str) -> tuple[str, ...]:
+    """Let infos with an entry of the reset be those after each step, but for observations; return a note.
+
+    Raises:
+        BadInputError: an observation and another column take the same one.
+    """
+    observed, others = set[str](), set(mapping.split.ends)
+    for name, column in mapping.columns.items():
+        (observed if name.startswith("observation") else others).update(column.fields)
+    with_reset = sorted(name for name in fields if name.startswith("infos/") and f"next_{name}" in fields)
+    if both := [name for name in with_reset if name in observed & others]:
+        raise BadInputError(
+            f"{origin}: {', '.join(both)} has an entry for the reset, too, and is taken as an observation, "
+            f"before a step, and of its outcome: write next_{both[0]} for what is after the step"
+        )
+    after = [name for name in with_reset if name in others]
+    for name in after:
+        fields[name] = fields[f"next_{name}"]
+    if not after:
+        return ()
+    return (f"{', '.join(after)}: of one entry more than steps, each step has the one after it",)
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, Array]]:  # noqa: ANN401 - nested dicts and tuples

@@ -41,7 +41,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
                 field: _rows(files[field], (rows, *shape[1:]), dtype)
                 for field, (shape, dtype) in headers.items()
             }
-            yield Block(values, str(source))
+            yield Block(values, str(source), known=known)
         for file in files.values():
             if file.read(1):  # to the end, where the archive's sum is checked
                 raise BadInputError(f"{source}: {file.name} holds more values than its header says")

@@ -38,7 +38,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             for field, rows in values.items():
                 if rows.shape[1:] != first[field].shape[1:]:
                     raise BadInputError(f"{source}: field '{field}': {_ONE_LENGTH}")
-            yield Block(values, str(source))
+            yield Block(values, str(source), known=file.schema_arrow.names)
 
 
 def _values_of(metadata: pq.FileMetaData, fields: set[str]) -> int:

@@ -35,7 +35,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     source.refuse_beyond(sum(VALUE_BYTES * value.numel() for value in used.values()))
     for first in range(0, n, BLOCK_ROWS):
         rows = slice(first, first + BLOCK_ROWS)
-        yield Block({name: value[rows].numpy() for name, value in used.items()}, str(source))
+        values = {name: value[rows].numpy() for name, value in used.items()}
+        yield Block(values, str(source), known=tensors)
 
 
 def layout(source: Source) -> dict[str, Any]:

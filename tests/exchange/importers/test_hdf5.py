@@ -47,12 +47,17 @@ def test_without_next_observations_episodes_lose_their_last_row(tmp_path: Path) 
     dataset, report = imported(tmp_path, tmp_path / "ant.hdf5", None, name="ant", fps=20)
     assert dataset.lengths.tolist() == [6, 4]
     assert (report.tally.last_rows, report.tally.last_terminated) == (2, 1)
-    assert report.tally.last_reward == pytest.approx(fields["rewards"][[6, 11]].sum())
+    assert report.tally.last_reward == pytest.approx(fields["rewards"][11])
     state, got = fields["observations"], dataset.columns([NEXT_STATE, TERMINATED, TRUNCATED, REWARD])
     np.testing.assert_array_equal(got[NEXT_STATE], [*state[1:7], *state[8:]])
     np.testing.assert_array_equal(got[TERMINATED], np.arange(10) == 5)
     np.testing.assert_array_equal(got[TRUNCATED], np.arange(10) == 9)
+    fields["rewards"][5] += fields["rewards"][6]
     np.testing.assert_array_equal(got[REWARD], np.delete(fields["rewards"], [6, 11]))
+    assert dataset.metadata["return"] == pytest.approx(
+        [fields["rewards"][:6].sum(), fields["rewards"][7:11].sum()]
+    )
+    assert "taken without a mapping: observation.state from observations; action from act" in str(report)
 
 
 def test_d4rl_needs_a_name_and_fps(tmp_path: Path) -> None:
@@ -150,7 +155,9 @@ def test_d3rlpy_needs_no_mapping(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.columns[STATE], state[:steps])
         np.testing.assert_array_equal(found.columns[NEXT_STATE][: len(state) - 1], state[1:])
         np.testing.assert_array_equal(found.columns[ACTION], episode["actions"][:steps])
-        np.testing.assert_array_equal(found.columns[REWARD], episode["rewards"][:steps, 0])
+        rewards = episode["rewards"][:steps, 0].copy()
+        rewards[-1] += episode["rewards"][-1, 0] * (number == 1)  # that of the terminated row
+        np.testing.assert_array_equal(found.columns[REWARD], rewards)
         is_last = np.arange(steps) == steps - 1
         np.testing.assert_array_equal(found.columns[TERMINATED], is_last & (number == 1))
 
@@ -291,3 +298,51 @@ def test_a_chunk_far_larger_than_its_rows_is_refused(tmp_path: Path, monkeypatch
         file.create_dataset("x", data=values, chunks=(2**22,), maxshape=(None,), compression="gzip")
     with pytest.raises(BadInputError, match=r"holds values of 33\d+ bytes or more"):
         imported(tmp_path, path)
+
+
+def write_demos(path: Path, successes: list[bool | None], **fields: tuple[int, ...]) -> Path:
+    """Write a demonstration for each success, None for none that is recorded, with fields of these shapes."""
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for number, success in enumerate(successes):
+            for name, shape in fields.items():
+                file[f"data/demo_{number}/{name.replace('__', '/')}"] = rng.normal(size=(9, *shape))
+            if success is not None:
+                file[f"data/demo_{number}"].attrs["success"] = success
+    return path
+
+
+def test_commands_among_observations_are_left_out_and_the_success_of_a_demonstration_is_read(
+    tmp_path: Path,
+) -> None:
+    """As in what Isaac Lab's recorder writes."""
+    shapes: dict[str, tuple[int, ...]] = {"actions": (2,), "obs__joint_pos": (3,), "obs__contraction": ()}
+    shapes |= {"obs__actions": (2,), "obs__last_action": (2,), "obs__camera": (4, 4, 3), "states": (5,)}
+    path = write_demos(tmp_path / "isaac.hdf5", [True, False, True], **shapes)
+    dataset, report = imported(tmp_path, path, None, name="isaac", fps=20)
+    [state] = dataset.specs([STATE])
+    assert state.names == ("contraction", "joint_pos_0", "joint_pos_1", "joint_pos_2")
+    assert dataset.successes() == [True, False, True]
+    assert [episode.columns["next.success"].sum() for episode in dataset.episodes()] == [1, 0, 1]
+    told = str(report)
+    assert (
+        "observation.state from obs/contraction, obs/joint_pos; next.success from @success; without obs/"
+        in told
+    )
+    assert "\nfields left out: obs/actions, obs/camera, obs/last_action, states\n" in told
+
+
+def test_a_success_that_only_some_demonstrations_have_is_left_out_and_told(tmp_path: Path) -> None:
+    path = write_demos(tmp_path / "isaac.hdf5", [True, None], actions=(2,), obs__x=(3,))
+    dataset, report = imported(tmp_path, path, None, name="isaac", fps=20)
+    assert dataset.successes() is None
+    assert "without the attribute success, which 1 of 2 have\n" in str(report)
+
+
+def test_demonstrations_without_observations_are_refused(tmp_path: Path) -> None:
+    """As robosuite writes them, before observations are rendered."""
+    path = write_demos(tmp_path / "raw.hdf5", [None, None], actions=(2,), states=(3,))
+    told = r"data/demo_0 has no obs .*\(its fields: actions, states\): run robomimic's dataset_states_to_obs"
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path, path, None, name="raw", fps=20)
+    assert not (tmp_path / "out").exists()

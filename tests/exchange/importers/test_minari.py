@@ -63,11 +63,13 @@ def test_a_dataset_need_not_have_infos(tmp_path: Path, data_format: str) -> None
         np.testing.assert_array_equal(got.columns[STATE], episode["observations"][:-1].astype(np.float32))
 
 
-def test_infos_are_of_the_step_with_or_without_that_of_the_reset(tmp_path: Path) -> None:
+def test_infos_that_begin_with_the_resets_are_those_before_a_step_or_after_it(tmp_path: Path) -> None:
     """Minari's `DataCollector` records the info of the reset, too."""
     made = episodes(is_dict=True)
     for episode, length in zip(made, LENGTHS, strict=True):
-        episode["infos"] = {"qpos": np.arange(length + 1.0), "cost": -np.arange(1.0 * length)}
+        success = np.arange(length + 1) == length
+        infos = {"qpos": np.arange(length + 1.0), "cost": -np.arange(1.0 * length), "success": success}
+        episode["infos"] = infos | {"speed": np.arange(length + 1.0), "unused": success}
     path = write_minari(tmp_path / "minari", made)
     mapping = """
 name = "ant"
@@ -77,12 +79,35 @@ fps = 10
 fields = ["infos/qpos", "infos/cost"]
 [columns."next.observation.state"]
 fields = ["next_infos/qpos", "infos/cost"]
+[columns."next.success"]
+fields = ["infos/success"]
+[columns.speed]
+fields = ["infos/speed"]
 """
-    dataset, _ = imported(tmp_path, path, mapping)
+    dataset, report = imported(tmp_path, path, mapping)
+    assert "infos/speed, infos/success: of one entry more than steps, each step has the one after it" in str(
+        report
+    )
+    left = ["actions", "infos/unused", "observations/achieved_goal", "observations/desired_goal"]
+    assert sorted(report.tally.unused_fields)[: len(left)] == left
     for got, length in zip(dataset.episodes(), LENGTHS, strict=True):
         steps = np.arange(length, dtype=np.float32)
         np.testing.assert_array_equal(got.columns[STATE], np.stack([steps, -steps], axis=1))
         np.testing.assert_array_equal(got.columns[NEXT_STATE], np.stack([steps + 1, -steps], axis=1))
+        np.testing.assert_array_equal(got.columns["next.success"], steps == length - 1)
+        np.testing.assert_array_equal(got.columns["speed"], steps + 1)
+    both = mapping.replace('["infos/speed"]', '["infos/qpos"]')
+    with pytest.raises(BadInputError, match=r"infos/qpos has an entry for the reset.* write next_infos/qpos"):
+        imported(tmp_path / "both", path, both)
+
+
+def test_infos_that_are_left_out_are_named(tmp_path: Path) -> None:
+    made = [
+        {**episode, "infos": {"success": np.zeros(len(episode["rewards"]) + 1)}}
+        for episode in episodes(is_dict=True)
+    ]
+    _, report = imported(tmp_path, write_minari(tmp_path / "minari", made), None, name="ant", fps=10)
+    assert "next.reward from rewards; " in str(report) and "\nfields left out: infos/success\n" in str(report)
 
 
 def test_fields_that_are_missing_are_told(tmp_path: Path) -> None:

@@ -49,9 +49,11 @@ def test_a_log_of_pace_arrives_row_by_row(
 
 def test_a_log_of_pace_needs_no_mapping(tmp_path: Path) -> None:
     path = write_log(tmp_path / "three.pt", 1200, seed=3)
+    torch.save(torch.load(path) | {"spare": torch.zeros(1200)}, path)
     report = import_dataset([path], name="three", out=tmp_path / "out")
     dataset = Dataset.open(report.root)
     assert (report.frames, dataset.info["fps"]) == (1199, FPS)
+    assert "observation.state from dof_pos; action from des_dof_pos\nfields left out: spare\n" in str(report)
     expected = targets(1200, 3)[:-1].astype(np.float32)
     np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], expected)
 
