@@ -58,8 +58,11 @@ def robot_of(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _labels(labels: object, size: int) -> list[str] | None:
-    """Return a name per value, where `labels` has them: as a list, or a list within an object."""
-    if isinstance(labels, dict) and len(labels) == 1:
-        [labels] = labels.values()
+    """Return a name per value, where `labels` has them: as a list, alone in an object or in another list."""
+    while isinstance(labels, dict | list) and len(labels) == 1:
+        [inner] = labels.values() if isinstance(labels, dict) else labels
+        if not isinstance(inner, dict | list):
+            break
+        labels = inner
     fits = isinstance(labels, list) and [type(label) for label in labels] == [str] * size
     return list(labels) if fits and isinstance(labels, list) else None

@@ -28,7 +28,9 @@ from astra_data.dataset.plain import (
     Run,
     data_files,
     flag_faults,
+    missing_files,
     read_object,
+    read_places,
     read_tasks,
     run_faults,
     runs,
@@ -62,12 +64,9 @@ def open_recording(root: Path) -> Contents:
     if isinstance(info, str) or isinstance(tasks, str):
         path = layout.INFO_PATH if isinstance(info, str) else layout.TASKS_PATH
         raise CorruptDatasetError(f"{path} {info if isinstance(info, str) else tasks}")
-    version = info.get("codebase_version")
-    if version != layout.CODEBASE_VERSION:
-        raise BadInputError(
-            f"{root} has LeRobot's format {version}, expected {layout.CODEBASE_VERSION}: convert it with "
-            "lerobot's convert_dataset_v21_to_v30"
-        )
+    places, _ = read_places(root, info)
+    if lost := missing_files(root, places):
+        raise CorruptDatasetError(f"{first_few(lost, MOST_FAULTS)} missing")
     stored, specs, fps = declared_columns(root, info)
     if missing := lacking(specs):
         raise BadInputError(
@@ -87,7 +86,7 @@ def open_recording(root: Path) -> Contents:
     description = {
         "name": name_of(root),
         "stage": "record",
-        "config": {"codebase_version": version},
+        "config": {"codebase_version": layout.CODEBASE_VERSION},
         "environment": robot_of(info),
     }
     order = {uid: index for index, uid in enumerate(uids)}

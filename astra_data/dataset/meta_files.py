@@ -1,7 +1,6 @@
 """The JSON files of the metadata, validated by strict models."""
 
-import re
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -11,22 +10,12 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeErr
 from astra_data.dataset.columns import Column
 from astra_data.dataset.description import NAME, VERSION
 from astra_data.dataset.format import DATASET_PATH, INFO_PATH, SUBSETS_PATH
-from astra_data.dataset.plain import MOST_FPS, read_object
+from astra_data.dataset.plain import MOST_FPS, is_data_path, read_object
 from astra_data.dataset.seal import is_description_sealed
-
-_DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
 
 NameText = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 VersionText = Annotated[str, Field(pattern=f"^{VERSION.pattern}$")]
 """Names and versions of datasets in files."""
-
-
-def is_data_path(pattern: object) -> bool:
-    """Return whether `pattern` is a path inside the dataset, of chunk_index and file_index only."""
-    if not isinstance(pattern, str) or not _DATA_PATH.fullmatch(pattern):
-        return False
-    path = PurePosixPath(pattern)
-    return not path.is_absolute() and ".." not in path.parts
 
 
 def _data_path(pattern: str) -> str:

@@ -8,16 +8,20 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.naming import RECORD
 from astra_data.core.wording import first_few
 from astra_data.dataset.declared import declared_columns
-from astra_data.dataset.format import INFO_PATH
-from astra_data.dataset.plain import read_object
+from astra_data.dataset.format import CODEBASE_VERSION, INFO_PATH, OUR_FOLDER
+from astra_data.dataset.plain import is_format_2, read_object
 
+REPAIR = "astra-data repair {} --out DIR"
+"""The command that writes what is intact in a folder to another one."""
 _SHOWN = 4
 """Datasets of a run."""
 
 
 def refuse_others(root: Path) -> None:
-    """Raise BadInputError where `root` holds no dataset, or versions of one."""
+    """Raise BadInputError where `root` holds no dataset, versions of one, or one of another format."""
     refuse_versions(root)
+    if fault := format_fault(root):
+        raise BadInputError(fault)
     if not (root / "meta").is_dir():
         refuse_run(root)
         if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
@@ -29,6 +33,18 @@ def refuse_others(root: Path) -> None:
             f"{root}: found no dataset; check the path (`astra-data list` shows where names are) "
             "or run the stage that writes it."
         )
+
+
+def format_fault(root: Path) -> str | None:
+    """Return a sentence if the dataset in `root` is LeRobot's and of another format than ours."""
+    info = read_object(root / INFO_PATH)
+    version = info.get("codebase_version") if isinstance(info, dict) else CODEBASE_VERSION
+    if version == CODEBASE_VERSION or (root / OUR_FOLDER).is_dir():
+        return None
+    found = f"{root} has LeRobot's format {version}, expected {CODEBASE_VERSION}"
+    if not is_format_2(root):
+        return f"{found}: convert it with a version of lerobot that reads both"
+    return f"{found}: convert it with lerobot's convert_dataset_v21_to_v30, or {REPAIR.format(root)}"
 
 
 def refuse_versions(root: Path) -> None:

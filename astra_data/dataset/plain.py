@@ -2,10 +2,11 @@
 
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,8 +14,16 @@ import pyarrow as pa
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array
-from astra_data.dataset.format import STATS_PATH, TASKS_PATH, arrow_type, reserved_values
-from astra_data.dataset.parquet import UNREADABLE, open_parquet, to_numpy
+from astra_data.dataset.format import (
+    CHUNK_SIZE,
+    INFO_PATH,
+    STATS_PATH,
+    STORED_STATISTICS,
+    TASKS_PATH,
+    arrow_type,
+    reserved_values,
+)
+from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4
 """As LeRobot's own; what float32 cannot tell apart is allowed beside it."""
@@ -27,6 +36,18 @@ _NUMBERS = (
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
 )
 _END_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
+_DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
+_LOCATION = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
+_FORMAT_2 = {
+    "tasks": "meta/tasks.jsonl",
+    "episodes": "meta/episodes.jsonl",
+    "data": "data/chunk-{:03d}/episode_{:06d}.parquet",
+}
+"""Files of LeRobot's formats 2.0 and 2.1: one of the data for each episode."""
+PLAIN_STATISTICS = ("min", "max", "mean", "std", "count")
+"""Those that every file of the format has of every column."""
+_MOST_BYTES = 2**28
+"""Of a file of metadata in JSON."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +68,14 @@ class PlainColumn:
         return bool(
             kind == self.arrow_type or (self.size > 1 and kind == pa.list_(self.arrow_type.value_type))
         )
+
+
+class Place(NamedTuple):
+    """Where the metadata have an episode: its steps, its first row in the dataset, and its file."""
+
+    length: int
+    first_row: int | None = None
+    path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -107,11 +136,90 @@ def read_statistics(root: Path) -> dict[str, dict[str, Any]] | str:
     return f"has no JSON object for {', '.join(strange)}" if strange else found
 
 
+def is_format_2(root: Path) -> bool:
+    """Return whether the metadata in folder `root` are those of LeRobot's formats 2.0 and 2.1."""
+    info = read_object(root / INFO_PATH)
+    return isinstance(info, dict) and str(info.get("codebase_version")).startswith("v2.")
+
+
+def is_data_path(pattern: object) -> bool:
+    """Return whether `pattern` is a path inside the dataset, of chunk_index and file_index only."""
+    if not isinstance(pattern, str) or not _DATA_PATH.fullmatch(pattern):
+        return False
+    path = PurePosixPath(pattern)
+    return not path.is_absolute() and ".." not in path.parts
+
+
+def read_places(root: Path, info: Mapping[str, Any]) -> tuple[dict[int, Place], list[str]]:
+    """Return where the metadata have each episode, as far as they can be read, and what is wrong with them.
+
+    Args:
+        root: folder of the dataset.
+        info: its meta/info.json.
+    """
+    places: dict[int, Place] = {}
+    if is_format_2(root):
+        rows = _read_lines(root / _FORMAT_2["episodes"])
+        if isinstance(rows, str):
+            return places, [f"{_FORMAT_2['episodes']} {rows}"]
+        first, chunk = 0, info.get("chunks_size", CHUNK_SIZE)
+        for row in rows:
+            number, length = row.get("episode_index"), row.get("length")
+            if type(number) is not int or type(length) is not int or type(chunk) is not int or chunk < 1:
+                return places, [f"{_FORMAT_2['episodes']} has no whole numbers as episode_index and length"]
+            path = root / _FORMAT_2["data"].format(number // chunk, number)
+            places[number] = Place(length, first, path)
+            first += length
+        return places, []
+    pattern, faults = info.get("data_path"), []
+    for path in episodes_files(root):
+        try:
+            for block in read_blocks([path], _LOCATION):
+                for row in block.to_pylist():
+                    number, length, first, chunk, file = (row.get(name) for name in _LOCATION)
+                    if type(number) is not int or type(length) is not int:
+                        raise CorruptDatasetError(f"{path.name} has no whole episode_index or length")
+                    located = is_data_path(pattern) and type(chunk) is int and type(file) is int
+                    inside = str(pattern).format(chunk_index=chunk, file_index=file) if located else None
+                    start = first if type(first) is int else None
+                    places[number] = Place(length, start, root / inside if inside else None)
+        except CorruptDatasetError as error:
+            faults.append(str(error))
+    return places, faults
+
+
+def missing_files(root: Path, places: Mapping[int, Place]) -> list[str]:
+    """Return the data files of `places` that are not in folder `root`, by their paths inside it."""
+    paths = sorted({place.path for place in places.values() if place.path is not None})
+    return [str(path.relative_to(root)) for path in paths if not path.is_file()]
+
+
+def _read_lines(path: Path) -> list[dict[str, Any]] | str:
+    """Return the JSON objects in the file at `path`, one a line, or what is wrong with it."""
+    if not path.is_file():
+        return "is missing"
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            return f"has more than {_MOST_BYTES:,} bytes"
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except (OSError, RecursionError, ValueError) as error:
+        return f"cannot be read ({in_short(error)})"
+    return rows if all(isinstance(row, dict) for row in rows) else "has a line that is no JSON object"
+
+
 def read_tasks(root: Path) -> dict[int, str] | str:
     """Return the tasks by their task_index, or what is wrong with meta/tasks.parquet.
 
-    The name of the text column varies: it is the index of a pandas frame.
+    The name of the text column varies: it is the index of a pandas frame. Of format 2, it is a file of JSON.
     """
+    if is_format_2(root):
+        rows = _read_lines(root / (name := _FORMAT_2["tasks"]))
+        if isinstance(rows, str):
+            return f"is not there in format 2, and {name} {rows}"
+        listed = {row.get("task_index"): row.get("task") for row in rows}
+        if not all(type(key) is int and isinstance(text, str) for key, text in listed.items()):
+            return f"is not there in format 2, and {name} has no text for each task_index"
+        return {int(str(key)): str(text) for key, text in listed.items()}
     table = read_small_table(root / TASKS_PATH)
     if isinstance(table, str):
         return table
@@ -216,6 +324,21 @@ def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str
         if not column.fits(kind):
             faults.append(f"has {column.name} as {kind}, expected {column.arrow_type}")
     return faults
+
+
+def statistics_faults(
+    schema: pa.Schema, columns: Sequence[PlainColumn], features: Collection[str]
+) -> Iterator[str]:
+    """Yield which columns of statistics `schema`, of a file of meta/episodes, lacks or has beside the others.
+
+    Quantiles, which early files of the format lack, and statistics of what is no number are not required.
+    """
+    known = {f"stats/{feature}/{kind}" for feature in features for kind in STORED_STATISTICS}
+    needed = [f"stats/{column.name}/{kind}" for column in columns for kind in PLAIN_STATISTICS]
+    yield from (f"lacks column {name}" for name in needed if name not in schema.names)
+    for name in schema.names:
+        if name.startswith("stats/") and name not in known:
+            yield f"has an unknown column {name}"
 
 
 def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, Array]:

@@ -3,7 +3,7 @@ import json
 from pathlib import Path
 
 import pytest
-from damaged import edit
+from damaged import EPISODES, edit
 from fake_dataset import write_fake
 
 from astra_data.core.errors import CorruptDatasetError
@@ -17,11 +17,13 @@ def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "set")
     sums = dict(dataset.description["sums"])
     sums.pop(DATASET_PATH)
-    assert sums == {path: hashlib.sha256((dataset.root / path).read_bytes()).hexdigest() for path in SEALED}
+    assert sums == {
+        path: hashlib.sha256((dataset.root / path).read_bytes()).hexdigest() for path in (*SEALED, EPISODES)
+    }
     assert list(altered_files(dataset.root, dataset.description)) == []
 
 
-@pytest.mark.parametrize("path", SEALED)
+@pytest.mark.parametrize("path", [*SEALED, EPISODES])
 def test_every_sealed_file_is_known_when_altered_or_missing(path: str, tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "set")
     with (dataset.root / path).open("ab") as file:

@@ -24,19 +24,23 @@ from astra_data.dataset.format import (
     STATS_PATH,
     SUBSETS_PATH,
 )
-from astra_data.dataset.meta_files import is_data_path, read_description, read_subsets
-from astra_data.dataset.opening import refuse_run, refuse_versions
+from astra_data.dataset.meta_files import read_description, read_subsets
+from astra_data.dataset.opening import format_fault, refuse_run, refuse_versions
 from astra_data.dataset.plain import (
     MOST_FPS,
     PlainColumn,
     data_files,
     episodes_files,
+    is_data_path,
+    missing_files,
     plain_columns,
     read_footer,
     read_object,
+    read_places,
     read_small_table,
     read_statistics,
     schema_faults,
+    statistics_faults,
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.seal import SEALED, altered_files
@@ -55,6 +59,9 @@ def check(root: Path) -> Report:
         refuse_run(root)
         raise BadInputError(f"{root}: found no dataset; expected a folder with meta/ and data/")
     report = Report()
+    if fault := format_fault(root):
+        report.fault(INFO_PATH, fault)
+        return report
     info = read_object(root / INFO_PATH)
     if isinstance(info, str):
         report.fault(INFO_PATH, f"{INFO_PATH} {info}: nothing else was checked")
@@ -123,9 +130,9 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
 def _files_are_readable(
     root: Path, info: Mapping[str, Any], columns: list[PlainColumn], report: Report
 ) -> bool:
-    """Check the footers of all parquet files and the schemas of the data files."""
+    """Check which files there are, the footers of all parquet files, and their schemas."""
     _strangers(root, report)
-    before = report.fault_count
+    before, rows = report.fault_count, 0
     for kind, files in (("data", data_files(root)), ("meta/episodes", episodes_files(root))):
         if not files:
             report.fault("files", f"{kind} has no parquet file")
@@ -135,11 +142,18 @@ def _files_are_readable(
             if isinstance(footer, str):
                 report.fault("files", f"{name} {footer}")
             elif kind == "data":
-                _, schema = footer
+                rows += footer[0]
+                schema = footer[1]
                 unknown = sorted(set(schema.names) - info["features"].keys())
                 faults = schema_faults(schema, columns)
                 for fault in [*faults, *(f"has an unknown column {column}" for column in unknown)]:
                     report.fault("columns", f"{name} {fault}")
+            else:
+                for fault in statistics_faults(footer[1], columns, info["features"]):
+                    report.note("statistics", f"{name} {fault}")
+    if not isinstance(total := info.get("total_frames"), int) or rows < total:
+        for name in missing_files(root, read_places(root, info)[0]):
+            report.fault("files", f"{name} is missing")
     if report.fault_count > before:
         report.note("values", "values were not checked, because not all files could be read as declared")
         return False

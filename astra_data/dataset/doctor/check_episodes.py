@@ -16,6 +16,7 @@ from astra_data.dataset.doctor.findings import Report
 from astra_data.dataset.format import STATISTICS, STATS_PATH, TASKS_PATH
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.plain import (
+    PLAIN_STATISTICS,
     PlainColumn,
     Run,
     data_files,
@@ -31,7 +32,9 @@ from astra_data.dataset.plain import (
 EXACT = 1e-6
 """Relative tolerance of our own statistics."""
 ESTIMATED = 1e-3
-"""Relative tolerance of LeRobot's, which sums in float32 and estimates quantiles and std."""
+"""Relative tolerance of LeRobot's, which sums in float32."""
+_SUMS = 3e-5
+"""Error of its means of values and of squares, relative to the largest one; std is their difference."""
 
 
 class EpisodeChecks:
@@ -66,8 +69,7 @@ class EpisodeChecks:
         self._is_ours = is_ours
         self._report = report
         self._tasks = self._read_tasks()
-        self._lowest: NDArray[np.float64] | None = None
-        self._highest: NDArray[np.float64] | None = None
+        self._total = _Total()
 
     def run(self) -> None:
         """Check every episode.
@@ -106,7 +108,7 @@ class EpisodeChecks:
             self._report.frames += len(run)
 
     def totals(self) -> None:
-        """Check counts, uids and, if statistics are estimates, the extremes in stats.json."""
+        """Check counts, uids and, if statistics are estimates, those in stats.json."""
         found = {"total_episodes": self._report.episodes, "total_frames": self._report.frames}
         for key, count in (found | {"total_tasks": len(self._tasks)}).items():
             if self._info.get(key) != count:
@@ -116,7 +118,7 @@ class EpisodeChecks:
             if first.setdefault(uid, number) != number:
                 self._report.fault("uids", f"episodes {first[uid]} and {number} have the same uid {uid}")
         if not self._is_ours:
-            self._check_extremes()
+            self._check_global()
 
     def _read_tasks(self) -> dict[int, str]:
         tasks = read_tasks(self._root)
@@ -151,35 +153,93 @@ class EpisodeChecks:
         self._check_statistics(number, run, row)
 
     def _check_statistics(self, number: int, run: Run, row: Mapping[str, Any]) -> None:
-        found = episode_statistics(run.columns.values())
-        lowest, highest = found[STATISTICS.index("min")], found[STATISTICS.index("max")]
-        self._lowest = lowest if self._lowest is None else np.minimum(self._lowest, lowest)
-        self._highest = highest if self._highest is None else np.maximum(self._highest, highest)
-        kinds = STATISTICS if self._is_ours else ("min", "max", "mean")
-        for kind in kinds:
-            values = found[STATISTICS.index(kind)]
+        table = episode_statistics(run.columns.values())
+        found = dict(zip(STATISTICS, table, strict=True))
+        self._total.add(found, len(run))
+        for kind in STATISTICS if self._is_ours else PLAIN_STATISTICS[:-1]:
             stored = [row.get(f"stats/{column.name}/{kind}") for column in self._columns]
-            if _joined(stored, self._columns) == values.tolist():  # to the bit, as most are
+            if _joined(stored, self._columns) == found[kind].tolist():  # to the bit, as most are
                 continue
             for (column, part), one in zip(side_by_side(self._columns), stored, strict=True):
-                self._compare(f"{kind} of {column.name} in episode {number}", one, values[part])
+                self._compare(kind, f"{column.name} in episode {number}", one, found, part)
+        for column in self._columns:
+            self._compare_count(
+                f"{column.name} in episode {number}", row.get(f"stats/{column.name}/count"), len(run)
+            )
 
-    def _check_extremes(self) -> None:
+    def _check_global(self) -> None:
         stored = read_statistics(self._root)
         if isinstance(stored, str):
             self._report.fault("statistics", f"{STATS_PATH} {stored}")
             return
-        for column, part in side_by_side(self._columns):
-            for kind, values in (("min", self._lowest), ("max", self._highest)):
-                if values is not None:
-                    found = stored.get(column.name, {}).get(kind)
-                    self._compare(f"{kind} of {column.name}", found, values[part])
+        found = self._total.statistics()
+        for column, part in side_by_side(self._columns) if found else ():
+            one = stored.get(column.name, {})
+            for kind in PLAIN_STATISTICS[:-1]:
+                self._compare(kind, column.name, one.get(kind), found, part)
+            self._compare_count(column.name, one.get("count"), self._total.rows)
 
-    def _compare(self, what: str, stored: object, expected: NDArray[np.float64]) -> None:
-        if is_close(stored, expected, EXACT if self._is_ours else ESTIMATED):
-            return
+    def _compare(
+        self, kind: str, what: str, stored: object, found: Mapping[str, NDArray[np.float64]], part: slice
+    ) -> None:
+        expected = found[kind][part]
+        largest = np.maximum(np.abs(found["min"][part]), np.abs(found["max"][part]))
+        if self._is_ours:
+            is_right = is_close(stored, expected, EXACT)
+        else:
+            is_right = is_estimate(kind, stored, expected, largest)
+        if not is_right:
+            self._tell(f"{kind} of {what} is {stored}, expected {expected.tolist()}")
+
+    def _compare_count(self, what: str, stored: object, rows: int) -> None:
+        if stored != [rows]:
+            self._tell(f"count of {what} is {stored}, expected [{rows}]")
+
+    def _tell(self, sentence: str) -> None:
         add = self._report.fault if self._is_ours else self._report.note
-        add("statistics", f"statistics: {what} is {stored}, expected {expected.tolist()}")
+        add("statistics", f"statistics: {sentence}")
+
+
+class _Total:
+    """Min, max, mean and std of all rows, from those of the episodes; `rows` is their number."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self._found: dict[str, NDArray[np.float64]] = {}
+
+    def add(self, found: Mapping[str, NDArray[np.float64]], rows: int) -> None:
+        """Add an episode."""
+        old, count = self._found or found, self.rows + rows
+        shift = found["mean"] - old["mean"]
+        share = rows / count
+        variance = old["std"] ** 2 * (1 - share) + found["std"] ** 2 * share
+        self._found = {
+            "min": np.minimum(old["min"], found["min"]),
+            "max": np.maximum(old["max"], found["max"]),
+            "mean": old["mean"] + shift * share,
+            "std": np.sqrt(variance + shift**2 * share * (1 - share)),
+        }
+        self.rows = count
+
+    def statistics(self) -> Mapping[str, NDArray[np.float64]]:
+        """Return the statistics of all episodes added, empty if there are none."""
+        return self._found
+
+
+def is_estimate(
+    kind: str, stored: object, expected: NDArray[np.float64], largest: NDArray[np.float64]
+) -> bool:
+    """Return whether LeRobot may have `stored` as this kind of statistic, of values of at most `largest`."""
+    try:
+        found = np.asarray(stored, dtype=np.float64).ravel()
+    except (OverflowError, TypeError, ValueError):
+        return False
+    if found.size != expected.size:
+        return False
+    if kind == "std":
+        found, expected, largest = found**2, expected**2, largest**2
+    error = ESTIMATED * np.abs(expected) + _SUMS * largest
+    return bool((np.abs(found - expected) <= error).all())
 
 
 def _joined(stored: Sequence[object], columns: Sequence[PlainColumn]) -> list[object] | None:

@@ -13,6 +13,7 @@ from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.declared import DTYPES, declared_columns, name_of, robot_of
 from astra_data.dataset.digests import Digests, read_digests
 from astra_data.dataset.format import (
+    CODEBASE_VERSION,
     DATASET_PATH,
     INFO_PATH,
     METADATA_PATH,
@@ -22,7 +23,13 @@ from astra_data.dataset.format import (
 )
 from astra_data.dataset.lerobot_rows import Rows, lacking, our_columns
 from astra_data.dataset.meta_files import read_description
-from astra_data.dataset.plain import PlainColumn, read_object, read_small_table, read_tasks
+from astra_data.dataset.plain import (
+    PlainColumn,
+    is_format_2,
+    read_object,
+    read_small_table,
+    read_tasks,
+)
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.seal import altered_files
 from astra_data.dataset.versions import successor
@@ -92,6 +99,8 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     rows = _recorded_rows(folder, columns, specs, fps)
     if rows:
         specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
+    if is_format_2(folder):
+        notes.append(f"LeRobot's format {info['codebase_version']} became {CODEBASE_VERSION}")
     notes += _conversions(info, columns, specs)
     if isinstance(tasks, str):
         notes.append(f"{TASKS_PATH} {tasks}: the task is unknown")

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -11,22 +12,22 @@ from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset.digests import Digests, run_alterations
 from astra_data.dataset.doctor.footerless import rebuilt_metadata
-from astra_data.dataset.parquet import UNREADABLE, read_blocks
+from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.parquet import UNREADABLE
 from astra_data.dataset.plain import (
     PlainColumn,
     Run,
     block_values,
     data_files,
-    episodes_files,
     flag_faults,
+    missing_files,
     read_footer,
+    read_object,
+    read_places,
     run_faults,
     runs,
     schema_faults,
 )
-
-_STRUCTURE = {*(names.INDEX, names.EPISODE_INDEX, names.FRAME_INDEX), *(names.TIMESTAMP, names.EPISODE_UID)}
-"""Columns that locate episodes: after a fault in one, no later episode can be trusted without digests."""
 
 
 def whole_runs(
@@ -40,6 +41,9 @@ def whole_runs(
 ) -> Iterator[tuple[int, Run]]:
     """Yield the uid and the rows of each intact episode; add to `notes` which were left out, and why.
 
+    An episode after rows that are lost is known by its own number and rows, where they agree with
+    meta/episodes or, without that, where both are greater than those that should follow.
+
     Args:
         folder: the damaged dataset.
         columns: the columns to read, LeRobot's own among them.
@@ -48,75 +52,81 @@ def whole_runs(
         notes: a sentence is added for each loss.
         repeated: also yield episodes whose uid an earlier one has.
     """
-    lengths = _lengths(folder, notes)
+    info = read_object(folder / INFO_PATH)
+    places, faults = read_places(folder, info if isinstance(info, dict) else {})
+    notes += [f"meta/episodes was rebuilt from the data: {fault}" for fault in faults]
+    if not places and not faults:
+        notes.append("meta/episodes was missing and was rebuilt from the data")
+    notes += [f"{name} is missing" for name in missing_files(folder, places)]
+    counted = info.get("total_episodes") if isinstance(info, dict) else None
+    most = len(next(iter(digests.values()))) if digests else counted if isinstance(counted, int) else 2**31
     episode = row = 0
     uids: set[int] = set()
-    try:
-        for run, start, is_cut in _every_run(folder, columns, notes):
-            if is_cut and lengths.get(episode) != len(run):
-                continue
-            if start > row:  # the rows between belong to episodes that cannot be read
-                if run.columns[names.FRAME_INDEX][0]:
-                    continue
-                number = int(run.columns[names.EPISODE_INDEX][0])
-                if episode < number <= episode + start - row:
-                    which = f"s {episode} to {number - 1}" if number > episode + 1 else f" {episode}"
-                    notes.append(f"left out episode{which}: rows that belong there cannot be read")
-                    episode = number
-                row = start
-            found = list(run_faults(run, number=episode, row=row, fps=fps))
-            structural = [] if digests else [fault for name, fault in found if name in _STRUCTURE]
-            if lengths.get(episode, len(run)) != len(run):
-                structural.append(f"episode {episode} has {len(run)} frames, expected {lengths[episode]}")
-            if structural:
-                notes.append(f"stopped before episode {episode}: {'; '.join(structural)}")
-                return
-            faults = [*(fault for _, fault in found), *flag_faults(run, episode)]
-            faults += run_alterations(run, episode, digests)
-            uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
-            if uid < 0 or (uid in uids and not repeated):
-                faults.append(f"its uid {uid} is taken or negative")
-            if faults:
-                notes.append(f"left out episode {episode}: {'; '.join(faults)}")
-            else:
-                uids.add(uid)
-                yield uid, run
-            episode, row = episode + 1, row + len(run)
-    except CorruptDatasetError as error:
-        notes.append(f"stopped before episode {episode}: {error}")
-
-
-def _lengths(folder: Path, notes: list[str]) -> dict[int, int]:
-    """Return the episodes' lengths from meta/episodes, as far as it can be read."""
-    lengths: dict[int, int] = {}
-    before = len(notes)
-    for path in episodes_files(folder):
-        try:
-            for block in read_blocks([path], ["episode_index", "length"]):
-                columns = block.to_pydict()
-                lengths |= zip(columns["episode_index"], columns["length"], strict=True)
-        except (CorruptDatasetError, KeyError, TypeError) as error:
-            notes.append(f"meta/episodes was rebuilt from the data: {error}")
-    if not lengths and len(notes) == before:
-        notes.append("meta/episodes was missing and was rebuilt from the data")
-    return lengths
-
-
-def _every_run(
-    folder: Path, columns: Sequence[PlainColumn], notes: list[str]
-) -> Iterator[tuple[Run, int, bool]]:
-    """Yield each run, its first row in the dataset, and whether the rows after it cannot be read."""
-    base = 0
-    for path in data_files(folder):
-        footer = read_footer(path)
-        if isinstance(footer, str):
-            for run in _footerless_runs(path, columns, notes):
-                yield run, base, False
-                base += len(run)
+    for run, is_cut in _every_run(folder, columns, notes):
+        number, first, frame = _claimed(run)
+        place = places.get(number)
+        if frame > 0 or (is_cut and (place is None or place.length != len(run))):
+            continue  # a part of an episode whose other rows are lost
+        is_known = place is not None and place.length == len(run) and place.first_row in (None, first)
+        if place is None and number < most:
+            is_known = (number > episode and first > row) or (number < episode and first < row)
+        if is_known and number < episode:
+            notes.append(
+                f"left out rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}: "
+                f"they are of episode {number} once more"
+            )
+            continue
+        if is_known and number > episode:
+            notes.append(_lost(episode, number - 1))
+            episode, row = number, first
+        faults = [fault for _, fault in run_faults(run, number=episode, row=row, fps=fps)]
+        if (place := places.get(episode)) and place.length != len(run):
+            faults.append(f"it has {len(run)} frames, expected {place.length}")
+        if episode >= most and digests:
+            faults.append(f"expected {most} episodes")
+        faults += [*flag_faults(run, episode), *run_alterations(run, episode, digests)]
+        uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
+        if uid < 0 or (uid in uids and not repeated):
+            faults.append(f"its uid {uid} is taken or negative")
+        if faults:
+            notes.append(f"left out episode {episode}: {'; '.join(faults)}")
         else:
-            for run, is_cut in _footered_runs(path, columns, notes):
-                yield run, base + run.row, is_cut
-            base += footer[0]
+            uids.add(uid)
+            yield uid, run
+        episode, row = episode + 1, row + len(run)
+    if places and episode <= max(places):
+        notes.append(_lost(episode, max(places)))
+
+
+def _claimed(run: Run) -> tuple[int, int, int]:
+    """Return the episode, the first row in the dataset and the first frame that most rows of `run` tell."""
+    steps = np.arange(len(run))
+    number, index, frame = (
+        run.columns[name] for name in (names.EPISODE_INDEX, names.INDEX, names.FRAME_INDEX)
+    )
+    return tuple(int(np.sort(values)[len(run) // 2]) for values in (number, index - steps, frame - steps))
+
+
+def _lost(first: int, last: int) -> str:
+    which = f"s {first} to {last}" if last > first else f" {first}"
+    return f"left out episode{which}: rows that belong there cannot be read"
+
+
+def _name(path: Path) -> str:
+    """Return the path of a data file inside its dataset."""
+    return "/".join(path.parts[-3:])
+
+
+def _every_run(folder: Path, columns: Sequence[PlainColumn], notes: list[str]) -> Iterator[tuple[Run, bool]]:
+    """Yield each run, and whether the rows after it cannot be read."""
+    for path in data_files(folder):
+        try:
+            if isinstance(read_footer(path), str):
+                yield from ((run, False) for run in _footerless_runs(path, columns, notes))
+            else:
+                yield from _footered_runs(path, columns, notes)
+        except (*UNREADABLE, CorruptDatasetError) as error:
+            notes.append(f"{_name(path)} cannot be read: {in_short(error)}")
 
 
 def _footered_runs(
@@ -140,7 +150,7 @@ def _footered_runs(
             if faults:
                 lost = first + sum(rows)
                 notes.append(
-                    f"{path.parent.name}/{path.name} rows {lost} to {lost + counts[group + len(rows)] - 1} "
+                    f"{_name(path)} rows {lost} to {lost + counts[group + len(rows)] - 1} "
                     f"cannot be read ({faults[0]})"
                 )
             group += len(rows) + 1
@@ -156,9 +166,7 @@ def _footerless_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str
             if held is not None:
                 yield held
             held = run
-    notes.append(
-        f"{path.parent.name}/{path.name} has no footer: {len(rows)} whole row groups were found in it"
-    )
+    notes.append(f"{_name(path)} has no footer: {len(rows)} whole row groups were found in it")
     # LeRobot writes one row group per episode. With other groups, the last episode may be incomplete.
     if held is not None and len(held) == rows[-1]:
         yield held

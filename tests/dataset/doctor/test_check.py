@@ -11,7 +11,8 @@ import pytest
 from damaged import DATA, EPISODES, alter, as_in_0_1, drop, edit, retype, truncate, write
 from fake_dataset import fake_columns, write_fake, writer
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.findings import MOST
@@ -109,6 +110,10 @@ def test_statistics_that_only_together_are_right_are_found(tmp_path: Path) -> No
         (
             alter(EPISODES, "data/file_index", 1, 4),
             ["the file of episode 1 is data/chunk-000/file-004.parquet, expected file-000.parquet"],
+        ),
+        (
+            drop_last_row(DATA),
+            ["total_frames is 55, expected 54"],
         ),
         (retype(EPISODES, "tasks", 7), ["tasks of episode 0 are 7, expected {'run'}"]),
         (retype(EPISODES, "tasks", [["run"]]), ["tasks of episode 0 are [['run']], expected {'run'}"]),
@@ -265,6 +270,38 @@ def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
     faults = "\n".join(check(root).faults)
     for part in ("lacks column action", "unknown column extra", "has next.reward as int64, expected float"):
         assert part in faults
+
+
+def test_a_missing_file_is_named_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
+    root = write_fake(tmp_path / "set").root
+    name = DATA.replace("file-000", "file-002")
+    drop(name)(root)
+    assert check(root).faults == [f"{name} is missing"]
+    shutil.rmtree(root / "meta/astra")
+    assert check(root).faults == [f"{name} is missing"]
+    with pytest.raises(CorruptDatasetError, match=f"{name} missing"):
+        Dataset.open(root)
+
+
+@pytest.mark.parametrize(
+    ("renamed", "note"),
+    [
+        ("stats/action/count", f"{EPISODES} lacks column stats/action/count"),
+        ("stats/action/q10", f"{EPISODES} has an unknown column stats/action/q1o"),
+    ],
+)
+def test_a_renamed_column_of_statistics_is_told(tmp_path: Path, renamed: str, note: str) -> None:
+    root = write_fake(tmp_path / "set").root
+    table = pq.read_table(root / EPISODES)
+    other = renamed.replace("q10", "q1o").replace("count", "coumt")
+    listed = [other if name == renamed else name for name in table.column_names]
+    pq.write_table(table.rename_columns(listed), root / EPISODES)
+    assert f"{EPISODES} was altered after it was written, or is missing" in check(root).faults
+    with pytest.raises(CorruptDatasetError, match=f"{EPISODES} was altered"):
+        Dataset.open(root)
+    shutil.rmtree(root / "meta/astra")
+    assert note in check(root).notes
 
 
 def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None:

@@ -171,13 +171,61 @@ def test_only_the_first_episode_of_a_uid_is_saved(tmp_path: Path) -> None:
     assert (others.uids.tolist(), others.lengths.tolist()) == ([13, 4, 6, 0], [7, 12, 30, 5])
 
 
-def test_repair_stops_where_episodes_no_longer_begin_where_they_should(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    as_in_0_1(root)
-    alter_rows(root / DATA, "frame_index", {9: 7})
-    repaired = repair(root, out=tmp_path / "saved")
-    assert repaired.episodes == 2
-    assert "stopped before episode 2: frame_index is 7 in episode 2 frame 1, expected 1" in repaired.notes
+def as_format_2(root: Path, episodes: int = 4) -> Path:
+    """Write what LeRobot recorded in format 2.1: a file for each episode, tasks in JSON Lines."""
+    (root / "data/chunk-000").mkdir(parents=True)
+    (root / "meta").mkdir()
+    rng, row, rows = np.random.default_rng(0), 0, []
+    vector = {"dtype": "float32", "shape": [3], "names": [["hip", "knee", "foot"]]}
+    single = {"dtype": "int64", "shape": [1], "names": None}
+    for number in range(episodes):
+        length = 5 + number
+        state = rng.normal(size=(length, 3)).astype(np.float32)
+        columns = {
+            "observation.state": pa.array(list(state), pa.list_(pa.float32(), 3)),
+            "action": pa.array(list(state + 1), pa.list_(pa.float32(), 3)),
+            "timestamp": pa.array(np.arange(length) / 10, pa.float32()),
+            "frame_index": np.arange(length),
+            "episode_index": np.full(length, number),
+            "index": np.arange(row, row + length),
+            "task_index": np.zeros(length, np.int64),
+        }
+        pq.write_table(pa.table(columns), root / f"data/chunk-000/episode_{number:06d}.parquet")
+        rows.append({"episode_index": number, "tasks": ["open the door"], "length": length})
+        row += length
+    features = {name: single for name in columns}
+    features |= {name: vector for name in ("observation.state", "action")}
+    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    info = {"codebase_version": "v2.1", "fps": 10, "features": features, "data_path": path}
+    info |= {"total_episodes": episodes, "total_frames": row, "total_tasks": 1, "chunks_size": 1000}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    (root / "meta/episodes.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    (root / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "open the door"}\n')
+    return root
+
+
+@pytest.mark.parametrize("lost", [None, 0, 2, 3])
+def test_format_2_is_converted_with_tasks_and_names(tmp_path: Path, lost: int | None) -> None:
+    root = as_format_2(tmp_path / "old")
+    with pytest.raises(BadInputError, match=r"has LeRobot's format v2\.1, expected v3\.0: convert it with"):
+        Dataset.open(root)
+    [fault] = check(root).faults
+    assert fault.endswith(f"or astra-data repair {root} --out DIR")
+    names = [f"data/chunk-000/episode_{number:06d}.parquet" for number in range(4)]
+    states = [pq.read_table(root / name).column(STATE).to_pylist() for name in names]
+    if lost is not None:
+        (root / names[lost]).unlink()
+    notes = repair(root, out=tmp_path / "new").notes
+    found = Dataset.open(tmp_path / "new")
+    assert (found.task, found.info["fps"]) == ("open the door", 10)
+    assert found.features[STATE]["names"] == ["hip", "knee", "foot"]
+    whole = [states[number][:-1] for number in range(4) if number != lost]
+    assert [episode.columns[STATE].tolist() for episode in found.episodes()] == whole
+    assert notes[0] == "LeRobot's format v2.1 became v3.0"
+    assert [note for note in notes if note.endswith("is missing")] == (
+        [] if lost is None else [f"{names[lost]} is missing"]
+    )
 
 
 def test_episodes_without_a_uid_keep_their_number(killed: Path, tmp_path: Path) -> None:

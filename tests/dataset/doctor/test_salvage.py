@@ -37,13 +37,14 @@ def test_all_of_a_whole_dataset_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "left", "note"),
     [
-        # A wrong value costs its episode, a wrong structure all that follow.
+        # Whatever is wrong with an episode costs it alone.
         (alter(DATA, "action", 9, [np.nan, 0]), [0, 1, 3, 4], "left out episode 2: action is nan"),
         (alter(DATA, "next.done", 9, True), [0, 1, 3, 4], "left out episode 2: next.done is True"),
         (alter(DATA, "episode_uid", 7, -5), [0, 2, 3, 4], "left out episode 1: its uid -5 is taken or neg"),
-        (alter(DATA, "index", 9, 70), [0, 1], "stopped before episode 2: index is 70"),
-        (alter(DATA, "timestamp", 9, 7.0), [0, 1], "stopped before episode 2: timestamp is 7.0"),
-        (alter(EPISODES, "length", 2, 11), [0, 1], "episode 2 has 12 frames, expected 11"),
+        (alter(DATA, "index", 9, 70), [0, 1, 3, 4], "left out episode 2: index is 70"),
+        (alter(DATA, "timestamp", 9, 7.0), [0, 1, 3, 4], "left out episode 2: timestamp is 7.0"),
+        (alter(EPISODES, "length", 2, 11), [0, 1, 3, 4], "left out episode 2: it has 12 frames, expected 11"),
+        (alter(DATA, "episode_index", 8, 90), [0, 1, 3, 4], "left out episode 2: episode_index is 90"),
         (retype(EPISODES, "episode_index", [1]), [0, 1, 2, 3, 4], "meta/episodes was rebuilt from the data"),
         (drop(EPISODES), [0, 1, 2, 3, 4], "meta/episodes was missing and was rebuilt from the data"),
     ],
@@ -67,7 +68,10 @@ def test_without_a_footer_whole_row_groups_are_read(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: metadata.row_group(3).column(0).data_page_offset + 300])
     uids, notes = salvaged(root)
     assert uids == UIDS[:3]
-    assert notes == ["chunk-000/file-000.parquet has no footer: 3 whole row groups were found in it"]
+    assert notes == [
+        f"{DATA} has no footer: 3 whole row groups were found in it",
+        "left out episodes 3 to 4: rows that belong there cannot be read",
+    ]
 
 
 def test_an_episode_that_may_be_incomplete_is_left_out(tmp_path: Path) -> None:
@@ -78,7 +82,10 @@ def test_an_episode_that_may_be_incomplete_is_left_out(tmp_path: Path) -> None:
     path.write_bytes(data[: -8 - int.from_bytes(data[-8:-4], "little")])
     uids, notes = salvaged(root)
     assert uids == UIDS[:4]
-    assert notes[-1] == "the last 5 frames in file-000.parquet may be part of an episode and were left out"
+    assert notes[1:] == [
+        "the last 5 frames in file-000.parquet may be part of an episode and were left out",
+        "left out episode 4: rows that belong there cannot be read",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +123,7 @@ def test_an_unreadable_row_group_costs_its_episode_alone(
     deface(dataset.root / DATA, 2, column)
     uids, notes = salvaged(dataset.root, digests)
     assert uids == [uid for number, uid in enumerate(UIDS) if number != 2]
-    assert notes[0].startswith("chunk-000/file-000.parquet rows 8 to 19 cannot be read (")
+    assert notes[0].startswith(f"{DATA} rows 8 to 19 cannot be read (")
     assert notes[1:] == ["left out episode 2: rows that belong there cannot be read"]
 
 
@@ -150,11 +157,39 @@ def test_without_meta_episodes_the_rows_tell_which_episode_follows(tmp_path: Pat
     assert notes[-1] == "left out episodes 0 to 1: rows that belong there cannot be read"
 
 
-def test_episodes_of_the_next_file_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("has_places", [True, False])
+@pytest.mark.parametrize("damage", ["defaced", "rubbish", "without a column", "missing"])
+def test_a_lost_file_costs_its_episodes_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str, *, has_places: bool
+) -> None:
     monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
     root = write_fake(tmp_path / "set").root
-    for file in (1, 2):
-        deface(root / DATA.replace("file-000", f"file-00{file}"), 0, "action")
+    if not has_places:
+        drop(EPISODES)(root)
+    names = [DATA.replace("file-000", f"file-00{file}") for file in (1, 2)]
+    for path in (root / name for name in names):
+        if damage == "defaced":
+            deface(path, 0, "action")
+        elif damage == "rubbish":
+            path.write_bytes(b"PAR1 rubbish" * 50)
+        elif damage == "without a column":
+            pq.write_table(pq.read_table(path).drop_columns(["index"]), path)
+        else:
+            path.unlink()
     uids, notes = salvaged(root)
     assert uids == [UIDS[0], *UIDS[3:]]
-    assert notes[-1] == "left out episodes 1 to 2: rows that belong there cannot be read"
+    *named, lost = notes if has_places else [*notes[1:-1], notes[-1]]
+    assert lost == "left out episodes 1 to 2: rows that belong there cannot be read"
+    if has_places or damage != "missing":
+        assert [note.split(" ")[0] for note in named] == names
+
+
+def test_a_file_that_comes_twice_costs_no_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 500)  # a file for each episode
+    root = write_fake(tmp_path / "set").root
+    (root / DATA.replace("file-000", "file-002a")).write_bytes(
+        (root / DATA.replace("file-000", "file-001")).read_bytes()
+    )
+    uids, [note] = salvaged(root)
+    assert uids == UIDS
+    assert note == "left out rows 0 to 0 of data/chunk-000/file-002a.parquet: they are of episode 1 once more"
