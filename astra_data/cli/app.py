@@ -1,5 +1,6 @@
 """The command line. Commands import what they need when they run, so that `astra-data --help` is fast."""
 
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -33,6 +34,7 @@ from astra_data.core.disk import disk_error
 from astra_data.core.durable import NO_FSYNC
 from astra_data.core.errors import AstraDataError
 from astra_data.core.optional import missing_extra
+from astra_data.core.wording import in_lines
 
 app = typer.Typer(
     help="Turn robot logs into datasets, and datasets into policies trained in a simplified simulator.",
@@ -40,6 +42,14 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+
+
+class _InLines(logging.Formatter):
+    """Warnings whose names control no terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the message."""
+        return in_lines(super().format(record))
 
 
 def _show_version(wanted: bool) -> None:
@@ -63,6 +73,8 @@ def _options(
     ] = False,
 ) -> None:
     """Options before any command."""
+    if logging.lastResort is not None:  # what prints warnings
+        logging.lastResort.setFormatter(_InLines())
     if no_fsync:
         os.environ[NO_FSYNC] = "1"
 
@@ -130,7 +142,7 @@ def main() -> None:
         reported = _reported(error)
         if reported is None or os.environ.get("ASTRA_DATA_DEBUG"):
             raise
-        typer.echo(f"error: {reported}", err=True)
+        typer.echo(f"error: {in_lines(str(reported))}", err=True)
         sys.exit(1)
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName
+from astra_data.core.wording import printable
 
 
 def validate(
@@ -29,18 +30,18 @@ def validate(
     if with_lerobot and not report.faults:
         compare_with_lerobot(root, report)
     for note in report.notes:
-        typer.echo(f"note: {note}")
+        typer.echo(f"note: {printable(note)}")
     if report.faults:
         count = "1 error" if report.fault_count == 1 else f"{report.fault_count} errors"
         message = "\n  ".join([f"{root} has {count}:", *report.faults])
         if can_be_repaired(root):
             message += f"\nTo recover its intact episodes: astra-data repair {root} --out DIR"
         raise CorruptDatasetError(message)
-    typer.echo(f"{root} is intact: {report.episodes} episodes, {report.frames} steps")
+    typer.echo(f"{printable(str(root))} is intact: {report.episodes} episodes, {report.frames} steps")
     try:
         whole = Dataset.open(root)
     except BadInputError as error:  # intact, but no robot's trajectories
-        typer.echo(f"note: {error}")
+        typer.echo(f"note: {printable(str(error))}")
         return
     if TERMINATED in whole.features:
         typer.echo(f"episodes end: {endings_of(whole)}")
@@ -69,5 +70,5 @@ def repair(
     sources = [open_dataset(original) for original in like or ()]
     repaired = save(locate(dataset), out=out, like=sources, new_uids=new_uids)
     for note in repaired.notes:
-        typer.echo(f"note: {note}")
-    typer.echo(f"finished: {out} ({repaired.episodes} episodes, {repaired.frames} steps)")
+        typer.echo(f"note: {printable(note)}")
+    typer.echo(f"finished: {printable(str(out))} ({repaired.episodes} episodes, {repaired.frames} steps)")

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName
-from astra_data.core.wording import first_few
+from astra_data.core.wording import first_few, printable
 
 _SHOWN = 5
 """Uids of episodes whose metadata differ."""
@@ -43,8 +43,10 @@ def diff(
     if found.metadata:
         if not found.values:
             typer.echo("0 episodes differ in values")
-        keys = ", ".join(f"{key} ({first_few(uids, _SHOWN)})" for key, uids in found.metadata.items())
+        keys = ", ".join(
+            f"{printable(key)} ({first_few(uids, _SHOWN)})" for key, uids in found.metadata.items()
+        )
         different = set().union(*found.metadata.values())
         typer.echo(f"{len(different)} episodes differ in metadata: {keys}")
     for sentence in (*found.schema, *found.description):
-        typer.echo(sentence)
+        typer.echo(printable(sentence))

@@ -62,6 +62,7 @@ def import_(
     skip_bad: SkipBad = False,
 ) -> None:
     """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON, PyTorch) to a dataset."""
+    from astra_data.core.wording import printable
     from astra_data.exchange.importing import import_dataset
 
     report = import_dataset(
@@ -75,4 +76,4 @@ def import_(
         max_bytes=max_bytes,
         skip_bad=skip_bad,
     )
-    typer.echo(f"finished: {report}")
+    typer.echo("\n".join(map(printable, f"finished: {report}".split("\n"))))

@@ -80,11 +80,12 @@ def list_(
     from rich.table import Table
 
     from astra_data.core.errors import AstraDataError, CorruptDatasetError
+    from astra_data.core.wording import printable
     from astra_data.dataset.description import full_name
     from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
 
     faults: list[str] = []
-    table = Table("dataset", "stage", "episodes", "steps", "content", title=str(home()))
+    table = Table("dataset", "stage", "episodes", "steps", "content", title=printable(str(home())))
     for name in names_at_home():
         for version in versions_at_home(name):
             reference = full_name({"name": name, "version": version})
@@ -95,7 +96,12 @@ def list_(
                 faults.append(str(error))
                 continue
             steps = int(found.lengths.sum())
-            facts = (found.description["stage"], f"{len(found):,}", f"{steps:,}", found.content_hash[:12])
+            facts = (
+                printable(found.description["stage"]),
+                f"{len(found):,}",
+                f"{steps:,}",
+                found.content_hash[:12],
+            )
             table.add_row(found.reference, *facts)
     show_table(table)
     if faults:
@@ -104,6 +110,7 @@ def list_(
 
 def _clean(folders: list[Path]) -> None:
     from astra_data.core.durable import clean
+    from astra_data.core.wording import printable
     from astra_data.dataset.versions import home
 
     notes = {
@@ -111,10 +118,12 @@ def _clean(folders: list[Path]) -> None:
         "in use": ": another command is writing it",
         "kept": ": the interrupted command can continue from it; otherwise delete it",
     }
+    if home().exists():
+        folders = [home(), *folders]
     if missing := [str(folder) for folder in folders if not folder.is_dir()]:
         raise BadInputError(f"list --clean: expected folders, got {', '.join(missing)}")
-    found = dict(item for folder in (home(), *folders) for item in clean(folder))
+    found = dict(item for folder in folders for item in clean(folder))
     for path, state in found.items():
-        typer.echo(f"{state}: {path}{notes[state]}")
+        typer.echo(f"{state}: {printable(str(path))}{notes[state]}")
     if not found:
         typer.echo("found no leftovers of killed commands")

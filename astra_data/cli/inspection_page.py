@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from astra_data.core.arrays import Ints
+from astra_data.core.wording import printable
 from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
 
@@ -24,8 +25,8 @@ def inspection_page(inspection: Inspection, checkup: Checkup) -> RenderableType:
         label = f"positions, x {left:.1f} to {right:.1f} m, y {bottom:.1f} to {top:.1f} m"
         parts += [Text(label), Text(shaded(inspection.positions))]
     parts.append(Text("check-up", style="bold"))
-    parts += [Text(line) for line in checkup.summary]
-    parts += [Text(str(finding), style=_STYLES[finding.severity]) for finding in checkup.findings]
+    parts += [Text(printable(line)) for line in checkup.summary]
+    parts += [Text(printable(str(finding)), style=_STYLES[finding.severity]) for finding in checkup.findings]
     if not checkup.findings:
         parts.append(Text("nothing looks wrong in the values; `astra-data validate` also checks all files"))
     return Group(*parts)
@@ -85,6 +86,8 @@ def _tables(spreads: tuple[Spread, ...]) -> Iterator[RenderableType]:
         labels = column.names or [str(index) if column.size > 1 else "" for index in range(column.size)]
         for index, (label, unit) in enumerate(zip(labels, column.units, strict=True)):
             figures = (f"{values[index]:.4g}" for values in (spread.low, spread.mean, spread.high))
-            table.add_row(*map(Text, (label, unit, *figures, sparkline(spread.counts[index]))))
-        yield Text(f"{column.name} ({column.size}) {column.dtype}", style="bold")
+            table.add_row(
+                *map(Text, (printable(label), printable(unit), *figures, sparkline(spread.counts[index])))
+            )
+        yield Text(f"{printable(column.name)} ({column.size}) {column.dtype}", style="bold")
         yield table

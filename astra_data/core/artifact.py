@@ -125,7 +125,7 @@ def _begin(partial: Path, config: str) -> None:
     settings = partial / _SETTINGS
     if {path.name for path in partial.iterdir()} <= {_SETTINGS}:
         write_file(settings, config)
-    elif not (settings.exists() and settings.read_text() == config):
+    elif not (settings.is_file() and settings.read_text() == config):
         raise BadInputError(
             f"{partial} was started with other settings (see its config.json if it has one): remove it"
         )

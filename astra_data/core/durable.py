@@ -31,7 +31,7 @@ def sync(path: Path) -> None:
     """Flush a file or folder to the disk, unless `NO_FSYNC` is set."""
     if os.environ.get(NO_FSYNC):
         return
-    handle = os.open(path, os.O_RDONLY)
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         os.fsync(handle)
     finally:
@@ -41,7 +41,8 @@ def sync(path: Path) -> None:
 def sync_tree(folder: Path) -> None:
     """Flush `folder` and everything in it to the disk."""
     for path in (*folder.rglob("*"), folder):
-        sync(path)
+        if path.is_file() or path.is_dir():
+            sync(path)
 
 
 def move(source: Path, target: Path) -> None:

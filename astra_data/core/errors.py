@@ -9,7 +9,7 @@ AstraDataError          all expected errors; the command line prints one line an
 └── DiskError           a disk is full, read-only, failing or gone
 """
 
-from astra_data.core.wording import shortened
+from astra_data.core.wording import printable, shortened
 
 
 class AstraDataError(Exception):
@@ -47,5 +47,4 @@ _LONGEST = 300
 def in_short(error: Exception) -> str:
     """Return the first sentence of an error message, of bounded length and printable."""
     line = str(error).split("\n")[0].split(". ")[0].rstrip(".:")
-    shown = "".join(sign if sign.isprintable() else "\ufffd" for sign in line)
-    return shortened(shown, _LONGEST)
+    return shortened(printable(line), _LONGEST)

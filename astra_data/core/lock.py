@@ -17,7 +17,7 @@ def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
         folder: an existing folder.
         wait: wait while another process holds the lock, instead of yielding False.
     """
-    handle = os.open(folder, os.O_RDONLY)
+    handle = os.open(folder, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would wait for a writer
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:

@@ -12,7 +12,7 @@ from astra_data.dataset.columns import Array
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Valid names of datasets; they name folders, with some letters added, and file systems take 255."""
-VERSION = re.compile(r"[0-9]+\.[0-9]+\.[0-9]+")
+VERSION = re.compile(r"[0-9]{1,9}\.[0-9]{1,9}\.[0-9]{1,9}")
 """Valid versions of datasets."""
 
 _DEFAULTS: dict[str, Any] = {
@@ -56,7 +56,7 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(full["name"], str) or not NAME.fullmatch(full["name"]):
         faults.append(f"name {full['name']!r}, expected up to 200 letters, digits, '.', '_' and '-'")
     if not isinstance(full["version"], str) or not VERSION.fullmatch(full["version"]):
-        faults.append(f"version {full['version']!r}, expected three numbers such as 1.0.0")
+        faults.append(f"version {full['version']!r:.80}, expected three numbers such as 1.0.0")
     if not isinstance(full["stage"], str) or not full["stage"]:
         faults.append(f"stage {full['stage']!r}, expected the name of the stage that writes the dataset")
     for parent in full["parents"]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.naming import RECORD
-from astra_data.core.wording import shortened
-from astra_data.dataset.description import full_name
+from astra_data.core.wording import printable, shortened
+from astra_data.dataset.description import full_name, identity_of
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
@@ -19,11 +19,13 @@ from astra_data.dataset.versions import home_of
 
 _Described = tuple[Path, Mapping[str, Any]]
 """Folder and description."""
+_Key = tuple[str, str, str]
+"""Name, version and content hash."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ancestor:
-    """A dataset in the tree.
+    """A dataset in the tree; one that several were made from is one object.
 
     Attributes:
         reference: name and version.
@@ -50,8 +52,44 @@ def lineage(dataset: Dataset) -> Ancestor:
     Raises:
         CorruptDatasetError: a dataset is named among its own ancestors.
     """
-    beside = dataset.root.resolve().parent
-    return _ancestor(dataset.identity, (dataset.root, dataset.description), beside, ())
+    places = _Places(dataset.root.resolve().parent)
+    described: dict[_Key, _Described | None] = {_key(dataset.identity): (dataset.root, dataset.description)}
+    known: dict[_Key, Ancestor] = {}
+    begun: set[_Key] = set()
+    steps = [(_key(dataset.identity), False)]
+    while steps:  # without recursion: there may be thousands of versions
+        key, is_complete = steps.pop()
+        reference = full_name({"name": key[0], "version": key[1]})
+        if key in known:
+            continue
+        if not is_complete and key in begun:
+            raise CorruptDatasetError(
+                f"{reference} is among its own ancestors: a {DATASET_PATH} was altered; restore it from "
+                "a copy."
+            )
+        if not is_complete and key not in described:
+            described[key] = places.find(key)
+        folder, description = described[key] or (None, {})
+        parents = [_key(parent) for parent in description.get("parents", [])]
+        if not is_complete:
+            begun.add(key)
+            steps += [(key, True), *((parent, False) for parent in parents)]
+            continue
+        begun.remove(key)
+        known[key] = Ancestor(
+            reference=reference,
+            content_hash=key[2],
+            stage=description.get("stage", ""),
+            config=description.get("config", {}),
+            parents=tuple(known[parent] for parent in parents),
+            folder=folder,
+        )
+    return known[_key(dataset.identity)]
+
+
+def hashes(ancestor: Ancestor) -> set[str]:
+    """Return the content hashes of a dataset and of all its ancestors."""
+    return {one.content_hash for one, _, _ in _walked(ancestor)}
 
 
 def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
@@ -63,55 +101,59 @@ def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
 
 
 def tree_lines(ancestor: Ancestor) -> Iterator[str]:
-    """Yield the tree, one dataset per line, parents indented below their child."""
-    yield _line(ancestor)
-    for number, parent in enumerate(ancestor.parents, 1):
-        is_last = number == len(ancestor.parents)
-        first, *rest = tree_lines(parent)
-        yield ("└── " if is_last else "├── ") + first
-        for line in rest:
-            yield ("    " if is_last else "│   ") + line
+    """Yield the tree, a dataset per line, parents indented below their child, those of each dataset once."""
+    for one, margin, is_repeated in _walked(ancestor):
+        yield margin + _line(one) + ("  (its parents: see above)" if is_repeated and one.parents else "")
 
 
-def _ancestor(
-    identity: Mapping[str, str],
-    found: _Described | None,
-    beside: Path,
-    descendants: tuple[Mapping[str, str], ...],
-) -> Ancestor:
-    reference = full_name(identity)
-    if identity in descendants:
-        raise CorruptDatasetError(
-            f"{reference} is among its own ancestors: a {DATASET_PATH} was altered; restore it from a copy."
-        )
-    folder, description = found or (None, {})
-    parents = description.get("parents", [])
-    below = (*descendants, identity)
-    return Ancestor(
-        reference=reference,
-        content_hash=identity["hash"],
-        stage=description.get("stage", ""),
-        config=description.get("config", {}),
-        parents=tuple(_ancestor(parent, _found(parent, beside), beside, below) for parent in parents),
-        folder=folder,
-    )
-
-
-def _found(identity: Mapping[str, str], beside: Path) -> _Described | None:
-    places = [beside.glob(f"*/{DATASET_PATH}")]
-    for folder in beside.parents[:2]:
-        if (folder / RECORD).exists():
-            places += [folder.glob(f"{depth}/{DATASET_PATH}") for depth in ("*/*", "*/*/*")]
-    neighbors = [path.parents[2] for place in places for path in sorted(place)]
-    for folder in (home_of(identity), *neighbors):
-        try:
-            found = read_description(folder)
-        except CorruptDatasetError:
+def _walked(ancestor: Ancestor) -> Iterator[tuple[Ancestor, str, bool]]:
+    """Yield each dataset of a tree, what stands before it in its line, and whether it came before."""
+    seen: set[Ancestor] = set()
+    steps = [(ancestor, "", "")]
+    while steps:
+        one, margin, below = steps.pop()
+        yield one, margin, one in seen
+        if one in seen:
             continue
-        # A dataset may hold the same values under another name or version.
-        if identity == {"name": found["name"], "version": found["version"], "hash": found["content_hash"]}:
-            return folder, found
-    return None
+        seen.add(one)
+        for parent in reversed(one.parents):
+            is_last = parent is one.parents[-1]
+            branch, deeper = ("└── ", "    ") if is_last else ("├── ", "│   ")
+            steps.append((parent, below + branch, below + deeper))
+
+
+class _Places:
+    """Where datasets are looked for, each place once."""
+
+    def __init__(self, beside: Path) -> None:
+        """Look at home, in the folder `beside` the first dataset, and in the run that it is in."""
+        self._beside = beside
+        self._neighbors: dict[_Key, _Described] | None = None
+
+    def find(self, key: _Key) -> _Described | None:
+        """Return the dataset that has this name, version and hash."""
+        found = _described(home_of({"name": key[0], "version": key[1]})).get(key)
+        if found is None and self._neighbors is None:
+            places = [self._beside.glob(f"*/{DATASET_PATH}")]
+            for folder in self._beside.parents[:2]:
+                if (folder / RECORD).exists():
+                    places += [folder.glob(f"{depth}/{DATASET_PATH}") for depth in ("*/*", "*/*/*")]
+            listed = [_described(path.parents[2]) for place in places for path in sorted(place)]
+            self._neighbors = {key: found for one in reversed(listed) for key, found in one.items()}
+        return found or (self._neighbors or {}).get(key)
+
+
+def _described(folder: Path) -> dict[_Key, _Described]:
+    try:
+        found = read_description(folder)
+    except CorruptDatasetError:
+        return {}
+    # A dataset may hold the same values under another name or version.
+    return {_key(identity_of(found)): (folder, found)}
+
+
+def _key(identity: Mapping[str, str]) -> _Key:
+    return identity["name"], identity["version"], identity["hash"]
 
 
 def _line(ancestor: Ancestor) -> str:
@@ -120,6 +162,5 @@ def _line(ancestor: Ancestor) -> str:
     settings = ", ".join(
         f"{key} {shortened(str(value), 40)}" for key, value in ancestor.config.items() if value is not None
     )
-    return f"{ancestor.reference}  {ancestor.content_hash[:8]}  {ancestor.stage}" + (
-        f": {settings}" if settings else ""
-    )
+    line = f"{ancestor.reference}  {ancestor.content_hash[:8]}  {ancestor.stage}"
+    return printable(f"{line}: {settings}" if settings else line)

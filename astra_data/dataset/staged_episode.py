@@ -36,6 +36,8 @@ def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
         CorruptDatasetError: the file cannot be read, or has other values than were written.
     """
     try:
+        if not path.is_file():
+            raise OSError("it is no file")
         with pa.memory_map(str(path)) as source, pa.ipc.open_file(source) as file:
             table = file.read_all()
             facts = json.loads(table.schema.metadata[b"episode"])

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
+from astra_data.core.wording import shortened
 from astra_data.dataset.columns import Column
 from astra_data.dataset.description import NAME, VERSION, identity_of
 from astra_data.dataset.reader import Dataset
@@ -43,7 +44,7 @@ class Version:
             BadInputError: it is not three numbers.
         """
         if not VERSION.fullmatch(text):
-            raise BadInputError(f"version '{text}': expected three numbers such as 1.2.0")
+            raise BadInputError(f"version '{shortened(text, 80)}': expected three numbers such as 1.2.0")
         return cls(*map(int, text.split(".")))
 
     @property
@@ -76,19 +77,36 @@ def home() -> Path:
     return Path(os.environ.get("ASTRA_DATA_HOME", "datasets"))
 
 
+def _home_folder() -> Path:
+    folder = home()
+    if folder.exists() and not folder.is_dir():
+        raise BadInputError(
+            f"{folder} is no folder: expected that of the datasets; set $ASTRA_DATA_HOME to one"
+        )
+    return folder
+
+
 def home_of(description: Mapping[str, Any]) -> Path:
     """Return the folder at home of the dataset with this "name" and "version"."""
     return home() / str(description["name"]) / f"data-{description['version']}"
 
 
 def names_at_home() -> list[str]:
-    """Return the names of the datasets at home."""
-    return sorted(folder.name for folder in home().glob("*") if versions_at_home(folder.name))
+    """Return the names of the datasets at home.
+
+    Raises:
+        BadInputError: the home folder is none.
+    """
+    return sorted(folder.name for folder in _home_folder().glob("*") if versions_at_home(folder.name))
 
 
 def versions_at_home(name: str) -> list[Version]:
-    """Return the versions of dataset `name` at home, the oldest first."""
-    folders = (folder for folder in (home() / name).glob("data-*") if folder.is_dir())
+    """Return the versions of dataset `name` at home, the oldest first.
+
+    Raises:
+        BadInputError: the home folder is none.
+    """
+    folders = (folder for folder in (_home_folder() / name).glob("data-*") if folder.is_dir())
     return sorted(version for folder in folders if (version := Version.from_tag(folder.name)))
 
 

@@ -6,13 +6,14 @@ A file without an end, as of a recorder that was killed, is read up to its last 
 import json
 import struct
 from collections.abc import Callable, Collection, Iterator
-from io import SEEK_END, BufferedReader
+from io import SEEK_END, BufferedReader, BytesIO
 from typing import IO, Any
+from zlib import crc32
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.exchange.recording import Part, Source
+from astra_data.exchange.recording import MOST_UNPACKED, SMALL_BYTES, Part, Source
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
@@ -40,6 +41,7 @@ class McapFile:
         self._schemas: dict[int, Any] = {}
         self._chunks: list[Any] | None = None
         self._whole_bytes: int | None = None
+        self._left = 0
         self._open()
 
     def messages(self, *, checked: bool) -> Iterator[tuple[str, Any]]:
@@ -131,11 +133,13 @@ class McapFile:
         """Yield the records of the data, those of chunks unpacked, and `checked` by their sums."""
         reading, records = optional("mcap.stream_reader"), optional("mcap.records")
         with self._source.open() as stream:
+            size = stream.seek(0, SEEK_END)
+            self._left = max(self._source.most_bytes or 0, SMALL_BYTES, MOST_UNPACKED * size)
+            stream.seek(0)
             if self._chunks is not None:
                 for index in self._chunks:
                     stream.seek(index.chunk_start_offset + _HEAD.size)
-                    chunk = records.Chunk.read(reading.ReadDataStream(stream))
-                    yield from reading.breakup_chunk(chunk, validate_crc=checked)
+                    yield from self._unpacked(records.Chunk.read(reading.ReadDataStream(stream)), checked)
                 return
             whole: IO[bytes] = stream
             if self._whole_bytes is not None:
@@ -143,7 +147,7 @@ class McapFile:
             try:
                 for record in reading.StreamReader(whole, emit_chunks=True, validate_crcs=checked).records:
                     if isinstance(record, records.Chunk):
-                        yield from reading.breakup_chunk(record, validate_crc=checked)
+                        yield from self._unpacked(record, checked)
                     elif isinstance(record, records.DataEnd):
                         self.is_cut = False
                         return
@@ -152,6 +156,42 @@ class McapFile:
             except optional("mcap.exceptions").EndOfFile:
                 if self._whole_bytes is None:
                     raise
+
+    def _unpacked(self, chunk: Any, checked: bool) -> Iterator[Any]:  # noqa: ANN401 - mcap's
+        """Yield the records of a chunk, unpacked only as far as its header says and the limit allows."""
+        reading, records = optional("mcap.stream_reader"), optional("mcap.records")
+        if chunk.uncompressed_size > self._left:
+            raise BadInputError(
+                f"{self._source}: its chunks are more than {MOST_UNPACKED} times as large as the file once "
+                "unpacked: if you trust it, pass a larger --max-bytes"
+            )
+        self._left -= chunk.uncompressed_size
+        most = chunk.uncompressed_size + 1
+        data: bytes = chunk.data
+        if chunk.compression == "zstd":
+            packed = optional("zstandard").ZstdDecompressor().stream_reader(data, read_across_frames=True)
+            data = packed.read(most)
+        elif chunk.compression == "lz4":
+            data = optional("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=most)
+        elif chunk.compression:
+            raise BadInputError(f"{self._source}: chunks packed as {chunk.compression}, expected zstd or lz4")
+        if len(data) != chunk.uncompressed_size:
+            raise BadInputError(
+                f"{self._source}: a chunk has another size than its header says: it is damaged"
+            )
+        if checked and chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
+            raise BadInputError(
+                f"{self._source}: a chunk has another checksum than was written: it is damaged"
+            )
+        stream, kinds = reading.ReadDataStream(BytesIO(data)), optional("mcap.opcode").Opcode
+        while stream.count < len(data):
+            kind, length = stream.read1(), stream.read8()
+            if kind == kinds.MESSAGE:
+                yield records.Message.read(stream, length)
+            elif kind in (kinds.CHANNEL, kinds.SCHEMA):
+                yield (records.Channel if kind == kinds.CHANNEL else records.Schema).read(stream)
+            else:
+                stream.read(length)
 
 
 def _content_bytes(stream: IO[bytes]) -> int:

@@ -5,7 +5,7 @@ it was made from something else than what lies there now, or was made or begun w
 0.1 wrote no manifests: what it finished counts as finished, if its result is there.
 """
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError
 from astra_data.core.manifest import Manifest, read_manifest
 from astra_data.core.naming import stage_of_key
-from astra_data.dataset.lineage import Ancestor, lineage
+from astra_data.dataset.lineage import hashes, lineage
 from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
@@ -180,14 +180,8 @@ def _other_data(labeled: Path, data: str | None) -> str:
         named, made = open_dataset(data), read_description(labeled)
         known = {made["content_hash"], *(parent["hash"] for parent in made["parents"])}
         # What was made of it since, and has its name, is no other.
-        return "" if known & set(_hashes(lineage(named))) else named.reference
+        return "" if known & hashes(lineage(named)) else named.reference
     return ""
-
-
-def _hashes(ancestor: Ancestor) -> Iterator[str]:
-    yield ancestor.content_hash
-    for parent in ancestor.parents:
-        yield from _hashes(parent)
 
 
 def _digest(key: str, experiment: Experiment) -> str | None:

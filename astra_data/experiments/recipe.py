@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, JsonValue, ValidationInfo, create_model, field_validator, model_validator
 
-from astra_data.core.config import Config, did_you_mean
+from astra_data.core.config import Config, Seed, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
@@ -54,7 +54,7 @@ class Recipe(Config):
     """Your own methods, by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, alone or followed by `_plus`."""
-    seeds: tuple[int, ...] = Field(min_length=1)
+    seeds: tuple[Seed, ...] = Field(min_length=1)
     """For each seed everything is repeated, starting with collecting the dataset."""
 
     if TYPE_CHECKING:

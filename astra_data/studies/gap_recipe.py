@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from astra_data.core.config import Config, Positive, did_you_mean
+from astra_data.core.config import Config, Positive, Seed, did_you_mean
 from astra_data.studies.joints import JointsConfig
 from astra_data.studies.rollouts import FITS, FitConfig
 from astra_data.studies.sequences import StepsConfig
@@ -18,7 +18,7 @@ class GapRecipe(Config):
     """How logs become columns: a mapping of `astra-data import`, relative to the recipe."""
     models: Annotated[tuple[str, ...], Field(min_length=1)]
     """Names in `rollouts.FITS`; the raw simulator is always added."""
-    seeds: Annotated[tuple[int, ...], Field(min_length=1)]
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
     """Seeds of the networks, and of the choice of pieces for smaller data sizes."""
     minutes: tuple[Positive, ...] = ()
     """Sizes of the training data, in addition to all of it; each is a subset of the larger ones."""

@@ -1,14 +1,18 @@
 import json
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
 import pytest
 from command_line import call
-from fake_dataset import COLUMNS, write_fake
+from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake, writer
 from toy_logs import Columns, toy_columns, write_logs
 
+from astra_data.cli import app as cli
 from astra_data.core.errors import AstraDataError
+from astra_data.dataset.columns import Episode
 
 
 def test_a_dataset_is_shown_and_drawn(tmp_path: Path) -> None:
@@ -94,3 +98,41 @@ def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_folder_to_clean_that_is_not_there_is_told(tmp_path: Path) -> None:
     result = call("list", "--clean", str(tmp_path / "nowhere"))
     assert str(result.exception) == f"list --clean: expected folders, got {tmp_path / 'nowhere'}"
+
+
+@pytest.mark.parametrize("command", [["list"], ["list", "--clean"], ["inspect", "fake"]])
+def test_a_home_that_is_no_folder_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    (tmp_path / "home").touch()
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    error = call(*command).exception
+    assert isinstance(error, AstraDataError)
+    assert re.search("home is no folder: expected|expected folders, got .*home", str(error))
+
+
+def test_no_name_controls_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of columns, values, units, tasks, settings and folders; in what is shown, noted and refused."""
+    bad = "a\x1b]0;title\x07\nb\x9b31m"
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / bad))
+    column = replace(COLUMNS[1], name=f"x{bad}", names=(f"x{bad}", "y"), astra={"unit": [bad, "m"]})
+    description = DESCRIPTION | {"config": {bad: bad}, "stage": f"s{bad}"}
+    root = tmp_path / bad / "fake/data-1.0.0"
+    with writer(root, columns=[*COLUMNS, column], task=bad, description=description) as open_writer:
+        for episode in fake_episodes():
+            columns = {**episode.columns, column.name: episode.columns["action"]}
+            open_writer.add(Episode(episode.uid, columns, {bad: 1.0}))
+    (root / "meta" / bad).touch()
+    for command in ("list", "inspect", "log", "validate"):
+        monkeypatch.setattr(sys, "argv", ["astra-data", command, *(["fake"] if command != "list" else [])])
+        with pytest.raises(SystemExit):
+            cli.main()
+        shown = capsys.readouterr()
+        assert not {"\x1b", "\x07", "\x9b"} & {*shown.out, *shown.err}, command
+        assert not re.search("^b", shown.out + shown.err, re.MULTILINE)
+    monkeypatch.setattr(sys, "argv", ["astra-data", "inspect", str(tmp_path / f"none{bad}")])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert capsys.readouterr().err.count("\n  b") == 1

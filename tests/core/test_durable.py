@@ -201,6 +201,7 @@ def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
     for file in (".out.hdf5.tmp-99", ".recipe.json.partial", ".notes.partial", "file"):
         (home / file).touch()
     (dead / "data" / "file").touch()
+    os.mkfifo(home / ".pipe.tmp-98")
     with held(alive):
         found = dict(clean(home))
     assert found == {
@@ -208,6 +209,7 @@ def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
         alive: "in use",
         staged: "kept",
         home / ".out.hdf5.tmp-99": "removed",
+        home / ".pipe.tmp-98": "removed",
         home / ".recipe.json.partial": "removed",
     }
     assert names(home) == [
@@ -233,3 +235,8 @@ def test_ctrl_c_removes_the_folders_that_were_made(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), hidden_folder(tmp_path / "home/walks/data-1.0.0"):
         raise KeyboardInterrupt
     assert names(tmp_path) == []
+
+
+def test_pipes_among_files_are_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    sync_tree(tmp_path)

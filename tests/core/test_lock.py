@@ -1,3 +1,4 @@
+import os
 import threading
 from pathlib import Path
 
@@ -28,6 +29,12 @@ def test_who_waits_gets_the_lock_when_it_is_free(tmp_path: Path) -> None:
         assert not got.wait(0.1)
     waiting.join()
     assert got.is_set()
+
+
+def test_a_pipe_is_locked_without_waiting_for_a_writer(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with held(tmp_path / "pipe") as ours:
+        assert ours
 
 
 def test_a_run_is_alone_in_its_folder_or_told_what_to_do(tmp_path: Path) -> None:

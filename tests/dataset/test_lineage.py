@@ -1,15 +1,16 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
-from fake_dataset import fake_episode, write_fake, writer
+from fake_dataset import DESCRIPTION, fake_episode, write_fake, writer
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.edit import delete, merge, subset
 from astra_data.dataset.format import DATASET_PATH
-from astra_data.dataset.lineage import lineage, recordings_of, tree_lines
+from astra_data.dataset.lineage import hashes, lineage, recordings_of, tree_lines
 from astra_data.dataset.seal import sealed
 
 pytestmark = pytest.mark.usefixtures("home")
@@ -27,8 +28,7 @@ def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
         f"├── fake@data-1.1.0  {prints[1]}  delete: episodes [13]",
         f"│   └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
         f"└── fake@data-1.2.0  {prints[3]}  subset: episodes 2, seed 4",
-        f"    └── fake@data-1.1.0  {prints[1]}  delete: episodes [13]",
-        f"        └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
+        f"    └── fake@data-1.1.0  {prints[1]}  delete: episodes [13]  (its parents: see above)",
     ]
 
 
@@ -85,3 +85,37 @@ def test_an_altered_ancestor_is_not_found(tmp_path: Path) -> None:
     (first.root / DATASET_PATH).write_text(json.dumps(first.description | {"seeds": {"collect": 7}}))
     [line] = list(tree_lines(lineage(made)))[1:]
     assert line.endswith("(not found here)")
+
+
+def described(
+    root: Path, version: int, parents: list[dict[str, str]], description: dict[str, Any]
+) -> dict[str, str]:
+    """Write the description of a version without its files; return its identity."""
+    full = description | {"version": f"1.{version}.0", "parents": parents, "sums": {}}
+    folder = root / f"home/fake/data-1.{version}.0" / DATASET_PATH
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.write_text(json.dumps(full))
+    return {"name": "fake", "version": f"1.{version}.0", "hash": full["content_hash"]}
+
+
+@pytest.mark.parametrize(("versions", "each"), [(1500, 1), (60, 2)])
+def test_many_versions_are_told_once_each(tmp_path: Path, versions: int, each: int) -> None:
+    """In a chain, and where each was made from the one before it twice over."""
+    first = write_fake(tmp_path / "home/fake/data-1.0.0")
+    parents = [first.identity] * each
+    for version in range(1, versions):
+        parents = [described(tmp_path, version, parents, first.description)] * each
+    last = Dataset.open(delete(first, [13], out=tmp_path / "last"))
+    changed = sealed(last.root, last.description | {"parents": parents})
+    (last.root / DATASET_PATH).write_text(json.dumps(changed))
+    found = lineage(Dataset.open(last.root))
+    lines = list(tree_lines(found))
+    assert len(lines) == 1 + versions * each
+    assert sum(line.endswith("(its parents: see above)") for line in lines) == (versions - 1) * (each - 1)
+    assert hashes(found) == {last.content_hash, first.content_hash}
+
+
+def test_names_in_a_lineage_control_no_terminal(tmp_path: Path) -> None:
+    description = {**DESCRIPTION, "config": {"note\x1b]0;x\x07": "a\nb"}}
+    [line] = tree_lines(lineage(write_fake(tmp_path / "set", description=description)))
+    assert line.isprintable()

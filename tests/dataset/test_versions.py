@@ -26,8 +26,11 @@ def versions(*texts: str) -> list[Version]:
 def test_versions_order_as_numbers() -> None:
     assert sorted(versions("1.10.0", "1.9.3", "0.0.1")) == versions("0.0.1", "1.9.3", "1.10.0")
     assert str(Version.parse("1.10.0")) == "1.10.0"
-    with pytest.raises(BadInputError, match="expected three numbers"):
-        Version.parse("1.2")
+    for text in ("1.2", "9" * 5000 + ".0.0"):
+        with pytest.raises(BadInputError, match="expected three numbers") as caught:
+            Version.parse(text)
+        assert len(str(caught.value)) < 200
+    assert Version.from_tag("data-" + "9" * 5000 + ".0.0") is None
 
 
 def test_each_kind_of_change_moves_its_number() -> None:
@@ -60,6 +63,7 @@ def test_a_dataset_is_found_by_folder_name_and_version(home: Path, tmp_path: Pat
         ("ent", "did you mean 'ant'"),
         ("ant@data-9.0.0", "no version data-9.0.0 in .*home; it has data-1.2.0"),
         ("some/where", "no such folder"),
+        ("ant@data-" + "9" * 5000 + ".0.0", "no such folder"),
     ],
 )
 def test_a_missing_dataset_is_refused(home: Path, name: str, fault: str) -> None:

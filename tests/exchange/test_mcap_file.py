@@ -62,6 +62,43 @@ def test_every_form_is_read(tmp_path: Path, form: str) -> None:
     assert numbers(write(tmp_path / "log.mcap", **FORMS[form])) == (WANTED, False)
 
 
+PACKED = [CompressionType.ZSTD, CompressionType.LZ4]
+
+
+@pytest.mark.parametrize("compression", PACKED)
+def test_no_more_is_unpacked_than_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType
+) -> None:
+    path = write(tmp_path / "log.mcap", compression=compression)
+    unpacked = 300 * (22 + 9 + 23)  # of a message: what stands before it, and its content
+    monkeypatch.setattr("astra_data.exchange.mcap_file.MOST_UNPACKED", 0)
+    for limit, is_read in ((unpacked + 1000, True), (unpacked - 5000, False)):
+        monkeypatch.setattr("astra_data.exchange.mcap_file.SMALL_BYTES", limit)
+        file = McapFile(Source(path, None, path, most_bytes=0), ["/used", "/other"])
+        if is_read:
+            assert len(list(file.messages(checked=True))) == LENGTH
+            continue
+        with pytest.raises(BadInputError, match=r"once unpacked: if you trust it, pass a larger --max-bytes"):
+            list(file.messages(checked=True))
+
+
+@pytest.mark.parametrize("compression", PACKED)
+@pytest.mark.parametrize("declared", [0, 100, 10**6])
+def test_a_chunk_is_unpacked_as_far_as_it_says(
+    tmp_path: Path, compression: CompressionType, declared: int
+) -> None:
+    path = write(tmp_path / "log.mcap", compression=compression)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    content = bytearray(path.read_bytes())
+    start = summary.chunk_indexes[0].chunk_start_offset + 9 + 16
+    content[start : start + 8] = struct.pack("<Q", declared)
+    path.write_bytes(content)
+    with pytest.raises(BadInputError, match="has another size than its header says"):
+        numbers(path)
+
+
 def test_chunks_without_wanted_messages_are_not_read(tmp_path: Path) -> None:
     path = write(tmp_path / "log.mcap", compression=CompressionType.NONE)
     content = bytearray(path.read_bytes())
@@ -71,7 +108,7 @@ def test_chunks_without_wanted_messages_are_not_read(tmp_path: Path) -> None:
         path.write_bytes(content)
         if number == 150:
             assert numbers(path) == (WANTED, False)
-    with pytest.raises(ValueError, match="crc validation failed in Chunk"):
+    with pytest.raises(BadInputError, match="has another checksum than was written"):
         numbers(path)
     assert numbers(path, checked=False) == (WANTED, False)
 
@@ -121,7 +158,7 @@ def test_damage_before_a_cut_is_refused(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[content.index(b"050" + bytes(20))] ^= 1
     path.write_bytes(content[: 3 * len(content) // 4])
-    with pytest.raises(ValueError, match="crc validation failed in Chunk"):
+    with pytest.raises(BadInputError, match="has another checksum than was written"):
         numbers(path)
 
 

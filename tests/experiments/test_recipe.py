@@ -188,3 +188,10 @@ def test_disagreement_is_that_of_heads_or_of_members() -> None:
     by_heads = read(ground={"correction_heads": 2}, plus=penalty)
     by_members = read(ground={"members": 2}, plus=penalty | {"keep_member": True})
     assert by_heads.plus.disagreement_penalty == by_members.plus.disagreement_penalty == 1.0
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 2**64])
+def test_seeds_are_those_that_every_stage_takes(seed: int) -> None:
+    assert read(seeds=[0, 2**63 - 1]).seeds[1] == 2**63 - 1
+    with pytest.raises(RecipeError, match=r"seeds\.1: "):
+        read(seeds=[0, seed])

@@ -152,8 +152,8 @@ def _files_are_readable(
                 for fault in statistics_faults(footer[1], columns, info["features"]):
                     report.note("statistics", f"{name} {fault}")
     if not isinstance(total := info.get("total_frames"), int) or rows < total:
-        for name in missing_files(root, read_places(root, info)[0]):
-            report.fault("files", f"{name} is missing")
+        for missing in missing_files(root, read_places(root, info)[0]):
+            report.fault("files", f"{missing} is missing")
     if report.fault_count > before:
         report.note("values", "values were not checked, because not all files could be read as declared")
         return False

@@ -101,10 +101,10 @@ def whole_runs(
 def _claimed(run: Run) -> tuple[int, int, int]:
     """Return the episode, the first row in the dataset and the first frame that most rows of `run` tell."""
     steps = np.arange(len(run))
-    number, index, frame = (
-        run.columns[name] for name in (names.EPISODE_INDEX, names.INDEX, names.FRAME_INDEX)
-    )
-    return tuple(int(np.sort(values)[len(run) // 2]) for values in (number, index - steps, frame - steps))
+    columns = run.columns
+    told = columns[names.EPISODE_INDEX], columns[names.INDEX] - steps, columns[names.FRAME_INDEX] - steps
+    number, first, frame = (int(np.sort(values)[len(run) // 2]) for values in told)
+    return number, first, frame
 
 
 def _lost(first: int, last: int) -> str:

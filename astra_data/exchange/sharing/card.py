@@ -10,6 +10,7 @@ import numpy as np
 
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.wording import in_code, in_markdown
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import RESERVED, Column
@@ -107,11 +108,15 @@ def _folded(text: str) -> str:
 
 def _opening(dataset: Dataset) -> str:
     stand_in = dataset.description["environment"].get("stand_in")
-    note = f" The robot is a simulated stand-in (`{stand_in}`) for a physical one." if stand_in else ""
+    note = (
+        f" The robot is a simulated stand-in ({in_code(str(stand_in))}) for a physical one."
+        if stand_in
+        else ""
+    )
     return (
         f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
-        f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. Task: “{dataset.task}”. "
-        f"The format is LeRobot {layout.CODEBASE_VERSION}.{note}"
+        f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. "
+        f"Task: “{in_markdown(dataset.task)}”. The format is LeRobot {layout.CODEBASE_VERSION}.{note}"
     )
 
 
@@ -129,7 +134,9 @@ def _counts(dataset: Dataset) -> str:
     for key, values in sorted(facts.items()):
         if values and all(isinstance(value, bool) for value in values):
             share = sum(map(bool, values)) / len(values)
-            rows.append((key, f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.1%})"))
+            rows.append(
+                (in_markdown(key), f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.1%})")
+            )
         elif key == "return" and values:
             returns = np.array(values, dtype=np.float64)
             rows.append((key, f"mean {returns.mean():.2f}; {returns.min():.2f} to {returns.max():.2f}"))
@@ -142,13 +149,13 @@ def _columns(dataset: Dataset) -> str:
     wide: dict[tuple[str, ...], list[str]] = {}
     for column in columns:
         if column.name not in RESERVED or column.meaning:
-            meaning = column.meaning
-            if column.names and column.size > WIDE:
-                wide.setdefault(column.names, []).append(column.name)
-            elif column.names:
-                meaning = f"{meaning}: {', '.join(column.names)}".removeprefix(": ")
+            meaning, labels = in_markdown(column.meaning), tuple(map(in_markdown, column.names or ()))
+            if labels and column.size > WIDE:
+                wide.setdefault(labels, []).append(column.name)
+            elif labels:
+                meaning = f"{meaning}: {', '.join(labels)}".removeprefix(": ")
             shape = f"({column.size},)"
-            rows.append((f"`{column.name}`", column.dtype, shape, _units(column), meaning))
+            rows.append((in_code(column.name), column.dtype, shape, _units(column), meaning))
     plain = [f"`{column.name}`" for column in columns if column.name in RESERVED and not column.meaning]
     order = [f"In {_joined(same)}, in order: {', '.join(names)}." for names, same in wide.items()]
     return "\n\n".join(
@@ -162,35 +169,36 @@ def _columns(dataset: Dataset) -> str:
 
 
 def _joined(names: list[str]) -> str:
-    return " and ".join(f"`{name}`" for name in names)
+    return " and ".join(map(in_code, names))
 
 
 def _units(column: Column) -> str:
     units = (column.astra or {}).get("unit", [])
     runs = [(unit, len(list(run))) for unit, run in groupby(units)]
-    return ", ".join(unit if count == 1 else f"{unit} ({count})" for unit, count in runs)
+    counted = ((in_markdown(unit), count) for unit, count in runs)
+    return ", ".join(unit if count == 1 else f"{unit} ({count})" for unit, count in counted)
 
 
 def _provenance(description: dict[str, Any]) -> str:
-    parents = [f"{full_name(parent)} (`{parent['hash']}`)" for parent in description["parents"]]
+    parents = [f"{full_name(parent)} ({in_code(parent['hash'])})" for parent in description["parents"]]
     packages = [f"{name} {version}" for name, version in description["packages"].items()]
     rows = [
         ("version", description["version"]),
-        ("made by stage", description["stage"]),
+        ("made by stage", in_markdown(description["stage"])),
         ("from", "; ".join(parents) or "nothing earlier"),
         ("config", _json(description["config"])),
         ("seeds", _json(description["seeds"])),
         ("environment", _json(description["environment"])),
         ("simulator", _json(description["simulator"])),
-        ("packages", ", ".join(packages)),
-        ("commit", f"`{description['git_commit']}`" if description["git_commit"] else "not recorded"),
+        ("packages", in_markdown(", ".join(packages))),
+        ("commit", in_code(description["git_commit"]) if description["git_commit"] else "not recorded"),
         ("content hash (sha256)", f"`{description['content_hash']}`"),
     ]
     return _table(("what", "value"), rows)
 
 
 def _json(content: dict[str, Any]) -> str:
-    return f"`{json.dumps(content, ensure_ascii=False)}`" if content else "none"
+    return in_code(json.dumps(content, ensure_ascii=False)) if content else "none"
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

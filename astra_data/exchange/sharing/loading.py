@@ -1,5 +1,7 @@
 """The section of a dataset card on loading the dataset."""
 
+import json
+
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
 from astra_data.exchange.sharing.address import Hub, parse_source
@@ -32,7 +34,7 @@ def loading(dataset: Dataset, source: str | None) -> str:
 {fetched}```python
 from astra_data.dataset.versions import open_dataset
 
-values = open_dataset("{dataset.reference}").columns(["{column}"])
+values = open_dataset("{dataset.reference}").columns([{json.dumps(column)}])
 ```
 
 With [LeRobot](https://github.com/huggingface/lerobot):

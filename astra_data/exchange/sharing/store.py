@@ -16,6 +16,11 @@ from astra_data.exchange.sharing.sums import Listed
 
 TEXT_BYTES = 2**26
 """Most bytes of a description or of SHA256SUMS; some hundred thousand recordings or files fit into it."""
+DEPTH = 4
+"""Folders inside each other, at most: data/chunk-000/file-000.parquet needs three."""
+MOST_FOLDERS = 2000
+"""Folders of a dataset on HTTP, each a request."""
+MOST_FILES = 10**6
 BLOCK_BYTES = 2**24
 """Bytes per request."""
 
@@ -43,7 +48,9 @@ class RemoteFolder:
         try:
             self.filesystem.invalidate_cache()
             is_link = self.filesystem.info(self.path).get("islink", False)
-            found = self.filesystem.find(self.path, detail=True)
+            found = self._listed()
+        except SharingError:
+            raise
         except Exception as error:
             cause = f"{type(error).__name__}: {error}"
             raise SharingError(f"{self.name} cannot be listed ({cause}).") from error
@@ -55,6 +62,29 @@ class RemoteFolder:
                 "files; nothing was downloaded."
             )
         return files
+
+    def _listed(self) -> dict[str, dict[str, Any]]:
+        """Return what the file system tells of each file by its path, as deep as datasets are.
+
+        Over HTTP every folder is a request, and what a stranger's server lists has no end of its own.
+        """
+        if not {"http", "https"} & {*self._protocols()}:
+            return dict(self.filesystem.find(self.path, maxdepth=DEPTH, detail=True))
+        files: dict[str, dict[str, Any]] = {}
+        for number, (_, folders, found) in enumerate(
+            self.filesystem.walk(self.path, maxdepth=DEPTH, detail=True), 1
+        ):
+            files |= {str(facts["name"]): facts for facts in found.values()}
+            if max(number, len(folders)) > MOST_FOLDERS or len(files) > MOST_FILES:
+                raise SharingError(
+                    f"{self.name} lists more than {MOST_FOLDERS:,} folders or {MOST_FILES:,} files, which no "
+                    "dataset has; nothing was downloaded."
+                )
+        return files
+
+    def _protocols(self) -> tuple[str, ...]:
+        found = self.filesystem.protocol
+        return (found,) if isinstance(found, str) else tuple(found)
 
     def read_text(self, path: str) -> str:
         """Return the text of the small file `path`.
@@ -106,7 +136,7 @@ class RemoteFolder:
 
     def _digest(self, path: str, facts: Mapping[str, Any]) -> str | None:
         """Return the sha256 of a file, None where it would have to be downloaded for that."""
-        if "file" in self.filesystem.protocol:
+        if "file" in self._protocols():
             return file_digest(Path(self.path, path))
         large = facts.get("lfs")
         return large["sha256"] if large else None

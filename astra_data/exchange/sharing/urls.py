@@ -17,6 +17,7 @@ from astra_data.exchange.sharing.sums import SUMS_PATH, dataset_files
 
 MOST_FOLDERS = 20
 """Folders in which datasets are looked for, each with a request of its own."""
+MOST_VERSIONS = 1000
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 """Protocol → the extra of this package that is needed for it."""
 
@@ -56,7 +57,9 @@ class UrlStore:
             except FileNotFoundError:
                 return []
             tags = (str(path).rstrip("/").rpartition("/")[2] for path in found)
-            versions = (version for tag in tags if (version := Version.from_tag(tag)))
+            versions = {version for tag in tags if (version := Version.from_tag(tag))}
+            if len(versions) > MOST_VERSIONS:  # each is a request
+                raise SharingError(f"{self._url} lists more than {MOST_VERSIONS} versions")
             return sorted(version for version in versions if self._filesystem.exists(self._mark(version)))
 
     def datasets(self) -> list[str]:

@@ -193,7 +193,7 @@ def as_format_2(root: Path, episodes: int = 4) -> Path:
         pq.write_table(pa.table(columns), root / f"data/chunk-000/episode_{number:06d}.parquet")
         rows.append({"episode_index": number, "tasks": ["open the door"], "length": length})
         row += length
-    features = {name: single for name in columns}
+    features: dict[str, object] = {name: single for name in columns}
     features |= {name: vector for name in ("observation.state", "action")}
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"

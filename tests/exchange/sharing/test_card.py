@@ -147,3 +147,15 @@ def test_a_card_that_cannot_be_written_is_told(fake: Dataset, tmp_path: Path) ->
     (tmp_path / "none").touch()
     with pytest.raises(DiskError, match=r"it\.md cannot be written"):
         write_card(fake, tmp_path / "none/it.md", Notes())
+
+
+def test_what_strangers_wrote_is_words_in_a_card(tmp_path: Path) -> None:
+    bad = "x\n# Heading\n<script>alert(1)</script>"
+    columns = [Column(ACTION, size=2, names=("<b>", "y"), meaning=bad, astra={"unit": ["<i>", "m"]})]
+    description = {**DESCRIPTION, "config": {bad: "`<script>"}, "stage": bad}
+    with writer(tmp_path / "set", columns=columns, task=bad, description=description) as open_writer:
+        episode = Episode(0, {ACTION: np.zeros((3, 2), np.float32)}, {bad: True})
+        open_writer.add(episode)
+    text = re.sub(r"`[^`\n]*`", "", render_card(Dataset.open(tmp_path / "set"), NOTES))
+    assert "<script>" not in text and "<b>" not in text and "<i>" not in text
+    assert not re.search("^# Heading", text, re.MULTILINE)

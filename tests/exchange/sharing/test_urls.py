@@ -2,7 +2,9 @@
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from shared_files import contents
 
 from astra_data.core.errors import BadInputError, SharingError
 from astra_data.dataset import Dataset
+from astra_data.dataset.versions import Version
 from astra_data.exchange.sharing.pull import pull
 from astra_data.exchange.sharing.push import push
 from astra_data.exchange.sharing.urls import UrlStore
@@ -293,3 +296,51 @@ def test_what_a_killed_push_left_does_not_stop_the_next(fake: Dataset, tmp_path:
     push(fake.root, f"file://{tmp_path}/shared")
     assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
     assert not left.exists()
+
+
+class Endless(BaseHTTPRequestHandler):
+    """A server whose folders each hold two folders and a file; it counts the requests."""
+
+    requests = 0
+
+    def do_GET(self) -> None:
+        """List the folder."""
+        Endless.requests += 1
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        names = ["data-1.0.0/"] if self.path == "/" else ["one/", "two/", "file"]
+        base = self.path.rstrip("/")
+        self.wfile.write("".join(f'<a href="{base}/{name}">{name}</a>' for name in names).encode())
+
+    def do_HEAD(self) -> None:
+        """Say that there is a page."""
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def endless() -> Iterator[str]:
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Endless)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    Endless.requests = 0
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_folders_without_end_are_listed_as_deep_as_datasets_are(
+    endless: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = UrlStore(endless).folder(Version(1, 0, 0))
+    assert max(path.count("/") for path in folder.files()) == 3
+    assert Endless.requests < 40
+    monkeypatch.setattr("astra_data.exchange.sharing.store.MOST_FOLDERS", 5)
+    with pytest.raises(SharingError, match="lists more than 5 folders or 1,000,000 files, which no dataset"):
+        folder.files()
