@@ -15,7 +15,8 @@ from astra_data.dataset.edit import subset
 from astra_data.dataset.format import DATA_PATH, DATASET_PATH, INFO_PATH, STATS_PATH, SUBSETS_PATH
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.lineage import lineage, tree_lines
-from astra_data.dataset.meta_files import is_data_path, read_description
+from astra_data.dataset.meta_files import read_description
+from astra_data.dataset.plain import is_data_path
 
 VALUES: tuple[object, ...] = (
     *(None, True, -1, 0, 3, 0.5, 1e300, 10**400, float("nan"), float("inf")),
