@@ -47,7 +47,7 @@ def differences(a: Dataset, b: Dataset) -> Differences:
         if uids := [uid for uid in both if ours.get(uid) != theirs.get(uid)]:
             metadata[key] = uids
     return Differences(
-        schema=schema_differences(a, b),
+        schema=[*schema_differences(a, b), *_value_differences({"task": a.task}, {"task": b.task})],
         only_in_a=sorted(prints_a.keys() - prints_b.keys()),
         only_in_b=sorted(prints_b.keys() - prints_a.keys()),
         values=values,
@@ -57,16 +57,13 @@ def differences(a: Dataset, b: Dataset) -> Differences:
 
 
 def schema_differences(a: Dataset, b: Dataset) -> list[str]:
-    """List how the columns, fps and task of `b` differ from those of `a`, whatever the order of columns."""
+    """List how the columns and fps of `b` differ from those of `a`, whatever the order of columns."""
     ours, theirs = ({column.name: column for column in dataset.schema} for dataset in (a, b))
     found = [f"column {name}: only in {a.reference}" for name in ours if name not in theirs]
     found += [f"column {name}: only in {b.reference}" for name in theirs if name not in ours]
     for name in (name for name in ours if name in theirs):
         found += _value_differences(_facts(ours[name]), _facts(theirs[name]), f"column {name}: ")
-    found += _value_differences(
-        {"fps": a.info["fps"], "task": a.task}, {"fps": b.info["fps"], "task": b.task}
-    )
-    return found
+    return [*found, *_value_differences({"fps": a.info["fps"]}, {"fps": b.info["fps"]})]
 
 
 def world_differences(a: Dataset, b: Dataset) -> list[str]:

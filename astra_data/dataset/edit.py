@@ -4,6 +4,7 @@ Nothing is edited in place: every function streams the remaining episodes into a
 folder, which is `out`, or by default the new version's folder under `versions.home()`.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +23,10 @@ from astra_data.dataset.versions import next_version
 MOST_UIDS = 8
 """Uids listed in a message."""
 _IMPORTED = (
-    "what LeRobot recorded gets the columns and the task of others by an import of its files: `astra-data "
-    "import FOLDER/data/*/*.parquet --mapping FILE`"
+    "one of another origin gets the meanings of the others, and no robot_type, by an import of its files: "
+    "`astra-data import FOLDER/data/*/*.parquet --mapping FILE`, with the others' mapping"
 )
+_OF_ORIGIN = re.compile(r"\.meaning: |\bmeaning: |robot_type: ")
 
 
 def subset(
@@ -166,8 +168,10 @@ def merge(
 ) -> Path:
     """Write the episodes of all `sources` one after another; name, version and seeds are those of the first.
 
+    Where tasks differ, the dataset has them all, and each episode its own as "task" in its metadata.
+
     Args:
-        sources: two datasets or more, with equal columns, fps, task, environment and simulator.
+        sources: two datasets or more, with equal columns, fps, environment and simulator.
         new_uids: give an episode whose uid an earlier one has a new uid, the same in every run; the old one
             is kept as "merged_uid", and "source_episode" follows. Otherwise repeated uids are refused.
         name: name of the new dataset; by default it is the next version of the first.
@@ -193,19 +197,30 @@ def merge(
         for fault in (*schema_differences(first, other), *world_differences(first, other))
     ]
     if faults:
+        is_of_origin = any(source.recorded for source in sources) or any(map(_OF_ORIGIN.search, faults))
         raise BadInputError(
-            f"the datasets do not match: expected the columns, fps, task, environment and simulator "
+            f"the datasets do not match: expected the columns, fps, environment and simulator "
             f"of {first.reference} in all of them; merge only those that share them:\n  "
-            + "\n  ".join(faults + [_IMPORTED] * any(source.recorded for source in sources))
+            + "\n  ".join(faults + [_IMPORTED] * is_of_origin)
         )
+    tasks = list(dict.fromkeys(task for source in sources for task in _tasks(source)))
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
     with next_version(
-        first, "episodes", stage="merge", config=config, name=name, out=out, others=others
+        first,
+        "episodes",
+        stage="merge",
+        config=config,
+        name=name,
+        out=out,
+        others=others,
+        task=" / ".join(tasks),
     ) as writer:
         for source, named in zip(sources, names, strict=True):
             for episode in source.episodes():
                 metadata = renamed_metadata(episode.uid, episode.metadata, named)
+                if len(tasks) > 1:
+                    metadata = {"task": source.task, **metadata}
                 writer.add(replace(episode, uid=named[episode.uid], metadata=metadata))
     return writer.root
 
@@ -229,6 +244,12 @@ def _write(
         for episode in source.episodes(episodes=chosen):
             writer.add(episode)
     return writer.root
+
+
+def _tasks(source: Dataset) -> list[str]:
+    """Return the tasks of its episodes, which have their own where there are several."""
+    own = [source.task if task is None else str(task) for task in source.metadata.get("task", [])]
+    return list(dict.fromkeys(own)) or [source.task]
 
 
 def _uids(source: Dataset) -> list[int]:

@@ -8,6 +8,7 @@ A version never changes. Of MAJOR.MINOR.PATCH, a change of the columns increment
 episodes the second, one of the description alone the third.
 """
 
+import logging
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,8 +21,12 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.wording import shortened
 from astra_data.dataset.columns import Column
 from astra_data.dataset.description import NAME, VERSION, identity_of
+from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.plain import read_object
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
+
+_LOG = logging.getLogger(__name__)
 
 Change = Literal["columns", "episodes", "description"]
 
@@ -130,7 +135,12 @@ def locate(dataset: str | Path) -> Path:
     if version and Version.parse(version) not in versions:
         known = ", ".join(f"data-{known}" for known in versions)
         raise BadInputError(f"{name} has no version data-{version} in {home()}; it has {known}")
-    return home_of({"name": name, "version": version or versions[-1]})
+    folder = home_of({"name": name, "version": version or versions[-1]})
+    made = read_object(folder / DATASET_PATH) if version is None and len(versions) > 1 else {}
+    if isinstance(made, dict) and made.get("stage") == "subset":
+        known = ", ".join(f"{name}@{known.tag}" for known in versions[:-1])
+        _LOG.warning("%s is %s@%s here, a subset; the others are %s", name, name, versions[-1].tag, known)
+    return folder
 
 
 def _is_another(folder: Path) -> bool:
@@ -206,6 +216,7 @@ def next_version(
     more: Sequence[Column] = (),
     subset_seed: int | None = None,
     others: Iterable[Dataset] = (),
+    task: str | None = None,
     **changed: Any,  # noqa: ANN401 - JSON
 ) -> DatasetWriter:
     """Prepare to write the version that follows `source`; its folder is the writer's `root`.
@@ -220,6 +231,7 @@ def next_version(
         more: columns besides those of `source`.
         subset_seed: of the permutation of the subsets, by default that of `source`.
         others: further parents.
+        task: of its episodes, by default that of `source`.
         changed: keys of the description that differ from those of `source`.
     """
     description, folder = successor(
@@ -236,7 +248,7 @@ def next_version(
         folder,
         [*source.schema, *more],
         fps=source.info["fps"],
-        task=source.task,
+        task=source.task if task is None else task,
         description=description,
         subset_seed=source.subset_seed if subset_seed is None else subset_seed,
     )

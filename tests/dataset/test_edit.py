@@ -1,5 +1,7 @@
 import itertools
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -231,9 +233,40 @@ def test_datasets_that_differ_are_told_apart(tmp_path: Path) -> None:
         "column mode: only in",
         "column other: only in",
         "fps: 20, then 10",
-        "task: 'run', then 'walk'",
     ):
         assert part in str(caught.value)
+    assert "an import of its files" not in str(caught.value)
     with pytest.raises(BadInputError, match="two datasets or more"):
         merge([a], out=tmp_path / "all")
     assert not (tmp_path / "all").exists()
+
+
+def test_datasets_of_different_tasks_are_merged(tmp_path: Path) -> None:
+    parts = []
+    for uid, task in enumerate(("run", "walk", "run", "stand")):
+        with writer(tmp_path / str(uid), task=task) as open_writer:
+            open_writer.add(fake_episode(uid, 3))
+        parts.append(Dataset.open(tmp_path / str(uid)))
+    same = Dataset.open(merge([parts[0], parts[2]], out=tmp_path / "same"))
+    assert (same.task, "task" in same.metadata) == ("run", False)
+    two = Dataset.open(merge([parts[1], same], out=tmp_path / "two"))
+    assert (two.task, two.metadata["task"]) == ("walk / run", ["walk", "run", "run"])
+    more = Dataset.open(merge([two, parts[3]], out=tmp_path / "more"))
+    assert (more.task, more.metadata["task"]) == ("walk / run / stand", ["walk", "run", "run", "stand"])
+    part = Dataset.open(delete(more, [1], out=tmp_path / "part"))
+    both = Dataset.open(merge([parts[1], part], out=tmp_path / "both"))
+    assert (both.task, both.metadata["task"]) == ("walk / run / stand", ["walk", "run", "run", "stand"])
+
+
+@pytest.mark.parametrize("differs", ["robot_type", "meaning"])
+def test_what_differs_by_its_origin_alone_is_told_a_way_out(tmp_path: Path, differs: str) -> None:
+    first, *others = COLUMNS
+    changes: dict[str, dict[str, Any]] = {
+        "robot_type": {"description": {**DESCRIPTION, "environment": {"robot_type": "arm"}}},
+        "meaning": {"columns": [replace(first, meaning="another"), *others]},
+    }
+    parts = [write_fake(tmp_path / "a"), write_fake(tmp_path / "b", **changes[differs])]
+    with pytest.raises(
+        BadInputError, match=f"{differs}: .*\n.*by an import of its files: `astra-data import"
+    ):
+        merge(parts, new_uids=True, out=tmp_path / "all")

@@ -8,6 +8,7 @@ from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
+from astra_data.dataset.edit import subset
 from astra_data.dataset.versions import (
     Version,
     home_of,
@@ -135,3 +136,13 @@ def test_a_name_too_long_for_a_file_is_refused(home: Path, tmp_path: Path) -> No
             locate(name)
     with pytest.raises(BadInputError, match="expected up to 200 letters"):
         write_fake(tmp_path / "set", description={"name": "x" * 201, "stage": "collect"})
+
+
+def test_a_name_that_means_a_subset_says_so(home: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_fake(home / "fake/data-1.0.0")
+    assert len(open_dataset("fake")) == 5 and caplog.messages == []
+    subset(open_dataset("fake"), episodes=2)
+    assert len(open_dataset("fake")) == 2
+    [message] = caplog.messages
+    assert message == "fake is fake@data-1.1.0 here, a subset; the others are fake@data-1.0.0"
+    assert len(open_dataset("fake@1.1.0")) == 2 and len(caplog.messages) == 1
