@@ -29,9 +29,7 @@ SeedOrSeeds = Annotated[
 ]
 Behavior = Annotated[
     str | None,
-    typer.Option(
-        help="random, stress, policy, suboptimal_ppo, suboptimal_sac or planned.", show_default="random"
-    ),
+    typer.Option(help="random, stress, policy, suboptimal_ppo or suboptimal_sac.", show_default="random"),
 ]
 Episodes = Annotated[int | None, typer.Option(help="Number of episodes.", show_default="200")]
 LeastSteps = Annotated[
@@ -83,12 +81,6 @@ Grounding = Annotated[
 Encoder = Annotated[
     str | None, typer.Option(help="Folder of the policy's target encoder, if it has one.", show_default=False)
 ]
-Plan = Annotated[
-    str | None,
-    typer.Option(
-        help="Record these planned episodes: plan.json written by `astra-data suggest`.", show_default=False
-    ),
-]
 Name = Annotated[
     str | None, typer.Option(help="Name of the dataset.", show_default="task, behavior and seed")
 ]
@@ -114,7 +106,6 @@ def collect(
     policy: Policy = None,
     grounding: Grounding = None,
     target_encoder: Encoder = None,
-    plan: Plan = None,
     name: Name = None,
     out: Out = None,
     resume: Resume = False,
@@ -137,7 +128,6 @@ def collect(
         policy=policy,
         grounding=grounding,
         target_encoder=target_encoder,
-        plan=plan,
     )
     if task.endswith(".toml"):
         refuse({**given, "name": name, "out": out, "resume": resume or None}, "collect")
@@ -153,8 +143,7 @@ def collect(
     from astra_data.stages.collect import CollectConfig
     from astra_data.stages.collect import collect as collect_dataset
 
-    planned = {"behavior": "planned"} if plan is not None and behavior is None else {}
-    config = validated(given | planned, CollectConfig, "collect")
+    config = validated(given, CollectConfig, "collect")
     seed = seeds[0] if seeds else 0
     # The networks' idle threads would slow down the physics.
     torch.set_num_threads(1)

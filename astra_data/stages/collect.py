@@ -30,7 +30,6 @@ from astra_data.training.behaviors import (
 )
 from astra_data.training.policy_file import POLICY, PolicyFile, running
 from astra_data.training.recording import record
-from astra_data.training.recording_plan import PlannedCommands, RecordingPlan
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -44,20 +43,18 @@ MOST_STEPS = 10**10
 class CollectConfig(Config):
     """What to collect; the paper uses 200 episodes of random behavior of up to 500 steps."""
 
-    behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac", "planned"] = "random"
+    behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
     """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": commands at the
     bounds that often reverse, to provoke failures. "policy": a saved policy. "suboptimal_ppo",
     "suboptimal_sac": a policy trained in the target and stopped early. Policies sample their actions, as in
-    training. "planned": the episodes of a `plan`."""
+    training."""
     episodes: Count = 200
-    """Number of episodes: with `least_steps` the maximum; with a plan at most as many as it has, the first
-    ones."""
+    """Number of episodes: with `least_steps` the maximum."""
     least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
     """Record only as many episodes as it takes to reach this many steps in total, so that datasets of
     different behaviors have the same size."""
     max_steps: Count = 500
-    """Maximum steps per episode; longer episodes are truncated. With a plan, all are as long as its longest,
-    and hold their last command until then."""
+    """Maximum steps per episode; longer episodes are truncated."""
     num_envs: AtOnce = 200
     """Episodes recorded in one batch; also affects which random numbers each episode gets."""
     start: Literal["anywhere", "task"] = "anywhere"
@@ -81,22 +78,16 @@ class CollectConfig(Config):
     """Folder of the grounding that computes the latent for the saved policy, if it has one."""
     target_encoder: str | None = None
     """Folder of the aligned target encoder; by default the grounding's own encoder is used."""
-    plan: str | None = Field(default=None, exclude_if=lambda plan: plan is None)
-    """File of planned episodes, as written by `astra-data suggest`: starts and commands."""
 
     @model_validator(mode="after")
     def _fits_the_behavior(self) -> Self:
         if self.behavior == "policy" and self.policy is None:
             raise ValueError('behavior "policy": expected the folder of a trained policy as policy, got none')
-        if (self.behavior == "planned") != (self.plan is not None):
-            raise ValueError(
-                f'plan: expected with behavior "planned" and only then, got "{self.behavior}" and {self.plan}'
-            )
         artifacts = ("policy", "grounding", "target_encoder")
         given = [name for name in artifacts if getattr(self, name) is not None]
         if self.behavior != "policy" and given:
             raise ValueError(f'{", ".join(given)}: expected behavior "policy", got "{self.behavior}"')
-        if self.random_share and self.behavior in {"random", "stress", "planned"}:
+        if self.random_share and self.behavior in {"random", "stress"}:
             raise ValueError(f'random_share: expected the behavior of a policy, got "{self.behavior}"')
         if self.episodes * self.max_steps > MOST_STEPS:
             raise ValueError(
@@ -139,7 +130,6 @@ def collect(
         >>> drives = collect("antmaze-umaze", CollectConfig(episodes=2, max_steps=5), out=Path("drives"))
     """
     world = task_named(task)
-    plan = None if config.plan is None else RecordingPlan.load(config.plan, world)
     description = _description(world, config, seed, name)
     folder = out or home_of(description)
     with StagedWriter(
@@ -153,16 +143,13 @@ def collect(
     ) as writer:
         share = _TRAINING_SHARE if config.behavior.startswith("suboptimal") else 0.0
         training = part(progress, 0.0, share)
-        if plan is None:
-            behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
-        else:
-            behavior, metadata = PlannedCommands(plan.actions(world)), {}
+        behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
         if config.random_share:
             behavior = MixedBehavior(behavior, _random(world, config, RandomCommands), config.random_share)
         stopwatch = Stopwatch(metadata.get("spent"))
         recording = part(progress, share, 1.0)
         trained = time.perf_counter()
-        steps = _record(world, config, plan, behavior, seed, writer, num_threads, recording)
+        steps = _record(world, config, behavior, seed, writer, num_threads, recording)
         if config.least_steps:
             _keep(config.least_steps, writer)
         rate = steps / (time.perf_counter() - trained)
@@ -182,7 +169,6 @@ def _description(world: Task, config: CollectConfig, seed: int, name: str | None
     """Return what the dataset says of itself."""
     files = _saved_files(config).items()
     saved = {f"{kind}_sha256": file_digest(path) for kind, path in files if path.is_file()}
-    saved |= {"plan_sha256": file_digest(Path(config.plan))} if config.plan is not None else {}
     behaviors = config.behavior + ("-and-random" if config.random_share else "")
     return {
         "name": name or f"{world.name}-{behaviors}-seed{seed}".replace("_", "-"),
@@ -197,7 +183,6 @@ def _description(world: Task, config: CollectConfig, seed: int, name: str | None
 def _record(
     world: Task,
     config: CollectConfig,
-    plan: RecordingPlan | None,
     behavior: Behavior,
     seed: int,
     writer: StagedWriter,
@@ -205,10 +190,9 @@ def _record(
     progress: Progress,
 ) -> int:
     """Record the episodes that `writer` lacks, `num_envs` at once; return the number of their steps."""
-    episodes = config.episodes if plan is None else min(config.episodes, len(plan.episodes))
     steps = 0
-    for first in range(0, episodes, config.num_envs):
-        rows = range(first, min(first + config.num_envs, episodes))
+    for first in range(0, config.episodes, config.num_envs):
+        rows = range(first, min(first + config.num_envs, config.episodes))
         if config.least_steps and _steps_before(first, writer) >= config.least_steps:
             break
         if writer.staged.keys() >= set(rows):
@@ -219,7 +203,6 @@ def _record(
             seed=derive(batch_seed, "collect"),
             start_anywhere=config.start == "anywhere",
             num_threads=num_threads,
-            **({} if plan is None else {"starts": plan.starts[rows.start : rows.stop]}),
         )
         env.reset()
         behavior.start(rows, batch_seed)
@@ -229,9 +212,9 @@ def _record(
             behavior,
             rows,
             writer,
-            max_steps=config.max_steps if plan is None else plan.longest,
+            max_steps=config.max_steps,
             seed=seed,
-            progress=part(progress, rows.start / episodes, rows.stop / episodes),
+            progress=part(progress, rows.start / config.episodes, rows.stop / config.episodes),
         )
     return steps
 

@@ -22,24 +22,15 @@ class PlanarTarget(ABC):
         goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
     """
 
-    def __init__(
-        self,
-        objective: PlanarObjective,
-        num_envs: int,
-        *,
-        start_anywhere: bool = False,
-        starts: Floats | None = None,
-    ) -> None:
+    def __init__(self, objective: PlanarObjective, num_envs: int, *, start_anywhere: bool = False) -> None:
         """Set no goals yet.
 
         Args:
             objective: maze, goal and reward.
             num_envs: B.
             start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
-            starts: abstract states (B, X) to start at in place of drawn ones.
         """
-        self.objective, self.num_envs = objective, num_envs
-        self.start_anywhere, self.starts = start_anywhere, starts
+        self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
         self.goal = torch.zeros(num_envs, 2)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
 
@@ -59,8 +50,6 @@ class PlanarTarget(ABC):
 
     def _start(self, rows: NDArray[np.intp]) -> Floats:
         """Return the abstract states (n, X) at which the robots `rows` (n,) start."""
-        if self.starts is not None:
-            return self.starts[rows]
         objective = self.objective
         draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
         return draw(self._rng, len(rows))

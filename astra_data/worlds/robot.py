@@ -28,8 +28,7 @@ class Robot(Protocol):
 
     `astra-data deploy` is for a physical one.
 
-    `reset` may take a keyword `seed`, for what is random about it, and a keyword `start`: the abstract state
-    (X,) that a planned episode starts at.
+    `reset` may take a keyword `seed`, for what is random about it.
     """
 
     def reset(self) -> State:
@@ -62,7 +61,6 @@ class RobotEnv:
         seed: int,
         num_threads: int | None = None,
         start_anywhere: bool = False,
-        starts: NDArray[np.float64] | None = None,
     ) -> None:
         """Build B robots.
 
@@ -76,7 +74,6 @@ class RobotEnv:
             seed: of goals, and of the robots if they take one.
             num_threads: without effect.
             start_anywhere: without effect: a robot starts where it is put.
-            starts: abstract states (B, X) to start at, for robots that can be told.
         """
         self.num_envs, self.action_size = num_envs, len(commands)
         self._objective, self._column, self._commands = objective, state, commands
@@ -84,7 +81,7 @@ class RobotEnv:
         self._robots = [robot() for _ in range(num_envs)]
         takes = inspect.signature(self._robots[0].reset).parameters
         self._any_end_fails = getattr(self._robots[0], "any_end_fails", False)
-        self._takes_seed, self._starts = "seed" in takes, starts if "start" in takes else None
+        self._takes_seed = "seed" in takes
         self.goal = torch.zeros(num_envs, objective.goal_size)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self._fell = self.failed.clone()
@@ -146,7 +143,6 @@ class RobotEnv:
             episode = f"episode {self._episodes}"
             self._episodes += 1
             options: dict[str, Any] = {"seed": derive(self._seed, episode)} if self._takes_seed else {}
-            options |= {} if self._starts is None else {"start": self._starts[row]}
             with explained("reset of the robot"):
                 found = self._robots[row].reset(**options)
             self._steps[row] = 0

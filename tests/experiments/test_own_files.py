@@ -197,8 +197,6 @@ def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:
     "asked",
     [
         "deploy runs/rail --row nas --out out",
-        "suggest runs/rail --out out",
-        "suggest rail.toml --out out",
         "select runs/rail",
         "select runs/rail --trials 50",
         "view runs/rail --save out",

@@ -1,5 +1,4 @@
 import hashlib
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -396,43 +395,6 @@ def test_steps_that_take_terabytes_are_refused() -> None:
 def test_an_unknown_task_is_told(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"unknown task 'antmaze-umase': did you mean 'antmaze-umaze'\?"):
         collect("antmaze-umase", TINY, seed=0, out=tmp_path / "out", progress=silent)
-
-
-def test_planned_episodes_start_and_go_as_the_plan_says(task: str, tmp_path: Path) -> None:
-    starts, held = [[0.0, 0.0], [4.0, 4.0], [-4.0, 4.0]], [2, 3]
-    commands = [[[0.5, -1.0], [0.25, row / 4]] for row in range(3)]
-    episodes = [
-        {"start": [*start, 0.0, 0.0], "commands": both, "hold_steps": held}
-        for start, both in zip(starts, commands, strict=True)
-    ]
-    names = {"start_names": ["x", "y", "vx", "vy"], "command_names": ["vx", "vy"]}
-    plan = {"task": task, "timestep_s": 0.05, **names, "episodes": episodes}
-    (tmp_path / "plan.json").write_text(json.dumps(plan))
-    config = CollectConfig(behavior="planned", plan=str(tmp_path / "plan.json"), num_envs=2)
-    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
-    dataset = Dataset.open(tmp_path / "out")
-    assert dataset.reference == f"{task}-planned-seed0@data-1.0.0" and dataset.lengths.tolist() == [5] * 3
-    for episode, start, (first, second) in zip(dataset.episodes(), starts, commands, strict=True):
-        np.testing.assert_allclose(episode.columns[STATE][0, :2], start)
-        assert episode.columns[ACTION].tolist() == [first] * 2 + [second] * 3
-        assert episode.columns[TRUNCATED][-1]
-    config = config.model_copy(update={"episodes": 1})
-    collect(task, config, seed=0, out=tmp_path / "one", progress=silent)
-    (one,) = Dataset.open(tmp_path / "one").episodes()
-    np.testing.assert_array_equal(one.columns[ACTION], next(dataset.episodes()).columns[ACTION])
-    digest = hashlib.sha256((tmp_path / "plan.json").read_bytes()).hexdigest()
-    assert dataset.description["config"]["plan_sha256"] == digest
-
-
-def test_a_plan_and_its_behavior_come_together() -> None:
-    for given in (
-        {"behavior": "planned"},
-        {"plan": "plan.json"},
-        {"behavior": "stress", "plan": "plan.json"},
-    ):
-        with pytest.raises(ValueError, match=r'plan: expected with behavior "planned" and only then'):
-            CollectConfig(**given)  # type: ignore[arg-type]
-    assert "plan" not in CollectConfig().model_dump()
 
 
 @pytest.mark.parametrize("behavior", ["random", "stress"])

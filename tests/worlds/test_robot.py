@@ -233,23 +233,3 @@ def test_a_robot_is_not_put_anywhere() -> None:
     env = TASK.target(1, seed=0)
     with pytest.raises(BadInputError, match="data_start_share = 0"):
         env.reset_to(np.array([0]), np.zeros((1, 2)))
-
-
-def test_a_robot_that_can_be_told_starts_where_it_is_planned_to() -> None:
-    class Placed(Cart):
-        def reset(self, start: Any = (0.0,)) -> list[float]:  # noqa: ANN401
-            super().reset()
-            self.x = float(start[0])
-            return [self.x, self.speed]
-
-    starts = np.array([[0.25], [-1.0]])
-    placed, other = (
-        replace(TASK, robot=Placed).target(2, seed=0, starts=starts),
-        TASK.target(2, seed=0, starts=starts),
-    )
-    for env, expected in ((placed, [0.25, -1.0]), (other, [0.0, 0.0])):
-        env.reset()
-        assert env.state[:, 0].tolist() == expected
-    placed.step(torch.tensor([[0.0], [0.0]]))
-    placed.reset(torch.tensor([False, True]))
-    assert placed.state[:, 0].tolist() == pytest.approx([0.25 + 0.09 * 1.5, -1.0])

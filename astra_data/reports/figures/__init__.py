@@ -9,7 +9,6 @@ reliability   reliability: whether predicted failures come true
 sizes         data_efficiency: a score over the size of the dataset, and what each size covers
 open_loop     open_loop_error: how fast a simulator drifts from the target
 strips        strips: episodes in pictures, a strip per method
-suggestions   information_map: where another episode would teach most
 walks         walk_prediction: how well models predict a recorded walk, by horizon and size of the data
 """
 
@@ -21,7 +20,6 @@ from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
 from astra_data.reports.figures.sizes import Scored, data_efficiency
 from astra_data.reports.figures.strips import Strip, strips
 from astra_data.reports.figures.style import method_color, method_title, png
-from astra_data.reports.figures.suggestions import information_map
 from astra_data.reports.figures.validity import SimulatorReturns, predictive_validity
 from astra_data.reports.figures.walks import walk_prediction
 
@@ -35,7 +33,6 @@ __all__ = [
     "coverage",
     "data_efficiency",
     "dynamics_mismatch",
-    "information_map",
     "learning_curves",
     "method_color",
     "method_title",

@@ -43,7 +43,6 @@ class AntMazeEnv(PlanarTarget):
         seed: int,
         leg_scale: float = 1.0,
         start_anywhere: bool = False,
-        starts: Floats | None = None,
         controller: VelocityController | None = None,
         num_threads: int | None = None,
     ) -> None:
@@ -55,11 +54,10 @@ class AntMazeEnv(PlanarTarget):
             seed: of starts, goals and headings.
             leg_scale: factor on the legs' length.
             start_anywhere: start anywhere in the free space, not at the task's start (for data collection).
-            starts: abstract states (B, X) to start at in place of drawn ones.
             controller: the low-level controller, by default the one shipped.
             num_threads: physics threads, by default one per core.
         """
-        super().__init__(objective, num_envs, start_anywhere=start_anywhere, starts=starts)
+        super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.leg_scale = leg_scale
         self.controller = controller or VelocityController.load()
         model = ant_model(objective.maze, leg_scale=leg_scale)

@@ -33,7 +33,6 @@ class HumanoidEnv:
         *,
         seed: int,
         start_anywhere: bool = False,
-        starts: Floats | None = None,
         ranges: CommandRanges | None = None,
         num_threads: int | None = None,
     ) -> None:
@@ -44,7 +43,6 @@ class HumanoidEnv:
             num_envs: B.
             seed: of starts.
             start_anywhere: false, for there is no maze.
-            starts: without effect: a humanoid starts upright.
             ranges: joint angles of commands.
             num_threads: physics threads, by default one per core.
 

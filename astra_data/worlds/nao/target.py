@@ -54,7 +54,6 @@ class NaoEnv(PlanarTarget):
         seed: int,
         ball: bool = False,
         start_anywhere: bool = False,
-        starts: Floats | None = None,
         errors: PerceptionErrors | None = None,
         num_threads: int | None = None,
     ) -> None:
@@ -66,11 +65,10 @@ class NaoEnv(PlanarTarget):
             seed: of everything random.
             ball: whether there is a ball.
             start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
-            starts: abstract states (B, X) to start at in place of drawn ones.
             errors: of the estimates.
             num_threads: of the physics, by default one per core.
         """
-        super().__init__(objective, num_envs, start_anywhere=start_anywhere, starts=starts)
+        super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.has_ball, self.action_size = ball, objective.action_size
         self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
         errors = errors or PerceptionErrors()

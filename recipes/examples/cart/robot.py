@@ -24,11 +24,9 @@ class TrueCart:
     def __init__(self):
         self.rng = np.random.default_rng()
 
-    def reset(self, seed=None, start=None):
+    def reset(self, seed=None):
         self.rng = np.random.default_rng(seed)
         self.x, self.y, self.yaw = 0.0, 0.0, self.rng.uniform(-np.pi, np.pi)
-        if start is not None:  # of a planned episode: [x, y, heading]
-            self.x, self.y, self.yaw = start[0], start[1], np.arctan2(start[3], start[2])
         self.wheels, self.tilt = np.zeros(2), np.zeros(2)
         return self.state()
 

@@ -33,13 +33,6 @@ def test_states_have_their_columns_and_abstractions(task: str) -> None:
     assert (abstract - one.truth).abs().max() < 0.5
 
 
-def test_robots_and_balls_start_where_they_are_planned_to() -> None:
-    starts = TASKS["nao-kick"].objective.draw_starts(np.random.default_rng(5), 3)
-    one = env("nao-kick", starts=starts)
-    one.reset(torch.tensor([False, True, False]))
-    np.testing.assert_allclose(one.truth[:, [0, 1, 4, 5]], starts[:, [0, 1, 4, 5]], atol=0.02)
-
-
 def test_robots_turn_to_where_they_are_to_go_and_go_there() -> None:
     one = env(count=8, errors=NO_ERRORS)
     start = one.position
