@@ -21,8 +21,8 @@ from astra_data.core.lock import held
 NO_FSYNC = "ASTRA_DATA_NO_FSYNC"
 """Environment variable; unless it is empty, files survive a kill but perhaps not a power failure."""
 
-_HIDDEN = re.compile(r"\..+\.(tmp-\d+(-\d+)?|(safetensors|json|csv)\.partial)")
-"""Names of what is being written; the second kind is that of version 0.1."""
+_HIDDEN = re.compile(r"\..+\.tmp-\d+(-\d+)?")
+"""Names of what is being written."""
 _RESUMABLE = re.compile(r"\..+\.(staged|partial|pull-\d+\.\d+\.\d+)")
 """Names of folders with which a command goes on."""
 

@@ -59,7 +59,7 @@ def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """Return the manifest of the artifact in `folder`; None where version 0.1 made it.
+    """Return the manifest of the artifact in `folder`; None if it has none.
 
     Raises:
         BadInputError: it cannot be read.

@@ -12,7 +12,6 @@ EXTRAS = {
     "gymnasium_robotics": "sim",
     "safetensors": "sim",
     "scipy": "sim",
-    "torchrl": "train",
     "matplotlib": "report",
     "PIL": "report",
     "rliable": "report",

@@ -68,12 +68,11 @@ class Column:
         size: values per step.
         names: a name for each of them.
         meaning: one sentence.
-        astra: "unit", "frame", "role" and "mirror", each a list with one word per index. A role says how a
+        astra: "unit", "frame" and "role", each a list with one word per index. A role says how a
             rotation and shift of the planar frame act: "position" and "vector" come as consecutive (x, y)
             pairs, "heading" is an angle in rad, "quaternion" four consecutive values (w, x, y, z) that rotate
             from the body's frame to the world's, "invariant" values do not change, such as those in the
-            body's frame. Reflections act by role, too, except on invariant values: there "mirror" names the
-            value that each becomes, "-hip_2" with its sign changed; it is "" for all other roles.
+            body's frame.
 
     Example:
         >>> from astra_data import Column
@@ -105,13 +104,13 @@ class Column:
         if self.names is not None and len(self.names) != self.size:
             faults.append(f"{len(self.names)} names for {self.size} values")
         for key, words in (self.astra or {}).items():
-            if key not in ("unit", "frame", "role", "mirror"):
-                faults.append(f"astra has {key!r}, expected unit, frame, role, mirror")
+            if key not in ("unit", "frame", "role"):
+                faults.append(f"astra has {key!r}, expected unit, frame, role")
             elif len(words) != self.size:
                 faults.append(f"{len(words)} words in astra's {key} for {self.size} values")
         if unknown := sorted(set((self.astra or {}).get("role", [])) - set(ROLES)):
             faults.append(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
-        if faults := faults or [*self._role_faults(), *self._mirror_faults()]:
+        if faults := faults or self._role_faults():
             raise BadInputError(f"Column {self.name[:MOST_NAME_BYTES]!r}: {'; '.join(faults)}.")
 
     @property
@@ -134,19 +133,6 @@ class Column:
             index += width
         return groups
 
-    @property
-    def mirror(self) -> tuple[list[int], list[int]] | None:
-        """How a reflection acts on invariant values: for each index the source index, and the sign, +1 or -1.
-
-        All other values keep their index. None if there are invariant values without a mirror image.
-        """
-        astra = self.astra or {}
-        words = astra.get("mirror")
-        if words is None:
-            return None if "invariant" in astra.get("role", []) else ([*range(self.size)], [1] * self.size)
-        source = [self.labels.index(word.lstrip("-")) if word else index for index, word in enumerate(words)]
-        return source, [-1 if word.startswith("-") else 1 for word in words]
-
     def _role_faults(self) -> list[str]:
         words = (self.astra or {}).get("role", [])
         return [
@@ -154,24 +140,6 @@ class Column:
             for role, group in self.roles
             if words[group] != [role] * ROLES[role]
         ]
-
-    def _mirror_faults(self) -> list[str]:
-        words = (self.astra or {}).get("mirror")
-        if words is None:
-            return []
-        roles, names = (self.astra or {}).get("role", []), self.names or ()
-        named = zip(names, words, roles, strict=False)
-        of = {name: word for name, word, role in named if role == "invariant"}
-        faults = [
-            f"mirror {word!r} of a {role}, expected '', because its role defines it"
-            for word, role in zip(words, roles, strict=False)
-            if word and role != "invariant"
-        ]
-        for name, word in of.items():
-            other, sign = word.lstrip("-"), "-" if word.startswith("-") else ""
-            if of.get(other) != sign + name:
-                faults.append(f"mirror {word!r} of {name}, expected a value whose mirror is {sign}{name}")
-        return faults if of else [*faults, "a mirror without names and roles of invariant values"]
 
     def feature(self) -> dict[str, Any]:
         """Return the column's entry in LeRobot's `features`."""

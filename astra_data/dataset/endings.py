@@ -1,7 +1,7 @@
 """How the episodes of a dataset end, and which of their next states were made up.
 
-Version 0.1 kept a terminated last row of a log whose next state was not recorded, and let its state stand for
-it, as `terminal = "stand_still"` still does: that is no step of the robot.
+`terminal = "stand_still"` keeps a terminated last row of a log whose next state was not recorded, and lets
+its state stand for it: that is no step of the robot.
 """
 
 from collections.abc import Mapping

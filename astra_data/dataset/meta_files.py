@@ -35,7 +35,6 @@ class _Meaning(Config):
     unit: tuple[str, ...] = ()
     frame: tuple[str, ...] = ()
     role: tuple[str, ...] = ()
-    mirror: tuple[str, ...] = ()
 
 
 class _Feature(_Open):

@@ -30,7 +30,7 @@ def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:
 
 
 def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
-    """Return the episode in the file at `path`; those of version 0.1 have no digests.
+    """Return the episode in the file at `path`.
 
     Raises:
         CorruptDatasetError: the file cannot be read, or has other values than were written.
@@ -42,7 +42,7 @@ def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
             table = file.read_all()
             facts = json.loads(table.schema.metadata[b"episode"])
             values = {c.name: to_numpy(table.column(c.name), c.size, c.dtype) for c in columns}
-            uid, metadata, digests = facts["uid"], facts["metadata"], facts.get("digests", {})
+            uid, metadata, digests = facts["uid"], facts["metadata"], facts["digests"]
             altered = [name for name, digest in digests.items() if digest_of(values[name]) != digest]
     except (OSError, pa.ArrowException, AttributeError, KeyError, TypeError, ValueError) as error:
         raise CorruptDatasetError(

@@ -1,8 +1,7 @@
 """The condition of a run's artifacts: whether each is finished, missing, damaged or stale, and why.
 
 An artifact is damaged if it is not what its manifest says, or a dataset that cannot be opened; it is stale if
-it was made from something else than what lies there now, or was made or begun with other settings. Version
-0.1 wrote no manifests: what it finished counts as finished, if its result is there.
+it was made from something else than what lies there now, or was made or begun with other settings.
 """
 
 from collections.abc import Callable, Collection
@@ -11,9 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from astra_data.core.digest import file_digest
 from astra_data.core.errors import AstraDataError
-from astra_data.core.manifest import Manifest, read_manifest
+from astra_data.core.manifest import MANIFEST, Manifest, read_manifest
 from astra_data.core.naming import stage_of_key
 from astra_data.dataset.lineage import hashes, lineage
 from astra_data.dataset.meta_files import read_description
@@ -67,7 +65,7 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
 
 
 def examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Manifest | None]:
-    """Return what is wrong with the files of the artifact `key`, and its manifest if it has one.
+    """Return what is wrong with the files of the artifact `key`, and its manifest; of datasets, None.
 
     Their sizes are compared or, with `verify`, their bytes. Of datasets, it is what the metadata and the
     footers of the files show or, with `verify`, all values.
@@ -81,8 +79,7 @@ def examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Ma
         elif manifest := read_manifest(folder):
             faults = manifest.faults(folder, verify=verify)
         else:
-            whole = stage.result is None or _has_bytes(folder / stage.result)
-            faults = [] if whole else [f"{stage.result} is missing or empty"]
+            faults = [f"{MANIFEST} is missing"]
     except AstraDataError as error:
         return str(error), None
     return "; ".join(faults), manifest
@@ -130,10 +127,6 @@ def can_be_made_again(key: str, experiment: Experiment) -> bool:
     with suppress(AstraDataError):
         return bool(read_description(experiment.place(key))["stage"] == stage.name)
     return False
-
-
-def _has_bytes(path: Path) -> bool:
-    return path.is_file() and path.stat().st_size > 0
 
 
 def _stage(key: str) -> Stage:
@@ -190,16 +183,14 @@ def _digest(key: str, experiment: Experiment) -> str | None:
     with suppress(AstraDataError, OSError, KeyError):
         if stage.makes_dataset:
             return str(read_description(folder)["content_hash"])
-        manifest, name = read_manifest(folder), str(stage.result)
-        return manifest.files[name][1] if manifest else file_digest(folder / name)
+        manifest = read_manifest(folder)
+        return manifest.files[str(stage.result)][1] if manifest else None
     return None
 
 
 def _remark(key: str, experiment: Experiment, manifest: Manifest | None) -> str:
     """Return what is unusual about a finished artifact with this manifest."""
-    if _stage(key).makes_dataset:
-        return ""
     if manifest is None:
-        return "no manifest (made by 0.1)"
+        return ""
     foreign = manifest.foreign(experiment.place(key))
     return f"not of it: {', '.join(foreign)}" if foreign else ""

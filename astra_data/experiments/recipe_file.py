@@ -1,12 +1,9 @@
-"""The file of a recipe: its tables, with keys that were renamed since under their names of today.
+"""The file of a recipe: its tables.
 
 A run writes down the settings that it is made with, in recipe.json.
 """
 
 import os
-import sys
-from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,6 @@ from astra_data.core.naming import RECORD
 from astra_data.dataset.format import INFO_PATH
 from astra_data.exchange.mapping import refuse_mapping
 from astra_data.experiments.own_methods import looked_up
-from astra_data.training.build_env import RENAMED
 from astra_data.worlds.own_code import place_beside
 
 
@@ -52,9 +48,9 @@ def read_tables(path: Path) -> dict[str, Any]:
     """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it.
 
     Raises:
-        RecipeError: it cannot be read, is a recipe of `gap`, or has a key by two names.
+        RecipeError: it cannot be read, or is a recipe of `gap`.
     """
-    tables = with_current_keys(tables_of(path), path)
+    tables = tables_of(path)
     if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
         raise RecipeError(
             f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
@@ -99,29 +95,3 @@ def _refuse_folder(path: Path) -> None:
     if kind:
         made_by = f", {run.name}.toml" if run else ""
         raise RecipeError(f"{path} is {kind}: expected the recipe that made it{made_by}")
-
-
-def with_current_keys(tables: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return the `tables` of the recipe at `path` with renamed keys under their current names.
-
-    A message on standard error says so, once for each key.
-
-    Raises:
-        RecipeError: a table has a key by both names.
-    """
-    current = dict(tables)
-    for name, table in tables.items():
-        for old, new in RENAMED.items():
-            if isinstance(table, dict) and old in table:
-                if new in table:
-                    raise RecipeError(
-                        f"{path}: {name} has both {old} and {new}, its current name: remove {old}"
-                    )
-                current[name] = {new if key == old else key: value for key, value in current[name].items()}
-                _say(f"{path}: {name}.{old} is now called {new}: please rename it")
-    return current
-
-
-@cache
-def _say(message: str) -> None:
-    print(message, file=sys.stderr)

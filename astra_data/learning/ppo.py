@@ -1,4 +1,4 @@
-"""Proximal policy optimization (Schulman et al. 2017) on a batched environment, with TorchRL's GAE.
+"""Proximal policy optimization (Schulman et al. 2017) on a batched environment.
 
 One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are whole
 rollouts of some environments, so the same code trains policies with and without memory.
@@ -132,8 +132,6 @@ class Ppo(Learner):
 
     @torch.no_grad()
     def _collect(self) -> dict[str, Tensor]:
-        from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
-
         acting, policy = self.acting, self.policy
         columns: dict[str, list[Tensor]] = {}
         first_hidden = acting.hidden
@@ -170,10 +168,8 @@ class Ppo(Learner):
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
         parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
-        advantage, target = vec_generalized_advantage_estimate(
-            self.config.discount, self.config.gae_lambda, *(part.unsqueeze(-1) for part in parts)
-        )
-        advantage, target = advantage.squeeze(-1), target.squeeze(-1)
+        advantage = generalized_advantages(*parts, self.config.discount, self.config.gae_lambda)
+        target = advantage + rollout["value"]
         return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
 
     def _scaled(self, taken: Taken) -> Tensor:
@@ -220,3 +216,31 @@ class Ppo(Learner):
         if policy.shape.clips_mean:
             loss = loss + _PULL * (output.abs() - 1.0).clamp_min(0.0).square().mean()
         return loss, -moved.mean()
+
+
+def generalized_advantages(
+    value: Tensor,
+    following: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor,
+    discount: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Return the generalized advantage estimates (B, T) of Schulman et al. 2016, eq. 16.
+
+    Args:
+        value: of the observation before each step, (B, T).
+        following: of the one after it, (B, T); without effect where a step terminates.
+        reward: (B, T).
+        done: whether the episode ends with the step, (B, T) bool.
+        terminated: whether nothing follows the step, (B, T) bool.
+        discount: per step.
+        gae_lambda: λ.
+    """
+    error = reward + discount * following * ~terminated - value
+    kept = discount * gae_lambda * ~done
+    advantage, later = torch.empty_like(error), torch.zeros_like(error[:, 0])
+    for step in reversed(range(error.shape[1])):
+        later = advantage[:, step] = error[:, step] + kept[:, step] * later
+    return advantage

@@ -66,7 +66,7 @@ class Learning(Section):
     """One seed's training."""
 
     steps: list[float]
-    score: list[NullableFloat] = Field(validation_alias=AliasChoices("score", "success"))
+    score: list[NullableFloat]
     """Headline score of the training episodes that ended, from all start states."""
 
 

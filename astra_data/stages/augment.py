@@ -59,8 +59,6 @@ class AugmentConfig(Config):
     """
     translations: bool = True
     """Move copies anywhere in the maze; otherwise a copy starts where the original did."""
-    reflections: bool = Field(default=False, deprecated="copies are not mirrored")
-    """Always false; kept because the random seeds of copies depend on it."""
     held_out_share: Annotated[float, Field(ge=0, lt=1)] = 0.1
     """Fraction of the episodes to hold out first, at least one episode unless it is 0."""
     keep_originals: bool = True
@@ -87,13 +85,6 @@ class AugmentConfig(Config):
         if not translations and info.data.get("rotations") == "none":
             raise ValueError("expected rotations or translations, got neither")
         return translations
-
-    @field_validator("reflections")
-    @classmethod
-    def _is_no_longer_offered(cls, reflections: bool) -> bool:
-        if reflections:
-            raise ValueError("expected false, since copies are no longer mirrored: leave the key out")
-        return reflections
 
 
 def augment(

@@ -250,7 +250,7 @@ def _behavior(
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         return _random(task, config, commands), {}
     if config.behavior.startswith("suboptimal"):
-        from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - TorchRL is slow to import
+        from astra_data.training.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - slow to import
 
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)

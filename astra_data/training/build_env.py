@@ -1,12 +1,12 @@
 """Build the environment that a policy is trained in: from a grounding, switches and the data."""
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import scipy
 import torch
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from astra_data.core.config import Config, Count, NotNegative, Positive, Share
@@ -36,8 +36,6 @@ class EnvConfig(Config):
     recorded episodes alone, none has.
     """
 
-    model_config = ConfigDict(serialize_by_alias=True)
-
     reward: RewardSource | None = None
     """Source of the reward: "abstract", "predicted" or "blend"; by default that of the method."""
     topple: bool = False
@@ -52,7 +50,7 @@ class EnvConfig(Config):
     """Subtracted from the reward of a step to a place without data; less is subtracted where data is thin."""
     support_density: Positive = 0.3
     """Data is thin where its density is below this fraction of the free space's median density."""
-    disagreement_penalty: NotNegative = Field(default=0.0, serialization_alias="doubt_penalty")
+    disagreement_penalty: NotNegative = 0.0
     """Subtracted from the reward of a step, multiplied by how much the correction's heads (`[ground]
     correction_heads`) disagree beyond the usual; with `keep_member`, by how much a row's member disagrees
     with the model."""
@@ -62,7 +60,7 @@ class EnvConfig(Config):
     change_penalty: NotNegative = Field(default=0.0, exclude_if=lambda weight: not weight)
     """Subtracted from the reward of a step, multiplied by the squared change of the command; not ramped up.
     Robots fall and lose time when commands jump."""
-    command_limit: Positive = Field(default=NO_LIMIT, serialization_alias="command_limit_m_s")
+    command_limit: Positive = NO_LIMIT
     """Shorten commands longer than this, in training and in the target, as a multiple of the largest along an
     axis (1 m/s for the ant); by default no command is shortened."""
     ramp: Share = 0.0
@@ -76,14 +74,6 @@ class EnvConfig(Config):
     episode_steps: Count | None = None
     """Steps after which simulated episodes are truncated and their values bootstrapped; by default the task's
     horizon. In short episodes from recorded states, errors have no time to grow (Janner et al. 2019)."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _rename_old_keys(cls, values: Any) -> Any:  # noqa: ANN401 - checked next
-        if not isinstance(values, dict) or not RENAMED.keys() & values.keys():
-            return values
-        current = {key: value for key, value in values.items() if key not in RENAMED}
-        return {new: values[old] for old, new in RENAMED.items() if old in values} | current
 
     @model_validator(mode="after")
     def _has_a_ramp(self) -> Self:
@@ -105,14 +95,6 @@ class EnvConfig(Config):
     def limits_commands(self) -> bool:
         """Whether commands are shortened."""
         return self.command_limit != NO_LIMIT
-
-
-RENAMED = {
-    field.serialization_alias: name
-    for name, field in EnvConfig.model_fields.items()
-    if field.serialization_alias
-}
-"""Keys as they were up to 0.1, and as they are now. Recipes may have the old ones; files always do."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ class ColumnEntry(NamedTuple):
     unit: str
     frame: str
     role: str
-    mirror: str = ""
 
 
 PLANAR_STATE = (
@@ -32,11 +31,9 @@ PLANAR_GOAL = (
 
 
 def column(name: str, entries: Sequence[ColumnEntry], meaning: str) -> Column:
-    """Return the column `name` with `entries`; it has mirror images only if one of them has."""
-    names, units, frames, roles, mirror = zip(*entries, strict=True)
+    """Return the column `name` with `entries`."""
+    names, units, frames, roles = zip(*entries, strict=True)
     astra = {"unit": [*units], "frame": [*frames], "role": [*roles]}
-    if any(mirror):
-        astra["mirror"] = [*mirror]
     return Column(name, size=len(entries), names=names, meaning=meaning, astra=astra)
 
 
@@ -57,30 +54,19 @@ def repeated_names(column: Column | None) -> list[str]:
     return sorted({name for name in names if names.count(name) > 1})
 
 
-def free_body(joints: Sequence[str], mirrored: Sequence[str] = ()) -> list[ColumnEntry]:
-    """Return the entries of MuJoCo's qpos, then qvel, of a free body with hinge joints.
-
-    Args:
-        joints: their names, in the model's order.
-        mirrored: the joint that each becomes in the mirror image, "-hip_2" with its sign changed; by default
-            there are no mirror images.
-    """
-    paired = [*zip(joints, mirrored or joints, strict=True)]
-    entries = [
+def free_body(joints: Sequence[str]) -> list[ColumnEntry]:
+    """Return the entries of MuJoCo's qpos, then qvel, of a free body with hinge `joints`, in their order."""
+    return [
         ColumnEntry("x", "m", "world", "position"),
         ColumnEntry("y", "m", "world", "position"),
-        ColumnEntry("z", "m", "world", "invariant", "z"),
+        ColumnEntry("z", "m", "world", "invariant"),
         *(ColumnEntry(name, "1", "world", "quaternion") for name in ("qw", "qx", "qy", "qz")),
-        *(ColumnEntry(joint, "rad", "joint", "invariant", mirror) for joint, mirror in paired),
+        *(ColumnEntry(joint, "rad", "joint", "invariant") for joint in joints),
         ColumnEntry("vx", "m/s", "world", "vector"),
         ColumnEntry("vy", "m/s", "world", "vector"),
-        ColumnEntry("vz", "m/s", "world", "invariant", "vz"),
-        ColumnEntry("wx", "rad/s", "body", "invariant", "-wx"),
-        ColumnEntry("wy", "rad/s", "body", "invariant", "wy"),
-        ColumnEntry("wz", "rad/s", "body", "invariant", "-wz"),
-        *(
-            ColumnEntry(f"{joint}_rate", "rad/s", "joint", "invariant", f"{mirror}_rate")
-            for joint, mirror in paired
-        ),
+        ColumnEntry("vz", "m/s", "world", "invariant"),
+        ColumnEntry("wx", "rad/s", "body", "invariant"),
+        ColumnEntry("wy", "rad/s", "body", "invariant"),
+        ColumnEntry("wz", "rad/s", "body", "invariant"),
+        *(ColumnEntry(f"{joint}_rate", "rad/s", "joint", "invariant") for joint in joints),
     ]
-    return entries if mirrored else [entry._replace(mirror="") for entry in entries]

@@ -66,7 +66,6 @@ def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
             ["collect", "humanoid-walker2d", "--clearance-m", "0.5", "--start", "task"],
             r"expected a task in a maze",
         ),
-        (["collect", "antmaze-umaze", "--plan", "none.json"], r"none.json cannot be read as a plan: No such"),
         (["collect", "antmaze-umase"], r"did you mean 'antmaze-umaze'"),
         (
             ["pair", "recipe.toml", "--simulator", "antmaze-umaze"],

@@ -90,7 +90,6 @@ def test_only_the_folders_of_dead_processes_are_removed(tmp_path: Path) -> None:
 def test_what_a_killed_export_left_is_swept_by_the_next(tmp_path: Path) -> None:
     (tmp_path / ".out.hdf5.tmp-1").mkdir()
     (tmp_path / ".out.hdf5.tmp-1" / "out.hdf5").touch()
-    (tmp_path / ".out.hdf5.tmp-2").touch()  # as version 0.1 named it
     with atomic_file(tmp_path / "out.hdf5") as path:
         path.write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["out.hdf5"]

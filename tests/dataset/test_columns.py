@@ -100,24 +100,12 @@ def test_an_empty_episode_is_refused(columns: dict[str, Array], part: str) -> No
     [
         ({"role": ["position", "vector", "vector"]}, "role position at index 0, expected 2 indices"),
         ({"role": ["heading", "heading", "position"]}, "role position at index 2, expected 2 indices"),
-        ({"role": ["invariant"] * 3, "mirror": ["b", "-a", "c"]}, "mirror 'b' of a, expected a value whose"),
-        ({"role": ["invariant"] * 3, "mirror": ["a", "b", "d"]}, "mirror 'd' of c, expected a value whose"),
-        ({"role": ["invariant", "heading", "heading"], "mirror": ["a", "-b", ""]}, "'-b' of a heading"),
-        ({"role": ["heading"] * 3, "mirror": [""] * 3}, "without names and roles of invariant values"),
-        ({"mirror": ["a", "b", "c"]}, "without names and roles of invariant values"),
+        ({"mirror": ["a", "b", "c"]}, "astra has 'mirror', expected unit, frame, role"),
     ],
 )
-def test_roles_and_mirror_images_must_make_sense(astra: dict[str, list[str]], fault: str) -> None:
+def test_roles_must_make_sense(astra: dict[str, list[str]], fault: str) -> None:
     with pytest.raises(BadInputError, match=fault):
         Column("pose", size=3, names=("a", "b", "c"), astra=astra)
-
-
-def test_a_mirror_image_is_a_swap_with_signs() -> None:
-    role = ["heading", "invariant", "invariant"]
-    column = Column("pose", size=3, names=("a", "b", "c"), astra={"role": role, "mirror": ["", "-c", "-b"]})
-    assert column.mirror == ([0, 2, 1], [1, -1, -1])
-    assert Column("pose", size=3, astra={"role": role}).mirror is None
-    assert Column("pose", size=3, astra={"role": ["heading"] * 3}).mirror == ([0, 1, 2], [1, 1, 1])
 
 
 @pytest.mark.parametrize(

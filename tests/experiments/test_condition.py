@@ -202,22 +202,9 @@ def test_a_file_that_somebody_added_is_a_remark(recipe: Path, folder: Path) -> N
     assert (folder / TRAIN / "notes.txt").exists()
 
 
-def test_artifacts_without_manifests_are_finished_as_in_0_1(recipe: Path, folder: Path) -> None:
-    for path in folder.rglob(MANIFEST):
-        path.unlink()
-    remark = ("finished", "no manifest (made by 0.1)")
-    made = {GROUND, TRAIN, ALIGN, EVALUATE, *PLUS, "report"}
-    assert states(recipe) == dict.fromkeys(made, remark)
-    run(recipe, root=recipe.parent, jobs=1)
-    assert not (folder / "set_aside").exists()
-    (folder / TRAIN / "policy.safetensors").write_bytes(b"")
-    assert states(recipe)[TRAIN] == ("damaged", "policy.safetensors is missing or empty")
-    run(recipe, root=recipe.parent, jobs=1)
-    assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}"]
-    assert TRAIN not in states(recipe)
-
-
-def test_a_damaged_manifest_is_damage(recipe: Path, folder: Path) -> None:
+def test_a_missing_or_damaged_manifest_is_damage(recipe: Path, folder: Path) -> None:
+    (folder / ALIGN / MANIFEST).unlink()
+    assert states(recipe)[ALIGN] == ("damaged", "manifest.json is missing")
     (folder / TRAIN / MANIFEST).write_text("{")
     state, why = states(recipe)[TRAIN]
     assert state == "damaged" and why.startswith("manifest.json cannot be read")

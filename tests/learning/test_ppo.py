@@ -4,6 +4,7 @@ from functools import partial
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from kept_states import came_back
@@ -12,7 +13,7 @@ from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall
 
 from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.learning.ppo import Ppo, PpoConfig
+from astra_data.learning.ppo import Ppo, PpoConfig, generalized_advantages
 from astra_data.worlds.batched import BatchedEnv
 
 
@@ -89,6 +90,23 @@ def test_running_out_of_time_bootstraps_and_ending_does_not(terminates_after: fl
     with torch.no_grad():
         value = float(learner.policy.value(torch.ones(1, 1)))
     assert value == pytest.approx(expected, rel=0.12)
+
+
+def test_generalized_advantages_are_discounted_sums_of_errors_up_to_the_episodes_end() -> None:
+    rng = np.random.default_rng(0)
+    value, following, reward = rng.normal(size=(3, 4, 30))
+    done, terminated = rng.random((4, 30)) < 0.2, rng.random((4, 30)) < 0.5
+    terminated &= done
+    expected = np.zeros((4, 30))
+    for row, first in np.ndindex(4, 30):
+        for step in range(first, 30):
+            error = reward[row, step] - value[row, step]
+            error += 0 if terminated[row, step] else 0.9 * following[row, step]
+            expected[row, first] += (0.9 * 0.8) ** (step - first) * error
+            if done[row, step]:
+                break
+    parts = map(torch.from_numpy, (value, following, reward, done, terminated))
+    np.testing.assert_allclose(generalized_advantages(*parts, 0.9, 0.8), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("memory", [0, 8])

@@ -9,8 +9,7 @@ import pytest
 import torch
 from small_run import TASK, short_task
 
-from astra_data.core.config import validated
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
@@ -307,14 +306,6 @@ def test_copies_differ_from_what_they_are_of() -> None:
         AugmentConfig(rotations="none", translations=False)
     with pytest.raises(ValueError, match="expected either copies or episodes, got both"):
         AugmentConfig(copies=2, episodes=30)
-
-
-def test_mirror_images_are_no_longer_made() -> None:
-    assert validated({"reflections": False}, AugmentConfig, "[augment]") == AugmentConfig()
-    with pytest.raises(
-        RecipeError, match=r"augment\]: reflections: expected false, since copies are no longer mirrored"
-    ):
-        validated({"reflections": True}, AugmentConfig, "[augment]")
 
 
 @pytest.mark.parametrize(

@@ -110,9 +110,7 @@ def test_failures_are_foreseen_where_rewards_or_ends_depend_on_them() -> None:
     assert EnvConfig(topple=True).foresees
 
 
-def test_settings_have_their_old_names_as_well_and_penalties_grow_as_they_say() -> None:
-    assert EnvConfig.model_validate({"doubt_penalty": 0.5}).disagreement_penalty == 0.5
-    assert EnvConfig.model_validate({"command_limit_m_s": 0.5, "ramp": 0.1}).command_limit == 0.5
+def test_penalties_grow_as_settings_say() -> None:
     assert EnvConfig(ramp=0.4, ramp_while=0.5).penalty_ramp == Ramp(0.4, 0.5)
     with pytest.raises(ValidationError, match="ramp_while: expected a ramp"):
         EnvConfig(ramp_while=0.5)

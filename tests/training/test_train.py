@@ -272,7 +272,7 @@ def test_switches_reach_the_environment_and_the_policy_file(tmp_path: Path) -> N
     assert env.simulator.scatter is simulation.scatter
     assert (
         simulation.world.model_dump().items()
-        >= {"topple": True, "doubt_penalty": 0.3, "data_start_share": 0.6}.items()
+        >= {"topple": True, "disagreement_penalty": 0.3, "data_start_share": 0.6}.items()
     )
 
 

@@ -1,7 +1,6 @@
 """AntMaze: Gymnasium's ant in a maze, and a planar point mass as its abstract simulator (Section V-A)."""
 
 from functools import partial
-from typing import get_args
 
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
 from astra_data.worlds.ant.abstraction import ant_beyond_point_mass, ant_to_point_mass
@@ -9,32 +8,29 @@ from astra_data.worlds.ant.body import INTEGRATOR, TIMESTEP_S, WALL_REACH_M
 from astra_data.worlds.ant.target import AntMazeEnv
 from astra_data.worlds.column_entries import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, column, free_body
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
-from astra_data.worlds.plane.navigation import Navigation, RewardKind
+from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.plane.states import VariedPlanar
 from astra_data.worlds.task import Plane, Task, Varied
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
 _JOINTS = tuple(f"{joint}_{leg}" for leg in range(1, 5) for joint in ("hip", "ankle"))
-# Left and right swap: legs 1 (front left) and 4, legs 2 (back left) and 3. The hips' axes are vertical, so
-# they turn the other way; the ankles' axes are each other's mirror image.
-_MIRRORED_JOINTS = [joint for leg in (4, 3, 2, 1) for joint in (f"-hip_{leg}", f"ankle_{leg}")]
 _COMMAND = (
     ColumnEntry("command_vx", "m/s", "world", "vector"),
     ColumnEntry("command_vy", "m/s", "world", "vector"),
 )
 
 
-def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
+def _antmaze(name: str, maze: Maze, horizon: int) -> Task:
     return Task(
-        name=name if reward == "geodesic" else f"{name}-{reward}",
+        name=name,
         instruction="walk through the maze to the goal",
-        objective=Navigation(maze, reward, horizon=horizon),
+        objective=Navigation(maze, horizon=horizon),
         make_target=AntMazeEnv,
         make_simulator=partial(PointMass, maze, timestep_s=TIMESTEP_S),
         abstraction=ant_to_point_mass,
         beyond=ant_beyond_point_mass,
-        state=column(STATE, free_body(_JOINTS, _MIRRORED_JOINTS), "qpos (15) and qvel (14) of the ant"),
+        state=column(STATE, free_body(_JOINTS), "qpos (15) and qvel (14) of the ant"),
         goal=column(GOAL, PLANAR_GOAL, "where to go"),
         action=column(ACTION, _COMMAND, "commanded planar velocity, ±1 m/s per axis"),
         commands={"vx": (-1.0, 1.0), "vy": (-1.0, 1.0)},
@@ -48,11 +44,4 @@ def _antmaze(name: str, maze: Maze, horizon: int, reward: RewardKind) -> Task:
     )
 
 
-_MAZES: tuple[tuple[str, Maze, int], ...] = (
-    ("antmaze-umaze", U_MAZE, 700),
-    ("antmaze-long", LONG_MAZE, 1000),
-)
-
-ANTMAZE_TASKS = tuple(_antmaze(*maze, reward) for maze in _MAZES for reward in get_args(RewardKind))
-"""A maze's plain name has the reward of progress along its corridors; `-euclidean` and `-sparse` follow the
-name of the same task with another reward."""
+ANTMAZE_TASKS = (_antmaze("antmaze-umaze", U_MAZE, 700), _antmaze("antmaze-long", LONG_MAZE, 1000))

@@ -42,12 +42,6 @@ _QUANTITIES = {"position_m": (0, 1), "velocity_m_s": (2, 3)}
 _BALL_QUANTITIES = {"ball_position_m": (4, 5), "ball_velocity_m_s": (6, 7)}
 
 
-def _mirrored(joint: str) -> str:
-    """Return the joint of a joint's mirror image: sides swap, and roll angles change sign."""
-    other = {"L": "R", "R": "L"}.get(joint[0], joint[0]) + joint[1:]
-    return f"-{other}" if joint.endswith("Roll") else other
-
-
 _STATE = [
     ColumnEntry("x", "m", "world", "position"),
     ColumnEntry("y", "m", "world", "position"),
@@ -55,19 +49,19 @@ _STATE = [
     ColumnEntry("sin_heading", "1", "world", "vector"),
     ColumnEntry("vx", "m/s", "world", "vector"),
     ColumnEntry("vy", "m/s", "world", "vector"),
-    *(ColumnEntry(joint, "rad", "joint", "invariant", _mirrored(joint)) for joint in JOINTS),
-    ColumnEntry("gyro_x", "rad/s", "body", "invariant", "-gyro_x"),
-    ColumnEntry("gyro_y", "rad/s", "body", "invariant", "gyro_y"),
-    ColumnEntry("gyro_z", "rad/s", "body", "invariant", "-gyro_z"),
-    ColumnEntry("roll", "rad", "body", "invariant", "-roll"),
-    ColumnEntry("pitch", "rad", "body", "invariant", "pitch"),
-    ColumnEntry("load_left", "50 N", "body", "invariant", "load_right"),
-    ColumnEntry("load_right", "50 N", "body", "invariant", "load_left"),
-    ColumnEntry("step_sine", "1", "body", "invariant", "-step_sine"),
-    ColumnEntry("step_cosine", "1", "body", "invariant", "-step_cosine"),
-    ColumnEntry("planned_forward", "m/s", "body", "invariant", "planned_forward"),
-    ColumnEntry("planned_left", "m/s", "body", "invariant", "-planned_left"),
-    ColumnEntry("planned_turn", "rad/s", "body", "invariant", "-planned_turn"),
+    *(ColumnEntry(joint, "rad", "joint", "invariant") for joint in JOINTS),
+    ColumnEntry("gyro_x", "rad/s", "body", "invariant"),
+    ColumnEntry("gyro_y", "rad/s", "body", "invariant"),
+    ColumnEntry("gyro_z", "rad/s", "body", "invariant"),
+    ColumnEntry("roll", "rad", "body", "invariant"),
+    ColumnEntry("pitch", "rad", "body", "invariant"),
+    ColumnEntry("load_left", "50 N", "body", "invariant"),
+    ColumnEntry("load_right", "50 N", "body", "invariant"),
+    ColumnEntry("step_sine", "1", "body", "invariant"),
+    ColumnEntry("step_cosine", "1", "body", "invariant"),
+    ColumnEntry("planned_forward", "m/s", "body", "invariant"),
+    ColumnEntry("planned_left", "m/s", "body", "invariant"),
+    ColumnEntry("planned_turn", "rad/s", "body", "invariant"),
 ]
 _BALL = [
     ColumnEntry("ball_x", "m", "world", "position"),
@@ -75,12 +69,12 @@ _BALL = [
     ColumnEntry("ball_vx", "m/s", "world", "vector"),
     ColumnEntry("ball_vy", "m/s", "world", "vector"),
 ]
-_UNSEEN = ColumnEntry("ball_unseen", "s", "body", "invariant", "ball_unseen")
+_UNSEEN = ColumnEntry("ball_unseen", "s", "body", "invariant")
 _COMMAND = [
     ColumnEntry("command_vx", "0.25 m/s", "world", "vector"),
     ColumnEntry("command_vy", "0.25 m/s", "world", "vector"),
 ]
-_KICK = ColumnEntry("kick", "1", "body", "invariant", "kick")
+_KICK = ColumnEntry("kick", "1", "body", "invariant")
 
 
 def _columns(*, ball: bool) -> dict[str, Any]:

@@ -1,12 +1,11 @@
 """The navigation objective: reach a goal in a maze.
 
 The paper prints no reward. Ours: progress along the shortest free path to the goal, +10 for reaching it, and
-a negative reward for a failure; sparse and Euclidean rewards are options.
+a negative reward for a failure.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import torch
@@ -17,16 +16,12 @@ from astra_data.core.errors import BadInputError
 from astra_data.worlds.objective import PlanarObjective
 from astra_data.worlds.plane.free_space import GoalDistance
 
-RewardKind = Literal["geodesic", "euclidean", "sparse"]
-
 
 @dataclass(frozen=True)
 class Navigation(PlanarObjective):
     """Reach the goal of `maze` within `horizon` steps.
 
     Attributes:
-        reward_kind: "geodesic" (progress along the corridors), "euclidean" (along the straight line) or
-            "sparse" (none), each plus the bonuses of success and failure.
         meter_reward: for a meter of progress.
         path_clearance_m: clearance from walls of the shortest free path.
         success_radius_m: distance from the goal within which the episode ends in success.
@@ -37,7 +32,6 @@ class Navigation(PlanarObjective):
         start_offsets_m: offsets of the usual starts from the center of the start cell, drawn uniformly.
     """
 
-    reward_kind: RewardKind = "geodesic"
     meter_reward: float = 1.0
     path_clearance_m: float = 0.0
     position_waves: int = 0
@@ -120,13 +114,8 @@ class Navigation(PlanarObjective):
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
         """Return the progress in m (B,) toward `goal` (B, 2) from `before` to `after`, (B, 2 or more)."""
-        before, after = before[:, :2], after[:, :2]
-        if self.reward_kind == "geodesic":
-            distance = self._goal_distance_on(goal.device)(torch.stack([before, after]), goal)
-            return distance[0] - distance[1]
-        if self.reward_kind == "euclidean":
-            return torch.pairwise_distance(before, goal, eps=0) - torch.pairwise_distance(after, goal, eps=0)
-        return torch.zeros(len(goal), device=goal.device)
+        distance = self._goal_distance_on(goal.device)(torch.stack([before[:, :2], after[:, :2]]), goal)
+        return distance[0] - distance[1]
 
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
         """Return the reward (B,) of a step between states that begin with the position, (B, 2 or more)."""

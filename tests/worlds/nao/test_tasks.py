@@ -1,13 +1,9 @@
 import numpy as np
 import pytest
 import torch
-from nao_values import NO_ERRORS
 
 from astra_data.dataset.columns import ACTION, GOAL, STATE
-from astra_data.worlds.nao.kinematics import JOINTS, foot_poses
-from astra_data.worlds.nao.target import NaoEnv
 from astra_data.worlds.nao.tasks import KICK_RANGES, NAO_TASKS
-from astra_data.worlds.nao.traits import IDENTICAL
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.variation import WIDE_RANGES
@@ -61,47 +57,6 @@ def test_abstract_states_keep_the_entries_of_their_names(task: object) -> None:
         unit = "m/s" if name.endswith("m_s") else "m"
         assert [words["unit"][entry] for entry in entries] == [unit] * 2
         assert all(abstract.names[entry].startswith("ball") == name.startswith("ball") for entry in entries)
-
-
-def test_mirror_images_of_the_joints_are_those_of_the_legs() -> None:
-    state = NAVIGATION.state_columns[0]
-    assert state.mirror is not None and state.names is not None
-    source, sign = state.mirror
-    first = state.names.index(JOINTS[0])
-    rng = np.random.default_rng(0)
-    values = np.zeros((5, state.size))
-    values[:, first : first + 11] = rng.uniform(-0.3, 0.3, (5, 11))
-    mirrored = (values[:, source] * sign)[:, first : first + 11]
-    left, right = np.moveaxis(foot_poses(values[:, first : first + 11]), -2, 0)
-    flip = [1, -1, 1, -1, 1, -1]  # y, roll and yaw of a pose
-    expected = np.stack([right * flip, left * flip], axis=-2)
-    np.testing.assert_allclose(foot_poses(mirrored), expected, atol=1e-12)
-    assert (np.array(source)[source] == np.arange(state.size)).all()
-
-
-def test_a_robot_that_is_sent_the_other_way_is_the_mirror_image_that_columns_record() -> None:
-    env = NAVIGATION.target(2, seed=0, num_threads=1, errors=NO_ERRORS)
-    assert isinstance(env, NaoEnv)
-    env.robots.spread = IDENTICAL
-    start = env.reset().double().numpy()
-    start[:, 2:4] = [1.0, 0.0]
-    env.reset_to(np.arange(2), start[[0, 0]])
-    column = NAVIGATION.state_columns[0]
-    assert column.mirror is not None
-    source, sign = column.mirror
-    numbers = np.arange(column.size)
-    own = np.concatenate([numbers[group] for role, group in column.roles if role == "invariant"])
-    seen = []
-    for _ in range(8):
-        env.robots.step(np.array([[0.1, 0.08, 0.3], [0.1, -0.08, -0.3]]))
-        seen.append(env.state.double().numpy())
-    states = np.array(seen)
-    images = (states[:, 1, source] * sign)[:, own]
-    np.testing.assert_allclose(images, states[:, 0, own], atol=5e-3)
-    # No entry is so small that another sign or another side would do as well.
-    is_kept = (np.array(source) == numbers) & (np.array(sign) > 0)
-    told = np.where(is_kept, np.abs(states).max(axis=(0, 1)), np.abs(states[:, 1] - states[:, 0]).max(axis=0))
-    assert (told[own] > 0.02).all()
 
 
 def test_kicking_varies_what_walking_does_and_the_ball() -> None:

@@ -2,7 +2,6 @@ from copy import copy
 from dataclasses import replace
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -93,8 +92,6 @@ def test_half_a_turn_is_minus_pi() -> None:
 def test_columns_of_every_task_tell_all(column: Column) -> None:
     words = column.astra or {}
     assert {len(words[key]) for key in ("unit", "frame", "role")} == {column.size}
-    # Datasets also record what each value becomes in a mirror image of the robot.
-    assert column.mirror is not None
     for frame, role in zip(words["frame"], words["role"], strict=True):
         # What is measured in the body does not turn with the world.
         assert role == "invariant" or frame == "world"
@@ -156,7 +153,7 @@ def test_the_point_mass_does_not_feel_the_map(change: PlanarMap) -> None:
 
 def walking(count: int, steps: int) -> Array:
     """Return states (count, 29) of ants that have walked for a while, in contact with the ground."""
-    env = AntMazeEnv(Navigation(OPEN, "sparse", horizon=100), count, seed=3, num_threads=1)
+    env = AntMazeEnv(Navigation(OPEN, horizon=100), count, seed=3, num_threads=1)
     env.reset()
     command = torch.from_numpy(np.random.default_rng(4).uniform(-1, 1, (count, 2)))
     for _ in range(steps):
@@ -226,42 +223,10 @@ def test_the_walking_ant_follows_the_turned_command(rotation: float) -> None:
     command = np.random.default_rng(6).uniform(-0.7, 0.7, (3, 2))
 
     def stepped(state: Array, command: Array) -> Array:
-        env = AntMazeEnv(Navigation(OPEN, "sparse", horizon=100), len(state), seed=0, num_threads=1)
+        env = AntMazeEnv(Navigation(OPEN, horizon=100), len(state), seed=0, num_threads=1)
         env.reset_to(np.arange(len(state)), state)
         env.step(torch.from_numpy(command))
         return np.concatenate([env.physics.qpos, env.physics.qvel], axis=1)
 
     moved = stepped(change.of_column(STATE_COLUMN, WALKING), change.of_column(ACTION_COLUMN, command))
     np.testing.assert_allclose(moved, change.of_column(STATE_COLUMN, stepped(WALKING, command)), atol=1e-4)
-
-
-def mirrored(column: Column, state: Array) -> Array:
-    """Return the mirror image of ants in the xz plane, by what the column records of it."""
-    assert column.mirror is not None
-    source, sign = column.mirror
-    image = state[:, source] * sign
-    image[:, [1, 4, 6, 16]] *= -1  # y, qx, qz, vy
-    return image
-
-
-def test_mujoco_sees_the_mirror_image_that_columns_record() -> None:
-    model = ant_model()
-
-    def places(state: Array) -> Array:
-        data = mujoco.MjData(model)
-        data.qpos[:] = state[:15]
-        mujoco.mj_forward(model, data)
-        return np.array(data.geom_xpos[1:])
-
-    swapped = [0, *(1 + 3 * leg + part for leg in (3, 2, 1, 0) for part in range(3))]
-    for state in WALKING:
-        seen = places(mirrored(STATE_COLUMN, state[None])[0])
-        np.testing.assert_allclose(seen[swapped], places(state) * [1, -1, 1], atol=1e-12)
-
-
-def test_a_mirror_image_in_the_air_moves_as_the_mirror_image_of_the_ant() -> None:
-    state = airborne(WALKING)
-    # Controls are of hip and ankle of legs 4, 1, 2, 3; hips turn the other way, ankles are mirror images.
-    torques = TORQUES.reshape(-1, 4, 2)[:, [1, 0, 3, 2]] * [-1, 1]
-    image = physics_step(mirrored(STATE_COLUMN, state), torques.reshape(-1, 8))
-    np.testing.assert_allclose(image, mirrored(STATE_COLUMN, physics_step(state, TORQUES)), atol=1e-7)
