@@ -20,9 +20,5 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def points(table: dict[str, Any]) -> np.ndarray[Any, Any]:
-    return np.array(table["Points3D:positions"].to_pylist())[:, 0]
-
-
 def scalars(table: dict[str, Any]) -> np.ndarray[Any, Any]:
     return np.array(table["Scalars:scalars"].to_pylist())[:, 0]

@@ -1,140 +1,101 @@
-"""A run in Rerun: episodes of its dataset, and what its simulators make of the same commands."""
+"""A run in Rerun (https://rerun.io): held-out episodes, and their replays in each of its simulators."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from astra_data.core.config import validated
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import row_of_key
-from astra_data.dataset.columns import ABSTRACT_SIMULATED_NEXT_STATE
+from astra_data.core.optional import optional
+from astra_data.dataset.columns import ABSTRACT_NEXT_STATE, ABSTRACT_STATE, ACTION, Array, Column
 from astra_data.dataset.edit import check_uids
 from astra_data.dataset.reader import Dataset
-from astra_data.experiments.execution import Item
 from astra_data.experiments.plan import plan, stage_of
 from astra_data.experiments.points import Selection
 from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.trained_policy import settings_of
 from astra_data.grounding.files import load_grounding
-from astra_data.grounding.open_loop_replay import OpenLoopReplay, replay_open_loop
+from astra_data.grounding.open_loop_replay import replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.reports.figures import method_color
-from astra_data.reports.rerun_view import ReplayedEpisode, view
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import task_named
 
-RAW = "raw"
-SHOWN = 5
-"""Episodes that are shown where none are asked for."""
-_RAW_COLOR = (255, 187, 120)
-
 
 def view_run(
-    run: str | Path, uids: Sequence[int] = (), *, seed: int | None = None, save: Path | None = None
-) -> str:
-    """Show episodes of a run's dataset as `view` does, with open-loop replays in its simulators.
+    run: Path, uids: Sequence[int] = (), *, seed: int | None = None, save: Path | None = None
+) -> None:
+    """Show episodes of a run's pairs, and replays of their commands in the raw and every grounded simulator.
 
-    Each replay begins with its episode and takes the recorded commands: in the `raw` simulator, and in that
-    of every finished grounding, by the name of its method, with the `hazard` of its failure model and the
-    `disagreement` of its ensemble. Of a run with several sizes, the largest is shown.
-
-    Args:
-        run: the folder of a run, such as "runs/quickstart".
-        uids: of the episodes; by default the first 5 that groundings held out, or of all where there are no
-            groundings.
-        seed: one of the recipe's; by default the first.
-        save: the recording, in place of the viewer.
-
-    Returns:
-        what the run lacks and is left out, empty if nothing.
+    By default these are the first 5 `uids` that groundings held out, of the first `seed` of the recipe.
+    `save` is a file that ends in `.rrd` and is replaced, in place of the viewer.
 
     Raises:
-        BadInputError: as `view`, or it is not the folder of a run, has no dataset yet, or no such seed.
+        BadInputError: Rerun is not installed or its viewer does not open, `save` is no `.rrd` file, or `run`
+            is not the folder of a run, or has no pairs yet, no such seed or no such episode.
     """
+    rerun = optional("rerun")
+    if save is not None and save.suffix != ".rrd":
+        raise BadInputError(f"--save {save}: expected a file that ends in .rrd")
     recipe = validated(settings_of(run), Recipe, f"{run}")
-    percents = (max(recipe.sweep.percent),) if recipe.sweep.percent else ()
-    selection = Selection.of(recipe, seeds=recipe.seeds[:1] if seed is None else (seed,), percents=percents)
-    made = [item for item in plan(recipe, Path(f"{run}.toml"), Path(run), selection) if _is_made(run, item)]
-    datasets = [item for item in made if STAGES[stage_of(item)].makes_dataset]
-    if not datasets:
-        raise BadInputError(
-            f"{run} has no dataset of seed {selection.seeds[0]} yet: run the recipe until pair first"
-        )
-    dataset = Dataset.open(Path(run) / datasets[-1].key)
+    seeds = recipe.seeds[:1] if seed is None else (seed,)
+    selection = Selection.of(recipe, seeds=seeds, percents=sorted(recipe.sweep.percent)[-1:])
+    items = plan(recipe, Path(f"{run}.toml"), run, selection)
+    pairs = next(run / item.key for item in items if stage_of(item) == "pair")
+    if not pairs.is_dir():
+        raise BadInputError(f"{run} has no pairs of seed {seeds[0]} yet: run the recipe until pair")
+    dataset, held_out = Dataset.open(pairs), (episodes := PairedEpisodes.load(pairs))
     check_uids(dataset, uids)
-    if ABSTRACT_SIMULATED_NEXT_STATE not in dataset.features:
-        view(dataset, uids or dataset.uids[:SHOWN].tolist(), save=save)
-        return "all simulators (the dataset is not paired yet)"
-    groundings = {row_of_key(item.key): item for item in made if stage_of(item) == "ground"}
-    episodes = _chosen(PairedEpisodes.load(dataset.root), uids, [*groundings.values()])
-    of: dict[str, Grounding] = {RAW: NO_GROUNDING}
-    of |= {name: load_grounding(_result(run, item)) for name, item in groundings.items()}
-    task, drawn = task_named(recipe.task), selection.seeds[0]
+    simulators: dict[str, Grounding] = {"raw": NO_GROUNDING}
+    for item in items:
+        made = run / item.key / str(STAGES["ground"].result)
+        if stage_of(item) == "ground" and made.is_file():
+            assert isinstance(item.call, partial)
+            share, drawn = item.call.keywords["config"].held_out_share, item.call.keywords["seed"]
+            held_out = episodes.split(share, drawn)[1]
+            simulators[row_of_key(item.key)] = load_grounding(made)
+    wanted = torch.tensor(uids or held_out.uids[:5].tolist())
+    episodes, task = (
+        episodes.select(torch.isin(episodes.uids, wanted).nonzero()[:, 0]),
+        task_named(recipe.task),
+    )
     episodes.check(task)
-    replays = {name: replay_open_loop(task, one, episodes, seed=drawn) for name, one in of.items()}
-    view(dataset, uids or episodes.uids.tolist(), save=save, replays=_by_episode(replays, episodes))
-    return _lacking({name: replay for name, replay in replays.items() if name != RAW})
+    replays = {name: replay_open_loop(task, one, episodes, seed=0) for name, one in simulators.items()}
 
+    stream = rerun.RecordingStream("astra-data", recording_id=dataset.reference)
+    recorded = None if save is None else stream.binary_stream()
+    if save is None:
+        try:
+            stream.spawn()
+        except RuntimeError as error:
+            advice = "activate the environment where rerun-sdk is installed, or use --save FILE.rrd"
+            raise BadInputError(f"the viewer does not open ({error}): {advice}") from error
 
-def _is_made(run: str | Path, item: Item) -> bool:
-    stage = STAGES[stage_of(item)]
-    folder = Path(run) / item.key
-    return folder.is_dir() if stage.result is None else (folder / stage.result).is_file()
+    def send(entity: str, column: Column, values: Array, color: str) -> None:
+        steps = np.arange(len(values))
+        times = rerun.TimeColumn("step", sequence=steps), rerun.TimeColumn("time", duration=steps / task.fps)
+        for label, one in zip(column.labels, values.T, strict=True):
+            scalars = rerun.Scalars.columns(scalars=one.astype(np.float64))
+            stream.send_columns(f"{entity}/{label}", times, scalars)
+        for group in [group for role, group in column.roles if role == "position"]:
+            line = np.pad(values[:, group], ((0, 0), (0, 1)))
+            stream.log(entity, rerun.LineStrips3D([line], colors=bytes.fromhex(color)), static=True)
 
-
-def _result(run: str | Path, item: Item) -> Path:
-    return Path(run) / item.key / str(STAGES["ground"].result)
-
-
-def _chosen(episodes: PairedEpisodes, uids: Sequence[int], groundings: Sequence[Item]) -> PairedEpisodes:
-    """Return the episodes `uids`, else the first that were held out."""
-    if uids:
-        return episodes.select(torch.isin(episodes.uids, torch.tensor(uids)).nonzero()[:, 0])
-    if groundings:
-        call = groundings[0].call
-        assert isinstance(call, partial)
-        episodes = episodes.split(call.keywords["config"].held_out_share, call.keywords["seed"])[1]
-    return episodes.select(torch.arange(min(SHOWN, len(episodes))))
-
-
-def _by_episode(
-    replays: Mapping[str, OpenLoopReplay], episodes: PairedEpisodes
-) -> dict[int, list[ReplayedEpisode]]:
-    """Return the replays of each episode, without what comes after it, by its uid."""
-    found: dict[int, list[ReplayedEpisode]] = {}
-    for number, (uid, steps) in enumerate(
-        zip(episodes.uids.tolist(), episodes.lengths.tolist(), strict=True)
-    ):
+    rows = [dataset.uids.tolist().index(uid) for uid in episodes.uids.tolist()]
+    for number, episode in enumerate(dataset.episodes([ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ACTION], rows)):
+        root, columns = f"episode_{episode.uid}", episode.columns
+        path = np.concatenate([columns[ABSTRACT_STATE], columns[ABSTRACT_NEXT_STATE][-1:]])
+        send(f"{root}/target", task.abstract_state, path, "1f77b4")
+        send(f"{root}/target", task.action, columns[ACTION], "1f77b4")
         for name, replay in replays.items():
-            measures = {"hazard": replay.hazard, "disagreement": replay.disagreement}
-            known = {key: values for key, values in measures.items() if values is not None}
-            replayed = ReplayedEpisode(
-                name,
-                _RAW_COLOR if name == RAW else _rgb(method_color(name)),
-                replay.state[number, : steps + 1].numpy(),
-                {key: values[number, :steps].numpy() for key, values in known.items()},
-            )
-            found.setdefault(uid, []).append(replayed)
-    return found
-
-
-def _rgb(color: str) -> tuple[int, int, int]:
-    red, green, blue = bytes.fromhex(color.removeprefix("#"))
-    return red, green, blue
-
-
-def _lacking(replays: Mapping[str, OpenLoopReplay]) -> str:
-    """Say what the groundings lack, in one line."""
-    if not replays:
-        return "grounded simulators (none is finished)"
-    lacks = {
-        "hazard of {} (no failure model)": [n for n, one in replays.items() if one.hazard is None],
-        "disagreement of {} (one model with one head)": [
-            name for name, one in replays.items() if one.disagreement is None
-        ],
-    }
-    return ", ".join(text.format(" and ".join(names)) for text, names in lacks.items() if names)
+            color = "ffbb78" if name == "raw" else method_color(name)[1:]
+            path = replay.state[number, : len(path)].numpy()
+            send(f"{root}/open_loop/{name}", task.abstract_state, path, color)
+    stream.flush() if recorded is None else write_file(save, recorded.read())

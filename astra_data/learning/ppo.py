@@ -168,7 +168,9 @@ class Ppo(Learner):
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
         parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
-        advantage = generalized_advantages(*parts, self.config.discount, self.config.gae_lambda)
+        advantage = generalized_advantages(
+            *parts, discount=self.config.discount, gae_lambda=self.config.gae_lambda
+        )
         target = advantage + rollout["value"]
         return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
 
@@ -224,6 +226,7 @@ def generalized_advantages(
     reward: Tensor,
     done: Tensor,
     terminated: Tensor,
+    *,
     discount: float,
     gae_lambda: float,
 ) -> Tensor:

@@ -27,6 +27,5 @@ sizes         Results at each dataset size, and their page
 cost_and_origin   text on cost and origin
 formatting    numbers, tables and templates of the pages
 held_out      errors of groundings on held-out episodes, and their page
-rerun_view    episodes of a dataset in Rerun, with replays
 files         results, page and figures → a folder
 """

@@ -105,8 +105,9 @@ def test_generalized_advantages_are_discounted_sums_of_errors_up_to_the_episodes
             expected[row, first] += (0.9 * 0.8) ** (step - first) * error
             if done[row, step]:
                 break
-    parts = map(torch.from_numpy, (value, following, reward, done, terminated))
-    np.testing.assert_allclose(generalized_advantages(*parts, 0.9, 0.8), expected, rtol=1e-12)
+    parts = [torch.from_numpy(part) for part in (value, following, reward, done, terminated)]
+    found = generalized_advantages(*parts, discount=0.9, gae_lambda=0.8).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("memory", [0, 8])

@@ -18,7 +18,9 @@ class Straight(Navigation):
     """Progress is paid as the crow flies."""
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
-        return (before[:, :2] - goal).norm(dim=1) - (after[:, :2] - goal).norm(dim=1)
+        return torch.pairwise_distance(before[:, :2], goal, eps=0) - torch.pairwise_distance(
+            after[:, :2], goal, eps=0
+        )
 
 
 TASK = Straight(U_MAZE, horizon=10)
