@@ -242,7 +242,7 @@ def generalized_advantages(
         gae_lambda: λ.
     """
     error = reward + discount * following * ~terminated - value
-    kept = discount * gae_lambda * ~done
+    kept = discount * gae_lambda * (~done).to(value.dtype)
     advantage, later = torch.empty_like(error), torch.zeros_like(error[:, 0])
     for step in reversed(range(error.shape[1])):
         later = advantage[:, step] = error[:, step] + kept[:, step] * later

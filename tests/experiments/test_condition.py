@@ -210,16 +210,6 @@ def test_a_missing_or_damaged_manifest_is_damage(recipe: Path, folder: Path) -> 
     assert state == "damaged" and why.startswith("manifest.json cannot be read")
 
 
-def test_without_a_manifest_a_result_is_compared_by_its_bytes(recipe: Path, folder: Path) -> None:
-    (folder / TRAIN / MANIFEST).unlink()
-    policy = folder / TRAIN / "policy.safetensors"
-    assert EVALUATE not in states(recipe)
-    policy.write_text("another")
-    assert states(recipe)[EVALUATE] == ("stale", f"made from another {TRAIN}")
-    policy.unlink()
-    assert states(recipe)[TRAIN][0] == "damaged" and EVALUATE not in states(recipe)
-
-
 def test_a_manifest_without_the_result_is_compared_with_nothing(recipe: Path, folder: Path) -> None:
     manifest = folder / TRAIN / MANIFEST
     manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"files": {}}))
