@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from astra_data.grounding.fit import GroundConfig
-from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.stages.align import AlignConfig
 from astra_data.stages.collect import CollectConfig
 from astra_data.training.train import PpoTrainConfig
@@ -17,7 +16,6 @@ _SHORT = replace(_LONG, name=TASK, objective=replace(_LONG.objective, horizon=25
 
 COLLECT = CollectConfig(episodes=8, max_steps=60)
 GROUND = GroundConfig(updates=30, batch_windows=4, window=20, latent_size=16, held_out_share=0.25)
-GOLEMO = GolemoConfig(epochs=3, hidden_size=8, layers=2)
 TRAIN = PpoTrainConfig(num_envs=8, rollout_steps=8, total_steps=8 * 8 * 6, hidden_sizes=(16,), memory_size=8)
 ALIGN = AlignConfig(updates=100, batch_windows=4, window=20, held_out_share=0.25)
 

@@ -13,9 +13,9 @@ from astra_data.training.policy_file import PolicyFile
 pytestmark = needs_cuda
 
 ROWS = (
-    *("direct_transfer", "domain_randomization", "compass_uniform", "compass", "rma"),
+    *("direct_transfer", "domain_randomization", "compass", "rma"),
     *("behavior_cloning", "iql", "direct_transfer_iql"),
-    *("nas_golemo", "nas", "astra", "astra_without_latent", "astra_plus", "target", "full_obs"),
+    *("nas", "astra", "astra_without_latent", "astra_plus", "target", "full_obs"),
 )
 PPO = """
 [train]
@@ -65,12 +65,8 @@ held_out_share = 0.25
 TABLES = """
 [target]
 total_steps = 256
-[compass]
-updates = 3
 [rma]
 adaptation_steps = 128
-[nas_golemo]
-epochs = 1
 """
 IQL = """
 critic_updates = 3

@@ -203,8 +203,8 @@ def test_plus_has_the_keys_of_train(site: Path) -> None:
     [
         ("collect", "hold_s", "s"),
         ("augment", "margin_m", "m"),
-        ("compass", "velocity_noise_m_s", "m/s"),
-        ("compass", "heading_bias_deg", "°"),
+        ("domain_randomization", "velocity_noise_m_s", "m/s"),
+        ("domain_randomization", "heading_bias_deg", "°"),
         ("sweep", "percent", "%"),
         ("pair", "reset_tolerance", ""),
     ],

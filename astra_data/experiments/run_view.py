@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -70,7 +71,7 @@ def view_run(
     replays = {name: replay_open_loop(task, one, episodes, seed=0) for name, one in simulators.items()}
 
     stream = rerun.RecordingStream("astra-data", recording_id=dataset.reference)
-    recorded = None if save is None else stream.binary_stream()
+    recorded: Any = None if save is None else stream.binary_stream()
     if save is None:
         try:
             stream.spawn()
@@ -98,4 +99,7 @@ def view_run(
             color = "ffbb78" if name == "raw" else method_color(name)[1:]
             path = replay.state[number, : len(path)].numpy()
             send(f"{root}/open_loop/{name}", task.abstract_state, path, color)
-    stream.flush() if recorded is None else write_file(save, recorded.read())
+    if save is None:
+        stream.flush()
+    else:
+        write_file(save, recorded.read())

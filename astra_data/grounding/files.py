@@ -7,17 +7,13 @@ from astra_data.core.checkpoint import loaded, save_tensors, understood
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.grounding.protocols import FittedGrounding, Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.grounding.residual import ResidualGrounding
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.worlds.own_saving import parts_of, restored
 
-KINDS: dict[str, type[FittedGrounding]] = {
-    kind.kind: kind for kind in (HistoryGrounding, ResidualGrounding, IdentifiedParameters)
-}
+KINDS: dict[str, type[FittedGrounding]] = {HistoryGrounding.kind: HistoryGrounding}
 """The groundings that can be read, by what their files call them."""
 
 GROUNDING, TARGET_ENCODER = "grounding.safetensors", "target_encoder.safetensors"

@@ -11,14 +11,13 @@ from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.grounding.files import KINDS
 from astra_data.grounding.own_grounding import missing_parts
 from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
-from astra_data.methods.compass import COMPASS, COMPASS_UNIFORM
+from astra_data.methods.compass import COMPASS
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.iql import BEHAVIOR_CLONING, DIRECT_TRANSFER_IQL, IQL
 from astra_data.methods.method import Method, Table
 from astra_data.methods.nas import NAS
-from astra_data.methods.nas_golemo import NAS_GOLEMO
 from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
 from astra_data.training.own_learner import OwnLearner
@@ -33,12 +32,10 @@ METHODS: dict[str, Method] = {
         DIRECT_TRANSFER,
         DOMAIN_RANDOMIZATION,
         NAS,
-        NAS_GOLEMO,
         RMA,
         TARGET,
         FULL_OBS,
         COMPASS,
-        COMPASS_UNIFORM,
         IQL,
         BEHAVIOR_CLONING,
         DIRECT_TRANSFER_IQL,

@@ -16,7 +16,7 @@ def test_a_row_is_a_method_or_its_plus() -> None:
 
 def test_rows_are_tested_in_nas_if_it_is_among_them() -> None:
     assert reference_of(["astra", "nas"]) == reference_of(["astra", "nas_plus"]) == "nas"
-    assert reference_of(["astra", "nas_golemo"]) is None
+    assert reference_of(["astra", "compass"]) is None
 
 
 def test_folders_of_seeds_lie_in_those_of_sizes() -> None:

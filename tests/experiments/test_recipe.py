@@ -8,7 +8,6 @@ from astra_data.core.errors import RecipeError
 from astra_data.experiments.recipe import Recipe, with_tables
 from astra_data.learning.iql import FINE_TUNING, IqlConfig
 from astra_data.methods.method import Table
-from astra_data.methods.nas_golemo import GolemoConfig
 from astra_data.stages.registry import STAGES
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig
 from astra_data.training.train_in_target import TargetConfig
@@ -78,13 +77,11 @@ def test_the_table_of_a_new_method_is_read() -> None:
 
 
 def test_settings_are_those_of_the_rows_method_for_the_stage_that_takes_them() -> None:
-    rows = ["iql", "behavior_cloning", "direct_transfer_iql", "nas_golemo", "target", "full_obs", "astra"]
-    recipe = read(methods=rows, iql={"batch_windows": 5}, nas_golemo={"epochs": 2}, target={"num_envs": 3})
+    rows = ["iql", "behavior_cloning", "direct_transfer_iql", "target", "full_obs", "astra"]
+    recipe = read(methods=rows, iql={"batch_windows": 5}, target={"num_envs": 3})
     assert recipe.settings_of("iql", "train") == IqlConfig(batch_windows=5)
     assert recipe.settings_of("behavior_cloning", "train") == IqlConfig(batch_windows=5)
     assert recipe.settings_of("direct_transfer_iql", "train") == FINE_TUNING
-    assert recipe.settings_of("nas_golemo", "ground") == GolemoConfig(epochs=2)
-    assert recipe.settings_of("nas_golemo_plus", "train") is None
     assert recipe.settings_of("full_obs", "train") == TargetConfig(num_envs=3)
     assert recipe.settings_of("target", "ground") is recipe.settings_of("astra", "train") is None
 
@@ -138,7 +135,7 @@ def test_stages_get_their_tables_and_plus_rows_theirs() -> None:
         ),
         ({"train": 3}, "train: expected a table, got 3"),
         ({"domain_randomization": 3}, "domain_randomization: expected a table, got 3"),
-        ({"compass": {"ball_friction": [0.5, 2.0]}}, "compass: expected ranges of"),
+        ({"domain_randomization": {"ball_friction": [0.5, 2.0]}}, "expected ranges of"),
         ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
         ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),
         (

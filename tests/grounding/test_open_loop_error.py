@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +10,15 @@ from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.open_loop_error import _interval, distances, gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.worlds.own_code import own_object
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
 
+EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"
+IDENTIFIED = own_object(f"{EXAMPLES}/compass_causal.py:IdentifiedParameters")
 TASK = TASKS["antmaze-umaze"]
 STEPS = 60
 
@@ -172,7 +175,7 @@ def test_a_grounding_starts_with_the_history_before_each_replay() -> None:
 
 def test_identified_parameters_are_replayed_without_their_noise() -> None:
     found = PlanarVariation(friction=(0.9, 0.9), position_noise_m=(0.3, 0.3), action_noise=(0.2, 0.2))
-    report = gap_report(TASK, IdentifiedParameters(found), episodes(speed=0.9), seed=0)
+    report = gap_report(TASK, IDENTIFIED(found), episodes(speed=0.9), seed=0)
     assert report["raw"]["position_m"]["mean"][-1] > 0.1
     assert report["grounded"]["position_m"]["mean"] == pytest.approx([0.0] * 3, abs=1e-3)
 
@@ -190,7 +193,7 @@ def test_a_simulator_that_diverges_is_told() -> None:
 
 
 def test_the_seed_decides_the_gap_of_parameters_that_vary() -> None:
-    found, given = IdentifiedParameters(PlanarVariation(friction=(0.5, 1.0))), episodes(speed=0.9)
+    found, given = IDENTIFIED(PlanarVariation(friction=(0.5, 1.0))), episodes(speed=0.9)
     one, same, other = (gap_report(TASK, found, given, seed=seed)["grounded"] for seed in (0, 0, 1))
     assert one == same
     assert one["position_m"]["mean"] != other["position_m"]["mean"]

@@ -21,7 +21,7 @@ def test_methods_are_known_by_their_names() -> None:
 
 
 def test_methods_have_titles_and_colors_of_their_own() -> None:
-    assert method_title("nas_golemo") == "NAS (Golemo et al.)" and method_title("nas_plus") == "NAS+"
+    assert method_title("iql") == METHODS["iql"].title and method_title("nas_plus") == "NAS+"
     assert method_title("my_own_plus") == "My own+"
     titles = [method.title for method in METHODS.values()]
     assert len(set(titles)) == len(titles)
@@ -44,26 +44,20 @@ def test_settings_are_read_from_one_table_by_the_stage_that_takes_them() -> None
     read = {name: (method.table.name, method.configures) for name, method in METHODS.items() if method.table}
     assert read == {
         "domain_randomization": ("domain_randomization", "train"),
-        "nas_golemo": ("nas_golemo", "ground"),
         "rma": ("rma", "train"),
         "target": ("target", "train"),
         "full_obs": ("target", "train"),
-        "compass": ("compass", "ground"),
-        "compass_uniform": ("compass", "train"),
         "iql": ("iql", "train"),
         "behavior_cloning": ("iql", "train"),
         "direct_transfer_iql": ("direct_transfer_iql", "train"),
     }
     # Recorded settings are compared as text as well: the order stays.
-    assert list(tables()) == [
-        *("domain_randomization", "nas_golemo", "rma", "target", "compass", "iql", "direct_transfer_iql")
-    ]
+    assert list(tables()) == [*("domain_randomization", "rma", "target", "iql", "direct_transfer_iql")]
     assert all(
         method.table is None or tables()[method.table.name] is method.table for method in METHODS.values()
     )
     assert {name: table.ranges for name, table in tables().items() if table.ranges} == {
         "domain_randomization": "randomized",
-        "compass": "wide",
     }
     assert {name: table.default for name, table in tables().items() if table.default} == {
         "direct_transfer_iql": FINE_TUNING
@@ -72,7 +66,7 @@ def test_settings_are_read_from_one_table_by_the_stage_that_takes_them() -> None
 
 def test_what_the_rows_of_the_paper_differ_in() -> None:
     assert [name for name, method in METHODS.items() if method.grounds] == [
-        *("nas", "nas_golemo", "compass", "astra"),
+        *("nas", "astra"),
         *("astra_without_latent", "astra_without_reward", "astra_task_reward"),
     ]
     fit = METHODS["nas"].fit
@@ -94,10 +88,8 @@ def test_what_the_rows_of_the_paper_differ_in() -> None:
         "direct_transfer": ("abstract", None),
         "domain_randomization": ("abstract", "randomized"),
         "nas": ("abstract", None),
-        "nas_golemo": ("abstract", None),
         "rma": ("abstract", "wide"),
-        "compass": ("abstract", None),
-        "compass_uniform": ("abstract", "wide"),
+        "compass": ("abstract", "wide"),
         "astra": ("predicted", None),
         "astra_without_latent": ("predicted", None),
         "astra_without_reward": ("abstract", None),

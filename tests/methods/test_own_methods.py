@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from small_cart import GIVEN, TASK, Rail
+from toy_episodes import toy_episodes
 
 import astra_data.methods as registry
 from astra_data.core.config import validated
@@ -21,10 +22,12 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.methods import METHODS, add_method, method_named
 from astra_data.worlds.own_code import own_object
+from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "recipes/examples/methods"
+ANTS = TASKS["antmaze-umaze"]
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
 SMALL = """
 [collect]
@@ -137,12 +140,60 @@ def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: 
     assert 0.0 < float(grounding.scatter(given.training)) < 0.03
 
 
+def test_golemos_lstm_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    state, simulated, action = *torch.randn(2, 40, 40, 4), torch.randn(40, 40, 2)
+    lacking = torch.nn.functional.pad(0.1 * action[:, :-2], (0, 2, 2, 0))  # commanded two steps before
+    both = toy_episodes(state, action, next_state=simulated + lacking, simulated_next=simulated)
+    training, held_out = both.select(torch.arange(32)), both.select(torch.arange(32, 40))
+    method = own_object(f"{EXAMPLES / 'nas_golemo.py'}:METHOD")
+    settings = method.table.model(epochs=12, hidden_size=16, layers=2, learning_rate=0.01)
+    given = Fitting(ANTS, GroundConfig(), settings, training, held_out, 0, "cpu", tmp_path, silent)
+    grounding, figures = method.fit(given)
+    assert figures["loss"] < 0.2  # 1 is the variance of what is lacking
+    windows = held_out.windows
+    simulator = grounding.simulator(ANTS, 8)
+    simulator.start(windows.state[:, 0], torch.arange(8), windows.goal[:, 0])
+    before = grounding.hidden_before(windows, every=10)
+    assert before.shape == (8, 4, 2 * 2 * 16) and not before[:, 0].any() and before[:, 1].any()
+
+
+def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -> None:
+    method, ranges = own_object(f"{EXAMPLES / 'compass_causal.py'}:METHOD"), ANTS.varied.wide
+    planted = {"friction": (0.92, 0.92), "timestep_scale": (1.1, 1.1), "heading_bias_deg": (3.0, 3.0)}
+    start = torch.tensor([*ANTS.maze.cell_center(*ANTS.maze.start), 0.0, 0.0])
+    sets = []
+    for seed, count in enumerate((16, 4)):
+        torch.manual_seed(seed)
+        target = ANTS.varied_simulator(count, type(ranges)(**planted))
+        target.reset_to(start.repeat(count, 1))
+        action = (2 * torch.rand(count, 4, 2) - 1).repeat_interleave(15, dim=1)
+        states = torch.stack([target.state, *(target.step(one) for one in action.unbind(1))], dim=1)
+        sets.append(toy_episodes(states[:, :-1], action, next_state=states[:, 1:]))
+    quiet = {"action_noise": (0.0, 0.0), "position_noise_m": (0.0, 2e-3), "velocity_noise_m_s": (0.0, 2e-3)}
+    task = replace(ANTS, varied=replace(ANTS.varied, wide=ranges.model_copy(update=quiet)))
+    settings = method.table.model(contexts=64, windows=60, window=15, updates=400, iterations=3)
+    grounding, figures = method.fit(
+        Fitting(task, GroundConfig(), settings, sets[0], sets[1], 0, "cpu", tmp_path, silent)
+    )
+    point = figures["point"]
+    assert point["friction"] * (1 + point["action_scale"]) == pytest.approx(0.92, rel=0.03)
+    assert point["timestep_scale"] == pytest.approx(1.1, rel=0.03)
+    assert point["heading_bias_deg"] == pytest.approx(3.0, abs=1.5)
+    (plain, *_), (identified, *_) = figures["held_out_gap"]
+    assert identified < 0.3 * plain
+    again = type(grounding).from_file(*grounding.to_file(), "cpu")
+    assert again.variation == grounding.variation and grounding.variation.friction == (point["friction"],) * 2
+    assert grounding.variation.position_noise_m == (0.0, 2e-3)  # noise is not identified
+
+
 def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     own = "".join(
         f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n'
-        for name in ("delta_action", "residual_ensemble", "sb3_ppo")
+        for name in ("delta_action", "residual_ensemble", "nas_golemo", "sb3_ppo")
     )
-    path = recipe(tmp_path, '["direct_transfer", "delta_action", "residual_ensemble", "sb3_ppo"]', own)
+    rows = '["direct_transfer", "delta_action", "residual_ensemble", "nas_golemo", "sb3_ppo"]'
+    path = recipe(tmp_path, rows, own)
     experiment = load_experiment(path, tmp_path / "runs")
     for item in plan(experiment.recipe, path, experiment.folder):
         item.call(progress=silent)
@@ -150,7 +201,7 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     fitted = load_grounding(experiment.folder / "ground/delta_action/seed_0/grounding.safetensors")
     assert fitted.kind == "delta action"
     page = (experiment.folder / "report/results.md").read_text()
-    for row in ("Delta action", "Residual ensemble", "NAS, PPO of SB3"):
+    for row in ("Delta action", "Residual ensemble", "NAS (Golemo et al.)", "NAS, PPO of SB3"):
         assert f"| {row} |" in page
     assert not (experiment.folder / "ground/sb3_ppo").exists()  # it is trained in NAS's simulator
     METHODS.pop("delta_action"), registry._PLACES.pop("delta_action")

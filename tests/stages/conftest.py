@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from small_run import ALIGN, COLLECT, GOLEMO, GROUND, TASK, TRAIN, short_task
+from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.manifest import write_manifest
@@ -55,15 +55,6 @@ def grounded_anew(grounded: Path, paired: Path) -> Path:
     tensors, told = load_tensors(out / "grounding.safetensors")
     save_tensors(out / "grounding.safetensors", {name: value * 0.5 for name, value in tensors.items()}, told)
     write_manifest(out, {})
-    return out
-
-
-@pytest.fixture(scope="session")
-def augmented(paired: Path) -> Path:
-    out = paired.with_name("ground_nas_golemo")
-    made = {"settings": GOLEMO, "dataset": paired, "seed": 0, "device": "cpu", "progress": silent}
-    with short_task():
-        ground(TASK, "nas_golemo", GROUND, **made, out=out)  # type: ignore[arg-type]
     return out
 
 

@@ -103,18 +103,6 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     assert torch.equal(paths["start"], paths["target.position"][:, 0])
 
 
-def test_a_policy_from_an_augmented_simulator_is_tested_in_both_worlds(
-    task: str, paired: Path, augmented: Path, tmp_path: Path
-) -> None:
-    made = {"dataset": paired, "grounding": augmented, "seed": 0, "device": "cpu", "progress": silent}
-    train(task, "nas_golemo", TRAIN, **made, out=tmp_path / "train")  # type: ignore[arg-type]
-    inputs = {"policy": tmp_path / "train", "grounding": augmented}
-    told, paths = make(task, "nas_golemo", tmp_path / "evaluate", inputs)
-    assert told["encoder"] == "source"
-    for world in ("target", "simulated"):
-        check_outcome(told[world], paths[f"{world}.position"])
-
-
 def test_simulators_that_all_rows_share_begin_and_reward_alike(
     task: str, paired: Path, trained: Path, grounded: Path, aligned: Path, tmp_path: Path
 ) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_run import GOLEMO, GROUND, TRAIN
+from small_run import GROUND
 from stopping import Stopped
 
 from astra_data.core.errors import BadInputError
@@ -15,13 +15,9 @@ from astra_data.grounding.diagnostics import telemetry
 from astra_data.grounding.files import load_grounding, load_history_model
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.parameters import IdentifiedParameters
 from astra_data.learning.networks.grounding import LossWeights
 from astra_data.methods import add_method
-from astra_data.methods.compass import CompassConfig
 from astra_data.stages.ground import ground
-from astra_data.stages.train import train
-from astra_data.worlds.variation import WIDE_RANGES
 
 
 def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
@@ -197,40 +193,6 @@ def test_after_an_interruption_it_goes_on(
     ]
 
 
-def test_whole_episodes_go_on_after_an_interruption(
-    task: str, paired: Path, augmented: Path, tmp_path: Path
-) -> None:
-    seen: list[float] = []
-
-    def progress(fraction: float, note: str) -> None:
-        seen.append(fraction)
-        if len(seen) == 9:  # of six episodes an epoch
-            raise Stopped
-
-    out = tmp_path / "ground"
-    inputs = {"settings": GOLEMO, "dataset": paired, "seed": 0, "device": "cpu", "progress": progress}
-    with pytest.raises(Stopped):
-        ground(task, "nas_golemo", GROUND, **inputs, out=out)  # type: ignore[arg-type]
-    ground(task, "nas_golemo", GROUND, **inputs, out=out)  # type: ignore[arg-type]
-    assert seen[9] == pytest.approx(7 / 18)
-    assert {file.name for file in out.iterdir()} == {
-        "config.json",
-        "gap.json",
-        "grounding.safetensors",
-        "manifest.json",
-        "metrics.json",
-    }
-    for name in ("grounding.safetensors", "gap.json", "config.json"):
-        assert (out / name).read_bytes() == (augmented / name).read_bytes()
-    told = json.loads((out / "config.json").read_text())
-    assert (told["method"], told["settings"]) == ("nas_golemo", GOLEMO.model_dump())
-    assert told["ground"] == json.loads(GROUND.model_dump_json())
-    epochs = [json.loads((folder / "metrics.json").read_text())["epochs"] for folder in (out, augmented)]
-    assert epochs[0] == epochs[1]
-    with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):
-        load_history_model(out / "grounding.safetensors")
-
-
 def test_methods_without_a_grounding_and_raw_datasets_are_refused(
     task: str, paired: Path, collected: Path, tmp_path: Path
 ) -> None:
@@ -241,23 +203,3 @@ def test_methods_without_a_grounding_and_raw_datasets_are_refused(
     assert "\n" not in str(caught.value)
     with pytest.raises(BadInputError, match="no such folder; expected a folder, name or name@data-"):
         make(task, tmp_path / "nowhere", tmp_path / "out")
-
-
-def test_identified_parameters_are_an_artifact_that_policies_are_trained_with(
-    task: str, paired: Path, tmp_path: Path
-) -> None:
-    settings = CompassConfig(
-        **WIDE_RANGES.model_dump(), contexts=4, windows=20, window=10, updates=5, iterations=1
-    )
-    given = {"dataset": paired, "seed": 0, "device": "cpu", "progress": silent}
-    ground(task, "compass", GROUND, settings=settings, out=tmp_path / "ground", **given)  # type: ignore[arg-type]
-    files = {"config.json", "gap.json", "grounding.safetensors", "manifest.json", "metrics.json"}
-    assert {file.name for file in (tmp_path / "ground").iterdir()} == files
-    found = load_grounding(tmp_path / "ground" / "grounding.safetensors")
-    assert isinstance(found, IdentifiedParameters)
-    metrics = json.loads((tmp_path / "ground" / "metrics.json").read_text())
-    assert {name: (value, value) for name, value in metrics["point"].items()}.items() <= dict(
-        found.variation
-    ).items()
-    train(task, "compass", TRAIN, grounding=tmp_path / "ground", out=tmp_path / "train", **given)  # type: ignore[arg-type]
-    assert (tmp_path / "train" / "policy.safetensors").is_file()

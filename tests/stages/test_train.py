@@ -113,18 +113,17 @@ def test_the_same_seed_gives_the_same_bytes(
     assert again == (trained / "policy.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("method", ["direct_transfer", "astra_plus", "nas_golemo_plus"])
+@pytest.mark.parametrize("method", ["direct_transfer", "astra_plus"])
 def test_after_an_interruption_it_goes_on(
     method: str,
     task: str,
     paired: Path,
     grounded: Path,
-    augmented: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
-    grounding = {"astra_plus": grounded, "nas_golemo_plus": augmented}.get(method)
+    grounding = grounded if method == "astra_plus" else None
     config = TRAIN.model_copy(update=SWITCHES)
     expected = make(task, method, paired, grounding, tmp_path / "whole", config)
     out = tmp_path / "interrupted"

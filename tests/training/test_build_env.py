@@ -12,11 +12,9 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.grounding.residual import ResidualGrounding
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.learning.networks.residual import ResidualModel, ResidualShape
 from astra_data.training.build_env import (
     EnvConfig,
     data_starts,
@@ -279,8 +277,10 @@ def test_the_usual_density_is_that_of_the_free_space() -> None:
 
 
 def test_episodes_begin_at_every_so_many_steps_as_the_grounding_says(episodes: PairedEpisodes) -> None:
-    """A residual model's memory is large: it is kept for every tenth step."""
-    used = ResidualGrounding(ResidualModel(ResidualShape(4, 2, hidden_size=8, layers=1)))
+    class EveryTenth(HistoryGrounding):
+        start_stride = 10
+
+    used = EveryTenth(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)))
     starts = data_starts(TASK, EnvConfig(data_start_share=1.0), episodes, used)
     windows = episodes.windows
     assert starts is not None and starts.hidden is not None and len(starts.hidden) == 40 + 30

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.residual import ResidualGrounding
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.worlds.own_code import own_object
 from astra_data.worlds.own_saving import parts_of, restored
 
@@ -117,4 +117,4 @@ def test_other_failures_are_told_in_a_line_with_their_place(body: str, told: str
 def test_failures_of_the_package_are_the_caller_s_to_explain() -> None:
     empty: tuple[dict[str, Tensor], Mapping[str, Any]] = ({}, {})
     with pytest.raises(KeyError, match="shape"):
-        restored(ResidualGrounding, *empty, "cpu")
+        restored(HistoryGrounding, *empty, "cpu")

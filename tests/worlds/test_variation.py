@@ -4,7 +4,6 @@ from pydantic import ValidationError, create_model
 
 from astra_data.core.config import Config, validated
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.methods.compass import CompassConfig
 from astra_data.worlds.variation import (
     AnyVariation,
     BallVariation,
@@ -88,7 +87,7 @@ def test_an_upside_down_range_is_refused() -> None:
         PlanarVariation(friction=(1.2, 0.8))
 
 
-@pytest.mark.parametrize("model", [PlanarVariation, CompassConfig])
+@pytest.mark.parametrize("model", [PlanarVariation, BallVariation])
 @pytest.mark.parametrize(
     ("name", "ends", "expected"),
     [
