@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -71,13 +70,13 @@ def view_run(
     replays = {name: replay_open_loop(task, one, episodes, seed=0) for name, one in simulators.items()}
 
     stream = rerun.RecordingStream("astra-data", recording_id=dataset.reference)
-    recorded: Any = None if save is None else stream.binary_stream()
-    if save is None:
-        try:
-            stream.spawn()
-        except RuntimeError as error:
-            advice = "activate the environment where rerun-sdk is installed, or use --save FILE.rrd"
-            raise BadInputError(f"the viewer does not open ({error}): {advice}") from error
+    recorded = stream.binary_stream() if save else None
+    try:
+        _ = save or stream.spawn()
+    except RuntimeError as error:
+        advice = "activate the environment where rerun-sdk is installed, or use --save FILE.rrd"
+        reason = str(error).partition("\n")[0]
+        raise BadInputError(f"the viewer does not open ({reason}): {advice}") from error
 
     def send(entity: str, column: Column, values: Array, color: str) -> None:
         steps = np.arange(len(values))
@@ -87,7 +86,7 @@ def view_run(
             stream.send_columns(f"{entity}/{label}", times, scalars)
         for group in [group for role, group in column.roles if role == "position"]:
             line = np.pad(values[:, group], ((0, 0), (0, 1)))
-            stream.log(entity, rerun.LineStrips3D([line], colors=bytes.fromhex(color)), static=True)
+            stream.log(entity, rerun.LineStrips3D([line], colors=[*bytes.fromhex(color)]), static=True)
 
     rows = [dataset.uids.tolist().index(uid) for uid in episodes.uids.tolist()]
     for number, episode in enumerate(dataset.episodes([ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ACTION], rows)):
@@ -99,7 +98,6 @@ def view_run(
             color = "ffbb78" if name == "raw" else method_color(name)[1:]
             path = replay.state[number, : len(path)].numpy()
             send(f"{root}/open_loop/{name}", task.abstract_state, path, color)
-    if save is None:
-        stream.flush()
-    else:
+    if save:
         write_file(save, recorded.read())
+    stream.flush()
