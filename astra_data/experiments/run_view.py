@@ -81,11 +81,10 @@ def view_run(
     def send(entity: str, column: Column, values: Array, color: str) -> None:
         steps = np.arange(len(values))
         times = rerun.TimeColumn("step", sequence=steps), rerun.TimeColumn("time", duration=steps / task.fps)
-        for label, one in zip(column.labels, values.T, strict=True):
-            scalars = rerun.Scalars.columns(scalars=one.astype(np.float64))
-            stream.send_columns(f"{entity}/{label}", times, scalars)
-        for group in [group for role, group in column.roles if role == "position"]:
-            line = np.pad(values[:, group], ((0, 0), (0, 1)))
+        for label, one in zip(column.labels, values.T.astype(np.float64), strict=True):
+            stream.send_columns(f"{entity}/{label}", times, rerun.Scalars.columns(scalars=one))
+        if {"x", "y"} <= set(column.labels):
+            line = np.pad(values[:, [column.labels.index(one) for one in "xy"]], ((0, 0), (0, 1)))
             stream.log(entity, rerun.LineStrips3D([line], colors=[*bytes.fromhex(color)]), static=True)
 
     rows = [dataset.uids.tolist().index(uid) for uid in episodes.uids.tolist()]

@@ -17,6 +17,7 @@ from astra_data.worlds.task import Task
 
 HORIZONS = (1, 10, 50, 200)
 _START_EVERY = 25
+"""Steps of an episode for each replay; one start is drawn from each part of this length."""
 
 
 def distances(task: Task, error: Tensor) -> Tensor:
@@ -28,52 +29,67 @@ def distances(task: Task, error: Tensor) -> Tensor:
 def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> dict[str, Any]:
     """Replay the actions of `episodes` open loop in both simulators and compare with the target.
 
-    Beside them, under "still", is the error of who expects the robot to stay where it is.
+    Beside them, under "still", is the error of the persistence baseline: the robot stays where it is.
 
-    Replays start every 25 steps, with a grounding's memory of the true history up to there. Errors are
-    distances in the task's quantities after 1, 10, 50 and 200 steps: means and 95 % bootstrap intervals over
-    episodes; None where a single episode is that long.
+    For each horizon, starts are drawn from all steps that have so many after them, one for every 25, with a
+    grounding's memory of the true history up to there. Errors are distances in the task's quantities after 1,
+    10, 50 and 200 steps: means and 95 % bootstrap intervals over episodes; None where a single episode is
+    that long.
 
     Raises:
         BadInputError: a simulator's states are not finite, though the recorded ones are.
     """
     torch.manual_seed(derive(seed, "gap noise"))
-    windows, lengths = episodes.windows, episodes.lengths
-    moments, device = Moments.every(windows, _START_EVERY), str(windows.state.device)
-    episode, start = moments.episode, moments.first
-    horizons = [horizon for horizon in HORIZONS if horizon <= int(lengths.max())]
-    simulators = {}
-    for name, one in {"raw": NO_GROUNDING, "grounded": grounding.for_replay()}.items():
-        simulators[name] = one.simulator(task, len(moments), device)
-        before = one.hidden_before(windows)
-        moments.start(simulators[name], None if before is None else before[episode, start])
-    errors: dict[str, dict[int, Tensor]] = {name: {} for name in (*simulators, "still")}
-    for step in range(horizons[-1]):
-        now = moments.after(step)
-        action = windows.action[episode, now]
-        states = {name: simulator.step(action) for name, simulator in simulators.items()}
-        states["still"] = moments.state
-        if step + 1 in horizons:
-            for name, state in states.items():
-                apart = distances(task, state - windows.next_state[episode, now])
-                beyond = start + step >= lengths[episode]
-                if not apart[~beyond].isfinite().all():
-                    raise BadInputError(
-                        f"the {name} simulator of {task.name} diverges: its states are not finite in step "
-                        f"{step + 1} of recorded commands: bound them in its `step`"
-                    )
-                apart[beyond] = torch.nan
-                errors[name][step + 1] = apart
+    windows, lengths = episodes.windows, episodes.lengths.cpu().numpy()
+    device, drawing = windows.state.device, generator(seed, "gap starts")
+    horizons = [horizon for horizon in HORIZONS if horizon <= lengths.max()]
+    groundings = {"raw": NO_GROUNDING, "grounded": grounding.for_replay()}
+    hidden = {name: one.hidden_before(windows) for name, one in groundings.items()}
+    errors: dict[str, dict[int, Tensor]] = {name: {} for name in (*groundings, "still")}
+    started: dict[int, Tensor] = {}
+    for horizon in horizons:
+        episode, first = (torch.from_numpy(one).to(device) for one in _starts(lengths, horizon, drawing))
+        moments, started[horizon] = Moments(windows, episode, first), episode
+        states = {"still": moments.state}
+        for name, one in groundings.items():
+            simulator, before = one.simulator(task, len(moments), str(device)), hidden[name]
+            moments.start(simulator, None if before is None else before[episode, first])
+            for step in range(horizon):
+                states[name] = simulator.step(moments.action(step))
+        for name, state in states.items():
+            apart = distances(task, state - windows.next_state[episode, moments.after(horizon - 1)])
+            if not apart.isfinite().all():
+                raise BadInputError(
+                    f"the {name} simulator of {task.name} diverges: its states are not finite in step "
+                    f"{horizon} of recorded commands: bound them in its `step`"
+                )
+            errors[name][horizon] = apart
     rng = generator(seed, "gap bootstrap")
-    report: dict[str, Any] = {"horizons": horizons, "replays": len(moments)}
+    report: dict[str, Any] = {"horizons": horizons, "replays": len(started[horizons[0]])}
     for name, by_horizon in errors.items():
         report[name] = {}
         for index, quantity in enumerate(task.quantities):
-            intervals = [_interval(by_horizon[h][:, index], episode, rng) for h in horizons]
+            intervals = [_interval(by_horizon[h][:, index], started[h], rng) for h in horizons]
             report[name][quantity] = dict(
                 zip(("mean", "low", "high"), zip(*intervals, strict=True), strict=True)
             )
     return report
+
+
+def _starts(
+    lengths: NDArray[np.int64], horizon: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Draw the episode and the first step, (N,) each, of replays of `horizon` steps.
+
+    In an episode each step with so many after it is equally likely, and there is a replay for every
+    `_START_EVERY` of them, spread evenly.
+    """
+    possible = np.maximum(lengths - horizon + 1, 0)
+    counts = -(-possible // _START_EVERY)
+    episode = np.repeat(np.arange(len(lengths)), counts)
+    part = np.arange(len(episode)) - np.repeat(counts.cumsum() - counts, counts)
+    share = (part + rng.random(len(episode))) / counts[episode]
+    return episode, (share * possible[episode]).astype(np.int64)
 
 
 def _interval(
@@ -81,9 +97,7 @@ def _interval(
 ) -> tuple[float, float | None, float | None]:
     """Return the mean of `errors` (N,) and its 95 % bootstrap interval, resampling episodes (N,)."""
     values, groups = errors.cpu().numpy(), episode.cpu().numpy()
-    keep = np.isfinite(values)
-    counts = np.bincount(groups[keep])
-    sums = np.bincount(groups[keep], values[keep])
+    counts, sums = np.bincount(groups), np.bincount(groups, values)
     present, mean = np.flatnonzero(counts), float(sums.sum() / counts.sum())
     if len(present) == 1:
         return mean, None, None

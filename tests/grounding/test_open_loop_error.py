@@ -7,8 +7,9 @@ import torch
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import generator
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.open_loop_error import _interval, distances, gap_report
+from astra_data.grounding.open_loop_error import _interval, _starts, distances, gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
@@ -62,7 +63,7 @@ def test_a_perfect_simulator_has_no_gap() -> None:
 
 def test_who_stands_still_is_left_behind_by_the_way_that_the_target_goes() -> None:
     report = gap_report(TASK, untrained(), episodes(speed=1.0), seed=0)
-    # After one step all eight replays count, after 50 the two of the episodes that are so long.
+    # After one step there are eight replays, after 50 two, of the episodes that are so long.
     speeds = {1: [3 * 0.5, 3 * 0.8, 2 * 1.0], 50: [0.5, 0.8]}
     for index, (steps, count) in ((0, (1, 8)), (2, (50, 2))):
         way = sum(speeds[steps]) / count * steps * TASK.timestep_s
@@ -71,7 +72,7 @@ def test_who_stands_still_is_left_behind_by_the_way_that_the_target_goes() -> No
 
 def test_a_slow_target_is_left_behind_in_proportion_to_the_horizon() -> None:
     report = gap_report(TASK, untrained(), episodes(speed=0.9), seed=0)
-    # Of eight replays only two are still within the data after 50 steps.
+    # After one step there are eight replays, and as many after 10; after 50 two.
     speeds = [(3 * 0.5 + 3 * 0.8 + 2 * 1.0) / 8] * 2 + [(0.5 + 0.8) / 2]
     position = [
         0.1 * speed * TASK.timestep_s * steps for speed, steps in zip(speeds, (1, 10, 50), strict=True)
@@ -105,7 +106,7 @@ def test_replays_that_run_into_padding_do_not_count() -> None:
     spoiled = replace(given, windows=replace(given.windows, next_state=far))
     report = gap_report(TASK, untrained(), spoiled, seed=0)
     assert report == gap_report(TASK, untrained(), given, seed=0)
-    # After 10 steps all replays count, also those from step 25 of the short episode; after 50, two.
+    # After 10 steps there are as many replays as after one; after 50, two.
     speeds = [3 * 0.5, 3 * 0.8, 2 * 1.0]
     expected = 0.1 * sum(speeds) / 8 * 10 * TASK.timestep_s
     assert report["raw"]["position_m"]["mean"][1] == pytest.approx(expected, rel=0.01)
@@ -166,9 +167,8 @@ def test_a_grounding_starts_with_the_history_before_each_replay() -> None:
     simulator.reset_to(windows.state.reshape(-1, 4))
     landed = simulator.step(windows.action.reshape(-1, 2)).reshape(3, STEPS, 4)
     corrected = model.correct(latent, windows.action, landed)
-    wrong = distances(TASK, corrected - windows.next_state)[:, ::25]
-    # Replays from steps 0, 25 and 50; the third episode ends after 40.
-    expected = torch.cat([wrong[0], wrong[1], wrong[2, :2]]).mean(0)
+    wrong = distances(TASK, corrected - windows.next_state)
+    expected = wrong[_starts(given.lengths.numpy(), 1, generator(0, "gap starts"))].mean(0)
     for index, quantity in enumerate(TASK.quantities):
         assert report["grounded"][quantity]["mean"][0] == pytest.approx(float(expected[index]), rel=1e-3)
 
@@ -197,3 +197,26 @@ def test_the_seed_decides_the_gap_of_parameters_that_vary() -> None:
     one, same, other = (gap_report(TASK, found, given, seed=seed)["grounded"] for seed in (0, 0, 1))
     assert one == same
     assert one["position_m"]["mean"] != other["position_m"]["mean"]
+
+
+def test_starts_are_drawn_from_all_steps_that_have_the_horizon_after_them() -> None:
+    lengths, rng = np.array([60, 3, 26]), np.random.default_rng(0)
+    counts = np.zeros((3, 60))
+    for _ in range(4000):
+        episode, first = _starts(lengths, 5, rng)
+        assert episode.tolist() == [0, 0, 0, 2]  # 56, none and 22 steps have four more after them
+        assert (np.diff(first[:3]) >= 0).all()
+        np.add.at(counts, (episode, first), 1)
+    np.testing.assert_allclose(counts[0, :56] / 4000, 3 / 56, rtol=0.4)
+    np.testing.assert_allclose(counts[2, :22] / 4000, 1 / 22, rtol=0.4)
+    assert counts.sum() == counts[0, :56].sum() + counts[2, :22].sum()
+
+
+def test_a_robot_that_stands_before_it_walks_is_judged_over_all_steps() -> None:
+    """Its starts at rest are no larger a share of the replays than of the steps."""
+    state = torch.zeros(200, STEPS + 1, 4)
+    state[..., :2] = torch.tensor(TASK.maze.cell_center(1, 1))
+    state[..., 0] += 0.01 * (torch.arange(STEPS + 1) - 6).clamp_min(0)
+    walks = toy_episodes(state[:, :-1], torch.zeros(200, STEPS, 2), next_state=state[:, 1:])
+    still = gap_report(TASK, NO_GROUNDING, walks, seed=0)["still"]["position_m"]
+    assert still["mean"][0] == pytest.approx(0.01 * 54 / 60, rel=0.03)

@@ -161,7 +161,7 @@ def test_golemos_lstm_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> N
 def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -> None:
     method, ranges = own_object(f"{EXAMPLES / 'compass_causal.py'}:METHOD"), ANTS.varied.wide
     planted = {"friction": (0.92, 0.92), "timestep_scale": (1.1, 1.1), "heading_bias_deg": (3.0, 3.0)}
-    start = torch.tensor([*ANTS.maze.cell_center(*ANTS.maze.start), 0.0, 0.0])
+    start = torch.tensor([*ANTS.maze.cell_center(*ANTS.maze.start), 0.0, 0.0]).float()
     sets = []
     for seed, count in enumerate((16, 4)):
         torch.manual_seed(seed)
