@@ -122,5 +122,5 @@ def test_what_needs_an_extra_says_which() -> None:
         "import astra_data\nfrom astra_data.core.errors import BadInputError\n"
         "try: astra_data.pair\nexcept BadInputError as error: print(error)\n"
     )
-    assert 'pip install "astra-data[sim]"' in python(code)
+    assert "uv sync --extra sim" in python(code)
     assert issubclass(BadInputError, Exception)

@@ -19,8 +19,9 @@ import torch
 import typer
 
 from astra_data.core.config import load_recipe
+from astra_data.core.manifest import write_manifest
 from astra_data.deployment.folder import describe
-from astra_data.deployment.graph import ONNX, TORCHSCRIPT, PolicyGraph, load_torchscript, write_graphs
+from astra_data.deployment.graph import write_graph
 from astra_data.deployment.run_policy import RobotPolicy
 from astra_data.experiments.recipe import Recipe
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
@@ -33,12 +34,13 @@ from astra_data.worlds.registry import TASKS
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
 TASK = TASKS[SETTINGS.task]
 ROUND_S = 0.2
+LOOP = "run_policy.py"
 
 
 def main(seconds: Annotated[float, typer.Option(help="Of each way to run each policy.")] = 3.0) -> None:
     """Print steps per second, and the slowest of a hundred steps of the ONNX loop."""
     torch.set_num_threads(1)
-    print(f"{'steps/s':<28}{'ONNX loop':>12}{'TorchScript':>14}{'astra-data':>13}{'ONNX, 99 %':>14}")
+    print(f"{'steps/s':<28}{'ONNX loop':>12}{'astra-data':>13}{'ONNX, 99 %':>14}")
     for name, deployed in policies().items():
         with tempfile.TemporaryDirectory() as folder:
             steps = ways(deployed, Path(folder))
@@ -46,9 +48,9 @@ def main(seconds: Annotated[float, typer.Option(help="Of each way to run each po
             for _ in range(max(1, round(seconds / ROUND_S))):
                 for way, step in steps.items():
                     spent[way] += timed(step)
-            onnx, script, ours = (1.0 / float(np.mean(times)) for times in spent.values())
-            slow_ms = 1e3 * float(np.percentile(spent[ONNX], 99))
-        print(f"{name:<28}{onnx:>12,.0f}{script:>14,.0f}{ours:>13,.0f}{slow_ms:>11.3f} ms")
+            onnx, ours = (1.0 / float(np.mean(times)) for times in spent.values())
+            slow_ms = 1e3 * float(np.percentile(spent[LOOP], 99))
+        print(f"{name:<28}{onnx:>12,.0f}{ours:>13,.0f}{slow_ms:>11.3f} ms")
 
 
 def policies() -> dict[str, RunningPolicy]:
@@ -74,27 +76,21 @@ def policies() -> dict[str, RunningPolicy]:
 
 
 def ways(deployed: RunningPolicy, folder: Path) -> dict[str, Callable[[], object]]:
-    """Return one step by the folder's own loop, by TorchScript and by this package, from NumPy to NumPy."""
-    written = write_graphs(deployed, folder)
+    """Return one step by the folder's own loop and by this package, from NumPy to NumPy."""
+    written = write_graph(deployed, folder)
     about = describe(deployed, written.parts)
     (folder / "policy.json").write_text(json.dumps(about))
+    write_manifest(folder, {})
     names = {column: about[column]["names"] for column in ("state", "goal")}
     policy = RobotPolicy(rate_hz=about["rate_hz"], folder=folder, **names)
     state, goal = (np.random.default_rng(0).standard_normal(len(names[column])) for column in names)
-    script = load_torchscript(folder / TORCHSCRIPT)
-    hidden = [PolicyGraph(deployed).example[2]]
     deployed.start(1)
 
     def tensors() -> tuple[torch.Tensor, torch.Tensor]:
         return torch.from_numpy(state[None].astype("float32")), torch.from_numpy(goal[None].astype("float32"))
 
-    def torchscript() -> object:
-        command, hidden[0] = script(*tensors(), hidden[0])
-        return command[0].numpy()
-
     return {
-        ONNX: lambda: policy.act(state, goal),
-        TORCHSCRIPT: torchscript,
+        LOOP: lambda: policy.act(state, goal),
         "astra-data": lambda: deployed.task.limits.in_units(deployed.act(*tensors()))[0].numpy(),
     }
 

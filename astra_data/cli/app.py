@@ -3,11 +3,14 @@
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
+from typer.core import TyperArgument
+from typer.models import OptionInfo
 
 from astra_data.cli import (
     augmenting,
@@ -37,8 +40,8 @@ from astra_data.core.wording import in_lines
 
 app = typer.Typer(
     help="Turn robot logs into datasets, and datasets into policies trained in a simplified simulator.",
-    add_completion=False,
     no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 
@@ -121,9 +124,71 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "pull": sharing.pull,
     },
 }
+EXAMPLES = {
+    "new": "astra-data new robot --from logs/*.csv",
+    "run": "astra-data run recipes/quickstart.toml --until ground",
+    "sweep": "astra-data sweep recipes/cart_sizes.toml --method astra --seed 0",
+    "check": "astra-data check recipes/quickstart.toml",
+    "ground": "astra-data ground recipes/quickstart.toml --method astra",
+    "train": "astra-data train recipes/quickstart.toml --method astra_plus --device cuda",
+    "align": "astra-data align recipes/quickstart.toml",
+    "evaluate": "astra-data evaluate recipes/quickstart.toml --seed 0",
+    "report": "astra-data report recipes/quickstart.toml",
+    "select": "astra-data select runs/cart --row astra --trials 40",
+    "deploy": "astra-data deploy runs/quickstart --row astra",
+    "tasks": "astra-data tasks cart.py:TASK",
+    "collect": "astra-data collect antmaze-umaze --episodes 50 --name walks",
+    "pair": "astra-data pair walks --simulator antmaze-umaze",
+    "subset": "astra-data subset walks --percent 50 --name half",
+    "label": "astra-data label logs --task cart.py:TASK",
+    "augment": "astra-data augment walks --copies 3 --rotations quarter",
+    "merge": "astra-data merge walks more --name all",
+    "delete": "astra-data delete walks --episode 3 --episode 7",
+    "filter": "astra-data filter walks --success",
+    "list": "astra-data list",
+    "inspect": "astra-data inspect walks --plot figures",
+    "view": "astra-data view runs/quickstart --save run.rrd",
+    "validate": "astra-data validate walks@data-1.0.0",
+    "repair": "astra-data repair broken --out repaired",
+    "log": "astra-data log walks",
+    "diff": "astra-data diff walks@data-1.0.0 walks@data-2.0.0",
+    "import": "astra-data import logs/*.csv --mapping logs.toml",
+    "export": "astra-data export walks --format d4rl --out walks.hdf5",
+    "card": "astra-data card walks",
+    "push": "astra-data push walks me/walks",
+    "pull": "astra-data pull me/walks",
+}
+"""What to type for each command, below its help."""
+_NAMES = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", bool: ""}
+"""How help names values of these types."""
+
+
+def _name_values(command: Callable[..., None]) -> Callable[..., None]:
+    """Let the help of a command name the values of its options by what they are, not by their types."""
+    for hint in get_type_hints(command, include_extras=True).values():
+        infos = [info for info in getattr(hint, "__metadata__", ()) if isinstance(info, OptionInfo)]
+        kinds = [kind for kind in (*_inner(hint),) if kind in _NAMES]
+        for info in infos:
+            if info.metavar is None and kinds:
+                info.metavar = _NAMES[kinds[0]]
+    return command
+
+
+def _inner(hint: Any) -> Iterator[Any]:  # noqa: ANN401 - any annotation
+    """Yield the types in an annotation, as int in `Annotated[list[int] | None, ...]`."""
+    inside = get_args(hint)[:1] if hasattr(hint, "__metadata__") else get_args(hint)
+    for one in inside:
+        yield from _inner(one)
+    if not inside:
+        yield hint
+
+
+TyperArgument.display_type_rich = lambda self, ctx: None  # type: ignore[method-assign]
+"""What an argument is, its name says."""
 for panel, commands in PANELS.items():
     for name, command in commands.items():
-        app.command(name, rich_help_panel=panel)(command)
+        epilog = f"Example: {EXAMPLES[name]}" if name in EXAMPLES else None
+        app.command(name, rich_help_panel=panel, epilog=epilog)(_name_values(command))
 app.add_typer(
     shipping.app,
     name="recipes",

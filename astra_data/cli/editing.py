@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.arguments import DatasetName, NewName, Out, Source
-from astra_data.cli.recipes import Jobs, Root, refuse, run_stage
+from astra_data.cli.arguments import DatasetName, Jobs, NewName, Out, Root, Source
+from astra_data.cli.recipes import refuse, run_stage
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS
 

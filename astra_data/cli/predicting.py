@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.recipes import Publish, RecipePath, Root, Seeds, resumable
+from astra_data.cli.arguments import RecipePath, Root, Seeds
+from astra_data.cli.recipes import Publish, resumable
 from astra_data.core.naming import RUNS
 
 Data = Annotated[

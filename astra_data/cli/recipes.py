@@ -7,32 +7,22 @@ from typing import Annotated
 
 import typer
 
+from astra_data.cli.arguments import (
+    Device,
+    Jobs,
+    Methods,
+    RecipePath,
+    RecipePaths,
+    Root,
+    Seeds,
+    Until,
+    check_asked,
+    recipe_at,
+    recipes_at,
+)
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS
 
-RecipePath = Annotated[
-    Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).", show_default=False)
-]
-RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE", help="Recipes (TOML files).")]
-Methods = Annotated[
-    list[str] | None,
-    typer.Option("--method", help="Run only this row of the recipe; may be repeated.", show_default=False),
-]
-Seeds = Annotated[
-    list[int] | None,
-    typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.", show_default=False),
-]
-Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …")]
-Jobs = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Number of parallel processes; on a CUDA device, each has its own CUDA context.",
-        show_default="one per core; 2 with --device cuda",
-    ),
-]
-Root = Annotated[Path, typer.Option(help="Folder that contains the runs.")]
-Until = Annotated[str | None, typer.Option(help="Stop after this stage.", show_default="all")]
 Publish = Annotated[
     bool, typer.Option("--publish", help="Also copy the results to the folder results/ next to the recipe.")
 ]
@@ -50,6 +40,7 @@ def run(
     root: Root = RUNS,
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
+    check_asked(recipe_at(recipe), seeds=seeds)
     from astra_data.experiments.run import run as run_recipe
 
     with resumable():
@@ -68,6 +59,7 @@ def check(
     ] = False,
 ) -> None:
     """Check recipes without running them, and list which artifacts are finished, damaged or stale."""
+    recipes_at(recipes)
     from astra_data.experiments.recipe_file import is_gap_recipe
     from astra_data.experiments.run import check as check_recipe
 
@@ -89,6 +81,8 @@ def check(
         for key, found in conditions.items():
             why = f": {found.why}" if found.why else ""
             typer.echo(f"  {'to do' if found.state == 'missing' else found.state:8}  {key}{why}")
+            for warning in found.warnings:
+                typer.echo(f"  warning   {key}: {warning}")
         spoilt = [f"{states.count(state)} {state}" for state in ("damaged", "stale") if state in states]
         if spoilt:
             again = f"`astra-data run {recipe}` recreates these"
@@ -187,6 +181,7 @@ def run_stage(
     add: bool = False,
 ) -> None:
     """Run one stage of a recipe, and print the folder of its artifacts."""
+    check_asked(recipe_at(recipe), [*methods], [*seeds])
     from astra_data.experiments.run import run_stage as run
 
     with resumable():

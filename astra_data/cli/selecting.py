@@ -1,25 +1,28 @@
 """`astra-data select`."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from astra_data.cli.arguments import RunFolder, run_at
 from astra_data.core.errors import BadInputError
 
 
 def select(
-    run: Annotated[
-        Path,
-        typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.", show_default=False),
-    ],
+    run: RunFolder,
     row: Annotated[
         list[str] | None,
-        typer.Option(help="Rank only policies of this row; may be repeated.", show_default="all"),
+        typer.Option(
+            metavar="ROW", help="Rank only policies of this row; may be repeated.", show_default="all"
+        ),
     ] = None,
     judge: Annotated[
         str | None,
-        typer.Option(help="The row whose groundings serve as judges.", show_default="the reference"),
+        typer.Option(
+            metavar="ROW",
+            help="The row whose groundings serve as judges.",
+            show_default="nas, else the first that grounds",
+        ),
     ] = None,
     episodes: Annotated[
         int | None,
@@ -48,14 +51,15 @@ def select(
     ] = None,
 ) -> None:
     """Rank the trained policies of a run without the target, or with a few trials in it."""
+    run_at(run)
+    if trials is None and (field is not None or percent is not None):
+        raise BadInputError("--field and --percent need --trials: add --trials, or leave them out")
     from astra_data.experiments.display import shown
     from astra_data.experiments.selecting import select as rank
     from astra_data.experiments.trials import choose_by_trials
     from astra_data.reports.choice import FOLDER
 
     given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
-    if trials is None and (field is not None or percent is not None):
-        raise BadInputError("--field and --percent need --trials: add --trials, or leave them out")
     if trials is not None:
         with shown("select") as progress:
             made = choose_by_trials(run, trials, field=field, percent=percent, progress=progress, **given)

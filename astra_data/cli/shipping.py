@@ -12,17 +12,22 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.command("list")
 def list_() -> None:
-    """List the package's recipes, and its mappings for `import`."""
+    """List the package's recipes and how long they take, and its mappings for `import`."""
     from rich.table import Table
+    from rich.text import Text
 
-    from astra_data.experiments.shipped import shipped_mappings, shipped_recipes
+    from astra_data.experiments.shipped import START_HERE, listed
 
-    table = Table("recipe", "task", "what it is")
-    for recipe in shipped_recipes():
-        table.add_row(recipe.name, recipe.task, recipe.about)
-    for mapping in shipped_mappings():
-        table.add_row(mapping.name, "(a mapping, for import)", mapping.about)
-    show_table(table)
+    for title, recipes in listed().items():
+        table = Table("name", "takes", "what it is", title=title, title_justify="left", box=None)
+        for column in table.columns[:2]:
+            column.no_wrap = True  # the last one gives way
+        for recipe in recipes:
+            summary = Text(recipe.summary, no_wrap=True, overflow="ellipsis")
+            table.add_row(recipe.name, recipe.duration, summary)
+        show_table(table)
+        typer.echo()
+    typer.echo(f"To begin: astra-data recipes copy {START_HERE[0]}")
 
 
 @app.command()

@@ -5,7 +5,18 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.recipes import Device, Jobs, Methods, RecipePath, Root, Seeds, Until, resumable, show_made
+from astra_data.cli.arguments import (
+    Device,
+    Jobs,
+    Methods,
+    RecipePath,
+    Root,
+    Seeds,
+    Until,
+    check_asked,
+    recipe_at,
+)
+from astra_data.cli.recipes import resumable, show_made
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS
 
@@ -55,6 +66,7 @@ def sweep(
     """Run a recipe over rows, seeds and dataset sizes, with a live table; run it again to continue."""
     if address is not None and engine is not Engine.ray:
         raise BadInputError("sweep: --address is for --engine ray")
+    check_asked(recipe_at(recipe), methods, seeds, percents)
     from astra_data.experiments.sweep import sweep as sweep_recipe
 
     with resumable():

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from astra_data.cli.arguments import DatasetName, NewName, Out
+from astra_data.cli.arguments import DatasetName, NewName, Out, dataset_at, task_at
 from astra_data.cli.showing import show_table
 from astra_data.core.wording import first_few
 
@@ -27,6 +27,8 @@ def tasks(
     ] = None,
 ) -> None:
     """List the named tasks and their parts; or test one task."""
+    if task is not None:
+        task_at(task)
     from rich.table import Table
 
     from astra_data.core.errors import BadInputError
@@ -69,7 +71,8 @@ def label(
     task: Annotated[
         str,
         typer.Option(
-            help="A task: a name, or a place such as cart.py:TASK. Its code is run.", show_default=False
+            help="A task: a name, or a place such as cart.py:TASK. Its code is run.",
+            show_default=False,
         ),
     ],
     seed: Annotated[int, typer.Option(help="Random seed of the goals.")] = 0,
@@ -77,10 +80,11 @@ def label(
     out: Out = None,
 ) -> None:
     """Compute the goals, rewards, successes and failures that a log lacks, as a task defines them."""
-    from astra_data.dataset.versions import locate
+    task_at(task)
+    data = dataset_at(dataset)
     from astra_data.experiments.display import shown
     from astra_data.stages.label import label as label_dataset
 
     with shown("label") as progress:
-        folder = label_dataset(task, data=locate(dataset), seed=seed, name=name, out=out, progress=progress)
+        folder = label_dataset(task, data=data, seed=seed, name=name, out=out, progress=progress)
     typer.echo(f"finished: {folder}")

@@ -10,10 +10,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import read_manifest
+from astra_data.core.manifest import check_intact
 
 type Nested = (
     Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
@@ -55,15 +54,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """
     if not path.is_file():
         raise BadInputError(f"{path} does not exist: expected a safetensors file")
-    try:
-        manifest = read_manifest(path.parent)
-    except BadInputError as error:
-        raise BadInputError(f"{path.parent}: {error}") from None
-    if manifest and path.name in manifest.files and manifest.files[path.name][1] != file_digest(path):
-        raise BadInputError(
-            f"{path} was altered since it was made: restore it from a copy, or remove {path.parent} and run "
-            "the recipe again"
-        )
+    check_intact(path)
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping

@@ -48,6 +48,39 @@ class Manifest:
         return [name for name in _files(folder) if name not in self.files]
 
 
+def check_intact(path: Path) -> None:
+    """Refuse a file whose bytes are not those in the manifest beside it, if there is one.
+
+    Raises:
+        BadInputError: it was altered, or the manifest cannot be read.
+    """
+    manifest = _manifest_beside(path)
+    if manifest and path.name in manifest.files and manifest.files[path.name][1] != file_digest(path):
+        raise BadInputError(
+            f"{path} was altered since it was made: restore it from a copy, or remove {path.parent} and run "
+            "the recipe again"
+        )
+
+
+def check_made_from(made: Path, read: Mapping[str, str | None]) -> None:
+    """Refuse the artifact of a file `made` that was made from others than those that are `read` with it.
+
+    Args:
+        made: a file of the artifact.
+        read: name as in `made_from` → digest now; None where there is none.
+
+    Raises:
+        BadInputError: its manifest has another digest under one of these names.
+    """
+    manifest = _manifest_beside(made)
+    made_from = manifest.made_from if manifest else {}
+    if others := [name for name, digest in read.items() if digest and made_from.get(name, digest) != digest]:
+        raise BadInputError(
+            f"{made.parent} was made from another {' and another '.join(others)} than the one used with it: "
+            "restore the folders that belong together from a copy, or run the recipe again"
+        )
+
+
 def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:
     """Write the manifest of all that is in `folder` now, leaving out of `made_from` what is None."""
     files = {
@@ -73,6 +106,13 @@ def read_manifest(folder: Path) -> Manifest | None:
         return Manifest(files, dict(content["made_from"]))
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise BadInputError(f"{MANIFEST} cannot be read ({error})") from None
+
+
+def _manifest_beside(file: Path) -> Manifest | None:
+    try:
+        return read_manifest(file.parent)
+    except BadInputError as error:
+        raise BadInputError(f"{file.parent}: {error}") from None
 
 
 def _files(folder: Path) -> dict[str, Path]:

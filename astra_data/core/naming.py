@@ -16,6 +16,12 @@ CODE = "code.json"
 RUNS = Path("runs")
 """The folder of the folders of runs, unless another is given."""
 
+STAGE_NAMES = (
+    *("collect", "label", "augment", "pair", "subset", "ground"),
+    *("train", "align", "select", "evaluate", "report"),
+)
+"""The stages in the order of the pipeline, for what need not load them."""
+
 
 def is_plus(row: str) -> bool:
     """Return whether a row is trained with the `[plus]` settings."""

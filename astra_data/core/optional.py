@@ -1,6 +1,9 @@
 """Packages of the optional extras."""
 
+import re
 from importlib import import_module
+from importlib.metadata import requires
+from pathlib import Path
 from typing import Any
 
 from astra_data.core.errors import BadInputError
@@ -30,6 +33,7 @@ EXTRAS = {
     "rerun": "view",
 }
 """Which extra brings each package."""
+_ROOT = Path(__file__).parents[2]
 
 
 def optional(module: str) -> Any:  # noqa: ANN401 - a module
@@ -51,8 +55,15 @@ def missing_extra(error: ModuleNotFoundError) -> BadInputError | None:
 
 
 def how_to_install(extra: str) -> str:
-    """Return the commands that install an `extra`, for messages."""
-    return f'uv sync --extra {extra} in a checkout, else pip install "astra-data[{extra}]"'
+    """Return the command that installs an `extra`, for messages: in a checkout, by its project.
+
+    Elsewhere it names the packages themselves, as this one may have come from a file.
+    """
+    if (_ROOT / "pyproject.toml").is_file():
+        return f"uv sync --extra {extra}"
+    entries = (entry.partition(";") for entry in requires("astra-data") or ())
+    wanted = [name for name, _, marker in entries if re.search(rf"extra == ['\"]{extra}['\"]", marker)]
+    return f"pip install {' '.join(f'"{name.strip()}"' for name in wanted)}"
 
 
 def _not_installed(package: str) -> BadInputError:

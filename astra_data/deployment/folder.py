@@ -1,8 +1,8 @@
-"""The folder of a deployed policy: graphs, a description, a page of its own, and a loop that runs them."""
+"""The folder of a deployed policy: its graph, a description, a page of its own, and a loop that runs it."""
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from astra_data.core.manifest import write_manifest
 from astra_data.core.provenance import origin
 from astra_data.dataset.atomic import atomic_folder, refuse_existing
 from astra_data.dataset.columns import Column
-from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, TORCHSCRIPT, write_graphs
+from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, write_graph
 from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.deployment.page import page
 from astra_data.experiments.trained_policy import trained_policy
@@ -35,22 +35,22 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
         percent: the size of the dataset, where the recipe sweeps over sizes.
 
     Raises:
-        BadInputError: the row trains no policy, an artifact of it is not there, code of the task cannot be
-            written as a graph, or `out` exists.
+        BadInputError: the row trains no policy, an artifact of it is not there, was altered or made from
+            another than lies there now, code of the task cannot be written as a graph, or `out` exists.
     """
     refuse_existing(out)
     trained = trained_policy(run, row, seed=seed, percent=percent)
     deployed = trained.running()
     digests = {stage: file_digest(path) for stage, path in trained.files.items()}
     with atomic_folder(out) as folder:
-        written = write_graphs(deployed, folder)
+        written = write_graph(deployed, folder)
         about = {
             "format": FORMAT,
             "row": row,
             "seed": seed,
             **({} if percent is None else {"percent": percent}),
             "trained_on": {"dataset": trained.file.dataset, "hash": trained.file.content_hash},
-            **describe(deployed, written.parts),
+            **describe(deployed, written.parts, trained.recorded()),
             "largest_difference": written.apart,
             "made_from": digests | file_of(trained.settings["task"]),
             **origin(),
@@ -64,19 +64,30 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
     return out
 
 
-def describe(deployed: RunningPolicy, parts: Mapping[str, int]) -> dict[str, Any]:
-    """Return what one has to know to run a policy whose hidden state has these `parts`, by their sizes."""
+def describe(
+    deployed: RunningPolicy,
+    parts: Mapping[str, int],
+    recorded: tuple[Sequence[float], Sequence[float]] | None = None,
+) -> dict[str, Any]:
+    """Return what one has to know to run a policy.
+
+    Args:
+        deployed: the policy.
+        parts: the sizes of the parts of its hidden state.
+        recorded: least and largest of each value of the state in the data it was learned from, if known.
+    """
     task = deployed.task
     encoder = "target" if deployed.target_encoder is not None else "source"
     least, largest = zip(*task.limits.values(), strict=True)
+    ranges = {"recorded_least": recorded[0], "recorded_largest": recorded[1]} if recorded else {}
     return {
         "task": task.name,
         "instruction": task.instruction,
         "rate_hz": 1.0 / task.timestep_s,
-        "files": {"onnx": ONNX, "torchscript": TORCHSCRIPT},
+        "file": ONNX,
         "inputs": list(INPUTS),
         "outputs": list(OUTPUTS),
-        "state": _values(task.state, "state"),
+        "state": _values(task.state, "state") | ranges,
         "goal": _values(task.goal, "goal") if task.goal else {"names": []},
         "command": _values(task.action, "command") | {"least": least, "largest": largest},
         "hidden": {"size": sum(parts.values()), "start": 0.0, "parts": dict(parts)},

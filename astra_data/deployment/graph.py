@@ -1,13 +1,11 @@
-"""A policy with its encoder and memory as one graph, without state: ONNX and TorchScript."""
+"""A policy with its encoder and memory as one ONNX graph, without state."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import ZipFile
 
 import numpy as np
 import torch
@@ -18,10 +16,10 @@ from astra_data.core.optional import optional
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.running_policy import Memory, RunningPolicy
 
-ONNX, TORCHSCRIPT = "policy.onnx", "policy.torchscript"
+ONNX = "policy.onnx"
 INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")
 TOLERANCE = 1e-3
-"""How far commands of a graph may be from those of the policy, in half ranges: more than rounding does."""
+"""How far commands of the graph may be from those of the policy, in half ranges: more than rounding does."""
 
 _COMPARED_STEPS = 100
 _MOST_DRAWS = 100
@@ -69,18 +67,18 @@ class Written(NamedTuple):
 
     Attributes:
         parts: the parts of the hidden state, with their sizes.
-        apart: the largest difference from the policy's commands, in half ranges of these, by file.
+        apart: the largest difference from the policy's commands, in half ranges of these.
     """
 
     parts: dict[str, int]
-    apart: dict[str, float]
+    apart: float
 
 
-def write_graphs(deployed: RunningPolicy, folder: Path) -> Written:
-    """Write the policy as ONNX and TorchScript into `folder`, and compare both with it.
+def write_graph(deployed: RunningPolicy, folder: Path) -> Written:
+    """Write the policy as ONNX into `folder`, and compare the file with it.
 
     Raises:
-        BadInputError: code of the task cannot be traced, or a graph gives other commands than the policy.
+        BadInputError: code of the task cannot be traced, or the graph gives other commands than the policy.
     """
     optional("onnxscript")
     if isinstance(deployed.policy, OwnPolicy):
@@ -96,11 +94,7 @@ def write_graphs(deployed: RunningPolicy, folder: Path) -> Written:
         except Exception as error:
             raise _not_traceable(deployed, error) from error
         (folder / ONNX).write_bytes(model.SerializeToString(deterministic=True))
-        script = torch.jit.freeze(torch.jit.trace(graph, example, check_trace=False))
-        _save_script(script, folder / TORCHSCRIPT)
-    readers = {ONNX: load_onnx, TORCHSCRIPT: load_torchscript}
-    apart = {name: _apart(graph, read(folder / name), name) for name, read in readers.items()}
-    return Written(graph.parts, apart)
+    return Written(graph.parts, _apart(graph, load_onnx(folder / ONNX), ONNX))
 
 
 def load_onnx(path: Path) -> Graph:
@@ -122,13 +116,6 @@ def load_onnx(path: Path) -> Graph:
     return run
 
 
-def load_torchscript(path: Path) -> Graph:
-    """Return the graph of a TorchScript file."""
-    with _quiet():
-        loaded: Graph = torch.jit.load(str(path))
-    return loaded
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Hide the warnings of torch's exporters about torch's own code."""
@@ -147,16 +134,6 @@ def _onnx(module: nn.Module, example: tuple[Tensor, ...], **names: Sequence[str]
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
     return model
-
-
-def _save_script(script: Any, path: Path) -> None:  # noqa: ANN401 - torch has no name for it
-    """Write a TorchScript module, without the lines and paths of the code that made it."""
-    buffer = BytesIO()
-    torch.jit.save(script, buffer)
-    with ZipFile(buffer) as whole, ZipFile(path, "w") as kept:
-        for record in whole.infolist():
-            if not record.filename.endswith(".debug_pkl"):
-                kept.writestr(record, whole.read(record))
 
 
 def _hypot(x: Tensor, y: Tensor) -> Tensor:

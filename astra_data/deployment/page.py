@@ -26,8 +26,9 @@ run(policy, measure, send, goal, steps={minute}, stop={stop})
 stops it, which is sent in the end, after an error and after Ctrl-C: all of these are yours. Zeros stop
 what is commanded by speeds, and move what is commanded by positions: there, None leaves the last command.
 `policy.start()` begins an episode and `policy.act(state, goal)` takes one step. Another rate, other
-values, and values that are not finite are refused with a `ValueError`. `pip install numpy onnxruntime`
-brings all that it takes; `python run_policy.py` tries it with zeros.
+values, values that are not finite and states far outside the recorded range, as of mm for m, are refused
+with a `ValueError`, and so are files that were altered. `pip install numpy onnxruntime` brings all that it
+takes; `python run_policy.py` tries it in the middle of the recorded range.
 
 ## State
 
@@ -43,11 +44,10 @@ brings all that it takes; `python run_policy.py` tries it with zeros.
 
 ## Graph
 
-`policy.onnx` and `policy.torchscript` are the same graph, of one robot and one step, in float32: `state`
-(1, {states}), `goal` (1, {goals}) and `hidden` (1, {hidden}) in, `command` (1, {commands}) and
-`next_hidden` (1, {hidden}) out. All values are in the task's units: scaling, φ, the encoder and the
-memory are inside. `hidden` is zeros when an episode begins, and after that what the last step gave as
-`next_hidden`.
+`policy.onnx` is a graph of one robot and one step, in float32: `state` (1, {states}), `goal` (1, {goals})
+and `hidden` (1, {hidden}) in, `command` (1, {commands}) and `next_hidden` (1, {hidden}) out. All values are
+in the task's units: scaling, φ, the encoder and the memory are inside. `hidden` is zeros when an episode
+begins, and after that what the last step gave as `next_hidden`.
 
 ## Where it comes from
 
@@ -88,6 +88,11 @@ def _stop(command: Mapping[str, Any]) -> list[float] | None:
 def _table(values: Mapping[str, Any]) -> str:
     """Return the lists in the description of a column as a table, one row for each value."""
     lists = {key: entries for key, entries in values.items() if not isinstance(entries, str)}
-    titles = [key.removesuffix("s") if key != "names" else "name" for key in lists]
-    rows = (map(str, row) for row in zip(*lists.values(), strict=True))
+    one = {"names": "name", "units": "unit", "frames": "frame"}
+    titles = [one.get(key, key.replace("_", " ")) for key in lists]
+    rows = (map(_text, row) for row in zip(*lists.values(), strict=True))
     return table(titles, rows, words=len(titles))
+
+
+def _text(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

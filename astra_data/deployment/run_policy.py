@@ -1,5 +1,6 @@
-"""Run the policy in this folder: onnxruntime and NumPy alone. `python run_policy.py` tries it at rest."""
+"""Run the policy in this folder: onnxruntime and NumPy alone. `python run_policy.py` tries it."""
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -10,6 +11,8 @@ import numpy as np
 import onnxruntime
 
 HERE = Path(__file__).parent
+FAR = 5.0
+"""How far beyond the recorded range a state may be, in widths of it: values in another unit are farther."""
 
 
 class RobotPolicy:
@@ -19,7 +22,8 @@ class RobotPolicy:
         self, *, rate_hz: float, state: Sequence[str], goal: Sequence[str] = (), folder: Path = HERE
     ) -> None:
         """Take the rate at which it will act, and the names of the values that it will be given."""
-        self.about: dict[str, Any] = json.loads((folder / "policy.json").read_text())
+        described, graph = intact(folder, "policy.json", "policy.onnx")
+        self.about: dict[str, Any] = json.loads(described)
         if abs(rate_hz / self.about["rate_hz"] - 1.0) > 0.01:
             raise ValueError(f"rate_hz: expected {self.about['rate_hz']:g}, got {rate_hz:g}")
         for column, names in (("state", state), ("goal", goal)):
@@ -27,9 +31,7 @@ class RobotPolicy:
                 raise ValueError(f"{column}: expected the values {expected}, got {list(names)}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
-        self.session = onnxruntime.InferenceSession(
-            folder / "policy.onnx", options, providers=["CPUExecutionProvider"]
-        )
+        self.session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
         self.start()
 
     def start(self) -> None:
@@ -41,11 +43,47 @@ class RobotPolicy:
         feed = {"hidden": self.hidden}
         for column, given in (("state", state), ("goal", goal)):
             feed[column] = finite(column, given, self.about[column]["names"])[None]
+        refuse_far(feed["state"][0], self.about["state"])
         command, hidden = self.session.run(None, feed)
         if not np.isfinite(command).all():
             raise ValueError(f"the policy gives no command for the state {state!r} and the goal {goal!r}")
         self.hidden = hidden
         return command[0]
+
+
+def intact(folder: Path, *names: str) -> list[bytes]:
+    """Return what the files hold, or raise a ValueError if manifest.json has other digests of them."""
+    try:
+        files = json.loads((folder / "manifest.json").read_bytes())["files"]
+        expected = [str(files[name]["sha256"]) for name in names]
+        found = [(folder / name).read_bytes() for name in names]
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise ValueError(
+            f"{folder}: expected {', '.join(names)} and manifest.json as astra-data deploy wrote them, got "
+            f"{type(error).__name__}: {error}: copy the folder again, or deploy again"
+        ) from None
+    for name, digest, content in zip(names, expected, found, strict=True):
+        if hashlib.sha256(content).hexdigest() != digest:
+            raise ValueError(f"{folder / name} was altered: copy the folder again, or deploy again")
+    return found
+
+
+def refuse_far(state: Any, about: dict[str, Any]) -> None:  # noqa: ANN401 - an array
+    """Raise a ValueError for a value of a state (S,) that is far outside what was recorded, if that is known.
+
+    A value that was always zero is not judged, as its range has no width.
+    """
+    if "recorded_least" not in about:
+        return
+    least, largest = (np.asarray(about[f"recorded_{end}"], float) for end in ("least", "largest"))
+    width = np.max([largest - least, np.abs(least), np.abs(largest)], axis=0)
+    far = np.maximum(least - state, state - largest) > FAR * width
+    for index in np.flatnonzero(far & (width > 0)):
+        unit = f" {about['units'][index]}" if "units" in about else ""
+        raise ValueError(
+            f"state: {about['names'][index]} is {state[index]:g}, recorded is {least[index]:g} to "
+            f"{largest[index]:g}{unit}: give it in that unit"
+        )
 
 
 def finite(called: str, given: Any, names: Sequence[str]) -> Any:  # noqa: ANN401 - anything like an array
@@ -85,8 +123,10 @@ def run(
 
 
 if __name__ == "__main__":
-    described = json.loads((HERE / "policy.json").read_text())
-    state, goal = described["state"]["names"], described["goal"]["names"]
-    policy = RobotPolicy(rate_hz=described["rate_hz"], state=state, goal=goal)
+    described = json.loads(intact(HERE, "policy.json")[0])
+    state, goal = described["state"], described["goal"]["names"]
+    policy = RobotPolicy(rate_hz=described["rate_hz"], state=state["names"], goal=goal)
+    zeros = [0.0] * len(state["names"])
+    ends = [state.get(f"recorded_{end}", zeros) for end in ("least", "largest")]
     still = [0.0] * len(described["command"]["names"])
-    run(policy, lambda: np.zeros(len(state)), print, [0.0] * len(goal), steps=10, stop=still)
+    run(policy, lambda: np.mean(ends, axis=0), print, [0.0] * len(goal), steps=10, stop=still)

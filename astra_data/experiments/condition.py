@@ -39,10 +39,11 @@ LOADERS: dict[str, Callable[[Path], object]] = {
 
 @dataclass(frozen=True)
 class Condition:
-    """The condition of an artifact, and why, where there is something to say."""
+    """The condition of an artifact, why, and warnings of its content, where there is something to say."""
 
     state: Literal["finished", "missing", "damaged", "stale"]
     why: str = ""
+    warnings: tuple[str, ...] = ()
 
     @property
     def is_finished(self) -> bool:
@@ -62,6 +63,18 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
     if why := experiment.outdated(key) or _replaced(item, experiment, manifest):
         return Condition("stale", why)
     return Condition("finished", _remark(key, experiment, manifest))
+
+
+def spoilt(item: Item, experiment: Experiment) -> str:
+    """Return why the finished artifact of `item` cannot be read by others, every byte considered; "" if not.
+
+    Of datasets, whose values are compared whenever they are read, only the metadata are.
+    """
+    why, manifest = examined(item.key, experiment, verify=not _stage(item.key).makes_dataset)
+    if why:
+        return f"damaged ({why})"
+    why = _replaced(item, experiment, manifest)
+    return f"stale ({why})" if why else ""
 
 
 def examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Manifest | None]:

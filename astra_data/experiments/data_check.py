@@ -46,7 +46,8 @@ def data_condition(recipe: Recipe) -> Condition | None:
     check_fits(source, task)
     if any(method_named(row).grounds for row in recipe.methods):
         _check_division(recipe, source)
-    return Condition("finished", "; ".join([*differing_bounds(task.limits, source), *remarks(source, task)]))
+    warnings = (*differing_bounds(task.limits, source), *remarks(source, task))
+    return Condition("finished", warnings=warnings)
 
 
 def _check_division(recipe: Recipe, source: Dataset) -> None:

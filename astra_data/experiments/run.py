@@ -14,7 +14,7 @@ from astra_data.core.durable import clean, folder_for, make_folder, move, write_
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
 from astra_data.core.naming import RECORD, RUNS, is_plus, row_of_key, stage_of_key
-from astra_data.experiments.condition import Condition, can_be_made_again, condition, examined, to_make_again
+from astra_data.experiments.condition import Condition, can_be_made_again, condition, spoilt, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
 from astra_data.experiments.display import display
@@ -78,7 +78,7 @@ def run(
     part = Selection.of(experiment.recipe, seeds=seeds)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if stage_of(item) in wanted]
-    make(experiment, items, jobs=jobs, device=device)
+    make(experiment, items, planned, jobs=jobs, device=device)
     if "ground" in wanted:
         write_errors(experiment, part)
     return experiment.folder
@@ -131,7 +131,7 @@ def run_stage(
         publish=experiment.results if publish else None,
         add_to=experiment.published_in if add else None,
     )
-    make(experiment, _selected(planned, stage, methods), jobs=jobs, device=device)
+    make(experiment, _selected(planned, stage, methods), planned, jobs=jobs, device=device)
     return folder / stage
 
 
@@ -174,13 +174,14 @@ def _warn_of_free_risk(experiment: Experiment) -> None:
             )
 
 
-Show = Callable[[int, Console], AbstractContextManager[Watcher]]
-"""Shows the progress of a number of items, as `display.display` does."""
+Show = Callable[[Collection[str], Console], AbstractContextManager[Watcher]]
+"""Shows the progress of items by their keys, as `display.display` does."""
 
 
 def make(
     experiment: Experiment,
     items: Collection[Item],
+    planned: Collection[Item],
     *,
     jobs: int | None,
     device: str,
@@ -195,6 +196,7 @@ def make(
     Args:
         experiment: whose artifacts they are.
         items: each after those it reads.
+        planned: all items of the recipe that these may read.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
         cluster: address of the Ray cluster to run on, or "local" to start one; by default processes of
@@ -202,7 +204,7 @@ def make(
         show: shows the progress of the items.
 
     Raises:
-        MissingStageError: an artifact that an item reads is neither finished nor among them.
+        MissingStageError: an artifact that an item reads is neither among them nor finished and intact.
         RecipeError: the recipe differs from the one that made the existing artifacts.
         BadInputError: another process runs in the recipe's folder, the device or cluster is not available, or
             a dataset is damaged that the recipe cannot make again.
@@ -224,18 +226,18 @@ def make(
                 )
         items = [item for item in items if item.key in again or not finished(item, experiment)]
         data = data_condition(recipe) if any(stage_of(item) == "label" for item in items) else None
-        _check_inputs(experiment, items)
+        _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
         console = Console()
-        if data and data.why:
-            console.print(f"data: {data.why}", markup=False, highlight=False, soft_wrap=True)
+        for warning in data.warnings if data else ():
+            console.print(f"warning: data: {warning}", markup=False, highlight=False, soft_wrap=True)
         for key, reason in again.items():
             line = f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
         record_code(recipe, folder)
         prepare, logs = partial(_prepare, dict(recipe.own_methods)), folder / "logs"
-        with show(len(items), console) as watch:
+        with show([item.key for item in items], console) as watch:
             if cluster is None:
                 jobs = jobs or default_jobs(device)
                 execute(share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
@@ -251,19 +253,20 @@ def _prepare(own_methods: dict[str, OwnMethod]) -> None:
     add_all(own_methods)
 
 
-def _check_inputs(experiment: Experiment, items: Collection[Item]) -> None:
-    """Check that every input of `items` is finished or made by one of them."""
-    made = {item.key for item in items}
+def _check_inputs(experiment: Experiment, items: Collection[Item], planned: Collection[Item]) -> None:
+    """Check that every input of `items` is made by one of them, or finished, intact and not stale."""
+    made, known = {item.key for item in items}, {item.key: item for item in planned}
     # The report uses the seeds that are finished, and itself lists rows without any.
-    readers = [item for item in items if stage_of(item) not in ALWAYS_NEW]
-    reads = [key for item in readers for key in item.inputs if key not in made]
+    reads = [
+        key
+        for item in items
+        for key in item.inputs
+        if key not in made and (stage_of(item) not in ALWAYS_NEW or experiment.has(key))
+    ]
     for key in dict.fromkeys(reads):
         stage, root = stage_of_key(key), experiment.folder.parent
-        if not experiment.has(key):
-            fault = "missing"
-        elif why := examined(key, experiment, verify=not STAGES[stage].makes_dataset)[0]:
-            fault = f"damaged ({why})"
-        else:
+        fault = spoilt(known[key], experiment) if experiment.has(key) else "missing"
+        if not fault:
             continue
         maker = experiment.maker(stage)
         # Of the base, `run` makes what comes before the stage as well; two commands take no recipe.

@@ -10,6 +10,7 @@ import torch
 from astra_data.core.config import validated
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_made_from
 from astra_data.core.naming import row_of_key
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import ABSTRACT_NEXT_STATE, ABSTRACT_STATE, ACTION, Array, Column
@@ -39,7 +40,8 @@ def view_run(
 
     Raises:
         BadInputError: Rerun is not installed or its viewer does not open, `save` is no `.rrd` file, or `run`
-            is not the folder of a run, or has no pairs yet, no such seed or no such episode.
+            is not the folder of a run, or has no pairs yet, no such seed or no such episode, or a grounding
+            of other data than lie there now.
     """
     rerun = optional("rerun")
     if save is not None and save.suffix != ".rrd":
@@ -59,6 +61,8 @@ def view_run(
         if stage_of(item) == "ground" and made.is_file():
             assert isinstance(item.call, partial)
             share, drawn = item.call.keywords["config"].held_out_share, item.call.keywords["seed"]
+            if (data := item.call.keywords["dataset"]).is_dir():
+                check_made_from(made, {"dataset": Dataset.open(data).content_hash})
             held_out = episodes.split(share, drawn)[1]
             simulators[row_of_key(item.key)] = load_grounding(made)
     wanted = torch.tensor(uids or held_out.uids[:5].tolist())

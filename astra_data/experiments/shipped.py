@@ -4,6 +4,7 @@ import re
 import shutil
 import tomllib
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,12 @@ RECIPES = next(folder for folder in (_PACKAGE / "recipes", _PACKAGE.parent / "re
 IMPORTS = "imports"
 """The folder of mappings, below `RECIPES`."""
 
+START_HERE = ("quickstart", "cart", "antmaze_quick")
+"""Recipes to begin with, the first first."""
+_EXAMPLES = "Examples: your own robot, data and methods"
+_ROBOTS = {"antmaze": "An ant in mazes", "nao": "A humanoid robot, NAO", "humanoid": "A simulated humanoid"}
+"""Titles of groups, by the beginnings of tasks."""
+_DURATION = re.compile(r"About (\d+ \w+( per seed)?)( on [^.]*)?\.")
 _COMMAND = re.compile(r"(uv run |astra-data |python |--)")
 
 
@@ -47,6 +54,30 @@ class ShippedRecipe:
         if base := self.table.get("based_on"):
             return str(self.table.get("task", shipped(base).task))
         return str(self.table.get("task", ""))
+
+    @property
+    def group(self) -> str:
+        """The title under which it is listed."""
+        if self.path.parts[0] == IMPORTS:
+            return "Mappings, for astra-data import LOGS --mapping"
+        if self.name in START_HERE:
+            return "Start here"
+        return _ROBOTS.get(self.task.partition("-")[0], _EXAMPLES)
+
+    @property
+    def duration(self) -> str:
+        """How long it takes, as its first comments say: without that, how much there is to train."""
+        if found := _DURATION.search(self.about):
+            return found[1]
+        base = shipped(self.table["based_on"]).table if "based_on" in self.table else {}
+        table = base | self.table
+        counts = [len(table.get(key, ())) for key in ("methods", "seeds")]
+        return f"hours ({counts[0]} rows, {counts[1]} seeds)" if all(counts) else ""
+
+    @property
+    def summary(self) -> str:
+        """What it is, in a sentence."""
+        return _DURATION.sub("", self.about).partition(". ")[0].strip().rstrip(".")
 
     @property
     def files(self) -> set[Path]:
@@ -84,6 +115,15 @@ def shipped_mappings() -> tuple[ShippedRecipe, ...]:
     return tuple(sorted(found, key=lambda mapping: mapping.name))
 
 
+def listed() -> dict[str, list[ShippedRecipe]]:
+    """Return all recipes and mappings by the titles of their groups, what to begin with first."""
+    groups: dict[str, list[ShippedRecipe]] = {title: [] for title in ("Start here", _EXAMPLES)}
+    for recipe in (*shipped_recipes(), *shipped_mappings()):
+        groups.setdefault(recipe.group, []).append(recipe)
+    groups["Start here"].sort(key=lambda recipe: START_HERE.index(recipe.name))
+    return groups
+
+
 def shipped(name: str) -> ShippedRecipe:
     """Return the recipe, or the mapping, of this name.
 
@@ -94,6 +134,16 @@ def shipped(name: str) -> ShippedRecipe:
     if name not in recipes:
         raise BadInputError(f"no recipe '{name}' comes with astra-data{did_you_mean(name, recipes)}")
     return recipes[name]
+
+
+def whereabouts(name: str) -> str:
+    """Return where the recipe of a name, or of one like it, is, or how to get it; "" if none is alike."""
+    recipes = {recipe.name: recipe for recipe in shipped_recipes()}
+    for found in get_close_matches(name, recipes, n=1):
+        place = Path(RECIPES.name) / recipes[found].path
+        how = f"`astra-data recipes copy {found}` writes {place}"
+        return f"did you mean {place}?" if place.is_file() else how
+    return ""
 
 
 def copy_recipe(name: str, folder: Path) -> list[Path]:

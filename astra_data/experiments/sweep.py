@@ -87,7 +87,7 @@ def sweep(
         points, items = _left(points, items, experiment.published())
     wanted = [item for item in items if stage_of(item) in stages - experiment.borrowed]
     show = partial(_shown, PointTable(experiment, points), log)
-    make(experiment, wanted, jobs=jobs, device=device, cluster=cluster, show=show)
+    make(experiment, wanted, items, jobs=jobs, device=device, cluster=cluster, show=show)
     if any(stage_of(item) == "ground" for item in wanted):
         write_errors(experiment, part)
     return experiment.folder
@@ -187,10 +187,10 @@ def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
 
 
 @contextmanager
-def _shown(table: PointTable, log: Log | None, total: int, console: Console) -> Iterator[Watcher]:
+def _shown(table: PointTable, log: Log | None, keys: Collection[str], console: Console) -> Iterator[Watcher]:
     """Show the points above the running items, and keep `sweep.csv` up to date."""
     table.write()
-    with display(total, console, above=table) as watch:
+    with display(keys, console, above=table) as watch:
         yield _PointWatcher(watch, table, log, console)
 
 

@@ -4,11 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import did_you_mean
+import numpy as np
+
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_made_from
 from astra_data.core.naming import RECORD, artifact_key
+from astra_data.dataset.column_statistics import ranges
+from astra_data.dataset.columns import STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.experiments.own_files import check_unchanged
 from astra_data.experiments.own_methods import add_all
+from astra_data.experiments.points import refuse_unmade
 from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.methods import grounded_as, method_named
@@ -24,12 +31,22 @@ class TrainedPolicy:
 
     Attributes:
         settings: of the run's recipe, see `settings_of`. files: those that make up the policy, by the stage
-            that wrote them. file: what that of `train` holds.
+            that wrote them. file: what that of `train` holds. dataset: that it was learned from, if it is
+            still there.
     """
 
     settings: dict[str, Any]
     files: dict[str, Path]
     file: PolicyFile
+    dataset: Dataset | None = None
+
+    def recorded(self) -> tuple[list[float], list[float]] | None:
+        """Return the least and the largest of each value of the recorded states; None if not known."""
+        if self.dataset is None:
+            return None
+        found = ranges(self.dataset.blocks([STATE]))[STATE]
+        least, largest = (np.asarray(found[end], float).tolist() for end in ("min", "max"))
+        return least, largest
 
     def running(self) -> RunningPolicy:
         """Return it ready to act, with its encoder if it has one."""
@@ -49,7 +66,15 @@ def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | N
     """
     settings = settings_of(run)
     files = _files(settings, Path(run), row, seed, percent)
-    return TrainedPolicy(settings, files, PolicyFile.load(files["train"]))
+    data = Path(run) / artifact_key("pair" if percent is None else "subset", "", seed, percent)
+    dataset = Dataset.open(data) if data.is_dir() else None
+    read = {
+        "grounding": file_digest(files["ground"]) if "ground" in files else None,
+        "dataset": dataset.content_hash if dataset else None,
+    }
+    for made, file in files.items():
+        check_made_from(file, read if made != "ground" else read | {"grounding": None})
+    return TrainedPolicy(settings, files, PolicyFile.load(files["train"]), dataset)
 
 
 def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> RunningPolicy:
@@ -65,7 +90,8 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
 
     Raises:
         BadInputError: the run has no such row or seed, the row trains no policy, an artifact of it is not
-            there, or the code of the task or of the row's method changed since the run was made.
+            there, was altered or made from another than lies there now, or the code of the task or of the
+            row's method changed since the run was made.
 
     Example:
         >>> from astra_data import load_policy
@@ -114,7 +140,7 @@ def _files(
     add_all(own_methods)
     files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}
     if not files["train"].is_file():
-        _check_asked(settings, row, seed)
+        refuse_unmade(settings, row, seed)
     method = method_named(row)
     if not method.trains:
         raise BadInputError(f"{row} has no trained policy: it is written by hand")
@@ -132,12 +158,3 @@ def _files(
     if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
         raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
     return files
-
-
-def _check_asked(settings: dict[str, Any], row: str, seed: int) -> None:
-    """Refuse a row or a seed that a run's recipe, which had these `settings`, does not have."""
-    rows, seeds = settings.get("methods", [row]), settings.get("seeds", [seed])
-    if row not in rows:
-        raise BadInputError(f"the run has no row '{row}'{did_you_mean(row, rows)}")
-    if seed not in seeds:
-        raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")

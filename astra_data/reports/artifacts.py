@@ -12,6 +12,7 @@ from safetensors.numpy import load_file
 
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_intact
 from astra_data.reports.schema import Machine
 
 EVALUATION = "evaluation.json"
@@ -193,8 +194,9 @@ def read_json[T: Artifact](model: type[T], path: Path) -> T:
     """Read one of the files above.
 
     Raises:
-        BadInputError: the file does not hold what its stage writes; the message lists mismatches.
+        BadInputError: the file was altered, or does not hold what its stage writes; lists mismatches.
     """
+    check_intact(path)
     return read_written(model, path, by="its stage", advice="run that stage again")
 
 
@@ -202,8 +204,9 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.flo
     """Read a safetensors file that holds at least `names`.
 
     Raises:
-        BadInputError: the file is no safetensors file, or lacks a tensor.
+        BadInputError: the file was altered, is no safetensors file, or lacks a tensor.
     """
+    check_intact(path)
     try:
         tensors = load_file(path)
     except SafetensorError as error:

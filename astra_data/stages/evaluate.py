@@ -20,6 +20,7 @@ from astra_data.core.checkpoint import save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_made_from
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
@@ -93,7 +94,7 @@ def evaluate(
         num_threads: of the physics, by default one per core; the outcome is the same with any number.
 
     Raises:
-        BadInputError: an input is missing or malformed, or `out` exists.
+        BadInputError: an input is missing, malformed or of another grounding, or `out` exists.
 
     Example:
         >>> import json
@@ -115,13 +116,15 @@ def evaluate(
         "reference": reference and reference / GROUNDING,
     }
     read = {name: file for name, file in files.items() if file}
+    made_from = {name: file_digest(file) for name, file in read.items()}
+    for name in made_from.keys() & {"policy", "target_encoder"}:
+        check_made_from(read[name], {"grounding": made_from.get("grounding")})
     if policy is None:
         row = _follower(world)
     else:
         row = _policy(world, policy if isinstance(policy, PolicyFile) else None, read, config)
     shared = _shared_simulators(world, read.get("reference"), config) if row.shown_abstract else {}
     simulators = row.simulators | shared
-    made_from = {name: file_digest(file) for name, file in read.items()}
     asked = None if recorded is None else RecordedRange.of(recorded, world.limits)
     tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
     results: dict[str, Any] = {

@@ -5,6 +5,7 @@ grounding's own or one that is fitted to these; where nothing fails in them, sta
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from astra_data.core.config import AtOnce, Config, CountFromZero
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_made_from
 from astra_data.core.naming import artifact_key, reference_of
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
@@ -42,7 +44,7 @@ class SelectConfig(Config):
     episodes: AtOnce = 100
     """Episodes of each policy with each judge, run in one batch."""
     judge: str | None = None
-    """Row whose groundings serve as judges; by default the reference, NAS."""
+    """Row whose groundings serve as judges; by default NAS, or else the first row that grounds."""
     failure_members: CountFromZero = 5
     """Number of networks in the failure model fitted for a history model that serves as judge and has none,
     if some of the judge's episodes fail. 0: no failure model; the judge's states are then scattered around
@@ -62,9 +64,14 @@ class Entry:
     grounding: str | None
 
     def load(self, root: Path, task: str) -> RunningPolicy:
-        """Return the policy, with the encoder of its own grounding."""
-        model = grounding_at(root / self.grounding / GROUNDING if self.grounding else None)
-        return running(task_named(task), PolicyFile.load(root / self.policy / POLICY), model)
+        """Return the policy, with the encoder of its own grounding.
+
+        Raises:
+            BadInputError: a file was altered, or the grounding is not the one that the policy was made from.
+        """
+        policy, grounding = root / self.policy / POLICY, self.grounding and root / self.grounding / GROUNDING
+        check_made_from(policy, {"grounding": file_digest(grounding) if grounding else None})
+        return running(task_named(task), PolicyFile.load(policy), grounding_at(grounding or None))
 
 
 @dataclass(frozen=True)
@@ -98,16 +105,21 @@ class Bench:
         return Bench(self.percent, tuple(entries), judges)
 
 
-def judge_of(judge: str | None, rows: tuple[str, ...]) -> str:
-    """Return the method whose groundings judge the policies of `rows`, by default the reference.
+def judge_of(judge: str | None, rows: Sequence[str]) -> str:
+    """Return the method whose groundings judge the policies of `rows`.
+
+    By default that is the reference or, without it, the first row that grounds its simulator.
 
     Raises:
         BadInputError: it grounds nothing.
     """
-    asked = judge or reference_of(rows)
+    grounding = (row for row in rows if method_named(row).grounds)
+    asked = judge or reference_of(rows) or next(grounding, None)
     if asked is None or not method_named(asked).grounds:
-        known = "none, and NAS is not among the rows" if asked is None else asked
-        raise BadInputError(f"expected a row that grounds its simulator as judge, got {known}")
+        raise BadInputError(
+            "expected a row that grounds its simulator, such as nas or astra, as judge, got "
+            f"{asked or 'none'}"
+        )
     return grounded_as(asked)
 
 
@@ -117,7 +129,7 @@ def judge_in(recipe: Reported, config: SelectConfig) -> str:
     Raises:
         BadInputError: as `judge_of`.
     """
-    return judge_of(config.judge, tuple(recipe.settings["methods"]))  # type: ignore[arg-type]
+    return judge_of(config.judge, recipe.settings["methods"])  # type: ignore[arg-type]
 
 
 def benches(recipe: Reported, judge: str) -> list[Bench]:
@@ -230,6 +242,7 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
 def _judge(bench: Bench, task: str, root: Path, config: SelectConfig, seed: int) -> Judge:
     grounding, dataset = bench.judges[seed]
     made, episodes = load_grounding(root / grounding / GROUNDING), PairedEpisodes.load(root / dataset)
+    check_made_from(root / grounding / GROUNDING, {"dataset": episodes.content_hash})
     return Judge.of(task_named(task), made, episodes, config.failure_members, config.failure_steps)
 
 

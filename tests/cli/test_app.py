@@ -1,12 +1,16 @@
 import errno
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from failing_disk import small_files
 from fake_dataset import write_fake
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
@@ -41,6 +45,92 @@ def test_the_package_runs_as_a_module_does(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["run", "nope.toml"], "nope.toml does not exist"),
+        (["run", "quickstart"], "quickstart does not exist: did you mean recipes/quickstart.toml?"),
+        (["check", "a.toml", "b.toml"], "a.toml does not exist"),
+        (["run", "broken.toml"], "broken.toml, line 1"),
+        (["run", "small.toml", "--until", "grund"], "unknown stage 'grund': did you mean 'ground'?"),
+        (["run", "small.toml", "--device", "gpu"], "expected a device such as cpu, cuda or cuda:1, got"),
+        (["run", "small.toml", "--seed", "7"], "the recipe has no seed 7; its seeds: 0"),
+        (
+            ["train", "small.toml", "--method", "astr"],
+            "no method 'astr': did you mean 'astra'?",
+        ),
+        (["sweep", "small.toml", "--percent", "7"], "the recipe has no size 7; its sizes: none"),
+        (["pair", "none.toml"], "none.toml does not exist"),
+        (["pair", "none", "--simulator", "antmaze-umaze"], "no dataset 'none' in"),
+        (["pair", "fake", "--simulator", "no.py:SIMULATOR"], "no.py:SIMULATOR: expected a file no.py"),
+        (["collect", "no.py:TASK"], "no.py:TASK: expected a file no.py, found none: write path.py:TASK"),
+        (["tasks", "no.py:TASK"], "no.py:TASK: expected a file no.py"),
+        (["label", "none", "--task", "antmaze-umaze"], "no dataset 'none' in"),
+        (["label", "fake", "--task", "no.py:TASK"], "no.py:TASK: expected a file no.py"),
+        (["augment", "none"], "no dataset 'none' in"),
+        (["deploy", "none", "--row", "astra"], "none: expected the folder of a run (with recipe.json)"),
+        (["deploy", "runs/car", "--row", "nas"], "with astra-data run: did you mean 'runs/cart'?"),
+        (["deploy", "runs/cart", "--row", "nsa"], "the run has no row 'nsa': did you mean 'nas'?"),
+        (["deploy", "runs/cart", "--row", "nas", "--seed", "3"], "the run has no seed 3; its seeds: 0"),
+        (["deploy", "runs/cart", "--row", "nas", "--out", "fake"], "fake exists already"),
+        (["select", "none"], "none: expected the folder of a run (with recipe.json)"),
+        (["select", "runs/cart", "--field", "3"], "--field and --percent need --trials"),
+        (["view", "none"], "none: expected the folder of a run (with recipe.json)"),
+    ],
+)
+def test_a_mistake_is_told_before_anything_slow_is_loaded(
+    arguments: list[str], told: str, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(place)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    found = CliRunner().invoke(cli.app, arguments)
+    assert found.exit_code == 1 and told in str(found.exception)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recipe, a broken one, the package's quickstart, a run and a dataset."""
+    folder = tmp_path_factory.mktemp("place")
+    write_fake(folder / "fake")
+    (folder / "recipes").mkdir()
+    (folder / "recipes/quickstart.toml").touch()
+    (folder / "small.toml").write_text('task = "antmaze-umaze"\nmethods = ["nas", "astra"]\nseeds = [0]\n')
+    (folder / "broken.toml").write_text("=")
+    (folder / "runs/cart").mkdir(parents=True)
+    (folder / "runs/cart/recipe.json").write_text('{"task": "a", "methods": ["nas"], "seeds": [0]}')
+    return folder
+
+
+def test_a_mistake_loads_no_torch(place: Path) -> None:
+    """Also what the test's own process has loaded already: in a process of its own."""
+    code = (
+        "import sys; from astra_data.cli import app as cli; sys.argv = ['astra-data', 'run', 'nope.toml']\n"
+        "try: cli.main()\nexcept SystemExit: print(*sorted(name for name in sys.modules if '.' not in name))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=place, capture_output=True, text=True, check=True)
+    assert done.stderr == "error: nope.toml does not exist: did you mean 'broken.toml'?\n"
+    assert not (HEAVY - {"pydantic"}) & set(done.stdout.split())
+
+
+def test_every_command_has_an_example_of_options_that_it_has() -> None:
+    commands: Any = get_command(cli.app).commands  # type: ignore[attr-defined]
+    assert cli.EXAMPLES.keys() == commands.keys() - {"recipes", "gap"}
+    for name, example in cli.EXAMPLES.items():
+        _, typed, *words = shlex.split(example)
+        assert typed == name
+        options = {option for one in commands[name].params for option in one.opts}
+        assert {word for word in words if word.startswith("--")} <= options
+    shown = CliRunner().invoke(cli.app, ["run", "-h"], env={"COLUMNS": "100"}).output
+    assert "Example: astra-data run recipes/quickstart.toml" in shown and "ground, train, align" in shown
+
+
+def test_help_names_what_options_take() -> None:
+    commands: Any = get_command(cli.app).commands  # type: ignore[attr-defined]
+    for name in commands.keys() - {"recipes"}:
+        shown = CliRunner().invoke(cli.app, [name, "--help"], env={"COLUMNS": "160"}).output
+        assert not re.search(r"list\[|<(int|str|float|path)", shown), shown
 
 
 def test_version() -> None:

@@ -1,9 +1,12 @@
+import subprocess
+import sys
 from typing import Any
 
 import pytest
 from typer.main import get_command
 
 from astra_data.cli.app import app
+from astra_data.cli.settings import settings_of
 from astra_data.core.config import Config
 from astra_data.stages.augment import AugmentConfig
 from astra_data.stages.collect import CollectConfig
@@ -13,18 +16,20 @@ from astra_data.stages.pair import PairConfig
 @pytest.mark.parametrize(
     ("command", "model"), [("augment", AugmentConfig), ("collect", CollectConfig), ("pair", PairConfig)]
 )
-def test_the_defaults_that_help_shows_are_those_of_the_settings(command: str, model: type[Config]) -> None:
-    """They are written out in the command's options, so that help need not import the stage."""
+def test_a_command_has_an_option_for_each_setting(command: str, model: type[Config]) -> None:
     group: Any = get_command(app)
-    shown = {param.name: param.show_default for param in group.commands[command].params}
-    options = {name: field.default for name, field in model.model_fields.items() if name in shown}
-    assert options
-    for name, default in options.items():
-        if isinstance(default, bool):
-            assert shown[name] == ("" if default else "no-") + name.replace("_", "-")
-        elif isinstance(default, float | int):
-            assert float(shown[name]) == default
-        elif isinstance(default, tuple):
-            assert [*map(float, shown[name].split())] == [*default]
-        elif default is not None:
-            assert shown[name] == default
+    options = {one.name: one for one in group.commands[command].params}
+    read = settings_of(f"{model.__module__}:{model.__name__}")
+    assert [(one.name, one.default) for one in read] == [
+        (name, one.default) for name, one in model.model_fields.items()
+    ]
+    for one in read:
+        option, kind = options[one.name], type(one.default)
+        assert option.help.split() == one.about.replace("`", "").split() != []
+        assert option.default is None and (one.default is None or one.kind in (kind, tuple[float, float]))
+
+
+def test_settings_are_read_without_their_stages() -> None:
+    code = "import sys, astra_data.cli.app; print('astra_data.stages.collect' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

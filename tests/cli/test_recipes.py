@@ -71,6 +71,7 @@ def test_a_command_passes_its_options_to_its_stage(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, takes: set[str]
 ) -> None:
     asked: list[Any] = []
+    recipe.write_text('task = "maze"\nmethods = ["nas", "astra"]\nseeds = [4, 7]\n')
 
     def run_stage(*arguments: object, **options: object) -> Path:
         asked.append((*arguments, options))

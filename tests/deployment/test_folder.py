@@ -8,16 +8,20 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from rail_run import make_rail_run
 from small_run import GROUND, TASK, TRAIN, short_task
 
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import silent
+from astra_data.dataset import Dataset
 from astra_data.deployment.folder import deploy, describe
-from astra_data.deployment.graph import load_torchscript
+from astra_data.deployment.graph import load_onnx
 from astra_data.deployment.page import page
 from astra_data.experiments.recipe_file import recorded_settings
+from astra_data.experiments.selecting import select
 from astra_data.experiments.trained_policy import load_policy
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.alignment import TargetEncoder
@@ -56,9 +60,8 @@ def folder(run: Path) -> Path:
 
 def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) -> None:
     names = {path.name for path in folder.iterdir()}
-    graphs = {"policy.onnx", "policy.torchscript"}
     of_lerobot = {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
-    assert names == graphs | of_lerobot | {"policy.json", "README.md", "run_policy.py", "manifest.json"}
+    assert names == of_lerobot | {"policy.onnx", "policy.json", "README.md", "run_policy.py", "manifest.json"}
     about = json.loads((folder / "policy.json").read_text())
     task = TASKS["antmaze-umaze"]
     assert about["rate_hz"] == 20 and about["row"] == "nas" and about["encoder"] == "source"
@@ -68,10 +71,13 @@ def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) 
     assert about["command"]["least"] == [-1, -1] and about["command"]["largest"] == [1, 1]
     assert about["hidden"]["size"] == sum(about["hidden"]["parts"].values()) == 2 + 2 + 16
     assert len(about["trained_on"]["hash"]) == 64
-    assert max(about["largest_difference"].values()) < 1e-6
+    assert about["largest_difference"] < 1e-6
     manifest = read_manifest(folder)
     assert manifest is not None and manifest.faults(folder, verify=True) == []
     assert manifest.made_from == about["made_from"] and set(about["made_from"]) == {"train", "ground"}
+    states = recorded(run)
+    ends = [about["state"][f"recorded_{end}"] for end in ("least", "largest")]
+    np.testing.assert_array_equal(ends, [states.min(0), states.max(0)])
     page = " ".join((folder / "README.md").read_text().split())
     assert "20 times a second" in page and "{" not in page
     assert str(run.parent) not in page + json.dumps(about)
@@ -79,7 +85,8 @@ def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) 
 
 def test_its_page_runs(folder: Path) -> None:
     code = (folder / "README.md").read_text().partition("```python\n")[2].partition("```")[0]
-    given = "measure, send, goal = lambda: [0.0] * 29, print, [1.0, 2.0]\n"
+    start = json.loads((folder / "policy.json").read_text())["state"]["recorded_least"]
+    given = f"measure, send, goal = lambda: {start}, print, [1.0, 2.0]\n"
     code = code.replace("steps=1200", "steps=2")
     shown = alone(folder, given + code)
     assert len(shown.splitlines()) == 3 and shown.endswith("[0. 0.]\n")
@@ -87,7 +94,8 @@ def test_its_page_runs(folder: Path) -> None:
 
 def test_it_runs_without_this_package_and_without_torch(folder: Path, run: Path, tmp_path: Path) -> None:
     moved = shutil.copytree(folder, tmp_path / "robot")
-    states, goal = np.random.default_rng(0).standard_normal((20, 29)).astype("float32"), [1.0, -2.0]
+    noise, goal = np.random.default_rng(0).standard_normal((20, 29)).astype("float32"), [1.0, -2.0]
+    states = recorded(run)[:20] + 0.1 * noise
     np.save(tmp_path / "states.npy", states)
     shown = alone(
         moved,
@@ -115,6 +123,34 @@ def alone(folder: Path, code: str) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
+def test_folders_that_were_swapped_are_noticed(tmp_path: Path) -> None:
+    run = make_rail_run(tmp_path, seeds="[0, 1]", methods='["astra"]')
+    assert deploy(run, "astra", tmp_path / "whole").is_dir()
+    for stage, of in (("align", "dataset"), ("ground", "grounding"), ("pair", "dataset")):
+        rows = run / stage / "astra" if stage != "pair" else run / stage
+        swap(rows / "seed_0", rows / "seed_1")
+        with pytest.raises(
+            BadInputError, match=f"was made from another ({of}|grounding and another dataset) than"
+        ):
+            deploy(run, "astra", tmp_path / "policy")
+        if stage != "align":
+            with pytest.raises(BadInputError, match="was made from another"):
+                select(run, rows=["astra"], episodes=2)
+        swap(rows / "seed_0", rows / "seed_1")
+    assert not (tmp_path / "policy").exists()
+
+
+def recorded(run: Path) -> NDArray[np.float32]:
+    """Return the states (N, S) of the dataset of seed 0."""
+    return Dataset.open(run / "pair/seed_0").columns(["observation.state"])["observation.state"]
+
+
+def swap(one: Path, other: Path) -> None:
+    one.rename(one.with_name("aside"))
+    other.rename(one)
+    one.with_name("aside").rename(other)
+
+
 def test_what_is_no_policy_and_a_folder_that_exists_are_refused(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="follower has no trained policy"):
         deploy(run, "follower", tmp_path / "a/policy")
@@ -140,7 +176,7 @@ def test_of_a_policy_that_cannot_be_written_nothing_is_left(
         (folder / "policy.onnx").touch()
         raise BadInputError("code that cannot be traced")
 
-    monkeypatch.setattr("astra_data.deployment.folder.write_graphs", fail)
+    monkeypatch.setattr("astra_data.deployment.folder.write_graph", fail)
     with pytest.raises(BadInputError, match="cannot be traced"):
         deploy(run, "nas", tmp_path / "policy")
     assert list(tmp_path.iterdir()) == []
@@ -164,7 +200,7 @@ def test_the_policy_is_that_of_the_seed_and_size_that_are_asked_for(tmp_path: Pa
     here = load_policy(run, "direct_transfer", seed=1, percent=50)
     here.start(1)
     hidden = torch.zeros(1, about["hidden"]["size"])
-    command, _ = load_torchscript(folder / "policy.torchscript")(state, goal, hidden)
+    command, _ = load_onnx(folder / "policy.onnx")(state, goal, hidden)
     torch.testing.assert_close(command, here.command(state, goal), atol=1e-5, rtol=0)
     assert about["command_limit"] is None  # of velocities in a maze alone
 

@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,9 +9,10 @@ import pytest
 import torch
 from small_cart import TASK
 
+from astra_data.core.manifest import write_manifest
 from astra_data.deployment.folder import describe
-from astra_data.deployment.graph import write_graphs
-from astra_data.deployment.run_policy import RobotPolicy, run
+from astra_data.deployment.graph import write_graph
+from astra_data.deployment.run_policy import RobotPolicy, refuse_far, run
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.training.running_policy import RunningPolicy
 
@@ -20,12 +22,69 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("cart")
     torch.manual_seed(0)
     deployed = RunningPolicy(TASK, ActorCritic(ActorCriticShape(2, 1, memory_size=4)))
-    written = write_graphs(deployed, made)
-    (made / "policy.json").write_text(json.dumps(describe(deployed, written.parts)))
+    written = write_graph(deployed, made)
+    recorded = ([-0.5, 0.0], [1.0, 2.0])
+    (made / "policy.json").write_text(json.dumps(describe(deployed, written.parts, recorded)))
+    write_manifest(made, {})
     return made
 
 
 GIVEN: dict[str, Any] = {"rate_hz": 10, "state": ["x", "speed"], "goal": ["goal_0"]}
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "policy.json"])
+def test_of_altered_files_no_policy_is_made(name: str, folder: Path, tmp_path: Path) -> None:
+    """Whichever bit is another, and where: also where the command would be another one, or none."""
+    copied = Path(shutil.copytree(folder, tmp_path / "robot"))
+    whole = (copied / name).read_bytes()
+    for bit in np.random.default_rng(0).integers(8 * len(whole), size=50).tolist():
+        altered = bytearray(whole)
+        altered[bit // 8] ^= 1 << bit % 8
+        (copied / name).write_bytes(altered)
+        with pytest.raises(ValueError, match=rf"{name} was altered: copy the folder again"):
+            RobotPolicy(**GIVEN, folder=copied)
+    (copied / name).unlink()
+    with pytest.raises(ValueError, match=r"expected policy\.json, policy\.onnx and manifest\.json as"):
+        RobotPolicy(**GIVEN, folder=copied)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"files": {}}', '{"files": {"policy.json": 1}}'])
+def test_without_its_manifest_no_policy_is_made(content: str, folder: Path, tmp_path: Path) -> None:
+    copied = Path(shutil.copytree(folder, tmp_path / "robot"))
+    (copied / "manifest.json").write_text(content)
+    with pytest.raises(ValueError, match=r"as astra-data deploy wrote them, got .*: copy the folder again"):
+        RobotPolicy(**GIVEN, folder=copied)
+
+
+@pytest.mark.parametrize(
+    ("state", "refused"),
+    [
+        ([1.0, 2.0], ""),
+        ([6.9, -9.9], ""),  # 1.5 and 2 wide: up to 5 of these beyond either end
+        ([500.0, 0.5], "state: x is 500, recorded is -0.5 to 1: give it in that unit"),
+        ([-9.5, 0.5], "x is -9.5"),
+        ([0.5, 57.3], "speed is 57.3, recorded is 0 to 2"),
+    ],
+)
+def test_a_state_far_outside_what_was_recorded_is_refused(
+    state: list[float], refused: str, folder: Path
+) -> None:
+    policy = RobotPolicy(**GIVEN, folder=folder)
+    if not refused:
+        assert policy.act(state, [1.0]).shape == (1,)
+        return
+    with pytest.raises(ValueError, match=refused):
+        policy.act(state, [1.0])
+    assert not policy.hidden.any()
+
+
+def test_ranges_that_are_not_known_or_have_no_width_refuse_nothing() -> None:
+    refuse_far(np.array([9e9]), {"names": ["x"]})
+    refuse_far(np.array([9e9]), {"names": ["x"], "recorded_least": [0.0], "recorded_largest": [0.0]})
+    about = {"names": ["x"], "recorded_least": [3.0], "recorded_largest": [3.0], "units": ["m"]}
+    refuse_far(np.array([17.9]), about)
+    with pytest.raises(ValueError, match="x is 3000, recorded is 3 to 3 m: give it in that unit"):
+        refuse_far(np.array([3000.0]), about)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_dataset import writer
+from typer.testing import CliRunner
 
+from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
@@ -67,13 +69,13 @@ def test_bounds_beyond_what_was_recorded_are_told(
     recipe: Path, least: float, largest: float, expected: str
 ) -> None:
     write_logs(recipe.parent / "logs", least, largest)
-    found = check(recipe, root=recipe.parent / "runs")["data"]
-    assert found.is_finished
-    bounds, goals, _ = found.why.partition(
-        "fake@data-1.0.0 has no observation.environment_state: goals are dr"
-    )
-    assert bounds.startswith(expected) and bool(bounds) == bool(expected)
-    assert goals
+    shown = CliRunner().invoke(app, ["check", str(recipe), "--root", str(recipe.parent / "runs")]).output
+    data, *warnings = shown.splitlines()[1 : 4 if expected else 3]
+    assert data == "  finished  data"
+    goals = "  warning   data: fake@data-1.0.0 has no observation.environment_state: goals are dr"
+    assert warnings[-1].startswith(goals)
+    assert len(warnings) == 1 + bool(expected)
+    assert all(line.startswith(f"  warning   data: {expected}") for line in warnings[:-1])
 
 
 def test_steps_that_do_not_lead_to_the_row_after_them_are_told(
@@ -82,9 +84,9 @@ def test_steps_that_do_not_lead_to_the_row_after_them_are_told(
     write_logs(recipe.parent / "logs", -1.0, 4.0, ahead=0.5)
     found = check(recipe, root=recipe.parent / "runs")["data"]
     what = f"steps whose {NEXT_STATE} is not the state of the next row: 16 of 16: rows are missing"
-    assert found.is_finished and found.why.startswith(what)
+    assert found.is_finished and found.warnings[0].startswith(what)
     run(recipe, root=recipe.parent / "runs", until="label", jobs=1)
-    assert f"data: {found.why}\n" in capsys.readouterr().out
+    assert f"warning: data: {found.warnings[0]}\n" in capsys.readouterr().out
 
 
 def test_data_that_are_not_there_are_asked_for(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,14 +1,15 @@
+import re
 from io import StringIO
 
 import pytest
 from rich.console import Console
 
-from astra_data.experiments.display import display, shown
+from astra_data.experiments.display import Estimate, display, shown
 
 
 def test_without_a_terminal_there_are_plain_lines() -> None:
     file = StringIO()
-    with display(2, Console(file=file, width=20)) as watch:
+    with display(["collect/seed_0", "pair/seed_0"], Console(file=file, width=20)) as watch:
         watch.started("collect/seed_0")
         for percent in (1, 11, 12, 35):
             watch.progressed("collect/seed_0", percent / 100, "8 k steps/s [x]")
@@ -23,7 +24,8 @@ def test_without_a_terminal_there_are_plain_lines() -> None:
 
 def test_in_a_terminal_finished_items_become_lines_above_the_running_ones() -> None:
     file = StringIO()
-    with display(2, Console(file=file, width=120, force_terminal=True, no_color=True)) as watch:
+    keys = ["train/nas/seed_0", "train/nas/seed_1"]
+    with display(keys, Console(file=file, width=120, force_terminal=True, no_color=True)) as watch:
         watch.started("train/nas/seed_0")
         watch.progressed("train/nas/seed_0", 0.5, "success 0.83")
         watch.finished("train/nas/seed_0", 3.0)
@@ -35,10 +37,45 @@ def test_in_a_terminal_finished_items_become_lines_above_the_running_ones() -> N
     assert "train/nas/seed_1" in running and "25%" in running and "success 0.84 [x]" in running
 
 
+def test_in_80_columns_bar_share_and_time_left_stay() -> None:
+    file, key = StringIO(), "train/direct_transfer_task_reward_plus/percent_100/seed_0"
+    note = "31 k steps/s  success 0.83  return 12.1  made of very many words"
+    with display([key], Console(file=file, width=80, force_terminal=True, no_color=True)) as watch:
+        watch.started(key)
+        watch.progressed(key, 0.5, note)
+    *_, line = (line for line in file.getvalue().splitlines() if "train/direct" in line)
+    assert len(line.rstrip()) <= 80
+    assert re.search(r"train/direct\S*… .*━{9}.* 50% 0:00:00 31 k.*…", line)
+
+
+def test_the_time_left_counts_work_not_items() -> None:
+    now = [0.0]
+    keys = ["collect/seed_0", "train/nas/seed_0", "train/nas/seed_1", "evaluate/nas/seed_0"]
+    estimate = Estimate(keys, clock=lambda: now[0])
+    estimate.started("collect/seed_0")
+    now[0] = 5.0
+    estimate.finished("collect/seed_0", 5.0)
+    assert estimate.left() is None  # nothing is known of what takes longest
+    estimate.started("train/nas/seed_0")
+    assert estimate.left() is None and estimate.left_of("train/nas/seed_0") is None
+    now[0] = 25.0
+    estimate.progressed("train/nas/seed_0", 0.1)  # 200 s in all
+    assert estimate.left_of("train/nas/seed_0") == pytest.approx(180)
+    assert estimate.left() == pytest.approx(180 + 200)
+    estimate.started("train/nas/seed_1")
+    assert estimate.left() == pytest.approx(200)  # two at a time, and not before the longer one ends
+    now[0] = 125.0
+    estimate.finished("train/nas/seed_0", 120.0)
+    estimate.progressed("train/nas/seed_1", 0.5)
+    estimate.started("evaluate/nas/seed_0")
+    estimate.progressed("evaluate/nas/seed_0", 0.0)
+    assert estimate.left() == pytest.approx(100)
+
+
 def test_in_a_terminal_something_may_stand_above_the_items() -> None:
     file = StringIO()
     terminal = Console(file=file, width=120, force_terminal=True, no_color=True)
-    with display(2, terminal, above="all points") as watch:
+    with display(["train/nas/seed_0"], terminal, above="all points") as watch:
         watch.started("train/nas/seed_0")
         watch.failed("train/nas/seed_0")
     _, above, last = file.getvalue().rpartition("all points")
@@ -48,7 +85,7 @@ def test_in_a_terminal_something_may_stand_above_the_items() -> None:
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_an_item_may_fail_before_it_has_begun(is_terminal: bool) -> None:
     console = Console(file=StringIO(), force_terminal=is_terminal)
-    with display(1, console) as watch:
+    with display(["train/nas/seed_0"], console) as watch:
         watch.failed("train/nas/seed_0")
 
 

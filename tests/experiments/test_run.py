@@ -145,7 +145,7 @@ def test_a_task_is_walked_through_where_its_policies_are_trained(
         monkeypatch.setattr(f"astra_data.experiments.run.{way}", lambda *_, **__: None)
     device = "cuda" if cluster else "cuda:0"
     experiment = load_experiment(recipe, tmp_path)
-    make(experiment, (), jobs=1, device=device, cluster=cluster)
+    make(experiment, (), (), jobs=1, device=device, cluster=cluster)
     assert told == [walked]
 
 
@@ -208,6 +208,31 @@ def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> Non
     assert str(caught.value) == (
         f"{root / 'pair/seed_0'} is missing: run `astra-data pair {recipe} --root {tmp_path}` first"
     )
+
+
+@pytest.mark.parametrize(
+    ("stage", "part", "fault"),
+    [
+        ("report", "evaluate/astra/seed_1/evaluation.json", r"damaged \(evaluation.json was altered\)"),
+        ("evaluate", "train/astra/seed_0/policy.safetensors", r"damaged \(policy.safetensors was altered\)"),
+        ("train", "ground/astra", r"stale \(made from another pair/seed_0\)"),
+        ("evaluate", "align/astra", r"stale \(made from another pair/seed_0\)"),
+    ],
+)
+def test_a_stage_alone_reads_nothing_altered_and_nothing_swapped(
+    recipe: Path, tmp_path: Path, stage: str, part: str, fault: str
+) -> None:
+    recipe.write_text('task = "maze"\nmethods = ["astra"]\nseeds = [0, 1]\n')
+    place = run(recipe, root=tmp_path, jobs=2) / part
+    if place.is_file():
+        place.write_bytes(place.read_bytes().swapcase())
+    else:
+        for one, other in (("seed_0", "aside"), ("seed_1", "seed_0"), ("aside", "seed_1")):
+            (place / one).rename(place / other)
+    if stage != "report":
+        shutil.rmtree(tmp_path / "r" / stage)
+    with pytest.raises(MissingStageError, match=f"/{part.partition('/seed')[0]}/seed_. is {fault}: run"):
+        run_stage(recipe, stage, root=tmp_path, jobs=1)
 
 
 def test_moved_copies_are_made_by_running_the_recipe(recipe: Path, tmp_path: Path) -> None:

@@ -202,7 +202,7 @@ def test_finished_points_are_logged(recipe: Path, tmp_path: Path, monkeypatch: p
     )
     part: dict[str, Any] = {"methods": ["follower"], "seeds": [1], "percents": [50], "root": tmp_path}
     monkeypatch.setitem(sys.modules, "trackio", None)
-    with pytest.raises(BadInputError, match=r'pip install "astra-data\[trackio\]"'):
+    with pytest.raises(BadInputError, match="uv sync --extra trackio"):
         sweep(recipe, **part, trackio="ants")
     assert not (tmp_path / "r").exists()
     monkeypatch.setitem(sys.modules, "trackio", trackio)

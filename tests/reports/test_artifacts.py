@@ -7,6 +7,7 @@ from fake_runs import band, edit_json, outcomes, write_evaluation, write_json
 from safetensors.numpy import save_file
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import write_manifest
 from astra_data.reports.artifacts import (
     CurveFile,
     Evaluation,
@@ -29,6 +30,18 @@ def test_means_are_over_episodes_under_the_names_in_the_file(path: Path) -> None
     assert means == pytest.approx(
         {"success": 0.25, "failed": 0.75, "wall_contact": 0.2, "steps": 115.0, "return": 1.0}
     )
+
+
+@pytest.mark.parametrize("name", ["evaluation.json", "trajectories.safetensors"])
+def test_a_file_that_was_altered_is_not_read(name: str, path: Path) -> None:
+    write_manifest(path.parent, {})
+    assert read_json(Evaluation, path) and read_tensors(path.with_name("trajectories.safetensors"), ())
+    file = path.with_name(name)
+    altered = bytearray(file.read_bytes())
+    altered[-5] ^= 1
+    file.write_bytes(altered)
+    with pytest.raises(BadInputError, match=f"{name} was altered since it was made: restore it from a copy"):
+        read_json(Evaluation, file) if name == path.name else read_tensors(file, ())
 
 
 def test_a_malformed_artifact_is_named_with_every_fault(path: Path) -> None:

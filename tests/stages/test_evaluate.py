@@ -103,6 +103,19 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     assert torch.equal(paths["start"], paths["target.position"][:, 0])
 
 
+@pytest.mark.parametrize("foreign", ["policy", "target_encoder"])
+def test_artifacts_of_another_grounding_are_refused(
+    foreign: str, task: str, trained: Path, grounded: Path, grounded_anew: Path, aligned: Path, tmp_path: Path
+) -> None:
+    inputs = {"policy": trained, "grounding": grounded_anew, "target_encoder": aligned}
+    (fits,) = {"policy", "target_encoder"} - {foreign}
+    inputs[fits] = Path(shutil.copytree(inputs[fits], tmp_path / fits))
+    write_manifest(inputs[fits], {"grounding": file_digest(grounded_anew / "grounding.safetensors")})
+    with pytest.raises(BadInputError, match=f"{inputs[foreign]} was made from another grounding than"):
+        make(task, "astra", tmp_path / "out", inputs)
+    assert not (tmp_path / "out").exists()
+
+
 def test_simulators_that_all_rows_share_begin_and_reward_alike(
     task: str, paired: Path, trained: Path, grounded: Path, aligned: Path, tmp_path: Path
 ) -> None:

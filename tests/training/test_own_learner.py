@@ -13,7 +13,7 @@ from small_cart import TASK, Last
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
-from astra_data.deployment.graph import write_graphs
+from astra_data.deployment.graph import write_graph
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.training.own_learner import OwnLearner
 from astra_data.training.own_policy import KINDS, Array
@@ -142,7 +142,7 @@ def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
     with pytest.raises(
         BadInputError, match="Constant is a policy of another learner, which cannot be traced"
     ):
-        write_graphs(read, tmp_path)
+        write_graph(read, tmp_path)
     del KINDS["constant"]
     with pytest.raises(BadInputError, match="found kind constant"):
         PolicyFile.load(tmp_path / "policy.safetensors")

@@ -9,11 +9,13 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_intact
 from astra_data.dataset.columns import GOAL, STATE
 from astra_data.deployment.folder import DESCRIPTION
-from astra_data.deployment.graph import TORCHSCRIPT, load_torchscript
+from astra_data.deployment.graph import ONNX, load_onnx
 from astra_data.deployment.lerobot.configuration_astra_data import AstraDataConfig
 from astra_data.deployment.lerobot.files import TYPE
+from astra_data.deployment.run_policy import refuse_far
 
 
 class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
@@ -26,7 +28,7 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Read the folder `config.pretrained_path`.
 
         Raises:
-            BadInputError: there is none, or it is not the folder of a policy.
+            BadInputError: there is none, it is not the folder of a policy, or a file of it was altered.
         """
         super().__init__(config)
         folder = config.pretrained_path
@@ -34,8 +36,10 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
             raise BadInputError(
                 f"--policy.path: expected a folder that astra-data deploy wrote, got {folder or 'none'}"
             )
+        for name in (DESCRIPTION, ONNX):
+            check_intact(Path(folder) / name)
         self._about: dict[str, Any] = json.loads((Path(folder) / DESCRIPTION).read_text())
-        self._graph = load_torchscript(Path(folder) / TORCHSCRIPT)
+        self._graph = load_onnx(Path(folder) / ONNX)
         self.reset()
 
     @classmethod
@@ -61,8 +65,8 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Return commands (B, A), in their units, for the states (B, S) and goals (B, G) of `batch`.
 
         Raises:
-            BadInputError: values are missing, too many or not finite, or the number of robots has changed
-                since the last `reset`.
+            BadInputError: values are missing, too many, not finite or far outside what was recorded, or the
+                number of robots has changed since the last `reset`.
         """
         state = self._checked(batch, STATE, "state")
         goal = self._checked(batch, GOAL, "goal") if self._about["goal"]["names"] else state[:, :0]
@@ -73,6 +77,11 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"expected states and goals of {len(self._hidden)} robots, as since the last reset, got "
                 f"{len(state)} states and {len(goal)} goals: call reset() before the number of robots changes"
             )
+        try:
+            for row in state.numpy():
+                refuse_far(row, self._about["state"])
+        except ValueError as error:
+            raise BadInputError(str(error)) from None
         # The graph is of one robot.
         rows = [part.split(1) for part in (state, goal, self._hidden)]
         steps = [self._graph(*row) for row in zip(*rows, strict=True)]

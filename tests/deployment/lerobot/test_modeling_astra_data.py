@@ -77,7 +77,7 @@ def test_another_number_of_robots_needs_a_reset(made: Any) -> None:  # noqa: ANN
 def test_a_folder_without_a_policy_is_refused(made: Any, run: Path, tmp_path: Path) -> None:  # noqa: ANN401
     with pytest.raises(BadInputError, match=r"--policy\.path: expected a folder .* got none"):
         type(made)(type(made.config)())
-    for name in ("config.json", "policy.torchscript"):
+    for name in ("config.json", "policy.onnx"):
         shutil.copy(run.with_name("policy") / name, tmp_path)
     with pytest.raises(BadInputError, match=f"astra-data deploy wrote, got {tmp_path}"):
         type(made).from_pretrained(tmp_path)

@@ -273,7 +273,7 @@ def test_a_shape_that_the_file_does_not_hold_is_told(tmp_path: Path) -> None:
 def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_table(tmp_path / "log.h5", rows())
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(BadInputError, match=r'h5py .*not installed: .* pip install "astra-data\[hdf5\]"'):
+    with pytest.raises(BadInputError, match=r"h5py .*not installed: uv sync --extra hdf5"):
         imported(tmp_path, path)
 
 

@@ -96,7 +96,7 @@ def test_messages_that_change_in_size_are_told(tmp_path: Path) -> None:
 def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_json(tmp_path / "log.mcap", log())
     monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
-    with pytest.raises(BadInputError, match=r'pip install "astra-data\[mcap\]"'):
+    with pytest.raises(BadInputError, match="uv sync --extra mcap"):
         imported(tmp_path, path, MAPPING)
 
 

@@ -124,7 +124,7 @@ def test_a_folder_without_a_dataset_is_told(tmp_path: Path) -> None:
 def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_minari(tmp_path / "minari", episodes(is_dict=False))
     monkeypatch.setitem(sys.modules, "minari", None)
-    with pytest.raises(BadInputError, match=r'pip install "astra-data\[minari\]"'):
+    with pytest.raises(BadInputError, match="uv sync --extra minari"):
         imported(tmp_path, path, None, name="ant", fps=10)
 
 
