@@ -20,7 +20,7 @@ def new(
         typer.Option(
             "--from",
             help="The robot's logs: CSV files, folders of them, or a dataset.",
-            show_default="logs of a made-up cart",
+            show_default=False,
         ),
     ] = None,
     more: Annotated[
@@ -34,32 +34,41 @@ def new(
     """Start a project for your own robot: a task, a recipe, a mapping of its logs, a test and a page."""
     from rich.table import Table
 
+    from astra_data.core.errors import BadInputError
     from astra_data.core.wording import first_few
-    from astra_data.experiments.kind_errors import JUDGED_STEPS, badly_predicted
+    from astra_data.experiments.first_simulator import CLEARLY, JUDGED_STEPS
     from astra_data.experiments.new_robot import write_robot
 
+    places = [*(logs or ()), *(more or ())]
+    if not places:
+        raise BadInputError(
+            "expected the robot's logs, --from LOGS: CSV files, folders of them, or a dataset; without any, "
+            "begin with the files of `astra-data recipes copy cart`"
+        )
     folder = out or Path(name)
-    kind = write_robot(name, folder, [*(logs or ()), *(more or ())])
-    found = kind.logs
+    simulator = write_robot(name, folder, places)
+    found = simulator.logs
     table = Table("field", "used as", "unit", "factor", "why")
     for field in found.fields:
         table.add_row(field.name, field.taken_for, field.unit, f"{field.scale:.4g}", field.why)
     show_table(table)
-    typer.echo(f"abstract simulator: {kind.simulator}")
-    if worse := badly_predicted(kind):
-        which = "each state" if len(worse) == len(kind.names) else " and ".join(worse)
+    typer.echo(f"abstract simulator: {simulator.described}")
+    simulated, still = simulator.errors()
+    worse = [
+        one for one, is_worse in zip(simulator.names, simulated > CLEARLY * still, strict=True) if is_worse
+    ]
+    if worse:
         typer.echo(
-            f"after {JUDGED_STEPS} steps it predicts {which} of the logs worse than standing still would: "
-            f"edit `step` in {folder}/{name}.py"
+            f"after {JUDGED_STEPS} steps it predicts {' and '.join(worse)} of the logs worse than standing "
+            f"still would: edit `step` in {folder}/{name}.py"
         )
     if not found.of("time"):
         typer.echo(f"found no time field, so assumed {found.rate} rows per second: set fps and TIMESTEP_S")
-    if found.uneven:
-        typer.echo(f"{found.uneven} (CHECK)")
-    if found.still:
-        typer.echo(f"{found.still} (CHECK)")
-    for name, count in found.left_out.items():
-        typer.echo(f"{name} is not a number in {count} rows, which are left out: see logs.toml (CHECK)")
+    for line in (found.uneven, found.still):
+        if line:
+            typer.echo(f"{line} (CHECK)")
+    for field_name, count in found.left_out.items():
+        typer.echo(f"{field_name} is not a number in {count} rows, which are left out: see logs.toml (CHECK)")
     if found.cut_off:
         files = first_few(found.cut_off, _NAMED)
         typer.echo(f"{files}: the last line is cut off and is left out, as it is by an import")

@@ -2,9 +2,8 @@
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,242 +12,290 @@ import numpy as np
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.angles import ANGLE, LARGEST
-from astra_data.exchange.csv_numbers import MOSTLY, plain_name, read_numbers, torn_files
 from astra_data.exchange.cutting import RATE_TOLERANCE
-from astra_data.exchange.field_names import (
-    COMMAND,
-    COMMANDED,
-    ENDINGS,
-    EPISODE,
-    FORCE,
-    GOAL,
-    LENGTH,
-    NAMES,
-    PEDAL,
-    PLACE_TO_GO,
-    TIMES,
-    UNCLEAR,
-    UNITS,
-    WEAK_FAILURE,
+from astra_data.exchange.importers.csv import torn_bytes
+from astra_data.exchange.logs import (
+    HEADING,
+    MOSTLY,
+    TURNED,
+    Field,
+    Logs,
     Role,
+    csv_files,
+    plain_name,
+    read_numbers,
 )
-from astra_data.exchange.log_files import csv_files
-from astra_data.exchange.logs import Field, Logs
+from astra_data.exchange.recording import Source
+
+EPISODE = re.compile(
+    r"(ep(isode)?|trial|drive|run|rollout|traj(ectory)?|flight|lap|session|bag)(_?(id|index|nr))?"
+)
+CLOCK = r"time|timestamps?|stamp|clock|utc|epoch|uptime|[mun]?secs?|seconds"
+TIME, STAMP = re.compile(rf"t|(.+_)?({CLOCK})"), re.compile(rf"t|(.+_)?({CLOCK})(_.+|\d+)?")
+"""Names of a log's time, and of times of topics too, such as stamp_motors; they never go back."""
+COUNT = re.compile(r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?")
+FLAGS: dict[Role, str] = {
+    "failure": r"fail(ed|ure)?|fell|fall(en)?|tipped|toppled|overturned|capsized|jack_?knif(e|ed|ing)|"
+    r"crash(ed)?|colli(sion|ded)|bump(ed|er)?|e_?stop|stuck|fault|terminated",
+    "success": r"success|succeeded|(goal_)?reached|at_goal|arrived|delivered|docked|parked|solved",
+}
+UNCLEAR = re.compile(r"done|ended|truncated|timeout")
+"""Ends of which the name does not tell whether they are successes, failures or neither."""
+COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|sp|desired|des|target|ref"
+COMMAND = re.compile(rf"(.+_)?({COMMANDED})(_.+|\d+)?|u(_.+|\d+)?")
+COMMAND_WORD = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")
+TORQUE, FORCE = (
+    re.compile(rf"(.+_)?({words})(_.+|\d+)?") for words in ("tau|torque|effort|moment", "force|thrust")
+)
+PEDAL = re.compile(r"throttle|brake|steer(ing)?(_angle)?")
+NO_PLACE = f"{TURNED}|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque|moment"
+PLACE = re.compile(
+    rf"(?!.*({NO_PLACE}))(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)"
+)
+GPS = re.compile(r"(?P<stem>(.+_)?)(?P<axis>lat|lon|lng)(itude|gitude)?")
+GOAL = re.compile(
+    r"(?!.*(dist|bearing|_to_|_from_))(.+_)?(goal|destination|waypoint)"
+    r"(?P<axis>_(x|y|z|yaw|heading|theta|psi|east|north|lat(itude)?|lon(gitude)?))?|"
+    r"(target|ref|desired|des)_([xyz]|east|north)"
+)
+"""A goal where it is constant in each episode."""
+METERS_PER_DEGREE = 111_195.0
+"""Along a meridian of a sphere with Earth's mean radius, 6371 km."""
+_DEGREE = math.pi / 180
+_UNITS = (
+    (
+        "m/s",
+        {"mm_s": 1e-3, "cm_s": 1e-2, "m_s": 1, "m_per_s": 1, "mps": 1, "mph": 0.44704, "knots": 0.514444},
+    ),
+    ("m/s", {"km_h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6}),
+    (
+        "rad/s",
+        {
+            "deg_s": _DEGREE,
+            "deg_per_s": _DEGREE,
+            "dps": _DEGREE,
+            "rpm": math.pi / 30,
+            "rad_s": 1,
+            "rad_per_s": 1,
+        },
+    ),
+    ("m/s²", {"m_s2": 1, "mps2": 1}),
+    ("rad/s²", {"deg_s2": _DEGREE, "rad_s2": 1}),
+    ("m", {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "m": 1}),
+    ("rad", {"deg": _DEGREE, "degrees": _DEGREE, "rad": 1}),
+    *(("N m", {"nm": 1}), ("N", {"n": 1}), ("V", {"v": 1}), ("A", {"a": 1})),
+)
+UNITS = {ending: (unit, float(scale)) for unit, endings in _UNITS for ending, scale in endings.items()}
+"""Endings of names, the unit that values are stored in, and the factor to it."""
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+MOST_END_ROWS = 10
+"""Rows at the end of a log for which a flag that ends it may be set."""
 
 
 def guess(paths: Sequence[Path]) -> Logs:
-    """Read CSV logs, and guess what their fields are.
-
-    Args:
-        paths: files with the same fields; a folder stands for the CSV files in it.
+    """Read CSV logs, files with the same fields or folders of them, and guess what their fields are.
 
     Raises:
-        BadInputError: there is no such file, it is no CSV, files differ, a time is not finite or a command
-            mostly not, two fields come to the same name, there are no commands, no states or no episodes of
-            two rows, or the rate is too far from a whole number for an import.
+        BadInputError: there is no such file, it is no CSV, files differ, there are no commands, no states or
+            no episodes of two rows, or the rate is too far from a whole number for an import.
     """
     files = [file for path in paths for file in csv_files(path)]
-    tables = {file: read_numbers(file, EPISODE) for file in files}
-    first = next(iter(tables.values()))
-    header = [name for name in first if all(name in table for table in tables.values())]
-    for file, table in tables.items():
-        if {*_filled(table), *_filled(first)} - (table.keys() & first.keys()):
-            raise BadInputError(
-                f"{file}: expected the fields of {files[0]}, {_filled(first)}: got {_filled(table)}"
-            )
-    joined = {name: np.concatenate([table[name] for table in tables.values()]) for name in header}
-    guessed, every = [], list(tables.values())
-    for name, values in joined.items():
-        try:
-            guessed.append(_goal(name, values, every) or _field(name, values))
-        except BadInputError as error:
-            lacking = next(file for file, table in tables.items() if not np.isfinite(table[name]).all())
-            raise BadInputError(f"{lacking}: {error}") from None
-    try:
-        fields = _distinct(_times_apart(_places_apart(guessed, every), every))
-    except BadInputError as error:
-        raise BadInputError(f"{files[0]}: {error}") from None
-    needed = [field.name for field in fields if field.role in ("state", "command")]
-    gaps = {name: int((~np.isfinite(joined[name])).sum()) for name in needed}
-    episodes = tuple(_episodes(fields, (_whole(table, needed) for table in tables.values())))
-    if all(len(values) < 2 for episode in episodes for values in episode.values()):
-        cut = [field.name for field in fields if field.role == "episode"]
-        why = f"{' and '.join(cut)} changes in every row: leave it out" if cut else "record longer"
-        raise BadInputError(f"{files[0]}: expected episodes of two rows or more, found none: {why}")
-    found = Logs(fields, episodes, {name: gaps[name] for name in needed if gaps[name]}, torn_files(files))
+    sources = [Source(file, None, file) for file in files]
+    tables = [read_numbers(source, EPISODE) for source in sources]
+    filled = [[name for name, values in table.items() if np.isfinite(values).any()] for table in tables]
+    for file, names, table in zip(files, filled, tables, strict=True):
+        if {*names, *filled[0]} - (table.keys() & tables[0].keys()):
+            raise BadInputError(f"{file}: expected the fields of {files[0]}, {filled[0]}: got {names}")
+    raw = [episode for table in tables for episode in _episodes(table)]
+    fields = []
+    for name in (name for name in tables[0] if all(name in table for table in tables)):
+        found = _field(name, [episode[name] for episode in raw])
+        taken = any(
+            found.taken_for == other.taken_for for other in fields if other.role in ("state", "command")
+        )
+        fields.append(replace(found, short=plain_name(name)) if taken else found)
+    fields = _places(_roles(_times(fields, raw)), raw)
+    needed = [field.name for field in fields if field.role in ("time", "state", "command")]
+    gaps = {name: sum(int((~np.isfinite(episode[name])).sum()) for episode in raw) for name in needed}
+    rows = [np.all([np.isfinite(episode[name]) for name in needed], axis=0) for episode in raw]
+    episodes = tuple(
+        {one.name: (episode[one.name] * one.scale + one.offset)[kept] for one in fields}
+        for episode, kept in zip(raw, rows, strict=True)
+        if kept.any()
+    )
+    cut_off = tuple(str(source.path) for source in sources if torn_bytes(source))
+    logs = Logs(tuple(fields), episodes, {name: gap for name, gap in gaps.items() if gap}, cut_off)
     for role, example in (("command", "cmd_v"), ("state", "x")):
-        if not found.of(role):  # type: ignore[arg-type]
+        if role not in [field.role for field in fields]:
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
             raise BadInputError(
                 f"{files[0]}: found no {role} among {listed}: name one in the header, such as {example}"
             )
-    if abs(found.rate_error) > RATE_TOLERANCE:
-        (time, *_) = found.of("time")
+    if all(kept.sum() < 2 for kept in rows):
+        cut = [field.name for field in fields if field.role == "episode" or gaps.get(field.name)]
+        why = f"look at {' and '.join(cut)}, which cut or lack rows" if cut else "record longer"
+        raise BadInputError(f"{files[0]}: expected episodes of two rows or more, found none: {why}")
+    if abs(logs.recorded_rate / logs.rate - 1) > RATE_TOLERANCE:
         raise BadInputError(
-            f"{files[0]}: {time.name}: expected rows per second within {RATE_TOLERANCE:.0%} of a "
-            f"whole number, as fps is one, got {found.recorded_rate:.4g}: correct its unit, or resample the "
-            f"logs to {found.rate} rows per second"
+            f"{files[0]}: {logs.of('time')[0].name}: expected rows per second within {RATE_TOLERANCE:.0%} "
+            f"of a whole number, as fps is one, got {logs.recorded_rate:.4g}: correct its unit or resample"
         )
-    return found
+    return logs
 
 
-def _filled(table: dict[str, Floats]) -> list[str]:
-    """Return the fields that hold numbers."""
-    return [name for name, values in table.items() if np.isfinite(values).any()]
+def _episodes(table: dict[str, Floats]) -> list[dict[str, Floats]]:
+    """Cut a file where a field of the episode changes."""
+    cuts = {0, len(next(iter(table.values())))}
+    for name, values in table.items():
+        if EPISODE.fullmatch(plain_name(name)) and _is_whole(values):
+            cuts |= set((1 + np.flatnonzero(np.diff(values))).tolist())
+    return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(sorted(cuts))]
 
 
-def _distinct(fields: list[Field]) -> tuple[Field, ...]:
-    """Return the fields, with forces, or pedals and a wheel, as commands where there are no others.
-
-    `u` is a speed where `v` is one too and something else is commanded.
-
-    Raises:
-        BadInputError: two states, or two commands, come to the same name.
-    """
-    named = {_without_unit(plain_name(field.name), ENDINGS)[0]: field for field in fields}
-    commands = [field for field in fields if field.role == "command"]
-    if len(commands) > 1 and "v" in named and (speed := named.get("u")) in commands:
-        fields[fields.index(speed)] = replace(speed, role="state", short="u", why="a speed, like v")
-    if not commands:
-        fields = [
-            replace(field, role="command", why=f"{why}, and no other command") if why else field
-            for field, why in ((field, _may_command(field)) for field in fields)
-        ]
-    ends = set[Role]()
-    # What is a failure for want of another one comes last.
-    weak = [bool(WEAK_FAILURE.fullmatch(plain_name(field.name))) for field in fields]
-    for number, field in sorted(enumerate(fields), key=lambda numbered: weak[numbered[0]]):
-        if field.role in ("failure", "success", "reward"):
-            if field.role in ends:
-                why = f"a second {field.role}: combine both into one field"
-                fields[number] = replace(field, role="left out", why=why)
-            ends.add(field.role)
-    seen: dict[str, str] = {}
-    for field in fields:
-        if field.role not in ("state", "command"):
-            continue
-        if (other := seen.setdefault(field.taken_for, field.name)) != field.name:
-            raise BadInputError(
-                f"{other} and {field.name} would both become {field.taken_for}: rename one, or leave it out"
+def _field(name: str, series: Sequence[Floats]) -> Field:
+    """Return what a field is by itself, of its values (T,) in each episode."""
+    plain, values = plain_name(name), np.concatenate(series)
+    finite = np.isfinite(values)
+    steps = np.concatenate([np.diff(one[np.isfinite(one)]) for one in series])
+    clock, time_unit = _without_unit(plain, TIMES)
+    body, ending = _without_unit(plain, UNITS)
+    if ending in ("n", "v", "a") and re.fullmatch(f"{COMMANDED}|u", body):
+        body, ending = plain, None  # an axis, as in cmd_v
+    is_flag, is_constant = (
+        bool(np.isin(values, (0, 1)).all()),
+        not np.ptp(values[finite]) if finite.any() else True,
+    )
+    role: Role = "left out"
+    why = "its name"
+    if not plain or not finite.any():
+        why = (
+            "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"
+            if plain
+            else "no letter a to z"
+        )
+    elif (STAMP.fullmatch(clock) or time_unit) and (steps >= 0).all() and (steps > 0).any():
+        step = float(np.median(steps))
+        unit = time_unit or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
+        why = "its ending, and it never goes back" if time_unit else f"steps of {step:g}"
+        return Field(name, "time", plain, unit, TIMES[unit], why)
+    elif TIME.fullmatch(clock):
+        why = "a time that does not rise"
+    elif UNCLEAR.fullmatch(plain):
+        why = "an end, but which? name it success or failed"
+    elif EPISODE.fullmatch(plain) and _is_whole(values):
+        role = "episode"
+    elif COUNT.fullmatch(plain):
+        pass
+    elif is_flag and (flag := next((flag for flag in FLAGS if re.fullmatch(FLAGS[flag], plain)), None)):
+        role = flag
+    elif plain == "reward":
+        role = "reward"
+    elif (
+        (goal := GOAL.fullmatch(body))
+        and (goal["axis"] or not is_flag)
+        and not any(np.ptp(one) for one in series)
+    ):
+        return _with_unit(name, "goal", body, ending, values)
+    elif is_constant:
+        why = "never changes"
+    elif COMMAND.fullmatch(body):
+        return _with_unit(
+            name, "command", COMMAND_WORD.sub("_", body).strip("_") or "command", ending, values
+        )
+    elif is_flag:
+        flags = [one for one in series if one.any()]
+        why = "0 or 1: name it success or failed if it is an end"
+        if all(one[-1] and one[np.argmax(one > 0) :].all() and one.sum() <= MOST_END_ROWS for one in flags):
+            role, why = (
+                "failure",
+                f"0 or 1, and it ends all {len(flags)} of {len(series)} episodes that have a 1 (CHECK)",
             )
-    return tuple(fields)
+    elif finite.mean() <= MOSTLY:
+        why = f"no number in {(~finite).sum()} rows"
+    else:
+        return _with_unit(name, "state", body, ending, values)
+    return Field(name, role, plain, why=why)
 
 
-def _goal(name: str, values: Floats, tables: Sequence[dict[str, Floats]]) -> Field | None:
-    """Return a field that its name calls a goal, and that has one value in each episode; None for others."""
-    body, ending = _without_unit(plain_name(name), ENDINGS)
-    found = GOAL.fullmatch(body)
-    is_flag = bool(np.isin(values, (0, 1)).all())
-    if found is None or (is_flag and not found["axis"]) or not _stays(name, tables):
-        return None
-    return _with_unit(name, "goal", body, ending, values)
+def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Floats) -> Field:
+    """Return a field with its unit, by the ending of its name, or else by what it is called."""
+    short = f"{'u' if role == 'command' else 's'}{short}" if short[0].isdigit() else short
+    if ending is not None:
+        return Field(name, role, short, *UNITS[ending], "its ending")
+    unit, scale, why = "1", 1.0, "its name"
+    if TORQUE.fullmatch(short) or FORCE.fullmatch(short):
+        unit = "N m" if TORQUE.fullmatch(short) else "N"
+    elif role != "command" and (ANGLE.fullmatch(short) or HEADING.fullmatch(short)):
+        largest, unit = np.nanmax(np.abs(values)), "rad"
+        scale, why = (
+            (_DEGREE, f"an angle up to {largest:.0f}: degrees") if largest > LARGEST else (scale, why)
+        )
+    elif role != "command" and PLACE.fullmatch(short):
+        unit = "m"
+    return Field(name, role, short, unit, scale, why if unit != "1" else "no unit in its name")
 
 
-def _places_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> list[Field]:
-    """Return the fields, with commanded places as goals where these stay and something else is commanded."""
-    bodies = [_without_unit(plain_name(field.name), ENDINGS)[0] for field in fields]
-    stay = {
-        field.name
-        for field, body in zip(fields, bodies, strict=True)
-        if field.role == "command" and PLACE_TO_GO.fullmatch(body) and _stays(field.name, tables)
-    }
-    if not any(field.role == "command" or _may_command(field) for field in fields if field.name not in stay):
-        return list(fields)
+def _times(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
+    """Return the fields with one time, that of the log: the others are times of topics."""
+
+    def rank(field: Field) -> tuple[bool, bool]:
+        steps = np.concatenate([np.diff(episode[field.name]) for episode in episodes])
+        return bool((steps > 0).mean() <= MOSTLY), not TIME.fullmatch(_without_unit(field.short, TIMES)[0])
+
+    times = sorted((field for field in fields if field.role == "time"), key=rank)
+    chosen = [field for field in times[:1] if not rank(field)[0]]
+    why = f"a time beside {chosen[0].name}" if chosen else "a time that stands still in some rows"
     return [
-        replace(field, role="goal", why="constant in each episode") if field.name in stay else field
-        for field in fields
+        Field(f.name, "left out", f.short, why=why) if f in times and f not in chosen else f for f in fields
     ]
 
 
-def _may_command(field: Field) -> str:
-    """Return why a state is a command where there is no other; nothing for what is none."""
-    if field.role != "state":
-        return ""
-    return "a force" if FORCE.fullmatch(field.short) else "its name" if PEDAL.fullmatch(field.short) else ""
-
-
-def _times_apart(fields: Sequence[Field], tables: Sequence[dict[str, Floats]]) -> list[Field]:
-    """Return the fields, with a state that ends in a unit of time and rises as a time, if none is one."""
+def _roles(fields: Sequence[Field]) -> list[Field]:
+    """Return the fields, with forces and pedals as commands if there are no others, one of each outcome."""
+    is_commanded = any(field.role == "command" for field in fields)
     found: list[Field] = []
-    has_time = any(field.role == "time" for field in fields)
-    for field in fields:
-        _, ending = _without_unit(plain_name(field.name), TIMES)
-        if ending is None or (field.role, field.unit) != ("state", "1") or not _rises(field.name, tables):
-            found.append(field)
-        elif has_time:
-            found.append(replace(field, role="left out", why="a second time"))
-        else:
-            has_time = True
-            why = "its ending, and it increases in every row"
-            found.append(Field(field.name, "time", "time", ending, TIMES[ending], why))
-    return found
+    for field in sorted(fields, key=lambda field: field.why.endswith("(CHECK)")):
+        if field.role in ("failure", "success", "reward") and field.role in [one.role for one in found]:
+            field = replace(field, role="left out", why=f"a second {field.role}: combine both into one field")
+        acts = any(pattern.fullmatch(field.short) for pattern in (TORQUE, FORCE, PEDAL))
+        if acts and field.role == "state" and not is_commanded:
+            field = replace(field, role="command", why=f"{field.why}, and no other command")
+        found.append(field)
+    by_name = {field.name: field for field in found}
+    return [by_name[field.name] for field in fields]
 
 
-def _stays(name: str, tables: Sequence[dict[str, Floats]]) -> bool:
-    """Return whether a field has one value in each episode."""
-    return not any(_steps(name, table).any() for table in tables)
-
-
-def _rises(name: str, tables: Sequence[dict[str, Floats]]) -> bool:
-    """Return whether a field grows from each row of an episode to the next."""
-    return all((_steps(name, table) > 0).all() for table in tables)
-
-
-def _steps(name: str, table: dict[str, Floats]) -> Floats:
-    """Return the differences between the rows of each episode; nan where one is not finite."""
-    values: Floats = np.where(np.isfinite(table[name]), table[name], np.nan)
-    goes_on = np.ones(len(values) - 1, bool)
-    for other, numbers in table.items():
-        if EPISODE.fullmatch(plain_name(other)) and _is_whole(numbers):
-            goes_on &= np.diff(numbers) == 0
-    steps: Floats = np.diff(values)[goes_on]
-    return steps
-
-
-def _field(name: str, values: Floats) -> Field:
-    plain = plain_name(name)
-    left_out = partial(Field, name, "left out", plain, "1", 1.0)
-    if not plain:
-        return left_out("no letter a to z and no digit in its name")
-    if not np.isfinite(values).any():
-        return left_out("texts, dates or nothing: expected numbers, of a time in s, ms, us or ns")
-    body, ending = _without_unit(plain, TIMES)
-    if re.fullmatch(NAMES[0][1], body):
-        _check_finite(name, "time", values)
-        if (np.diff(values) > 0).mean() <= 0.9:
-            return left_out("a time that does not rise")
-        step = float(np.median(np.diff(values)))
-        unit = ending or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
-        why = "its ending" if ending else f"steps of {step:g}"
-        return Field(name, "time", "time", unit, TIMES[unit], why)
-    if re.fullmatch(UNCLEAR, plain):
-        return left_out("an end, but which? name it success or failed")
-    body, ending = _without_unit(plain, ENDINGS)
-    if ending in ("n", "v", "a") and re.fullmatch(f"{COMMANDED}|u", body):
-        body, ending = plain, None  # an axis, as in cmd_v
-    is_flag = bool(np.isin(values, (0, 1)).all())
-    for role, pattern in NAMES[1:]:
-        if re.fullmatch(pattern, plain) or re.fullmatch(pattern, body):
-            if role in ("failure", "success") and not is_flag:
-                continue
-            if role == "episode" and not _is_whole(values):
-                continue
-            if WEAK_FAILURE.fullmatch(body) and not values.any():
-                return left_out("never changes")
-            if role != "command":
-                return Field(name, role, role, "1", 1.0, "its name")
-            if np.isfinite(values).mean() <= MOSTLY:
-                _check_finite(name, "command", values)
-            if np.ptp(values[np.isfinite(values)]) == 0:
-                return left_out("never changes")
-            short = COMMAND.sub("_", body).strip("_") or "command"
-            return _with_unit(name, role, f"u{short}" if short[0].isdigit() else short, ending, values)
-    finite = np.isfinite(values)
-    if finite.mean() <= MOSTLY or np.ptp(values[finite]) == 0:
-        return left_out("never changes" if finite.all() else f"no number in {(~finite).sum()} rows")
-    if is_flag:
-        return left_out("0 or 1: name it success or failed if it is an end")
-    return _with_unit(name, "state", f"s{body}" if body[0].isdigit() else body, ending, values)
+def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
+    """Return the fields, with latitude and longitude in m, and with offsets where float32 loses steps."""
+    gps = {field.short: found for field in fields if (found := GPS.fullmatch(field.short))}
+    latitudes = {found["stem"]: short for short, found in gps.items() if found["axis"] == "lat"}
+    pairs = {found["stem"] for found in gps.values() if found["axis"] != "lat"} & latitudes.keys()
+    offsets: dict[str, float] = {}
+    placed: dict[str, Field] = {}
+    for field in sorted(fields, key=lambda field: field.role == "goal"):  # goals take the offsets of states
+        values = np.concatenate([episode[field.name] for episode in episodes])
+        if field.role not in ("state", "goal") or not np.isfinite(values).any():
+            continue
+        first, largest = float(values[np.isfinite(values)][0]), float(np.nanmax(np.abs(values)))
+        place, at = PLACE.fullmatch(field.short), gps.get(field.short)
+        if at and at["stem"] in pairs:
+            latitude = next(one.name for one in fields if one.short == latitudes[at["stem"]])
+            degrees = 1e-7 if largest > 360 else 1.0
+            north = math.radians(float(np.nanmean(episodes[0][latitude])) * degrees)
+            scale = degrees * METERS_PER_DEGREE * (1.0 if at["axis"] == "lat" else math.cos(north))
+            why, offset = "degrees, to m from the first row", offsets.setdefault(at["axis"], -first * scale)
+            placed[field.name] = replace(field, unit="m", scale=scale, offset=offset, why=why)
+        elif place and field.unit == "m":
+            steps = (
+                np.abs(np.concatenate([np.diff(episode[field.name]) for episode in episodes])) * field.scale
+            )
+            step = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.inf
+            if field.role == "state" and np.spacing(np.float32(largest * field.scale)) > step / 100:
+                offsets[place["axis"]] = -float(round(first * field.scale))
+            if offset := offsets.get(place["axis"], 0.0):
+                why = f"{field.why}; an offset, as float32 cannot hold its steps"
+                placed[field.name] = replace(field, offset=offset, why=why)
+    return [placed.get(field.name, field) for field in fields]
 
 
 def _is_whole(values: Floats) -> bool:
@@ -256,45 +303,8 @@ def _is_whole(values: Floats) -> bool:
     return bool((finite == np.rint(finite)).all())
 
 
-def _check_finite(name: str, role: Role, values: Floats) -> None:
-    if wrong := int((~np.isfinite(values)).sum()):
-        found = f"got none in {wrong} of {len(values)}: leave these rows out"
-        raise BadInputError(f"{name}: expected a number in each row of a {role}, {found}")
-
-
-def _without_unit(name: str, endings: Sequence[str] | dict[str, float]) -> tuple[str, str | None]:
-    for ending in endings:
+def _without_unit(name: str, endings: Iterable[str]) -> tuple[str, str | None]:
+    for ending in sorted(endings, key=len, reverse=True):
         if name.endswith(f"_{ending}") and len(name) > len(ending) + 1:
             return name.removesuffix(f"_{ending}"), ending
     return name, None
-
-
-def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Floats) -> Field:
-    for known, unit, scale in UNITS:
-        if ending == known:
-            return Field(name, role, short, unit, scale, "its ending")
-    if role in ("state", "goal") and ANGLE.fullmatch(short):
-        if (largest := np.nanmax(np.abs(values))) > LARGEST:
-            return Field(name, role, short, "rad", math.pi / 180, f"an angle up to {largest:.0f}: degrees")
-        return Field(name, role, short, "rad", 1.0, "its name")
-    if role in ("state", "goal") and LENGTH.fullmatch(short):
-        return Field(name, role, short, "m", 1.0, "its name")
-    return Field(name, role, short, "1", 1.0, "no unit in its name")
-
-
-def _whole(table: dict[str, Floats], needed: Sequence[str]) -> dict[str, Floats]:
-    """Return the rows of a file with a number in each of the fields `needed`."""
-    kept = np.all([np.isfinite(table[name]) for name in needed], axis=0)
-    return {name: values[kept] for name, values in table.items()} if needed else table
-
-
-def _episodes(fields: Sequence[Field], tables: Iterable[dict[str, Floats]]) -> Iterator[dict[str, Floats]]:
-    """Cut the files where the field of the episode changes, and scale their values."""
-    for table in tables:
-        values = {field.name: table[field.name] * field.scale for field in fields}
-        cuts = {0, len(next(iter(values.values())))}
-        for field in fields:
-            if field.role == "episode":
-                cuts |= set(1 + np.flatnonzero(np.diff(values[field.name])))
-        for first, last in pairwise(sorted(cuts)):
-            yield {name: column[first:last] for name, column in values.items()}

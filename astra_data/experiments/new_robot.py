@@ -1,4 +1,4 @@
-"""A folder for a robot of one's own: a task, a recipe, a mapping of its logs, a test and a page."""
+"""A folder for a new robot: a task, a recipe, a mapping of its logs, a test and a page."""
 
 import importlib.util
 import json
@@ -8,13 +8,14 @@ import re
 import shlex
 import sys
 import sysconfig
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 
 import numpy as np
 
+from astra_data.core.arrays import Floats
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.atomic import atomic_folder
@@ -22,38 +23,33 @@ from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TER
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import locate, names_at_home
-from astra_data.exchange.dataset_logs import logs_of
-from astra_data.exchange.field_names import Role
 from astra_data.exchange.guessing import guess
-from astra_data.exchange.logs import Logs
-from astra_data.experiments.fitted_kinds import Bicycle, Differential
-from astra_data.experiments.planar_kinds import Holonomic, Planar
-from astra_data.experiments.robot_kinds import Direct
-from astra_data.experiments.written_values import numbers, significant, texts
+from astra_data.exchange.logs import Logs, Role, logs_of
+from astra_data.experiments.first_simulator import DIRECT, Simulator, first_simulator, unpacked
 
 _COLUMNS: dict[Role, str] = {
     "state": STATE,
     "command": ACTION,
+    "goal": GOAL,
     "failure": TERMINATED,
     "success": SUCCESS,
     "reward": REWARD,
 }
 _TAKEN = sys.stdlib_module_names | {"astra_data", "conftest", "logs", "numpy", "pytest", "torch"}
 """Names whose file would be found in place of a module, or is that of the mapping."""
+_FILES = {"task.py": "{}.py", "recipe.toml": "{}.toml", "test.py": "test_{}.py", "README.md": "README.md"}
 
 
-def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Direct:
+def write_robot(name: str, out: Path, logs: Sequence[Path]) -> Simulator:
     """Write the new folder `out` of the robot `name`; return the simulator that it begins with, and its logs.
 
     Args:
         name: of the task: a-z, digits and _, and no module's.
         out: the folder to write.
-        logs: CSV files, or folders of them; or one dataset. By default the logs are those of a made-up cart,
-            which are written too.
+        logs: CSV files, or folders of them; or one dataset.
 
     Raises:
-        BadInputError: `name` is no name, `out` exists, or the logs are not there, or of no use: see `guess`
-            and `logs_of`.
+        BadInputError: `name` is no name, `out` exists, or logs are missing or useless, see `guess`.
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(
@@ -62,26 +58,27 @@ def write_robot(name: str, out: Path, logs: Sequence[Path] = ()) -> Planar | Dir
     if name in _TAKEN or keyword.iskeyword(name) or _is_installed(name):
         raise BadInputError(f"'{name}': expected a name that Python does not use, such as my_{name}")
     with atomic_folder(out) as folder:
-        places = [path.resolve() for path in logs]
-        if not places:
-            _drive(folder / "logs")
         data = _dataset(logs)
-        found = logs_of(data) if data else guess(places or [folder / "logs"])
-        kinds = (Holonomic, Bicycle, Differential, Planar)
-        kind = next(filter(None, (one.of(found) for one in kinds)), None) or Direct.of(found)
-        values = _common(name, found) | kind.values()
-        values["simulator"] = kind.simulator
-        values |= _of_dataset(data.root, found) if data else _of_mapping(name, places)
-        written_as = {
-            kind.template: f"{name}.py",
-            "recipe.toml": f"{name}.toml",
-            "test.py": f"test_{name}.py",
-            "README.md": "README.md",
-        }
-        for template, written in (written_as if data else written_as | {"logs.toml": "logs.toml"}).items():
-            text = (files("astra_data.experiments") / f"robot_files/{template}.template").read_text()
-            (folder / written).write_text(Template(text).substitute(values), encoding="utf-8")
-    return kind
+        found = logs_of(data) if data else guess(logs)
+        simulator = first_simulator(found)
+        values = _values(name, simulator)
+        if data:
+            values |= dict.fromkeys(("and_mapping", "versions", "import_line", "mapping_row"), "")
+            values |= {
+                "data": _code(str(data.root.resolve())),
+                "dataset": shlex.quote(str(data.root.resolve())),
+            }
+        else:
+            values |= _of_mapping(name, [path.resolve() for path in logs])
+        for template, written in (_FILES if data else _FILES | {"logs.toml": "logs.toml"}).items():
+            (folder / written.format(name)).write_text(_template(template, values), encoding="utf-8")
+    return simulator
+
+
+def _is_installed(name: str) -> bool:
+    spec = importlib.util.find_spec(name)
+    places = [Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib")]
+    return bool(spec and spec.origin and any(Path(spec.origin).is_relative_to(place) for place in places))
 
 
 def _dataset(logs: Sequence[Path]) -> Dataset | None:
@@ -91,7 +88,18 @@ def _dataset(logs: Sequence[Path]) -> Dataset | None:
         BadInputError: one of several is a dataset, or nothing is there.
         CorruptDatasetError: the dataset is incomplete or was altered.
     """
-    folders = [folder for place in logs if (folder := _folder(place))]
+    folders = []
+    for place in logs:
+        try:
+            folder = locate(place)
+        except BadInputError:
+            if not place.exists() and "@" not in place.name:
+                close = did_you_mean(str(place), names_at_home())
+                raise BadInputError(f"{place}: no such file, folder or dataset{close}") from None
+            if not place.exists():
+                raise
+            continue
+        folders += [folder] if folder != place or (folder / INFO_PATH).is_file() else []
     if folders and len(logs) > 1:
         raise BadInputError(
             f"{' and '.join(map(str, logs))}: expected logs, or one dataset: `astra-data merge` them first"
@@ -99,165 +107,184 @@ def _dataset(logs: Sequence[Path]) -> Dataset | None:
     return Dataset.open(folders[0]) if folders else None
 
 
-def _folder(place: Path) -> Path | None:
-    """Return the folder of the dataset that `place` names; None where it is another folder, or a file.
-
-    Raises:
-        BadInputError: there is no such place, or no such version.
-    """
-    try:
-        folder = locate(place)
-    except BadInputError:
-        if place.exists():
-            return None
-        if "@" in place.name:
-            raise
-        close = did_you_mean(str(place), names_at_home())
-        raise BadInputError(f"{place}: no such file, folder or dataset{close}") from None
-    return folder if folder != place or (folder / INFO_PATH).is_file() else None
-
-
-def _of_dataset(root: Path, logs: Logs) -> dict[str, str]:
-    """Return what recipe, page and task say where the data are a dataset."""
-    place = str(root.resolve())
-    return {
-        "data": _toml(place),
-        "dataset": shlex.quote(place),
-        "goals": _recorded_goals(logs),
-    } | dict.fromkeys(("and_mapping", "versions", "import_line", "mapping_row"), "")
-
-
 def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
     """Return what recipe and page say where the data are imported from `logs`, by a mapping."""
-    places = shlex.join(map(str, logs)) or "logs"
+    places = shlex.join(map(str, logs))
     return {
         "logs": places,
-        "data": _toml(f"{name}-logs@data-1.0.0"),
+        "data": _code(f"{name}-logs@data-1.0.0"),
         "dataset": f"{name}-logs",
-        "goals": "",
         "and_mapping": " and `logs.toml`",
-        "versions": "\nAfter a change of `logs.toml` give it a `version`, and the recipe's `data` the same.",
+        "versions": " After a change of `logs.toml` give it a `version`, and the recipe's `data` the same.",
         "import_line": f"astra-data import {places} --mapping logs.toml  # a dataset, {name}-logs\n",
         "mapping_row": "| `logs.toml` | which fields of the logs become which columns, in which units |\n",
     }
 
 
-def _is_installed(name: str) -> bool:
-    spec = importlib.util.find_spec(name)
-    places = [Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib")]
-    return bool(spec and spec.origin and any(Path(spec.origin).is_relative_to(place) for place in places))
-
-
-def _common(name: str, logs: Logs) -> dict[str, str]:
-    """Return what the templates of every kind name."""
+def _values(name: str, simulator: Simulator) -> dict[str, str]:
+    """Return what the templates name."""
+    logs = simulator.logs
     states, commands = logs.of("state"), logs.of("command")
-    given = np.concatenate(logs.values(commands))
-    lows, highs = given.min(axis=0), given.max(axis=0)
-    span = np.where(highs > lows, highs - lows, 1.0)
-    unit = 10.0 ** np.floor(np.log10(span)) / 1e3  # a thousandth or less of the range, outwards
-    lows, highs = np.floor(lows / unit) * unit, np.ceil(highs / unit) * unit
-    highs = np.where(highs > lows, highs, lows + unit)  # of a command that never changes
-    bounds = {
-        field.short: (significant(low), significant(high))
-        for field, low, high in zip(commands, lows, highs, strict=True)
-    }
-    horizon = max(len(values) for values in logs.values(states))
-    time = [f"time = {_toml(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")[:1]]
-    split = [f"field = {_toml(field.name)}\n" for field in logs.of("episode")[:1]]
+    lines = ["| field | used as | unit | factor | why |", "|---|---|---|---|---|"]
+    for one in logs.fields:
+        called = one.name.replace("|", r"\|")
+        lines.append(f"| `{called}` | {one.taken_for} | {one.unit} | {one.scale:.4g} | {one.why} |")
+    time = [f"time = {_code(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")]
+    split = [f"field = {_code(field.name)}\n" for field in logs.of("episode")[:1]]
     if time:
         split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
-    check = logs.uneven if logs.of("time") else "the logs have no time field"
-    lines = ["| field | used as | unit | factor | why |", "|---|---|---|---|---|"]
-    for field in logs.fields:
-        called = field.name.replace("|", r"\|")
-        taken = f"`{called}` | {field.taken_for} | {field.unit} | {field.scale:.4g}"
-        lines.append(f"| {taken} | {field.why} |")
+    check = logs.uneven if time else "the logs have no time field"
+    row, command = logs.values(states)[0][:1], logs.values(commands)[0][:1]
+    first = simulator.episodes()[0][0][:1]
+    given = np.concatenate(logs.values(commands))
+    lows, highs = given.min(axis=0), given.max(axis=0)
+    unit = 10.0 ** np.floor(np.log10(np.where(highs > lows, highs - lows, 1.0))) / 1e3
+    lows, highs = np.floor(lows / unit) * unit, np.ceil(highs / unit) * unit  # outwards
+    highs = np.where(highs > lows, highs, lows + unit)  # of a command that never changes
+    ranges = zip(commands, lows, highs, strict=True)
+    bounds = ", ".join(f"{_code(command.short)}: {_code((low, high))}" for command, low, high in ranges)
     return {
         "name": name,
+        "called": simulator.called,
+        "simulator": simulator.code(),
+        "simulator_line": simulator.described,
         "timestep_s": repr(1 / logs.rate),
         "rate_hz": f"{logs.rate}" + (f"  # CHECK: {check}" if check else ""),
         "time": "".join(time),
         "not_finite": 'not_finite = "split"  # CHECK: rows with a missing number end the episode\n'
-        if logs.left_out
-        else "",
+        * bool(logs.left_out),
         "split": "".join(["\n[split]\n", *split]) if split else "",
-        "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)) + _goals(logs),
-        "window": str(max(2, min(20, horizon // 4))),
+        "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)),
         "size": str(len(states)),
-        "state": texts(field.short for field in states),
-        "state_units": texts(field.unit for field in states),
+        "state": _code(tuple(field.short for field in states)),
+        "state_units": _code([field.unit for field in states]),
         "command_size": str(len(commands)),
-        "command_names": texts(field.short for field in commands),
-        "command_units": texts(field.unit for field in commands),
-        "row": json.dumps([significant(value) for value in logs.values(states)[0][0]]),
-        "bounds": f"{{{', '.join(f'{_toml(name)}: {ends!r}' for name, ends in bounds.items())}}}",
+        "command_names": _code(tuple(field.short for field in commands)),
+        "command_units": _code([field.unit for field in commands]),
+        "bounds": f"{{{bounds}}}",
         "still": f"; {logs.still}" if logs.still else "",
-        "horizon": str(horizon),
+        "horizon": str(max(map(len, logs.values(states)))),
         "guesses": "\n".join(lines),
+        "row": _code(row[0]),
+        "phi": _code(first[0]),
+        "command": _code(command[0]),
+        "landed": _code(simulator.after(first, [command])[0]),
+        **_objective(simulator),
     }
+
+
+def _objective(simulator: Simulator) -> dict[str, str]:
+    """Return what the template names of the objective, to come to where logs go, and its code."""
+    logs, is_planar = simulator.logs, simulator.called != DIRECT
+    recorded = [states for states, _ in simulator.episodes()]
+    width = 2 if is_planar else len(simulator.names)
+    spans = np.ptp(np.concatenate(recorded), axis=0)
+    spans = np.where(spans > 0, spans, 1.0)  # of what never moves
+    shares = 1.0 if is_planar else spans
+    goal, way = _typical([states[:, :width] / shares for states in recorded], logs)
+    taken = _goals_of(simulator, is_planar=is_planar)
+    drawn, pairs, text = [], [], ""
+    for entry in simulator.entries:
+        at = [simulator.names.index(one) for one in entry.names]
+        begins = np.array([states[0, at] for states in recorded])
+        is_angle = len(at) > 1
+        pairs.append(_arc(np.arctan2(*begins.T[::-1])) if is_angle else (begins.min(), begins.max()))
+        drawn += entry.shown("np.cos({})", "np.sin({})")
+    if goals := logs.of("goal"):
+        every = np.concatenate(logs.values(goals))
+        use = "" if taken else "; nothing below uses them"
+        bounds = f"{_code(every.min(axis=0))}, {_code(every.max(axis=0))}, (count, {len(goals)})"
+        text = (
+            f"\n    goal_size = {len(goals)}\n\n"
+            f"    def draw_goals(self, rng, count):  # CHECK: where goals are{use}\n"
+            f"        return rng.uniform({bounds})"
+        )
+    values = {
+        "command_size": str(len(logs.of("command"))),
+        "goals": text,
+        "starts": unpacked([entry.name for entry in simulator.entries]),
+        "lows": _code([low for low, _ in pairs]),
+        "highs": _code([high for _, high in pairs]),
+        "start_size": str(len(pairs)),
+        "drawn": ", ".join(drawn),
+        "target": f"goal[..., {taken}]" if taken else "state.new_tensor(GOAL)",
+        "seen": "cos * east + sin * north, cos * north - sin * east",
+    }
+    if "east" in simulator.driven.values():
+        values["seen"] = "east, north"  # of a robot that is commanded along the axes of the world
+    sizes = [
+        f"\n{name} = {value!r}  # CHECK: fitted to the logs" for name, value in simulator.constants.items()
+    ]
+    return {
+        "names": _code(tuple(simulator.names)),
+        "constants": "".join(sizes),
+        "goal_line": "" if taken else f"GOAL = {_code(tuple(goal * shares))}  # CHECK: where to go\n",
+        "close": f"{way / 10:.2g}",
+        "range": f"{way:.3g}" if is_planar else _code(tuple(spans)),
+        "objective": _template("planar.py" if is_planar else "direct.py", values),
+    }
+
+
+def _template(name: str, values: Mapping[str, str]) -> str:
+    text = (files("astra_data.experiments") / f"robot_files/{name}.template").read_text(encoding="utf-8")
+    return Template(text).substitute(values)
+
+
+def _goals_of(simulator: Simulator, *, is_planar: bool) -> list[int]:
+    """Return which values of recorded goals are for the position, or for all states; none if none are."""
+    goals = simulator.logs.of("goal")
+    if not is_planar:
+        return list(range(len(goals))) if len(goals) == len(simulator.names) else []
+    axes = [entry.fields[0].plain.rpartition("_")[2][:3] for entry in simulator.entries[:2]]
+    found = [number for axis in axes for number, one in enumerate(goals) if f"_{axis}" in one.plain]
+    return found if len(found) == 2 else [0, 1] if len(goals) == 2 else []
+
+
+def _typical(episodes: Sequence[Floats], logs: Logs) -> tuple[Floats, float]:
+    """Return the end (D,) of the episode whose distance from its start is the median, and this distance.
+
+    Failed episodes do not count, unless all are. If it ends where it began, it is the farthest of all.
+    """
+    fields = logs.of("failure")
+    failed = [any(bool(one[field.name].any()) for field in fields) for one in logs.episodes]
+    kept = [values for values, fails in zip(episodes, failed, strict=True) if not fails] or episodes
+    ways = [float(np.linalg.norm(values[-1] - values[0])) for values in kept]
+    typical = int(np.argsort(ways)[len(ways) // 2])
+    farthest = max(float(np.linalg.norm(values - values[0], axis=1).max()) for values in episodes)
+    return kept[typical][-1], ways[typical] or farthest or 1.0
+
+
+def _arc(angles: Floats) -> tuple[float, float]:
+    """Return where the shortest arc that contains all angles begins and ends."""
+    order = np.sort(angles)
+    gaps = np.diff(order, append=order[0] + math.tau)
+    widest = int(np.argmax(gaps))
+    begin = float(order[(widest + 1) % len(order)])
+    return begin, begin + max(0.0, math.tau - float(gaps[widest]))
 
 
 def _column(role: Role, logs: Logs) -> str:
     """Return the table of a column in a mapping."""
-    fields, column = logs.of(role), _COLUMNS[role]
-    lines = [f'[columns."{column}"]']
-    if role in ("state", "command"):
-        lines += [
-            f"fields = {_toml([field.name for field in fields])}",
-            f"names = {_toml([field.short for field in fields])}",
-            f"unit = {_toml([field.unit for field in fields])}",
-            f"scale = {_toml([field.scale for field in fields])}",
-        ]
-    else:
-        lines.append(f"fields = {_toml([fields[0].name])}")
-    return "\n".join(lines) + "\n"
+    fields, lines = logs.of(role), [f'[columns."{_COLUMNS[role]}"]']
+    if fields[0].why.endswith("(CHECK)"):
+        called = f"{fields[0].name} is {fields[0].why.removesuffix(' (CHECK)')}"
+        lines.insert(
+            0, f"# CHECK: {called}: a failure? If a success, write next.success; if neither, delete this"
+        )
+    lines.append(f"fields = {_code([field.name for field in fields])}")
+    if role in ("state", "command", "goal"):
+        keys = {"names": "short", "unit": "unit", "scale": "scale", "offset": "offset"}
+        lines += [f"{key} = {_code([getattr(field, of) for field in fields])}" for key, of in keys.items()]
+    return "\n".join(line for line in lines if not re.fullmatch(r"offset = \[(0\.0(, )?)+\]", line)) + "\n"
 
 
-def _goals(logs: Logs) -> str:
-    """Return what to write into a mapping where a task takes the goals of the logs; nothing without any."""
-    if not (goals := logs.of("goal")):
-        return ""
-    return (
-        "\n# CHECK: the logs have goals, but the task drives to one place. To use the goals, give the\n"
-        "# objective goal_size and draw_goals:\n"
-        f'# [columns."{GOAL}"]\n# fields = {_toml([field.name for field in goals])}\n'
-        f"# scale = {_toml([field.scale for field in goals])}\n"
+def _code(value: str | Iterable[str] | Iterable[float]) -> str:
+    """Return a text, a tuple or a list as Python and, but for tuples, TOML; numbers as exact as float32."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    inside = ", ".join(
+        _code(one) if isinstance(one, str) else repr(float(f"{one:.9g}") + 0.0) for one in value
     )
-
-
-def _recorded_goals(logs: Logs) -> str:
-    """Return what an objective says of goals that its data have; nothing without any."""
-    if not (fields := logs.of("goal")):
-        return ""
-    goals = np.concatenate(logs.values(fields))
-    low, high = numbers(goals.min(axis=0)), numbers(goals.max(axis=0))
-    return (
-        f"\n    goal_size = {len(fields)}  # CHECK: {GOAL} of the data, which nothing below uses\n\n"
-        "    def draw_goals(self, rng, count):  # CHECK: where goals were\n"
-        f"        return rng.uniform({low}, {high}, (count, {len(fields)}))"
-    )
-
-
-def _toml(value: str | Sequence[str] | Sequence[float]) -> str:
-    """Return a text, or a list, as TOML, which is also Python."""
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _drive(folder: Path) -> None:
-    """Record a made-up cart that lags behind its commands and tips over in fast turns."""
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    header = "t_s,x_m,y_m,heading_x,heading_y,v_m_s,w_rad_s,cmd_v_m_s,cmd_w_rad_s,tipped"
-    for drive in range(60):
-        x, y, yaw, v, w, left, tilt, rows = 0.0, 0.0, rng.uniform(-math.pi, math.pi), 0.0, 0.0, 0, 0.0, []
-        for step in range(150):
-            if left == 0:
-                command, left = rng.uniform([-0.2, -1.5], [1.0, 1.5]), int(rng.integers(1, 21))
-            left -= 1
-            tilt += 0.3 * (v * w - tilt)
-            rows.append([step / 10, x, y, math.cos(yaw), math.sin(yaw), v, w, *command, abs(tilt) > 0.7])
-            if rows[-1][-1]:
-                break
-            v, w = np.array([v, w]) + 0.4 * (command - [v, w])
-            x, y, yaw = x + 0.095 * v * math.cos(yaw), y + 0.095 * v * math.sin(yaw), yaw + 0.085 * w
-        np.savetxt(folder / f"drive_{drive:02d}.csv", rows, "%.4f", ",", header=header, comments="")
+    if isinstance(value, tuple):
+        return f"({inside},)" if len(value) == 1 else f"({inside})"
+    return f"[{inside}]"

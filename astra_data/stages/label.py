@@ -151,8 +151,8 @@ def _drawn_goals(source: Dataset, task: Task) -> str:
     alike = [name for name in source.features if "goal" in name.lower()]
     mistaken = f" ({', '.join(alike)} is not read as one)" if alike else ""
     return (
-        f"{source.reference} has no {GOAL}{mistaken}: goals are drawn by the objective, one an episode; "
-        "import those that the robot had into that column"
+        f"{source.reference} has no {GOAL}{mistaken}: goals are drawn by the objective, one an episode "
+        f"(goal_size is {task.objective.goal_size}); import those that the robot had into that column"
     )
 
 

@@ -103,6 +103,12 @@ def _goals(task: Task) -> Tensor:
     what = f"objective.draw_goals(rng, {_COUNT})"
     with explained(what):
         found = task.objective.draw_goals(generator(0, "goals"), _COUNT)
+        size = found.shape[1] if np.ndim(found) == 2 else task.objective.goal_size
+    if size != task.objective.goal_size:
+        raise BadInputError(
+            f"{what}: expected shape ({_COUNT}, {task.objective.goal_size}), got {np.shape(found)}: write "
+            f"`goal_size = {size}` beside the objective's action_size"
+        )
     return _of_numpy(what, found, (_COUNT, task.objective.goal_size))
 
 

@@ -188,7 +188,8 @@ WRONG: list[tuple[Task, str]] = [
     ),
     (
         replace(objective(draw_goals=lambda self, rng, count: np.zeros((count, 2))), robot=None),
-        "objective.draw_goals(rng, 3): expected shape (3, 1), got (3, 2)",
+        "objective.draw_goals(rng, 3): expected shape (3, 1), got (3, 2): write `goal_size = 2` beside the "
+        "objective's action_size",
     ),
     (
         robot(reset=lambda self: [0.0, 0.0, 0.0]),
