@@ -107,7 +107,7 @@ def guess(paths: Sequence[Path]) -> Logs:
         if {*names, *filled[0]} - (table.keys() & tables[0].keys()):
             raise BadInputError(f"{file}: expected the fields of {files[0]}, {filled[0]}: got {names}")
     raw = [episode for table in tables for episode in _episodes(table)]
-    fields = []
+    fields: list[Field] = []
     for name in (name for name in tables[0] if all(name in table for table in tables)):
         found = _field(name, [episode[name] for episode in raw])
         taken = any(

@@ -196,7 +196,7 @@ def _as_numbers(values: pa.ChunkedArray, *, is_numbered: bool) -> Floats:
         with suppress(pa.ArrowInvalid):
             return np.asarray(without_blanks(values).cast(pa.float64()).to_numpy())
     if is_numbered and not values.null_count:
-        return np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
+        return np.asarray(np.unique(values.to_numpy(), return_inverse=True)[1], np.float64)
     return np.full(len(values), np.nan)
 
 

@@ -48,7 +48,8 @@ GENERIC = re.compile(
 """Words that do not tell one moving part of a robot from another."""
 FORCES = ("N", "N m")
 DIRECT = "values that commands move"
-Drive = tuple[str, dict[str, str], tuple[str, ...], Callable[[float, float], dict[str, float]]]
+Fit = Callable[[float, float], dict[str, float]]
+Drive = tuple[str, dict[str, str], tuple[str, ...], Fit]
 """What it is called, variables of commands, lines of a step, and constants by slopes of speed and turning."""
 
 
@@ -134,7 +135,13 @@ class Simulator:
 
     def built(self, count: int) -> Any:  # noqa: ANN401 - an instance of the code
         """Return `count` simulators."""
-        space = {"np": np, "torch": torch, "Column": Column, "NAMES": tuple(self.names), **self.constants}
+        space: dict[str, Any] = {
+            "np": np,
+            "torch": torch,
+            "Column": Column,
+            "NAMES": tuple(self.names),
+            **self.constants,
+        }
         exec(self.code(), space | {"TIMESTEP_S": 1 / self.logs.rate}, space)
         return space["Simulator"](count)
 
@@ -173,13 +180,15 @@ class Simulator:
 
         Sums of `steps` are compared: over one step, what lags behind looks slow. It is 0 where it stands.
         """
-        sums: list[list[Floats]] = [[], []]
-        for states, commands in self.episodes():
-            for found, after in zip(
-                sums, (self.after(states[:-1], [commands[:-1]]), states[1:]), strict=True
-            ):
-                total = np.cumsum(np.insert(moves(states[:-1], after), 0, 0, axis=0), axis=0)
-                found.append(total[min(steps, len(total) - 1) :] - total[: max(1, len(total) - steps)])
+        episodes = self.episodes()
+        rows = ((states[:-1], states[1:], commands[:-1]) for states, commands in episodes)
+        before, after, given = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+        ends = np.cumsum([len(states) - 1 for states, _ in episodes])[:-1]
+        sums = []
+        for landed in (self.after(before, [given]), after):
+            parts = np.split(moves(before, landed), ends)
+            totals = [np.cumsum(np.insert(part, 0, 0, axis=0), axis=0) for part in parts]
+            sums += [[t[min(steps, len(t) - 1) :] - t[: max(1, len(t) - steps)] for t in totals]]
         simulated, recorded = map(np.concatenate, sums)
         power = (simulated**2).sum(axis=0)
         slopes = np.divide((simulated * recorded).sum(axis=0), power, np.zeros(len(power)), where=power > 0)
@@ -305,10 +314,9 @@ def _drives(commands: Sequence[Field]) -> list[Drive]:
         driven = {c.name: "left" if side[1] else "right" for c, side in zip(commands, sides, strict=True)}
         speed = "speed = SPEED_PER_COMMAND * (left + right) / 2"
         turn = "turn = SPEED_PER_COMMAND * (right - left) / TRACK_M"
-        lines = (speed, turn, *along, turning)
-        return [
-            ("a differential drive", driven, lines, lambda v, w: {"SPEED_PER_COMMAND": v, "TRACK_M": v / w})
-        ]
+        step = (speed, turn, *along, turning)
+        sizes: Fit = lambda v, w: {"SPEED_PER_COMMAND": v, "TRACK_M": v / w}  # noqa: E731
+        return [("a differential drive", driven, step, sizes)]
     turns = [c for c in commands if _is_turn_rate(c) or (TURN.fullmatch(c.plain) and c.unit != "m/s")]
     turns = turns or [command for command in commands if command.unit == "rad/s"]
     straight = [command for command in commands if command not in turns]
@@ -317,45 +325,37 @@ def _drives(commands: Sequence[Field]) -> list[Drive]:
     found: list[Drive] = []
     if {"forward", "left"} <= ways.keys():
         turned, end = {turn.name: "turn" for turn in turns[:1]}, (turning,) * bool(turns)
-        x, y = (
-            "forward * heading.cos() - left * heading.sin()",
-            "forward * heading.sin() + left * heading.cos()",
-        )
+        x = "forward * heading.cos() - left * heading.sin()"
+        y = "forward * heading.sin() + left * heading.cos()"
         frames = [("a holonomic base", ("forward", "left"), (x, y))]
         if not any(BODY.fullmatch(way.plain) for way in ways.values()):
             frames.append(("a holonomic base, driven along x and y", ("east", "north"), ("east", "north")))
         for called, names, speeds in frames:
             driven = dict(zip((ways["forward"].name, ways["left"].name), names, strict=True)) | turned
-            lines = tuple(
-                f"{axis} = {axis} + ({v}) * TIMESTEP_S" for axis, v in zip("xy", speeds, strict=True)
-            )
-            found.append((called, driven, (*lines, *end), lambda v, w: {}))
+            moves = [f"{at} = {at} + ({by}) * TIMESTEP_S" for at, by in zip("xy", speeds, strict=True)]
+            found.append((called, driven, (*moves, *end), lambda v, w: {}))
     else:
+        called = "a unicycle"
         if len(commands) == 2 and not turns:
             straight, turns = [commands[0]], [commands[1]]
+            called += f" (CHECK: {turns[0].short} is used as a turn rate, although nothing says so)"
         ahead = [c for c in straight if len(commands) == 2 or c.unit == "m/s" or AHEAD.fullmatch(c.plain)]
         if not turns or not ahead:
             return []
         if turns[0].unit in ("1", "rad") and STEERING.fullmatch(turns[0].plain):
-            driven, turn = (
-                {ahead[0].name: "speed", turns[0].name: "angle"},
-                "turn = speed * angle.tan() / WHEELBASE_M",
-            )
+            driven = {ahead[0].name: "speed", turns[0].name: "angle"}
+            turn = "turn = speed * angle.tan() / WHEELBASE_M"
             found.append(("a bicycle", driven, (turn, *along, turning), lambda v, w: {"WHEELBASE_M": 1 / w}))
         driven = {ahead[0].name: "speed", turns[0].name: "turn"}
-        found.append(("a unicycle", driven, (*along, turning), lambda v, w: {}))
+        found.append((called, driven, (*along, turning), lambda v, w: {}))
     scaled = [name for name in ("speed", "turn") if name in found[-1][1].values()]
     factors = tuple(f"{name} = {name.upper()}_PER_COMMAND * {name}" for name in scaled)
-    sizes = [f"{name.upper()}_PER_COMMAND" for name in scaled]
-    for called, driven, lines, _ in [drive for drive in found if sizes and "angle" not in drive[1].values()]:
-        found.append(
-            (
-                called,
-                driven,
-                (*factors, *lines),
-                lambda v, w: dict(zip(sizes, (v, w)[-len(sizes) :], strict=True)),
-            )
-        )
+
+    def fit(speed: float, turn: float) -> dict[str, float]:
+        return {f"{name.upper()}_PER_COMMAND": {"speed": speed, "turn": turn}[name] for name in scaled}
+
+    for called, driven, lines, _ in [drive for drive in found if scaled and "angle" not in drive[1].values()]:
+        found.append((called, driven, (*factors, *lines), fit))
     return found
 
 

@@ -24,7 +24,7 @@ from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import locate, names_at_home
 from astra_data.exchange.guessing import guess
-from astra_data.exchange.logs import Logs, Role, logs_of
+from astra_data.exchange.logs import Logs, Role, csv_files, logs_of
 from astra_data.experiments.first_simulator import DIRECT, Simulator, first_simulator, unpacked
 
 _COLUMNS: dict[Role, str] = {
@@ -109,7 +109,9 @@ def _dataset(logs: Sequence[Path]) -> Dataset | None:
 
 def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
     """Return what recipe and page say where the data are imported from `logs`, by a mapping."""
-    places = shlex.join(map(str, logs))
+    folder = logs[0].parent
+    is_whole = len(logs) > 1 and all(path.is_file() for path in logs) and csv_files(folder) == sorted(logs)
+    places = shlex.join(map(str, [folder] if is_whole else logs))
     return {
         "logs": places,
         "data": _code(f"{name}-logs@data-1.0.0"),

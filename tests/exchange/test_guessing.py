@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.exchange.guessing import guess
 from astra_data.exchange.logs import Logs
@@ -173,7 +174,7 @@ def test_episodes_are_files_and_values_of_a_field(tmp_path: Path) -> None:
         (np.arange(90) / 10 + 60.0 * (np.arange(90) > 50), 10, True),  # a pause
     ],
 )
-def test_the_rate_is_that_of_the_rows(times: np.ndarray, rate: int, is_even: bool, tmp_path: Path) -> None:
+def test_the_rate_is_that_of_the_rows(times: Floats, rate: int, is_even: bool, tmp_path: Path) -> None:
     logs = guess([write(tmp_path / "log.csv", {"t": times, "x": times, "cmd": -times}, rows=90)])
     assert logs.rate == rate and (logs.uneven == "") is is_even
 

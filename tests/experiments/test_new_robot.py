@@ -85,7 +85,8 @@ def test_a_recipe_names_task_data_methods_and_seeds_alone(tmp_path: Path) -> Non
 
 def test_a_flag_that_ends_logs_and_goals_are_imported(tmp_path: Path) -> None:
     logs = drives(tmp_path / "logs")
-    write_robot("cart", Path("cart"), [logs])
+    write_robot("cart", Path("cart"), sorted(logs.iterdir()))
+    assert f"astra-data import {logs} --mapping logs.toml  #" in Path("cart/README.md").read_text()
     mapping = Path("cart/logs.toml").read_text()
     reason = (
         "# CHECK: folded is 0 or 1, and it ends all 4 of 8 episodes that have a 1: a failure? If a success"
@@ -158,7 +159,7 @@ def test_what_cannot_be_begun_with_is_refused(tmp_path: Path) -> None:
 
 def test_a_dataset_is_taken_as_it_is(tmp_path: Path) -> None:
     """One whose names have dots and quotes, with a quaternion, goals of another size and a still command."""
-    names = ("/odom:pose.position.x", "pose's y", "Orientation.z", "Orientation.w")
+    names = ("/odom:robot's x", "/odom:robot's y", "Orientation.z", "Orientation.w")
     state = Column(STATE, size=4, names=names)
     action = Column(ACTION, size=3, names=('"linear".x', "wz", "/arm:data"))
     columns = (state, action, Column(GOAL, size=3))
