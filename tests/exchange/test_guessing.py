@@ -72,7 +72,7 @@ ROLES: dict[str, tuple[dict[str, object], dict[str, str]]] = {
     "torques alone": ({"q1": RAMP, "tau1": RAMP}, {"q1": "state q1 rad 1", "tau1": "command tau1 N m 1"}),
     "pedals": (
         {"x": RAMP, "throttle": RAMP, "steering_angle": -RAMP},
-        {"throttle": "command throttle 1 1", "steering_angle": "command steering_angle 1 1"},
+        {"throttle": "command throttle 1 1", "steering_angle": "command steering_angle rad 1"},
     ),
     "positions": (
         {"east": RAMP, "gps_northing": RAMP, "altitude": RAMP, "angular_x": RAMP, "cmd": RAMP},
