@@ -16,7 +16,6 @@ from astra_data.dataset import DatasetWriter
 from astra_data.dataset.columns import ACTION, GOAL, STATE, TERMINATED, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.experiments.new_robot import write_robot
-from astra_data.experiments.run import check
 from astra_data.worlds.registry import task_named
 from astra_data.worlds.walk_through import check_task
 
@@ -185,7 +184,8 @@ def test_a_dataset_is_taken_as_it_is(tmp_path: Path) -> None:
     landed = simulator.step(torch.from_numpy(given[:-1]))
     np.testing.assert_allclose(landed, task.abstraction(states[1:]), atol=1e-6)
     assert not Path("robot/logs.toml").exists() and "logs.toml" not in Path("robot/README.md").read_text()
-    assert check(Path("robot/robot.toml"))["data"].state == "finished"
+    recipe = tomllib.loads(Path("robot/robot.toml").read_text())
+    assert recipe["data"] == str(tmp_path / "home/base/data-1.0.0")
 
 
 @pytest.mark.parametrize(
