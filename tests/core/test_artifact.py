@@ -244,7 +244,7 @@ def test_a_disk_that_fails_while_a_folder_is_replaced_leaves_the_old_one_or_the_
 def test_what_a_kill_left_in_the_working_folder_is_not_published(tmp_path: Path) -> None:
     partial = tmp_path / ".out.partial"
     (partial / ".checkpoint.safetensors.tmp-7").mkdir(parents=True)
-    (partial / ".model.safetensors.partial").touch()
+    (partial / ".model.safetensors.tmp-8").touch()
     with finished_folder(tmp_path / "out", config="1") as folder:
         (folder / "model").touch()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.json", "model"]

@@ -198,7 +198,7 @@ def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
     alive, staged = home / ".set.tmp-13-1", home / ".set.staged"
     for folder in (dead / "data", alive, staged, home / ".git", home / "set.tmp-1"):
         folder.mkdir(parents=True)
-    for file in (".out.hdf5.tmp-99", ".recipe.json.partial", ".notes.partial", "file"):
+    for file in (".out.hdf5.tmp-99", ".notes.partial", "file"):
         (home / file).touch()
     (dead / "data" / "file").touch()
     os.mkfifo(home / ".pipe.tmp-98")
@@ -210,7 +210,6 @@ def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
         staged: "kept",
         home / ".out.hdf5.tmp-99": "removed",
         home / ".pipe.tmp-98": "removed",
-        home / ".recipe.json.partial": "removed",
     }
     assert names(home) == [
         ".git",
