@@ -45,7 +45,7 @@ SkipBad = Annotated[
     bool,
     typer.Option(
         "--skip-bad",
-        help="Skip files that cannot be imported and list them at the end; reads each file twice.",
+        help="Skip files and episodes that cannot be imported and list them at the end.",
     ),
 ]
 

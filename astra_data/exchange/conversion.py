@@ -45,8 +45,8 @@ class Converter:
         self._converted: dict[str, Column] = {}
         self._rounding: dict[str, _Rounding] = {}
 
-    def convert(self, block: Block) -> tuple[dict[str, Array], Mask]:
-        """Return the columns of `block` with n rows, (n,) or (n, size), and which rows are finite, (n,).
+    def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Mask]]:
+        """Return the columns of `block` with n rows, (n,) or (n, size), and rows where fields are not finite.
 
         Raises:
             BadInputError: values do not fit their columns, or change in size; lists every fault.
@@ -55,17 +55,17 @@ class Converter:
         fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
-        finite = np.ones(len(block), bool)
+        columns, bad = {}, dict[str, Mask]()
         for name in (*self._mapping.split.ends, *([self._mapping.time] if self._mapping.time else [])):
-            finite &= np.isfinite(fields[name]).all(axis=1)
-        columns = {}
+            bad[name] = ~np.isfinite(fields[name]).all(axis=1)
         for name, spec in self._mapping.columns.items():
             try:
                 values = _transformed(np.concatenate([fields[f] for f in spec.fields], axis=1), spec)
                 column = self._converted.get(name) or column_of(name, spec, values.shape[1])
                 if values.shape[1] != column.size:
                     raise BadInputError(f"{values.shape[1]} values, before there were {column.size}")
-                cast, ok = _cast(values, column)
+                cast, finite = _cast(values, column)
+                ok = finite.all(axis=1)
                 if column.dtype == "float32" and not np.can_cast(values.dtype, np.float32):
                     self._rounding.setdefault(name, _Rounding(column, spec)).add(values[ok], cast[ok])
             except BadInputError as error:
@@ -73,13 +73,17 @@ class Converter:
                 continue
             self._converted[name] = column
             columns[name] = as_column(cast)
-            finite &= ok
+            widths = [(field, fields[field].shape[1]) for field in spec.fields]
+            sources = [f"{field}[{at}]" if n > 1 else field for field, n in widths for at in range(n)]
+            for entry in np.flatnonzero(~finite.all(axis=0)).tolist():
+                source = sources[spec.take[entry] if spec.take else entry]
+                bad[source] = bad.get(source, False) | ~finite[:, entry]
         if not faults:
             faults += self._size_faults()
         if faults:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
         self.columns = self.columns or _complete(self._converted, self._mapping.terminal)
-        return columns, finite
+        return columns, {name: mask for name, mask in bad.items() if mask.any()}
 
     def rounded(self) -> list[str]:
         """Return a warning for each column whose steps float32 holds badly, with the offset that helps.
@@ -172,9 +176,9 @@ def _transformed(values: Array, spec: ColumnMapping) -> Array:
 
 
 def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
-    """Return `values` (n, size) in the column's dtype, and which rows are finite."""
-    finite: Mask = np.asarray(np.isfinite(values).all(axis=1))
-    sound = values[finite]
+    """Return `values` (n, size) in the column's dtype, and which of them are finite."""
+    finite: Mask = np.asarray(np.isfinite(values))
+    sound = values[finite.all(axis=1)]
     if column.dtype == "float32":
         if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():
             raise BadInputError(
@@ -183,7 +187,7 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
             )
         with np.errstate(over="ignore"):
             cast = np.ascontiguousarray(values, np.float32)
-        return cast, finite & np.isfinite(cast).all(axis=1)
+        return cast, finite & np.isfinite(cast)
     if column.dtype == "bool" and not np.isin(sound, (0, 1)).all():
         raise BadInputError("expected true and false, or 1 and 0")
     if column.dtype == "int64" and sound.dtype.kind == "f":
@@ -197,7 +201,7 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
             )
     elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():
         raise BadInputError("expected whole numbers below 2^63")
-    return np.where(finite[:, None], values, 0).astype(column.dtype), finite
+    return np.where(finite.all(axis=1)[:, None], values, 0).astype(column.dtype), finite
 
 
 class _Rounding:
@@ -229,7 +233,7 @@ class _Rounding:
     def found(self) -> tuple[str, bool] | None:
         """Return a warning, and whether most steps are lost; None where all are held well enough."""
         steps, errors = np.concatenate(self._steps), np.concatenate(self._errors)
-        lost, helps, said = False, True, []
+        lost, helps, coarse = False, True, []
         offset = np.broadcast_to(self._offset or 0.0, self._column.size).tolist()
         for entry, (low, high) in enumerate(zip(self._low.tolist(), self._high.tolist(), strict=True)):
             moved = steps[:, entry] > 0
@@ -247,8 +251,10 @@ class _Rounding:
             offset[entry] = round(offset[entry] - digit * round((low + high) / 2 / digit), 12)
             helps &= float(np.spacing(np.float32(high - low))) / 3 < _ROUNDED * step
             name = self._column.names[entry] if self._column.names else f"entry {entry}"
-            said.append(f"{name} (up to {largest:.6g}) in steps of {spacing:.2g}, but it moves by {step:.2g}")
-        if not said:
+            coarse.append(
+                f"{name} (up to {largest:.6g}) in steps of {spacing:.2g}, but it moves by {step:.2g}"
+            )
+        if not coarse:
             return None
         listed = ", ".join(
             f"{number:.1f}" if number == round(number) else f"{number:.15g}" for number in offset
@@ -256,4 +262,4 @@ class _Rounding:
         advice = f"set offset = [{listed}]" if helps else "leave out what is a time"
         if lost:
             advice += ', leave out what is a time, or store counts with dtype = "int64"' if helps else ""
-        return f"columns.{self._column.name}: float32 holds {'; '.join(said)}: {advice}", lost
+        return f"columns.{self._column.name}: float32 holds {'; '.join(coarse)}: {advice}", lost

@@ -1,12 +1,17 @@
-"""Cut a recording into episodes."""
+"""Cut recordings into episodes.
+
+Rows are gathered until an episode has ended for sure, and cut with whole arrays: at most an episode and a
+block are held, or as much again.
+"""
 
 from collections.abc import Iterator
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_rows
 from astra_data.core.wording import first_few
 from astra_data.dataset.checkup.clock import Clock
 from astra_data.dataset.checkup.jumps import full_turns, shortest
@@ -24,9 +29,9 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.endings import is_terminated
 from astra_data.exchange.conversion import Converter, Mask
+from astra_data.exchange.import_report import Tally
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.recording import Block
-from astra_data.exchange.tally import Tally
+from astra_data.exchange.recording import BLOCK_ROWS, Block
 
 REASONS = ("file", "source", "field", "end", "gap", "back", "jump", "rejected")
 """Why a new episode begins, the first that applies: a new file, the format's own episodes, a field that
@@ -39,28 +44,29 @@ _ENOUGH = 20
 """Steps of a file of which its rate can be told."""
 
 Cut = tuple[dict[str, Array], dict[str, Scalar]]
+Table = dict[str, Array]
+"""Rows: columns by name and, by words without a dot, what decides where they are cut."""
 
 
 class Cutter:
-    """Cuts consecutive blocks into episodes; holds one episode in memory at a time.
+    """Cuts consecutive blocks into episodes.
 
     Attributes:
         tally: of the rows so far.
     """
 
-    def __init__(self, mapping: ImportMapping) -> None:
-        """Cut by `mapping`."""
+    def __init__(self, mapping: ImportMapping, *, skip_bad: bool = False) -> None:
+        """Cut by `mapping`; `skip_bad` leaves out whole episodes with a value that is not finite."""
         self.tally = Tally()
-        self._mapping = mapping
+        self._mapping, self._skips = mapping, skip_bad and mapping.not_finite == "refuse"
         self._converter = Converter(mapping)
-        self._before: dict[str, Array] = {}
-        self._kept_before: tuple[Array, Array | None] | None = None
-        self._counters: NDArray[np.int64] = np.zeros(len(REASONS) - 1, np.int64)
-        self._pieces: list[dict[str, Array]] = []
-        self._metadata: dict[str, Scalar] = {}
-        self._ended = False
-        self._spent: list[tuple[str, NDArray[np.float64]]] = []
         self._clock = Clock(mapping.time or "", mapping.fps)
+        self._tables: list[Table] = []
+        self._rows = self._carried = 0
+        self._parts: list[Block] = []
+        self._spent: list[NDArray[np.float64]] = []
+        self._file = 0
+        self._was_torn = self._ended = False
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -68,7 +74,7 @@ class Cutter:
         return self._converter.columns
 
     def feed(self, block: Block, row: int, *, is_apart: bool) -> Iterator[Cut]:
-        """Add `block`; yield the columns and the metadata of the episodes that ended.
+        """Add `block`; yield the columns and the metadata of episodes that ended.
 
         Args:
             block: at least one row.
@@ -78,69 +84,184 @@ class Cutter:
         Raises:
             BadInputError: values do not fit their columns, or change in size; lists every fault.
         """
-        columns, finite = self._converter.convert(block)
-        self.tally.rows += len(block)
-        used = {*self._mapping.all_fields, *self.tally.unused_fields}
-        self.tally.unused_fields += [name for name in block.known if name not in used]
-        for note in block.notes:
-            self.tally.topics.setdefault(note.removeprefix(f"{block.origin}: "), []).append(block.origin)
-        if is_apart or not self._spent or self._spent[-1][0] != block.origin:
-            self._spent.append((block.origin, np.zeros(3)))
-        rejected = ~finite
-        if rejected.any():
-            first = int(np.argmax(rejected))
-            self.tally.rejected_first = self.tally.rejected_first or block.place(first, row + first)
-            self.tally.rejected_rows += int(rejected.sum())
-        if block.torn:
-            self.tally.count_torn(block.torn, block.row_name(row + len(block)))
-        counters = self._count(block, row, columns, rejected, is_apart=is_apart)
-        self._keep_ends(columns, counters[:-1], finite)
-        if not finite.any():
-            return
-        kept = {name: values[finite] for name, values in columns.items()}
-        begins, is_new = self._begins(counters[:, finite], kept)
-        rows = row + np.flatnonzero(finite)
-        edges = [0, *np.flatnonzero(begins).tolist(), len(begins)]
-        for first, last in pairwise(edges):
-            if begins[first] and first < last:
-                yield from self.finish()
-                self._ended &= not is_new[first]
-                self._metadata = {"source": block.origin, "source_row": int(rows[first])}
-            if first < last:
-                self._pieces.append({name: values[first:last] for name, values in kept.items()})
-
-    def _keep_ends(self, columns: dict[str, Array], counters: NDArray[np.int64], finite: Mask) -> None:
-        """Where a rejected row ends an episode or succeeds, let the last row that is kept of it do so.
-
-        `counters` are those of all reasons but rejected rows.
-        """
-        flags = [columns[name] for name in (TERMINATED, SUCCESS) if name in columns]
-        if not flags:
-            return
-        kept_before = np.maximum.accumulate(np.where(finite, np.arange(len(finite)), -1))
-        for row in np.flatnonzero(~finite & np.any(flags, axis=0)):
-            last, at, then = columns, kept_before[row], counters[:, kept_before[row]]
-            if at < 0:
-                if self._kept_before is None:
-                    continue
-                last, then = self._pieces[-1], self._kept_before[0][:-1, 0]
-            if (then == counters[:, row]).all():
-                for name in {TERMINATED, SUCCESS} & columns.keys():
-                    last[name][at] |= columns[name][row]
+        columns, bad = self._converter.convert(block)
+        n, split = len(block), self._mapping.split
+        rejected = np.logical_or.reduce([np.zeros(n, bool), *bad.values()])
+        self.tally.count(block, row, bad, rejected, self._mapping.all_fields)
+        if is_apart or not self._parts or self._parts[-1].origin != block.origin:
+            self._parts.append(replace(block, values={}, places={}, known=()))
+            self._spent.append(np.zeros(3))
+        self._file += is_apart
+        fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
+        first = np.arange(n) == 0
+        table = columns | {
+            "finite": ~rejected,
+            "row": row + np.arange(n),
+            "part": np.full(n, len(self._parts) - 1),
+            "in file": np.full(n, self._file),
+            "file": first & is_apart,
+            "source": first & block.starts & (not block.is_back),
+            "back": first & block.is_back,
+            "torn": first & self._was_torn,
+        }
+        table |= {f"ends {name}": fields[name] for name in split.ends}
+        table |= {f"ends {name}": columns[name] for name in (TERMINATED, TRUNCATED) if name in columns}
+        if split.field:
+            table["field"] = fields[split.field]
+        if self._mapping.time:
+            table["time"] = fields[self._mapping.time][:, 0].astype(np.float64) * self._mapping.time_scale
+        for key, values in self._tables[-1].items() if self._tables else ():
+            if values.shape[1:] != table[key].shape[1:]:
+                sizes = f"{table[key].shape[1]} values, before there were {values.shape[1]}"
+                raise BadInputError(f"{block.origin}: split.{key} has {sizes}")
+        self._was_torn = block.torn > 0 and self._mapping.not_finite != "drop"
+        self._tables.append(table)
+        self._rows += n
+        if self._rows >= max(BLOCK_ROWS, 2 * self._carried):
+            yield from self._cut(is_last=False)
 
     def finish(self) -> Iterator[Cut]:
-        """Yield the current episode, if there is one, and begin the next."""
-        if not self._pieces:
+        """Yield the episodes that are left."""
+        yield from self._cut(is_last=True)
+
+    def abandon(self) -> Iterator[Cut]:
+        """Yield the episodes that have ended, and leave out the one that the last file was in."""
+        yield from self._cut(is_last=False)
+        self._tables = [
+            {key: values[table["in file"] != self._file] for key, values in table.items()}
+            for table in self._tables
+        ]
+        self._rows = self._carried = sum(len(table["row"]) for table in self._tables)
+
+    def _cut(self, *, is_last: bool) -> Iterator[Cut]:
+        """Yield the episodes in the rows that are held; hold on to the last one unless it `is_last`."""
+        if not self._rows:
             return
-        episode = {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
-        self._pieces = []
+        table = {key: np.concatenate([each[key] for each in self._tables]) for key in self._tables[0]}
+        self._tables = [table]
+        [kept] = np.nonzero(table["finite"])
+        counts, steps_s = self._reasons(table)
+        changed = np.diff(counts[:, kept], axis=1, prepend=counts[:, kept[:1]]) > 0
+        reasons = np.insert(changed, REASONS.index("jump"), self._jumped(table, kept), axis=0)
+        [begins] = np.nonzero(reasons.any(axis=0))
+        # Each rejected row belongs to an episode that no reason but rejected rows keeps it apart from.
+        own = counts[:-1].sum(axis=0)
+        before = np.maximum.accumulate(np.where(table["finite"], np.arange(len(own)), -1))
+        follows = (before >= 0) & (own[before] == own)
+        starts = [0, *(_first_row(int(kept[at]), before, own) for at in begins), len(own)]
+        self._keep_ends(table, before, follows)
+        ends = len(starts) - 1 if is_last else max(len(starts) - 2, 0)
+        until = len(own) if is_last else starts[ends]
+        self._count(table, steps_s, until, is_last=is_last)
+        for reason in np.argmax(reasons[:, begins], axis=0):
+            name = REASONS[reason]
+            self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
+        is_new = [False, *reasons[: REASONS.index("end"), begins].any(axis=0).tolist()]
+        columns = {column.name: table[column.name] for column in self.columns if column.name in table}
+        for number in range(ends):
+            self._ended &= not is_new[number]
+            rows = np.arange(starts[number], starts[number + 1])
+            finite = table["finite"][rows]
+            if finite.any() and not (self._skips and self._has_bad(table, rows[~finite])):
+                rows = rows[finite]
+                part, row = self._parts[table["part"][rows[0]]], int(table["row"][rows[0]])
+                episode = {name: values[rows] for name, values in columns.items()}
+                yield from self._episode(episode, {"source": part.origin, "source_row": row})
+        if not is_last:
+            self._ended &= not is_new[ends]
+        self._tables = [{key: values[until:].copy() for key, values in table.items()}]
+        self._rows = self._carried = len(own) - until
+
+    def _reasons(self, table: Table) -> tuple[NDArray[np.int64], Array]:
+        """Return how often each reason, except jumps, has applied up to each row, (reasons, n).
+
+        And the steps in time to each row from the one before, (n, 3): as recorded, held over rows without a
+        time, and held over rows that are dropped, too; NaN where a file or an episode of the format begins.
+        """
+        n, split, drops = len(table["row"]), self._mapping.split, self._mapping.not_finite == "drop"
+        masks = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
+        apart = table["file"] | table["source"] | table["back"]
+        for key, values in table.items():
+            if key.startswith("ends "):
+                masks["end"][1:] |= (np.nan_to_num(as_rows(values)[:-1]) != 0).any(axis=1)
+        if split.field:
+            earlier, later = table["field"][:-1], table["field"][1:]
+            # What is missing (NaN) is the same value again, as empty cells of CSV are.
+            are_missing = (earlier != earlier) & (later != later)
+            masks["field"][1:] = ((earlier != later) & ~are_missing).any(axis=1)
+        steps_s = np.full((n, 3), np.nan)
+        if "time" in table:
+            times = np.repeat(table["time"][:, None], 3, axis=1)
+            times[~table["finite"] & drops, 2] = np.nan
+            times[:, 1:] = _held(times[:, 1:], apart)
+            steps_s[1:] = np.diff(times, axis=0)
+            steps_s[apart] = np.nan
+            masks["back"] = steps_s[:, 1] < 0
+            if split.gap_s is not None:
+                masks["gap"] = (steps_s[:, 1:] > split.gap_s).any(axis=1)
+        for reason in ("end", "field"):
+            masks[reason] &= ~apart
+        masks["file"], masks["source"] = table["file"], table["source"]
+        masks["back"] |= table["back"]
+        masks["rejected"] = table["torn"] | (~table["finite"] & (self._mapping.not_finite == "split"))
+        counts: NDArray[np.int64] = np.cumsum(list(masks.values()), axis=1)
+        return counts, steps_s
+
+    def _jumped(self, table: Table, kept: NDArray[np.int64]) -> Mask:
+        """Return which of the rows that are kept are a jump away from the one before."""
+        jump = self._mapping.split.jump
+        if not jump:
+            return np.zeros(len(kept), bool)
+        [column] = (column for column in self.columns if column.name == jump.column)
+        where = as_rows(table[jump.column])[np.ix_(kept, list(jump.values))].astype(np.float64)
+        steps = shortest(np.diff(where, axis=0, prepend=where[:1]), full_turns(column)[list(jump.values)])
+        return np.asarray(np.linalg.norm(steps, axis=1) > jump.above)
+
+    def _keep_ends(self, table: Table, before: NDArray[np.int64], follows: Mask) -> None:
+        """Where a rejected row ends an episode or succeeds, let the last row that is kept of it do so."""
+        flags = [name for name in (TERMINATED, SUCCESS) if name in table]
+        rows = np.flatnonzero(~table["finite"] & follows)
+        for name in flags:
+            np.logical_or.at(table[name], before[rows], table[name][rows])
+
+    def _has_bad(self, table: Table, rejected: NDArray[np.int64]) -> bool:
+        """Note an episode that is left out for its `rejected` rows, if there are any."""
+        if not len(rejected):
+            return False
+        where = self._place(table, int(rejected[0]))
+        self.tally.bad_episodes.append(f"{where}: a value is not finite: its episode is left out")
+        return True
+
+    def _place(self, table: Table, at: int) -> str:
+        """Name the row `at` of the table."""
+        return self._parts[table["part"][at]].row_name(int(table["row"][at]))
+
+    def _count(self, table: Table, steps_s: Array, until: int, *, is_last: bool) -> None:
+        """Tally what the clock does up to the row `until`, and in the step to it."""
+        rows = slice(1, until + (not is_last))
+        recorded, held, kept = steps_s[rows].T
+        stands = (held == 0) & np.isfinite(recorded)
+        for name, mask in (("back", held < 0), ("still", stands)):
+            setattr(self.tally, f"{name}_rows", getattr(self.tally, f"{name}_rows") + int(mask.sum()))
+            if mask.any() and not getattr(self.tally, f"{name}_first"):
+                setattr(self.tally, f"{name}_first", self._place(table, 1 + int(mask.argmax())))
+        longest = self._mapping.split.gap_s or np.inf
+        regular = (kept > 0) & ~(held > longest) & ~(kept > longest)
+        for part in np.unique(table["part"][rows][regular]):
+            steps = kept[regular & (table["part"][rows] == part)]
+            self._spent[part] += steps.sum(), np.median(steps) * len(steps), len(steps)
+            self._clock.count(steps)
+
+    def _episode(self, episode: dict[str, Array], metadata: dict[str, Scalar]) -> Iterator[Cut]:
+        """Yield an episode with next states and ends, unless it is too short."""
         ended_before, self._ended = self._ended, is_terminated(episode)
-        if ended_before and self._ended and len(episode[TERMINATED]) == 1 and NEXT_STATE not in episode:
+        length = len(next(iter(episode.values())))
+        if ended_before and self._ended and length == 1 and NEXT_STATE not in episode:
             self.tally.rows_after_end += 1
             return
         if STATE in episode and NEXT_STATE not in episode:
             episode = self._with_next_states(episode)
-        length = len(next(iter(episode.values())))
+            length = len(episode[STATE])
         if length < self._mapping.min_steps:
             self.tally.short_rows += length
             return
@@ -150,8 +271,8 @@ class Cutter:
         episode |= {TRUNCATED: truncated, DONE: terminated | truncated}
         self.tally.endings.add(episode)
         if REWARD in episode:
-            self._metadata["return"] = float(episode[REWARD].sum(dtype=np.float64))
-        yield episode, self._metadata
+            metadata["return"] = float(episode[REWARD].sum(dtype=np.float64))
+        yield episode, metadata
 
     def _with_next_states(self, episode: dict[str, Array]) -> dict[str, Array]:
         """Add the state of the next row to each row, and drop the last or let it stand still."""
@@ -185,13 +306,15 @@ class Cutter:
                 `RATE_TOLERANCE` over all files; names those that differ.
         """
         self.tally.notes += self._converter.rounded()
-        origins = [origin for origin, spent in self._spent if spent.any()]
-        if not origins:
+        timed = [
+            (part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()
+        ]
+        if not timed:
             return
-        fps, spent = self._mapping.fps, np.array([spent for _, spent in self._spent if spent.any()])
+        fps, spent = self._mapping.fps, np.array([spent for _, spent in timed])
         rates = spent[:, 2:] / spent[:, :2]
         off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1) & (spent[:, 2] >= _ENOUGH)
-        named = [f"{origin}: {rates[at, 1]:.4g} Hz" for at, origin in enumerate(origins) if off[at]]
+        named = [f"{timed[at][0]}: {rates[at, 1]:.4g} Hz" for at in np.flatnonzero(off)]
         seconds, usual_seconds, steps = spent.sum(axis=0)
         pooled = steps / seconds, steps / usual_seconds
         if all(abs(rate / fps - 1) > RATE_TOLERANCE for rate in pooled):
@@ -201,7 +324,7 @@ class Cutter:
                     f"; time goes back in {self.tally.back_rows} rows, first in {self.tally.back_first}: "
                     "sort them if they belong together"
                 )
-            if named and len(origins) > 1:
+            if named and len(timed) > 1:
                 advice += f"; {first_few(named, 8)}"
             raise BadInputError(
                 f"'{self._mapping.time}' gives {pooled[0]:.4g} rows per second, but fps is {fps}: {advice}"
@@ -209,103 +332,16 @@ class Cutter:
         self.tally.notes += [f"{name}, {fps} Hz declared" for name in named]
         self.tally.clock = str(self._clock)
 
-    def _count(
-        self, block: Block, row: int, columns: dict[str, Array], rejected: Mask, *, is_apart: bool
-    ) -> NDArray[np.int64]:
-        """Return how often each reason, except jumps, has applied up to each row, (reasons, n)."""
-        split, n = self._mapping.split, len(block)
-        masks: dict[str, Mask] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
-        fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
-        now: dict[str, Array] = {f"ends {name}": fields[name] for name in split.ends}
-        now |= {name: columns[name][:, None] for name in (TERMINATED, TRUNCATED) if name in columns}
-        if split.field:
-            now["field"] = fields[split.field]
-        if self._mapping.time:
-            recorded = fields[self._mapping.time][:, :1].astype(np.float64) * self._mapping.time_scale
-            # As they are, held over rows without a time, and over those that are dropped.
-            now["gap"] = np.repeat(recorded, 3, axis=1)
-            if self._mapping.not_finite == "drop":
-                now["gap"][rejected, 2] = np.nan
-        continues = not (is_apart or block.starts)
-        for key, values in now.items():
-            before = self._before[key] if continues else values[:1]
-            if before.shape[1:] != values.shape[1:]:
-                sizes = f"{values.shape[1]} values, before there were {before.shape[1]}"
-                raise BadInputError(f"{block.origin}: split.{key} has {sizes}")
-            series = np.concatenate([before, values])
-            if key == "field":
-                earlier, later = series[:-1], series[1:]
-                # What is missing (NaN) is the same value again, as empty cells of CSV are.
-                are_missing = (earlier != earlier) & (later != later)
-                masks[key] = ((earlier != later) & ~are_missing).any(axis=1)
-            elif key == "gap":
-                series[:, 1:] = _held(series[:, 1:])
-                steps_s, kept_s = np.diff(series[:, 1:], axis=0).T
-                masks["back"], masks[key] = steps_s < 0, self._gaps(steps_s, kept_s)
-                known = np.isfinite(series[:, 0])
-                stands = (steps_s == 0) & known[:-1] & known[1:]
-                stands[0] &= continues
-                self.tally.count_times(masks["back"], stands, lambda at: block.row_name(row + at))
-                now[key] = series[1:]
-            else:
-                masks["end"] |= (np.nan_to_num(series[:-1]) != 0).any(axis=1)
-        masks["file"][0], masks["source"][0] = is_apart, block.starts and not block.is_back
-        masks["back"][0] |= block.is_back
-        self._before = {key: values[-1:] for key, values in now.items()}
-        if self._mapping.not_finite == "split":
-            masks["rejected"] = rejected
-        counters: NDArray[np.int64] = self._counters[:, None] + np.cumsum(list(masks.values()), axis=1)
-        self._counters = counters[:, -1].copy()
-        if self._mapping.not_finite != "drop":
-            self._counters[-1] += block.torn
-        return counters
 
-    def _gaps(self, steps_s: Array, kept_s: Array) -> Mask:
-        """Return which steps in time (n,), of all rows or of those that are kept, are longer than `gap_s`.
-
-        The others of those that are kept, and that go on, are measured: the seconds that they took, those
-        that they would have taken if all were as long as the median, and how many they are.
-        """
-        longest = self._mapping.split.gap_s
-        gaps = np.zeros(len(steps_s), bool) if longest is None else (steps_s > longest) | (kept_s > longest)
-        regular = kept_s[~gaps & (kept_s > 0)]
-        if len(regular):
-            measured = np.array([regular.sum(), np.median(regular) * len(regular), len(regular)])
-            self._spent[-1][1][:] += measured
-            self._clock.count(regular)
-        return gaps
-
-    def _begins(self, counters: NDArray[np.int64], kept: dict[str, Array]) -> tuple[Mask, Mask]:
-        """Return which of the kept rows begin an episode, and which a file, a source or a field's value.
-
-        The reasons are counted.
-        """
-        jump = self._mapping.split.jump
-        where = kept[jump.column].reshape(counters.shape[1], -1)[:, list(jump.values)] if jump else None
-        if self._kept_before is None:
-            old_counters, old_where = counters[:, :1], None if where is None else where[:1]
-        else:
-            old_counters, old_where = self._kept_before
-        changed = np.diff(np.concatenate([old_counters, counters], axis=1), axis=1) > 0
-        jumped = np.zeros(counters.shape[1], bool)
-        if jump and where is not None and old_where is not None:
-            [column] = (column for column in self.columns if column.name == jump.column)
-            steps = np.diff(np.concatenate([old_where, where]).astype(np.float64), axis=0)
-            steps = shortest(steps, full_turns(column)[list(jump.values)])
-            jumped = np.linalg.norm(steps, axis=1) > jump.above
-        reasons = np.insert(changed, REASONS.index("jump"), jumped, axis=0)
-        begins: Mask = np.asarray(reasons.any(axis=0))
-        for reason in np.argmax(reasons[:, begins], axis=0):
-            name = REASONS[reason]
-            self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
-        begins[0] |= self._kept_before is None
-        self._kept_before = counters[:, -1:], None if where is None else where[-1:]
-        is_new: Mask = np.asarray(reasons[: REASONS.index("end")].any(axis=0))
-        return begins, is_new
-
-
-def _held(times: Array) -> Array:
-    """Replace values of `times` (n, k) that are not finite by the last finite one, so that gaps are seen."""
-    rows = np.where(np.isfinite(times), np.arange(len(times))[:, None], 0)
-    held: Array = np.take_along_axis(times, np.maximum.accumulate(rows, axis=0), axis=0)
+def _held(times: Array, apart: Mask) -> Array:
+    """Replace what is not finite in `times` (n, k) by the last finite one, none from before rows `apart`."""
+    rows = np.arange(len(times))[:, None]
+    known = np.where(np.isfinite(times) | apart[:, None], rows, 0)
+    held: Array = np.take_along_axis(times, np.maximum.accumulate(known, axis=0), axis=0)
     return held
+
+
+def _first_row(row: int, before: NDArray[np.int64], own: NDArray[np.int64]) -> int:
+    """Return the first of the rejected rows right before the kept `row` that belong to its episode."""
+    earlier = int(before[row - 1]) + 1 if row else 0
+    return row - int((own[earlier:row] == own[row]).sum())

@@ -4,17 +4,25 @@ With it, an export is compared with its dataset before it is shown, and imported
 """
 
 import json
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Self
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from astra_data.core.config import Config, Count, CountFromZero, faults_of
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset.columns import Column, Episode
-from astra_data.dataset.description import ContentHash, identity_of
+from astra_data.dataset.columns import Array, Column, Episode
+from astra_data.dataset.description import ContentHash, full_name, identity_of
 from astra_data.dataset.meta_files import NameText, VersionText
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import successor
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.exchange.mapping import ColumnMapping, ImportMapping
+from astra_data.exchange.recording import Block, Source
 
 Uid = Annotated[int, Field(ge=0, lt=2**63)]
 Fact = bool | int | float | str | None
@@ -169,3 +177,135 @@ class Export:
     def text(self) -> str:
         """Return the record as a string of JSON."""
         return json.dumps(self.record(), ensure_ascii=False)
+
+
+def read_record(module: ModuleType, source: Source) -> ExportRecord | None:
+    """Return the record in `source`, None if it is no export of ours.
+
+    Args:
+        module: the importer of the format.
+        source: the file.
+
+    Raises:
+        CorruptDatasetError: the record is malformed.
+    """
+    text = module.record(source) if hasattr(module, "record") else None
+    return None if text is None else ExportRecord.parse(text, str(source))
+
+
+def restored(module: ModuleType, source: Source, record: ExportRecord) -> Iterator[Episode]:
+    """Yield the episodes of an export as its dataset had them; memory holds a block and an episode.
+
+    Args:
+        module: the importer of the format.
+        source: the file.
+        record: its record.
+
+    Raises:
+        BadInputError: fields are missing.
+        CorruptDatasetError: values differ from those that were exported; raised after the last episode.
+    """
+    columns, sums = record.columns, ContentHash()
+    rest = {column.name: _empty(column) for column in columns}
+    number = 0
+    for block in module.read(source, _mapping(record)):
+        values = {column.name: _values(block, column, record) for column in columns}
+        for name, column_values in values.items():
+            sums.update(name, column_values)
+        rest = {name: np.concatenate([rest[name], values[name]]) for name in values}
+        first, rows = 0, len(rest[columns[0].name])
+        while number < len(record.lengths) and (last := first + record.lengths[number]) <= rows:
+            metadata = {key: facts[number] for key, facts in record.metadata.items()}
+            known = {key: fact for key, fact in metadata.items() if fact is not None}
+            cut = {name: array[first:last] for name, array in rest.items()}
+            yield Episode(record.uids[number], cut, known)
+            first, number = last, number + 1
+        rest = {name: array[first:] for name, array in rest.items()}
+    found = sums.column_sums()
+    wrong = [column.name for column in columns if found.get(column.name) != record.sums[column.name]]
+    if wrong or number < len(record.lengths):
+        raise CorruptDatasetError(
+            f"{source} was altered or is incomplete: {', '.join(wrong) or 'the number of rows'} differs from "
+            f"what was exported of {full_name(record.identity)}; export it again, or restore a copy"
+        )
+
+
+def write_restored(
+    record: ExportRecord,
+    episodes: Iterable[Episode],
+    options: Mapping[str, Any],
+    recordings: Sequence[Mapping[str, str]],
+    out: Path | None,
+) -> tuple[Path, int]:
+    """Write the dataset that was exported as the version after it; return its folder and number of steps.
+
+    Args:
+        record: the record of the export.
+        episodes: those of `restored`.
+        options: name, fps and task, where they are to differ.
+        recordings: names and sums of the files.
+        out: the dataset's folder, by default its place at home.
+
+    Raises:
+        CorruptDatasetError: values differ from those that were exported; nothing is written.
+    """
+    began = time.perf_counter()
+    name = options.get("name", record.name)
+    anew: dict[str, Any] = {} if name == record.name else {"version": "1.0.0"}  # whatever is at home
+    description, root = successor(
+        dict(record),
+        "description",
+        stage="import",
+        config={"recordings": list(recordings)},
+        name=name,
+        out=out,
+        **anew,
+    )
+    frames = 0
+    with DatasetWriter(
+        root,
+        record.columns,
+        fps=options.get("fps", record.fps),
+        task=options.get("task", record.task),
+        description=description,
+        subset_seed=record.subset_seed,
+    ) as writer:
+        for episode in episodes:
+            writer.add(episode)
+            frames += len(episode)
+        if options.get("fps", record.fps) == record.fps and writer.content_hash != record.content_hash:
+            raise CorruptDatasetError(
+                f"the record of {full_name(record.identity)} was altered: with its uids, lengths and "
+                "names, the values are not those that were exported; export it again, or restore a copy"
+            )
+        writer.made = {"wall_seconds": time.perf_counter() - began}
+    return root, frames
+
+
+def _mapping(record: ExportRecord) -> ImportMapping:
+    """Return a mapping that reads every field once."""
+    fields = dict.fromkeys(slot.field for slot in record.places.values())
+    return ImportMapping(
+        name=record.name,
+        task=record.task,
+        fps=record.fps,
+        columns={str(number): ColumnMapping(fields=(field,)) for number, field in enumerate(fields)},
+        episodes=record.groups,
+    )
+
+
+def _empty(column: Column) -> Array:
+    return np.empty((0, column.size) if column.size > 1 else 0, column.dtype)
+
+
+def _values(block: Block, column: Column, record: ExportRecord) -> Array:
+    slot = record.places[column.name]
+    stored = np.asarray(block.values[slot.field])
+    rows = stored.reshape(len(block), -1)[:, slot.first : slot.first + slot.size]
+    if stored.dtype.kind not in "biuf" or rows.shape[1] != column.size:
+        raise CorruptDatasetError(
+            f"{block.origin}: field '{slot.field}' holds {stored.dtype} of shape {stored.shape}, expected "
+            f"{column.size} numbers per row"
+        )
+    values = np.ascontiguousarray(rows, column.dtype)
+    return values[:, 0].copy() if column.size == 1 else values

@@ -1,16 +1,24 @@
-"""HDF5 files that are written whole, or not at all.
+"""HDF5 files: written whole or not at all, and what those of others really hold.
 
-HDF5 loses a failure that it meets while it closes a file, and the process ends in a segmentation fault. So it
-writes through an object that never fails: the first error is kept, and raised once HDF5 is done.
+A file by a stranger may point elsewhere, or claim more than there is. HDF5 loses a failure that it meets
+while it closes a file, and the process ends in a segmentation fault. So it writes through an object that
+never fails: the first error is kept, and raised once HDF5 is done.
 """
 
 import io
-from collections.abc import Buffer, Iterable, Iterator
+from collections.abc import Buffer, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from math import prod
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
+
+MOST_COMPRESSED = 10_000
+"""Larger than the compression ratio of any filter; beyond it, the values were never written."""
 
 
 class Disk(io.RawIOBase):
@@ -104,3 +112,66 @@ def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[tuple[Any, D
     finally:
         disk.close()
     disk.check()
+
+
+def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py
+    """Map the path of each dataset below `group` to it; links into other files are not followed."""
+    found: dict[str, Any] = {}
+
+    def visit(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            found[name] = item
+
+    group.visititems(visit)
+    return found
+
+
+def refuse_links(h5py: Any, file: Any, origin: str) -> None:  # noqa: ANN401 - of h5py
+    """Refuse a file with links, which may lead into other files.
+
+    Raises:
+        BadInputError: it has links; lists them.
+    """
+    links: list[str] = []
+
+    def visit(name: str, link: object) -> None:
+        if not isinstance(link, h5py.HardLink):
+            links.append(name)
+
+    file.visititems_links(visit)
+    if links:
+        raise BadInputError(
+            f"{origin}: {', '.join(links[:10])}: expected no links; replace each by a copy of its target"
+        )
+
+
+def check_storage(datasets: Mapping[str, Any], origin: str) -> None:
+    """Check that all `datasets` are in their own file, as large as they claim, and written as a whole.
+
+    Raises:
+        BadInputError: one is not; lists every fault.
+    """
+    faults = []
+    for field, dataset in datasets.items():
+        if dataset.external or dataset.is_virtual:
+            faults.append(f"field '{field}' lies in another file; copy it into this one")
+        elif dataset.nbytes > MOST_COMPRESSED * (dataset.id.get_storage_size() + 2**10):
+            faults.append(f"field '{field}' claims the shape {dataset.shape}, but the file does not hold it")
+        elif not _is_written(dataset):
+            faults.append(f"field '{field}' was not written as a whole: what is missing reads as 0")
+    if faults:
+        raise BadInputError(f"{origin}: {'; '.join(faults)}")
+
+
+def _is_written(dataset: Any) -> bool:  # noqa: ANN401 - of h5py
+    """Return whether all values are in the file; others would be read as the fill value."""
+    if dataset.chunks is None:
+        return bool(dataset.size == 0 or dataset.id.get_storage_size() > 0)
+    wanted = prod(-(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    return bool(dataset.id.get_num_chunks() >= wanted)
+
+
+def unpacked_bytes(datasets: Mapping[str, Any]) -> int:
+    """Return how many bytes are read with all `datasets`; a chunk is unpacked whole, however few its rows."""
+    chunks = {name: int(np.prod(d.chunks or (0,), dtype=object)) for name, d in datasets.items()}
+    return sum(max(int(d.nbytes), chunks[name] * d.dtype.itemsize) for name, d in datasets.items())

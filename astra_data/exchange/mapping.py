@@ -1,5 +1,6 @@
 """The mapping of a recording's fields to columns, a TOML file."""
 
+import re
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,6 +15,7 @@ from astra_data.dataset.columns import (
     RESERVED,
     REWARD,
     ROLES,
+    STATE,
     SUCCESS,
     TERMINATED,
     TRUNCATED,
@@ -44,7 +46,8 @@ class ColumnMapping(Config):
     """
 
     fields: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Fields of the source; for MCAP "/topic:path.in.message", or "/topic:list[name]" for named values."""
+    """Fields of the source; for MCAP "/topic:path.in.message", or "/topic:list[name]" for named values; for
+    several CSV files of one recording, which are joined by `time`, "state.csv:field"."""
     take: tuple[Index, ...] = ()
     """Indices of the values to use, from 0; by default all."""
     scale: tuple[Factor, ...] = ()
@@ -196,6 +199,27 @@ class ImportMapping(Config):
         """The fields with numbers that the mapping needs, each once."""
         more = [*self.split.ends, *([self.time] if self.time else [])]
         return list(dict.fromkeys([field for c in self.columns.values() for field in c.fields] + more))
+
+    def renamed(self, names: Mapping[str, str]) -> "ImportMapping":
+        """Return the mapping with other names of fields."""
+        columns = {
+            key: column.model_copy(
+                update={"fields": tuple(names.get(field, field) for field in column.fields)}
+            )
+            for key, column in self.columns.items()
+        }
+        ends = tuple(names.get(field, field) for field in self.split.ends)
+        split = self.split.model_copy(
+            update={"ends": ends, "field": names.get(self.split.field or "", self.split.field)}
+        )
+        return self.model_copy(update={"columns": columns, "split": split})
+
+    @property
+    def files(self) -> list[str]:
+        """The CSV files that fields such as "control.csv:rudder" are of, that of the state first."""
+        first = self.columns[STATE].fields if STATE in self.columns else ()
+        found = [re.match(r"(.+\.[ct]sv):.", field) for field in (*first, *self.all_fields)]
+        return list(dict.fromkeys(match[1] for match in found if match))
 
     @property
     def flag_fields(self) -> list[str]:

@@ -16,7 +16,13 @@ _NAMES = "name"
 
 
 class MessageField:
-    """A field of a mapping: what it takes of each message of a topic."""
+    """A field of a mapping: what it takes of each message of a topic.
+
+    Attributes:
+        name: the field.
+        topic: that it is of.
+        wanted: the name of the value in a list with names beside it; "" where it is no such one.
+    """
 
     def __init__(self, name: str) -> None:
         """Take the field `name`, `/topic:path.in.message` or `/topic:path.in.message[name of the value]`."""
@@ -24,8 +30,14 @@ class MessageField:
         self.topic, _, path = name.partition(":")
         named = re.fullmatch(r"(.+?)\[(.+)\]", path)
         self._keys = (named[1] if named else path).split(".")
-        self._wanted = named[2] if named else ""
+        self.wanted = named[2] if named else ""
         self._names: list[str] | None = None
+
+    def names_in(self, content: Any) -> list[str]:  # noqa: ANN401 - any message
+        """Return the names of the values in a message; empty if it has none."""
+        for key in self._keys[:-1]:
+            content = _part(content, key)
+        return _names_in(content) or []
 
     def value(self, content: Any) -> Array:  # noqa: ANN401 - any message
         """Return the numbers, or the text, in a message; a time in s and ns as whole ns.
@@ -39,7 +51,7 @@ class MessageField:
             before, owner, part = owner, part, _part(part, key)
             if part is _MISSING:
                 raise BadInputError(self._lacks(owner, depth))
-        if self._wanted:
+        if self.wanted:
             part = self._named(owner, part)
         elif _is_list(part):
             self._check_order(owner, part)
@@ -68,11 +80,11 @@ class MessageField:
         where, names = self._path(len(self._keys)), _names_in(owner)
         if names is None or not _is_list(values):
             raise BadInputError(f"'{self.name}': {where} is no list with a list '{_NAMES}' beside it")
-        if self._wanted not in names:
-            raise BadInputError(f"no '{self._wanted}' in {where}{did_you_mean(self._wanted, names)}")
+        if self.wanted not in names:
+            raise BadInputError(f"no '{self.wanted}' in {where}{did_you_mean(self.wanted, names)}")
         if len(values) != len(names):
             raise BadInputError(f"{where} has {len(values)} values for {len(names)} names")
-        return values[names.index(self._wanted)]
+        return values[names.index(self.wanted)]
 
     def _check_order(self, owner: Any, values: Any) -> None:  # noqa: ANN401 - any parts of a message
         names = _names_in(owner)

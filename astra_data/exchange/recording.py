@@ -11,6 +11,7 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import IO, Any
 
 from astra_data.core.config import did_you_mean
+from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, in_short
 from astra_data.core.files import files_below
 from astra_data.dataset.columns import Array
@@ -40,6 +41,9 @@ class Source:
         recording: the file, folder or archive given by the user; its files follow one another.
         most_bytes: most bytes of values that are taken from it.
         name: what it is called, by default its path within its recording.
+        parts: the files of a recording that are joined by time, by their names in the mapping.
+        faults: episodes that cannot be read are left out, and what is wrong with them is added to it; None
+            where they are refused.
     """
 
     path: Path
@@ -47,6 +51,8 @@ class Source:
     recording: Path
     most_bytes: int = SMALL_BYTES
     name: str = ""
+    parts: Mapping[str, "Source"] = field(default_factory=dict, compare=False)
+    faults: list[str] | None = field(default=None, compare=False)
 
     def refuse_beyond(self, size: int) -> None:
         """Refuse to take values of `size` bytes, if these are too many.
@@ -59,6 +65,16 @@ class Source:
                 f"{self} holds values of {size} bytes or more, but at most {self.most_bytes} are accepted: "
                 "robot logs do not compress that much. If you trust it, pass a larger --max-bytes."
             )
+
+    @contextmanager
+    def tolerant(self) -> Iterator[None]:
+        """Add what makes an episode unreadable to `faults`, if there are some, instead of raising it."""
+        try:
+            yield
+        except BadInputError as error:
+            if self.faults is None:
+                raise
+            self.faults.append(str(error))
 
     def __str__(self) -> str:
         """Name the file within its recording, for messages and for the episodes' metadata."""
@@ -142,6 +158,54 @@ class Block:
         return f"{self.origin} line {self.line(number)}"
 
 
+_NAMELESS = (
+    "save it beside others under names, numpy.savez('log.npz', state=..., action=...), and import that"
+)
+ZARR = (".zgroup", ".zarray", ".zattrs", "zarr.json")
+FOREIGN = (
+    ((".npy",), f"a NumPy array without a name: {_NAMELESS}"),
+    (
+        (".gz", ".bz2", ".xz", ".zst", ".zip", ".7z"),
+        "compressed: unpack it (gunzip, bunzip2, unxz, unzstd, unzip)",
+    ),
+    (
+        (".bag",),
+        "a bag of ROS 1: run `uvx --from rosbags rosbags-convert --src FILE --dst NEW --dst-storage mcap`, "
+        "and import NEW with a mapping like recipes/imports/ros2_base.toml",
+    ),
+    (
+        (".ulg",),
+        "a log of PX4: run `uvx --from pyulog ulog2csv FILE`, and import the folder of its CSVs, joined by "
+        'time (fields such as "vehicle_odometry_0.csv:q[0]", time = "timestamp", time_scale = 1e-6)',
+    ),
+    (
+        ZARR,
+        "Zarr: save its arrays by numpy.savez('log.npz', **{name: array[:] for name, array in "
+        "zarr.open(FOLDER).arrays()}), and import that",
+    ),
+    (
+        (".pkl", ".pickle", ".joblib"),
+        "a pickle, which is code and never run: load it where you trust it, and numpy.savez its arrays",
+    ),
+    ((".xlsx", ".xls", ".ods"), "a spreadsheet: save it as CSV"),
+)
+"""Endings of files that are not read, and what they are and what to do."""
+
+
+def foreign(names: Sequence[str]) -> str:
+    """Say what files of these names are and how to import what they hold; nothing where that is not known."""
+    if any(".tfrecord" in name.lower() for name in names):
+        return (
+            "RLDS (TensorFlow Datasets): load it with tensorflow_datasets, and save each episode's steps by "
+            "numpy.savez('0.npz', state=..., action=..., reward=...), then import the folder"
+        )
+    for name in names:
+        for endings, advice in FOREIGN:
+            if name.lower().endswith(endings) and not is_archive(Path(name)):
+                return f"{PurePosixPath(name).name} is {advice}"
+    return ""
+
+
 def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
     """List the files of a recording in natural order (2 before 10), without hidden ones.
 
@@ -163,7 +227,8 @@ def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
     if not sources:
         endings = " or ".join(filter(None, suffixes))
         expected = f"files that end with {endings}" if endings else "files"
-        raise BadInputError(f"{recording}: expected {expected}, found none")
+        hint = foreign([str(path) for path in files_below(recording)]) if recording.is_dir() else ""
+        raise BadInputError(f"{recording}: {hint or f'expected {expected}, found none'}")
     return sorted(sources, key=lambda source: natural(f"{source.path}/{source}"))
 
 
@@ -274,6 +339,34 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
     return next(iter(lengths.values()))
 
 
+def joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
+    """Group files that are parts of one recording: those in a folder whose names end with `names`.
+
+    What precedes that end is the same for all files of a recording: `run3_state.csv`, `run3_control.csv`.
+
+    Raises:
+        BadInputError: a recording lacks a file; lists all that are missing.
+    """
+    groups: dict[tuple[str, str], dict[str, Source]] = {}
+    for source in sources:
+        path = PurePosixPath(source.path if source.member is None else f"{source.path}/{source.member.name}")
+        for name in sorted(names, key=len, reverse=True):
+            if path.name.endswith(name):
+                groups.setdefault((str(path.parent), path.name.removesuffix(name)), {})[name] = source
+                break
+    faults = [
+        f"{folder}/{prefix}{name} is missing, which is joined with {', '.join(map(str, found.values()))}"
+        for (folder, prefix), found in groups.items()
+        for name in names
+        if name not in found
+    ]
+    if faults or not groups:
+        raise BadInputError(
+            "; ".join(faults) or f"expected files whose names end with {', '.join(names)}, found none"
+        )
+    return [replace(found[names[0]], parts=found) for found in groups.values()]
+
+
 def bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
     """Let the sources be taken up to `max_bytes`, by default in proportion to the sizes of their files."""
     if max_bytes is None:
@@ -285,7 +378,8 @@ def bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
 def files_of(sources: Sequence[Source]) -> dict[Path, Path]:
     """Return the files, each with the recording that it is of."""
     files: dict[Path, Path] = {}
-    for path, recording in dict.fromkeys((source.path, source.recording) for source in sources):
+    each = [part for source in sources for part in (source.parts.values() or [source])]
+    for path, recording in dict.fromkeys((source.path, source.recording) for source in each):
         files |= dict.fromkeys(files_below(path) if path.is_dir() else [path], recording)
     return files
 
@@ -294,3 +388,32 @@ def named(path: Path, recording: Path) -> str:
     """Name a file by its path within a recording that is a folder."""
     within = path.relative_to(recording) if path.is_relative_to(recording) else Path()
     return within.as_posix() if within.parts else path.name
+
+
+def named_apart(sources: Sequence[Source]) -> list[Source]:
+    """Name sources that are called alike by more of their paths."""
+    within = ["" if source.member is None else source.member.name for source in sources]
+    names = _longer(
+        [str(source) for source in sources], [s.path / w for s, w in zip(sources, within, strict=True)]
+    )
+    return [replace(source, name=name) for source, name in zip(sources, names, strict=True)]
+
+
+def identities(sources: Sequence[Source]) -> list[dict[str, str]]:
+    """Return name and sha256 of every file of the recordings."""
+    files = files_of(sources)
+    names = _longer([named(file, recording) for file, recording in files.items()], list(files))
+    return [{"name": name, "sha256": file_digest(file)} for name, file in zip(names, files, strict=True)]
+
+
+def _longer(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
+    """Return `names`, the ends of `paths`; those of several paths are longer ends, by which these differ."""
+    places = [path.absolute() for path in paths]
+    of_name: dict[str, set[Path]] = {}
+    for name, place in zip(names, places, strict=True):
+        of_name.setdefault(name, set()).add(place)
+    longer = [
+        "/".join(place.parts[-len(PurePosixPath(name).parts) - 1 :]) if len(of_name[name]) > 1 else name
+        for name, place in zip(names, places, strict=True)
+    ]
+    return longer if longer == list(names) else _longer(longer, paths)

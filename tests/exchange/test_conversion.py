@@ -23,10 +23,10 @@ def converter(columns: dict[str, dict[str, Any]], **more: Any) -> Converter:  # 
 
 def convert(spec: dict[str, Any], values: list[Any], name: str = "c") -> tuple[Array, list[bool]]:
     """Return column `name` of one field with `values`, and which rows are finite."""
-    columns, finite = converter({name: {"fields": ("f",), **spec}}).convert(
+    columns, bad = converter({name: {"fields": ("f",), **spec}}).convert(
         Block({"f": np.array(values)}, "log")
     )
-    return columns[name], finite.tolist()
+    return columns[name], [not any(mask[row] for mask in bad.values()) for row in range(len(values))]
 
 
 def test_take_scale_offset_and_clip_follow_each_other() -> None:
@@ -69,8 +69,11 @@ def test_what_does_not_fit_float32_is_rejected() -> None:
 def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
     made = converter({"c": {"fields": ("f",)}}, time="t", split={"ends": ("e",)})
     fields = {"f": np.zeros(4), "t": np.array([0, NAN, 2, 3]), "e": np.array([0, 0, np.inf, 0])}
-    _, finite = made.convert(Block(fields, "log"))
-    assert finite.tolist() == [True, False, False, True]
+    _, bad = made.convert(Block(fields, "log"))
+    assert {name: mask.tolist() for name, mask in bad.items()} == {
+        "t": [False, True, False, False],
+        "e": [False, False, True, False],
+    }
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 from pathlib import Path
 
-from astra_data.exchange.import_report import ImportReport, losses
-from astra_data.exchange.tally import Tally
+from astra_data.exchange.import_report import ImportReport, Tally, losses
 
 
 def test_what_was_dropped_is_counted_aloud() -> None:

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
+from scipy.io import savemat
 
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
 from astra_data.exchange.cutting import Cutter
+from astra_data.exchange.import_report import Tally
 from astra_data.exchange.importing import import_dataset
-from astra_data.exchange.tally import Tally
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
@@ -73,7 +74,9 @@ def test_rejected_rows_refuse_the_import(tmp_path: Path) -> None:
     fields = rows()
     fields["command"][[3, 5]] = np.nan
     path = write_table(tmp_path / "log.npz", fields)
-    with pytest.raises(BadInputError, match=r"2 of 20 rows .* the first is log\.npz row 3; set not_finite"):
+    with pytest.raises(
+        BadInputError, match=r"2 of 20 rows .* command in 2 rows, first log\.npz row 3; set not_fin"
+    ):
         imported(tmp_path, path)
     assert not (tmp_path / "out").exists()
 
@@ -258,7 +261,10 @@ def test_what_an_archive_unpacks_to_is_bounded_over_all_its_blocks(tmp_path: Pat
 
 def test_a_recording_of_rejected_rows_alone_is_refused_for_them(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.npz", rows() | {"x": np.full(20, np.nan)})
-    with pytest.raises(BadInputError, match=r"20 of 20 rows have values that are not finite.*log\.npz row 0"):
+    with pytest.raises(
+        BadInputError,
+        match=r"20 of 20 rows have values that are not finite: x is empty in all 20 rows: leave it out;",
+    ):
         imported(tmp_path, path)
 
 
@@ -420,3 +426,57 @@ def test_keys_about_times_need_a_time(tmp_path: Path, set_keys: str, told: str) 
         import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
     mapping.write_text(text.replace("[split]\ngap_s = 0.5", "time_scale = 1.0\n[split]"))
     assert import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out").episodes == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("log.npy", r"log\.npy is a NumPy array without a name: .*numpy\.savez"),
+        ("log.csv.gz", r"log\.csv\.gz is compressed: unpack it \(gunzip"),
+        ("log.bag", r"log\.bag is a bag of ROS 1: run `uvx --from rosbags rosbags-convert"),
+        ("log.ulg", r"log\.ulg is a log of PX4: run `uvx --from pyulog ulog2csv FILE`, .*joined by time"),
+        ("rlds/1.0.0/demos.tfrecord-00000-of-00001", r"RLDS \(TensorFlow Datasets\): .*numpy\.savez"),
+        ("log.zarr/.zgroup", r"\.zgroup is Zarr: save its arrays"),
+        ("log.zarr/zarr.json", r"zarr\.json is Zarr: save its arrays"),
+        ("log.pkl", r"log\.pkl is a pickle, which is code and never run"),
+    ],
+)
+def test_formats_that_are_not_read_are_named_with_what_to_do(tmp_path: Path, name: str, told: str) -> None:
+    path = tmp_path / "logs" / name
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"{}")
+    for place in (tmp_path / "logs" / name.partition("/")[0], tmp_path / "logs"):
+        with pytest.raises(BadInputError, match=rf"{place.name}: {told}[^\n]*$"):
+            imported(tmp_path / "out", place)
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path / "out", tmp_path / "logs", file_format="csv")
+
+
+def test_matlabs_older_format_is_named_with_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "log.mat"
+    savemat(path, {name: values for name, values in rows().items()})
+    with pytest.raises(
+        BadInputError, match=r"log\.mat is of MATLAB's format 5, .*save\('NEW\.mat', '-v7\.3'\)"
+    ):
+        imported(tmp_path / "out", path)
+
+
+def test_fields_that_are_not_finite_are_named_with_their_places(tmp_path: Path) -> None:
+    fields = rows() | {"y": np.full(20, np.nan)}
+    fields["command"][[3, 7]], fields["x"][5] = np.inf, np.nan
+    path = write_table(tmp_path / "log.csv", fields)
+    told = "y is empty in all 20 rows: leave it out; x in 1 row, log.csv line 7; command in 2 rows, "
+    told += "first log.csv line 5"
+    with pytest.raises(
+        BadInputError, match=f"20 of 20 rows have values that are not finite: {told}; set not_finite"
+    ):
+        imported(tmp_path / "refuse", path)
+    with pytest.raises(BadInputError, match=rf"no episodes, .*rejected 20 \({told}\)"):
+        imported(tmp_path / "drop", path, 'not_finite = "drop"\n' + MAPPING)
+    wide = write_table(tmp_path / "log.npz", rows() | {"x": np.where(np.eye(20, 3), np.nan, 1.0)})
+    mapping = MAPPING.replace('fields = ["x", "y"]', 'fields = ["x"]\ntake = [2, 0]')
+    with pytest.raises(
+        BadInputError,
+        match=r"2 of 20 rows .*: x\[2\] in 1 row, log\.npz row 2; x\[0\] in 1 row, log\.npz row 0",
+    ):
+        imported(tmp_path / "wide", wide, mapping.replace('role = ["position"]\n', ""))

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from recordings import MAPPING, imported, rows, write_table
@@ -55,18 +56,72 @@ def test_bad_files_are_left_out_where_that_is_asked_for_and_told(tmp_path: Path)
     assert len(report.left_out) == 4 and "\n  4.csv" in told
     assert Dataset.open(report.root).description["left_out"] == list(report.left_out)
     names = [one["name"] for one in dataset.description["config"]["recordings"]]
-    assert names == ["0.csv", "5.csv"]
+    assert names == [path.name for path in paths]
 
 
-def test_a_file_that_is_bad_in_its_midst_is_left_out_as_a_whole(tmp_path: Path) -> None:
-    """Values that are not finite are found after an episode is complete."""
-    paths = [write_table(tmp_path / f"{number}.csv", rows()) for number in range(2)]
-    damaged = rows()
-    damaged["x"][-1] = np.nan
-    write_table(paths[0], damaged)
+def test_an_episode_that_is_bad_is_left_out_and_its_file_is_not(tmp_path: Path) -> None:
+    """Of three trials in each file."""
+    paths = [write_table(tmp_path / f"{number}.csv", rows(number)) for number in range(3)]
+    damaged = rows(1)
+    damaged["x"][6], damaged["command"][7] = np.nan, np.inf
+    write_table(paths[1], damaged)
+    whole, _ = imported(
+        tmp_path / "whole", [write_table(tmp_path / "w" / f"{k}.csv", rows(k)) for k in range(3)]
+    )
     dataset, report = imported(tmp_path, paths, skip_bad=True)
-    assert set(dataset.metadata["source"]) == {"1.csv"}
-    assert "1 of 20 rows have values that are not finite; the first is 0.csv line 21" in report.left_out[0]
+    assert report.left_out == ("1.csv line 8: a value is not finite: its episode is left out",)
+    kept = [episode for number, episode in enumerate(whole.episodes()) if number != 4]
+    for episode, expected in zip(dataset.episodes(), kept, strict=True):
+        for name, values in expected.columns.items():
+            if name != "episode_uid":
+                np.testing.assert_array_equal(episode.columns[name], values)
+    with pytest.raises(
+        BadInputError, match=r"2 of 60 rows .*: x in 1 row, 1\.csv line 8; command in 1 row, 1\.csv l"
+    ):
+        imported(tmp_path / "refused", paths)
+
+
+def test_a_demonstration_that_is_bad_is_left_out_and_its_file_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        for number in range(5):
+            fields = {name: values[:6] for name, values in rows(number).items()}
+            if number == 1:
+                del fields["command"]
+            if number == 2:
+                fields["gait"] = fields["gait"][:3]
+            if number == 3:
+                fields["gait"] = fields["gait"] + 0.5
+            for name, values in fields.items():
+                file[f"demo_{number}/{name}"] = values
+    mapping = 'episodes = "demo_*"\n' + MAPPING
+    dataset, report = imported(tmp_path, path, mapping, skip_bad=True)
+    assert dataset.metadata["source"] == ["log.h5/demo_0", "log.h5/demo_4"]
+    told = [
+        "demo_1: no field 'command'",
+        "demo_2: fields differ in their",
+        "demo_3: columns.gait: expected whole",
+    ]
+    for fault, found in zip(told, report.left_out, strict=True):
+        assert found.startswith(f"log.h5/{fault}")
+
+
+def test_episodes_before_a_fault_in_a_file_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("astra_data.exchange.importers.json.BLOCK_ROWS", 4)
+    paths = [write_table(tmp_path / f"{number}.jsonl", rows(number)) for number in range(3)]
+    lines = paths[1].read_text().splitlines()
+    lines[17] = lines[17].replace('"y": ', '"y": "far"; ')
+    paths[1].write_text("\n".join(lines))
+    dataset, report = imported(tmp_path, paths, skip_bad=True)
+    assert [
+        (source, row)
+        for source, row in zip(dataset.metadata["source"], dataset.metadata["source_row"], strict=True)
+    ] == [
+        *[("0.jsonl", row) for row in (0, 6, 15)],
+        ("1.jsonl", 0),
+        *[("2.jsonl", row) for row in (0, 6, 15)],
+    ]
+    assert len(report.left_out) == 1 and report.left_out[0].startswith("1.jsonl line 18: expected an object")
 
 
 def test_a_file_with_columns_of_other_sizes_is_left_out(tmp_path: Path) -> None:
@@ -86,12 +141,13 @@ fields = ["command"]
     ]
     dataset, report = imported(tmp_path, paths, mapping, skip_bad=True)
     assert dataset.metadata["source"] == ["0.npz", "2.npz"]
-    assert report.left_out == ("1.npz: observation.state has 3 values, in the files before 2",)
+    assert report.left_out == ("1.npz: columns.observation.state: 3 values, before there were 2",)
 
 
 def test_nothing_is_imported_where_all_files_are_bad(tmp_path: Path) -> None:
     with pytest.raises(
-        BadInputError, match=r"^1\.csv, 2\.csv: no field 'command'[^\n]*\n3\.csv: no field 'gait'"
+        BadInputError,
+        match=r"^1\.csv: no field 'command'[^\n]*\n2\.csv: no field .*\n3\.csv: no field 'gait'",
     ):
         imported(tmp_path, logs(tmp_path)[1:4], skip_bad=True)
     assert not (tmp_path / "out").exists()

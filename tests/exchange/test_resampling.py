@@ -1,12 +1,14 @@
 """Which message of each topic a row takes, where it is known which one is due."""
 
+import re
+
 import numpy as np
 import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE, Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.resampling import Resampler, usual_periods
+from astra_data.exchange.resampling import Resampler, uneven_steps, usual_periods
 
 MS = 10**6
 
@@ -343,3 +345,56 @@ def test_a_clock_that_is_a_little_off_is_not_told() -> None:
 def test_a_step_as_long_as_the_gap_is_one_of_the_period() -> None:
     times = {"/odom": np.array([0, 100, 200, 301], np.int64)}
     assert usual_periods(times, 100) == {"/odom": 100.0}
+
+
+def odd_share(rate: float, fps: int) -> float:
+    """Return the share of the steps between rows that have not as many messages as most, counted out."""
+    messages = np.floor(rate / fps * np.arange(10_000) + 1e-6)
+    counts = np.unique(np.diff(messages), return_counts=True)[1]
+    return float(1 - counts.max() / counts.sum())
+
+
+@pytest.mark.parametrize(
+    ("rate", "fps", "steps", "proposed"),
+    [
+        (30, 20, "33 and 67", "10, 15 or 30"),
+        (29.98, 20, "33 and 67", "10, 15 or 30"),
+        (50, 20, "40 and 60", "10, 25 or 50"),
+        (250, 100, "8 and 12", "50, 125 or 250"),
+        (31, 20, "32 and 65", "31"),
+    ],
+)
+def test_rates_that_divide_are_proposed(rate: float, fps: int, steps: str, proposed: str) -> None:
+    assert uneven_steps("/odom", rate, fps) == (
+        f"/odom comes {round(rate)} times a second, of which {fps} fps is no whole fraction: "
+        f"steps of {steps} ms alternate; take {proposed}"
+    )
+    assert odd_share(round(rate), fps) > 0.05
+    for each in re.findall("[0-9]+", proposed):
+        assert odd_share(round(rate), int(each)) == 0
+
+
+@pytest.mark.parametrize(("rate", "fps"), [(28.7, 20), (28.7, 10), (103, 20), (12.5, 10)])
+def test_where_no_rate_divides_the_spread_is_told_and_the_rate_that_divides_best(
+    rate: float, fps: int
+) -> None:
+    told = uneven_steps("/odom", rate, fps)
+    match = re.search(
+        r"at (\d+), (\d+)% .* of (\d+) ms, the others of (\d+); at (\d+) only (\d+)% are odd", told
+    )
+    assert match is not None, told
+    at, percent, long, short, best, odd = map(int, match.groups())
+    share = rate / fps % 1
+    assert at == fps and percent == round(100 * share)
+    assert long - short == pytest.approx(1000 / rate, abs=1.1)
+    assert odd_share(rate, best) == pytest.approx(odd / 100, abs=0.006)
+    assert odd_share(rate, best) < 0.05 < odd_share(rate, fps)
+    assert "no fps nearby is a whole fraction" in told
+
+
+@pytest.mark.parametrize(
+    ("rate", "fps"), [(50, 10), (49.9, 10), (20, 20), (20.2, 20), (30, 40), (20, 40), (0.4, 1), (400, 30)]
+)
+def test_even_steps_are_not_told(rate: float, fps: int) -> None:
+    """Nor rows that repeat messages, nor steps of which one is 13 messages long and the next 14."""
+    assert uneven_steps("/odom", rate, fps) == ""

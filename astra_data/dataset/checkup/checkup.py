@@ -13,6 +13,7 @@ from astra_data.dataset.checkup.ends import EpisodeEnds
 from astra_data.dataset.checkup.finding import Finding
 from astra_data.dataset.checkup.jumps import Jumps
 from astra_data.dataset.checkup.outliers import Outliers
+from astra_data.dataset.checkup.rows import Repeats, Shift
 from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, TERMINATED, Episode
 from astra_data.dataset.reader import Dataset
 
@@ -70,13 +71,15 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     jumps = Jumps(columns[STATE], int(dataset.lengths.sum())) if STATE in columns else None
     angles = Angles(columns[STATE]) if STATE in columns else None
     names = [column.name for column in columns.values() if column.name in LOOKED_AT or is_clock(column)]
-    parts: list[_Part] = [ends, duplicates, continuity, dead, outliers, *clocks]
+    repeats, shift = Repeats(), Shift()
+    parts: list[_Part] = [ends, duplicates, continuity, dead, outliers, repeats, shift, *clocks]
     parts += [part for part in (commands, jumps, angles) if part is not None]
     for episode in dataset.episodes(names or list(columns)):
         for part in parts:
             part.add(episode)
     mcap = _is_of_mcap(dataset)
     findings = [finding for clock in clocks for finding in clock.findings(called, mcap=mcap)]
+    findings += _of_import(dataset) + repeats.findings() + shift.findings()
     findings += angles.findings() if angles else []
     findings += jumps.findings(dataset, called) if jumps else []
     findings += continuity.findings() + duplicates.findings(called)
@@ -88,6 +91,15 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     summary += [f"rate: {rate}" for rate in rates]
     findings.sort(key=lambda finding: finding.severity != "warning")
     return Checkup(dataset.reference, tuple(summary), tuple(findings))
+
+
+def _of_import(dataset: Dataset) -> list[Finding]:
+    """Return what the import said of rates and of rounding, where the dataset is one."""
+    notes, topics = (dataset.description.get(key) for key in ("notes", "topics"))
+    found = [*(notes if isinstance(notes, list) else []), *(topics if isinstance(topics, dict) else [])]
+    return [
+        Finding("warning", f"at import, {note}", "correct the mapping and import again") for note in found
+    ]
 
 
 def _is_of_mcap(dataset: Dataset) -> bool | None:

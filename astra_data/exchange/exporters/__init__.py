@@ -16,11 +16,11 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset.atomic import atomic_file, atomic_folder
 from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.dataset.reader import Dataset
+from astra_data.exchange.export_record import read_record, restored
 from astra_data.exchange.exporters import d3rlpy, d4rl, minari, robomimic
 from astra_data.exchange.importers import hdf5
 from astra_data.exchange.importers import minari as minari_importer
 from astra_data.exchange.recording import Source
-from astra_data.exchange.restoring import read_record, restored
 
 
 class Exporter(NamedTuple):

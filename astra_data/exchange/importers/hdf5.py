@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED, Array
-from astra_data.exchange.hdf5_storage import check_storage, stored_datasets, unpacked_bytes
+from astra_data.exchange.hdf5_file import check_storage, stored_datasets, unpacked_bytes
 from astra_data.exchange.layouts import D3RLPY, D4RL, NUMBERED, RECORD, ROBOMIMIC
 from astra_data.exchange.mapping import ImportMapping
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source, natural, row_count
@@ -28,39 +29,64 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     Raises:
         BadInputError: groups or fields are missing, or are stored in another file.
     """
+    with _opened(source) as (h5py, file):
+        for origin, datasets, attributes in _episodes(h5py, file, mapping.episodes, str(source)):
+            with source.tolerant():
+                yield from _blocks(source, mapping, origin, datasets, attributes)
+
+
+def _blocks(
+    source: Source,
+    mapping: ImportMapping,
+    origin: str,
+    datasets: dict[str, Any],
+    attributes: dict[str, Any],
+) -> Iterator[Block]:
+    """Yield the rows of an episode, or of a file."""
+    if mapping.episodes is None:
+        _refuse_groups(datasets, mapping, origin)
+    order = slice(None, None, -1 if mapping.transposed else 1)
+    shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
+    single = {name: datasets[name] for name, shape in shapes.items() if not shape} | attributes
+    of_episodes = single if mapping.episodes else {}
+    rowed = [field for field in mapping.all_fields if field not in of_episodes]
+    n = row_count(origin, rowed, shapes)
+    used = {field: datasets[field] for field in rowed}
+    ends = {field: np.asarray(of_episodes[field][()]) for field in mapping.all_fields if field not in used}
+    known = [name for name, shape in shapes.items() if shape]
+    check_storage(used, origin)
+    source.refuse_beyond(unpacked_bytes(used))
+    for first in range(0, n, BLOCK_ROWS):
+        rows = slice(first, min(first + BLOCK_ROWS, n))
+        values = {
+            field: dataset[..., rows].T if mapping.transposed else dataset[rows]
+            for field, dataset in used.items()
+        }
+        values |= {field: _at_the_end(value, rows, n) for field, value in ends.items()}
+        yield Block(values, origin, starts=mapping.episodes is not None and first == 0, known=known)
+
+
+@contextmanager
+def _opened(source: Source) -> Iterator[tuple[Any, Any]]:
+    """Open a file; yield h5py and it.
+
+    Raises:
+        BadInputError: it is of MATLAB's older format; says what to do.
+    """
+    with source.open() as stream:
+        if stream.read(10) == b"MATLAB 5.0":
+            raise BadInputError(
+                f"{source} is of MATLAB's format 5, expected 7.3, which is HDF5: in MATLAB, load it and "
+                "save('NEW.mat', '-v7.3'); in Python, save the arrays of scipy.io.loadmat by numpy.savez"
+            )
     h5py = optional("h5py")
     with h5py.File(source.path, "r") as file:
-        for origin, datasets, attributes in _episodes(h5py, file, mapping.episodes, str(source)):
-            if mapping.episodes is None:
-                _refuse_groups(datasets, mapping, origin)
-            order = slice(None, None, -1 if mapping.transposed else 1)
-            shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
-            single = {name: datasets[name] for name, shape in shapes.items() if not shape} | attributes
-            of_episodes = single if mapping.episodes else {}
-            rowed = [field for field in mapping.all_fields if field not in of_episodes]
-            n = row_count(origin, rowed, shapes)
-            used = {field: datasets[field] for field in rowed}
-            ends = {
-                field: np.asarray(of_episodes[field][()]) for field in mapping.all_fields if field not in used
-            }
-            known = [name for name, shape in shapes.items() if shape]
-            check_storage(used, origin)
-            source.refuse_beyond(unpacked_bytes(used))
-            for first in range(0, n, BLOCK_ROWS):
-                rows = slice(first, min(first + BLOCK_ROWS, n))
-                values = {
-                    field: dataset[..., rows].T if mapping.transposed else dataset[rows]
-                    for field, dataset in used.items()
-                }
-                values |= {field: _at_the_end(value, rows, n) for field, value in ends.items()}
-                starts = mapping.episodes is not None and first == 0
-                yield Block(values, origin, starts, known=known)
+        yield h5py, file
 
 
 def record(source: Source) -> str | None:
     """Return the record of an export of ours, None if it has none."""
-    h5py = optional("h5py")
-    with h5py.File(source.path, "r") as file:
+    with _opened(source) as (h5py, file):
         found = file
         for part in RECORD.split("/"):
             is_here = isinstance(found, h5py.Group) and part in found
@@ -82,8 +108,7 @@ def layout(source: Source) -> dict[str, Any]:
     Raises:
         BadInputError: it is none of them, or has no observations.
     """
-    h5py = optional("h5py")
-    with h5py.File(source.path, "r") as file:
+    with _opened(source) as (h5py, file):
         fields = stored_datasets(h5py, file)
         if {"observations", "actions"} <= fields.keys():
             columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
@@ -114,11 +139,11 @@ def layout(source: Source) -> dict[str, Any]:
         keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
         if commands:
             keys["remark"] = f"without {', '.join(commands)}, which would show a policy the command to find"
-        told = [name for name in demos if "success" in file[f"data/{name}"].attrs]
-        if len(told) == len(demos):
+        with_success = [name for name in demos if "success" in file[f"data/{name}"].attrs]
+        if len(with_success) == len(demos):
             columns[SUCCESS] = {"fields": ["@success"]}
-        elif told:
-            keys["remark"] = f"without the attribute success, which {len(told)} of {len(demos)} have"
+        elif with_success:
+            keys["remark"] = f"without the attribute success, which {len(with_success)} of {len(demos)} have"
         if TRUNCATED not in columns:
             keys["min_steps"] = 2
         env_args = json.loads(file["data"].attrs.get("env_args", "{}"))

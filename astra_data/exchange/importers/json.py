@@ -1,4 +1,6 @@
-"""JSON: one object that maps each field to its rows, as the NAO's logs are, or lines with an object a row.
+"""JSON: one object of fields with their rows, as the NAO's logs are, or an object a row, in a list or lines.
+
+Fields of objects in objects have the names of both: `pose/x`.
 
 The former is read whole, since JSON cannot be parsed in blocks; files larger than `LIMIT_BYTES` are refused.
 Lines, of at most as many bytes, are read block by block.
@@ -37,11 +39,39 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     if len(text) > LIMIT_BYTES:
         raise BadInputError(f"{source}: expected at most {LIMIT_BYTES // 2**20} MB of JSON, split the file")
     fields = json.loads(text, object_pairs_hook=_once)
+    if isinstance(fields, list) and fields and all(isinstance(row, dict) for row in fields):
+        yield from _read_rows(fields, source, mapping)
+        return
+    fields = _flat(fields)
     if not isinstance(fields, dict):
         raise BadInputError(f"{source}: expected an object of fields, got {type(fields).__name__}")
     shapes = {name: (len(rows),) if isinstance(rows, list) else () for name, rows in fields.items()}
     if row_count(str(source), mapping.all_fields, shapes):
         yield _block(fields, mapping, str(source))
+
+
+def _read_rows(rows: list[dict[str, Any]], source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows of a list with an object each."""
+    flat = [_flat(row) for row in rows]
+    for number, row in enumerate(flat):
+        row_count(f"{source} row {number}", mapping.all_fields, dict.fromkeys(row, (1,)))
+    block = _block({name: [row[name] for row in flat] for name in mapping.all_fields}, mapping, str(source))
+    yield replace(block, known=flat[0])
+
+
+def _flat(value: Any) -> Any:  # noqa: ANN401 - any JSON
+    """Return an object with the values of objects in it as fields of their own: {"a": {"b": 1}} has a/b."""
+    if not isinstance(value, dict):
+        return value
+    flat: dict[str, Any] = {}
+    for name, part in value.items():
+        inner = _flat(part)
+        flat |= (
+            {f"{name}/{key}": each for key, each in inner.items()}
+            if isinstance(inner, dict)
+            else {name: part}
+        )
+    return flat
 
 
 def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -85,6 +115,7 @@ def _row(line: bytes, origin: str, fields: Sequence[str]) -> dict[str, Any]:
         raise BadInputError(f"{origin}: expected an object of fields ({in_short(error)})") from error
     if not isinstance(row, dict):
         raise BadInputError(f"{origin}: expected an object of fields, got {type(row).__name__}")
+    row = _flat(row)
     if not all(name in row for name in fields):
         row_count(origin, fields, dict.fromkeys(row, (1,)))
     return row

@@ -7,6 +7,7 @@ when rows are taken (`exchange/resampling.py`).
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.exchange.mapping import ImportMapping
-from astra_data.exchange.mcap_file import McapFile
-from astra_data.exchange.mcap_timeline import Timeline
+from astra_data.exchange.mcap_file import McapFile, Timeline
 from astra_data.exchange.message_fields import MessageField
 from astra_data.exchange.recording import BLOCK_ROWS, Block, Source
 from astra_data.exchange.resampling import Resampler
@@ -63,20 +63,24 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     _check_mapping(mapping, str(source))
     fields = _fields(mapping)
     file = McapFile(source, fields.keys())
+    mapping, fields = _by_publisher(file, mapping, fields)
     gaps_s = [mapping.split.gap_s or 0, *(column.gap_s or 0 for column in mapping.columns.values())]
     timeline = Timeline(file, gaps_s[0], max(gaps_s))
     resampler = Resampler(mapping, str(source), timeline.moments)
-    rows, known = _Rows(), sorted(file.topics - fields.keys())
+    topic_of = {field.name: topic for topic, each in fields.items() for field in each}
+    rows, known = _Rows(), sorted(file.topics - {field.topic for each in fields.values() for field in each})
     for begins, is_back, row, times in _rows(source, resampler, timeline, fields):
         if rows.values and (begins or len(rows.values) == BLOCK_ROWS):
-            yield _block(source, rows, known)
+            yield _block(source, rows, known, topic_of)
             rows = _Rows()
         rows.starts |= begins
         rows.is_back |= is_back
         rows.values.append(row)
         rows.times.append(times)
     if rows.values:
-        yield replace(_block(source, rows, known), torn=int(file.is_cut), notes=resampler.unevenness())
+        yield replace(
+            _block(source, rows, known, topic_of), torn=int(file.is_cut), notes=resampler.unevenness()
+        )
 
 
 def check(source: Source, mapping: ImportMapping) -> None:
@@ -98,7 +102,9 @@ def check(source: Source, mapping: ImportMapping) -> None:
         if topic not in first:
             raise BadInputError(f"{source}: no messages on {topic}")
         content = file.decoder(first[topic].channel_id)(first[topic].data)
-        _values(content, fields[topic], f"{source} at {first[topic].log_time} ns")
+        # Those with names may be sent by another publisher.
+        plain = [each for each in fields[topic] if not each.wanted]
+        _values(content, plain, f"{source} at {first[topic].log_time} ns")
 
 
 def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
@@ -108,6 +114,53 @@ def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
         of_message = MessageField(name)
         fields.setdefault(of_message.topic, []).append(of_message)
     return fields
+
+
+def _by_publisher(
+    file: McapFile, mapping: ImportMapping, fields: dict[str, list[MessageField]]
+) -> tuple[ImportMapping, dict[str, list[MessageField]]]:
+    """Treat what several publishers send to one topic, each its own joints, as topics of their own.
+
+    They are called by the topic and the joints. Returns the mapping and the fields of each.
+    """
+    named = {topic for topic, each in fields.items() if any(field.wanted for field in each)}
+    sent: dict[str, set[frozenset[str]]] = {topic: set() for topic in named}
+    for topic, message in file.messages(checked=False) if named else ():
+        if topic in named:
+            sent[topic].add(_sent(file, fields[topic], message))
+    streams: dict[str, str] = {}
+    split: dict[str, list[MessageField]] = {
+        topic: each for topic, each in fields.items() if topic not in named
+    }
+    for topic, groups in sent.items():
+        wanted = {field.wanted for field in fields[topic] if field.wanted}
+        if len(groups) < 2 or not wanted <= set().union(*groups):
+            split[topic] = fields[topic]  # of one publisher, or without what is wanted
+            continue
+        is_apart = sum(map(len, groups)) == len(wanted)
+        of = {n: f"{topic}[{','.join(sorted(group)) if is_apart else n}]" for group in groups for n in group}
+        for each in fields[topic]:
+            stream = of.get(each.wanted) or min(of.values())
+            split.setdefault(stream, []).append(each)
+            streams[each.name] = stream + each.name.removeprefix(topic)
+        file.streams[topic] = partial(_streams, file, fields[topic], of)
+    return mapping.renamed(streams), split
+
+
+def _sent(file: McapFile, fields: Sequence[MessageField], message: Any) -> frozenset[str]:  # noqa: ANN401
+    """Return which of the names that `fields` want are in a message of theirs."""
+    content = file.decoder(message.channel_id)(message.data)
+    return frozenset(field.wanted for field in fields if field.wanted in field.names_in(content))
+
+
+def _streams(
+    file: McapFile,
+    fields: Sequence[MessageField],
+    of: Mapping[str, str],
+    message: Any,  # noqa: ANN401 - of mcap
+) -> list[str]:
+    """Return as what topics a message counts."""
+    return sorted({of[name] for name in _sent(file, fields, message)})
 
 
 def _rows(
@@ -139,10 +192,10 @@ def _rows(
         _log.warning("%s", silence)
 
 
-def _block(source: Source, rows: _Rows, known: list[str]) -> Block:
+def _block(source: Source, rows: _Rows, known: list[str], topic_of: Mapping[str, str]) -> Block:
     values = {name: np.stack([row[name] for row in rows.values]) for name in rows.values[0]}
     places = {
-        row: f"{source}, {name} at {rows.times[row][name.partition(':')[0]]} ns"
+        row: f"{source} at {rows.times[row][topic_of[name]]} ns"
         for name, column in reversed(values.items())
         if column.dtype.kind == "f"
         for row in np.flatnonzero(~np.isfinite(column.reshape(len(column), -1)).all(axis=1)).tolist()

@@ -16,7 +16,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
-from astra_data.exchange.hdf5_storage import (
+from astra_data.exchange.hdf5_file import (
     check_storage,
     refuse_links,
     stored_datasets,
@@ -36,15 +36,16 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             much.
     """
     for episode in _open(source).iterate_episodes():
-        fields = _fields(episode)
         origin = f"{source}/episode_{episode.id}"
-        notes = _after_steps(fields, mapping, origin)
-        shapes = {name: values.shape for name, values in fields.items()}
-        if row_count(origin, mapping.all_fields, shapes):
-            used = {field: fields[field] for field in mapping.all_fields}
-            known = [name for name in fields if not {name, f"next_{name}"} & used.keys()]
-            known = [name for name in known if not name.startswith("next_")]
-            yield Block(used, origin, starts=True, notes=notes, known=known)
+        with source.tolerant():
+            fields = _fields(episode)
+            notes = _after_steps(fields, mapping, origin)
+            shapes = {name: values.shape for name, values in fields.items()}
+            if row_count(origin, mapping.all_fields, shapes):
+                used = {field: fields[field] for field in mapping.all_fields}
+                known = [name for name in fields if not {name, f"next_{name}"} & used.keys()]
+                known = [name for name in known if not name.startswith("next_")]
+                yield Block(used, origin, starts=True, notes=notes, known=known)
 
 
 def layout(source: Source) -> dict[str, Any]:

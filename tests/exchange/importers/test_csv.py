@@ -142,14 +142,6 @@ def test_another_separator_is_told(tmp_path: Path, name: str, mark: str, told: s
         imported(tmp_path, log)
 
 
-def test_fields_of_a_log_without_names_are_listed_once(tmp_path: Path) -> None:
-    log = tmp_path / "log.csv"
-    log.write_text("10,20,30\n1,2,3\n")
-    with pytest.raises(BadInputError) as caught:
-        imported(tmp_path, log)
-    assert str(caught.value).count("known: 10, 20, 30") == 1
-
-
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
@@ -227,3 +219,96 @@ def test_a_cut_off_line_begins_a_new_episode_where_files_go_on(tmp_path: Path) -
         mapping = f'not_finite = "{keys}"\n{TORN}[split]\nfiles = false\n'
         dataset, _ = imported(tmp_path / str(number), tmp_path / "logs", mapping)
         assert dataset.lengths.tolist() == lengths
+
+
+def joined(folder: Path, prefix: str, *, lost: slice = slice(0)) -> None:
+    """Write states at 10 Hz and commands at 20 Hz, 0.32 s later and without those `lost`."""
+    folder.mkdir(exist_ok=True)
+    states = "".join(f"{k / 10:.2f},{k},{-k}\n" for k in range(40))
+    commands = [f"{k / 20 + 0.32:.2f},{k}\n" for k in range(80)]
+    del commands[lost]
+    (folder / f"{prefix}state.csv").write_text(f"t,x,y\n{states}")
+    (folder / f"{prefix}control.csv").write_text("t,u\n" + "".join(commands))
+
+
+JOINED = """
+name = "log"
+task = "walk"
+fps = 10
+time = "t"
+[columns."observation.state"]
+fields = ["state.csv:x", "state.csv:y"]
+names = ["x", "y"]
+[columns.action]
+fields = ["control.csv:u"]
+[split]
+gap_s = 0.15
+"""
+
+
+def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
+    joined(tmp_path / "logs", "run1_")
+    joined(tmp_path / "logs/other", "", lost=slice(20, 30))
+    dataset, _ = imported(tmp_path, tmp_path / "logs", JOINED)
+    before, after, first = dataset.episodes()
+    # The first command comes at 0.32 s, so the first row is that at 0.4 s, with the command of 0.37 s.
+    assert first.columns["observation.state"][:2].tolist() == [[4, -4], [5, -5]]
+    assert first.columns["action"].tolist() == [1 + 2 * k for k in range(len(first))]
+    assert dataset.metadata["source"] == ["other/state.csv", "other/state.csv", "run1_state.csv"]
+    # Commands 20 to 29, of 1.32 to 1.77 s, are lost: 1.27 s holds until 1.4, and the next is of 1.82 s.
+    assert before.columns["observation.state"][[0, -1], 0].tolist() == [4, 13]
+    assert after.columns["observation.state"][0, 0] == 19
+    assert after.columns["action"][:2].tolist() == [31, 33]
+    assert len(dataset.description["config"]["recordings"]) == 4
+
+
+def test_files_that_cannot_be_joined_are_refused(tmp_path: Path) -> None:
+    joined(tmp_path / "logs", "")
+    for old, new, told in (
+        ('time = "t"\n', "", "files are joined by time: set `time`"),
+        ("control.csv:u", "u", r"u: expected the file of each field, such as state\.csv:x"),
+        ("control.csv:u", "wind.csv:u", r"wind\.csv is missing, which is joined with state\.csv"),
+        ("control.csv:u", "control.csv:v", r"control\.csv: no field 'v'"),
+    ):
+        mapping = JOINED.replace(old, new)
+        with pytest.raises(BadInputError, match=told):
+            imported(
+                tmp_path / "x", tmp_path / "logs", mapping if new else mapping.replace("gap_s = 0.15\n", "")
+            )
+    control = tmp_path / "logs/control.csv"
+    control.write_text("t,u\n1.0,1\n0.5,2\n")
+    with pytest.raises(BadInputError, match=r"control\.csv: 't' goes back or is missing: sort"):
+        imported(tmp_path / "x", tmp_path / "logs", JOINED)
+
+
+@pytest.mark.parametrize(
+    "cell", ['"[{0}, -{0}.5, 1e2]"', "[{0} -{0}.5  1e2]", '"({0}; -{0}.5; 100)"', '"[ {0}\n -{0}.5 100]"']
+)
+def test_a_cell_may_be_a_list(tmp_path: Path, cell: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("pose,u\n" + "".join(f"{cell.format(k)},{k}\n" for k in range(5)))
+    mapping = (
+        JOINED.partition("time")[0]
+        + '[columns."observation.state"]\nfields = ["pose"]\n[columns.action]\nfields = ["u"]\n'
+    )
+    dataset, _ = imported(tmp_path, path, mapping)
+    assert dataset.columns(["observation.state"])["observation.state"].tolist() == [
+        [k, -k - 0.5, 100] for k in range(4)
+    ]
+    path.write_text(path.read_text() + "[1 2],3\n")
+    with pytest.raises(
+        BadInputError, match=r"field 'pose': expected a list of 3 numbers as in .* got '\[1 2\]'"
+    ):
+        imported(tmp_path / "bad", path, mapping)
+
+
+def test_a_header_of_numbers_is_none_but_pandas_own(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("0.0,1,-2e3\n0.1,2,nan\n")
+    told = r"expected a header with a name for each field, got numbers: .* such as f0,f1,f2 \(sed"
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path, path)
+    path.write_text("0,1\n5,6\n7,8\n")
+    mapping = JOINED.partition("time")[0] + '[columns."observation.state"]\nfields = ["1"]\n'
+    dataset, _ = imported(tmp_path, path, mapping)
+    assert dataset.columns(["observation.state"])["observation.state"].tolist() == [6]

@@ -136,3 +136,28 @@ def test_lines_that_are_blank_are_counted(tmp_path: Path) -> None:
     _, report = imported(tmp_path, path, 'not_finite = "split"\n' + MAPPING)
     assert report.tally.rejected_first == "log.jsonl line 7"
     assert report.tally.torn_first == f"log.jsonl line {len(lines) + 5}"
+
+
+@pytest.mark.parametrize("kind", ["object", "list", "lines"])
+def test_objects_in_objects_are_fields_with_both_names(tmp_path: Path, kind: str) -> None:
+    rows_ = [{"pose": {"at": [k, -k], "yaw": {"rad": 0.5 * k}}, "u": k} for k in range(6)]
+    path = tmp_path / ("log.jsonl" if kind == "lines" else "log.json")
+    if kind == "object":
+        at, yaw = [row["pose"]["at"] for row in rows_], [row["pose"]["yaw"]["rad"] for row in rows_]  # type: ignore[index]
+        path.write_text(dumps({"pose": {"at": at, "yaw": {"rad": yaw}}, "u": list(range(6))}))
+    else:
+        path.write_text(dumps(rows_) if kind == "list" else "\n".join(map(dumps, rows_)))
+    mapping = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["pose/at", "pose/yaw/rad"]
+"""
+    dataset, report = imported(tmp_path, path, mapping)
+    assert dataset.columns(["observation.state"])["observation.state"].tolist() == [
+        [k, -k, 0.5 * k] for k in range(5)
+    ]
+    assert report.tally.unused_fields == ["u"]
+    with pytest.raises(BadInputError, match=r"no field 'pose/yaw'.*(known: |did you mean ')"):
+        imported(tmp_path / "bad", path, mapping.replace("pose/yaw/rad", "pose/yaw"))

@@ -296,7 +296,10 @@ def test_a_value_that_is_not_finite_is_named_by_its_topic_and_time(tmp_path: Pat
     messages = drive(0, 3)
     messages[24] = pose(1.2, float("nan"))
     path = write_json(tmp_path / "log.mcap", messages)
-    with pytest.raises(BadInputError, match=r"the first is log\.mcap, /pose:position\.x at 1200000000 ns;"):
+    told = (
+        r"1 of 30 rows .*: /pose:position\.x in 1 row, log\.mcap at 1200000000 ns; /pose:joints\[0\] in 1 row"
+    )
+    with pytest.raises(BadInputError, match=told):
         imported(tmp_path, path, MAPPING)
 
 
@@ -452,3 +455,33 @@ def test_the_gap_that_a_checkup_proposes_splits_there(tmp_path: Path, lost: set[
     )
     assert len(dataset) == 2
     assert not [f for f in check_up(dataset).findings if "stamp" in f.what or "steps of over" in f.what]
+
+
+def joints(time: float, **positions: float) -> tuple[str, float, dict[str, Any]]:
+    return "/joints", time, {"name": list(positions), "position": list(positions.values()), "stamp": time}
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_publishers_of_one_topic_are_held_apart(tmp_path: Path, shared: bool) -> None:
+    """An arm at 20 Hz and a gripper at 5 Hz; `shared`: the gripper's driver sends a joint of the arm, too."""
+    messages = [joints(k / 20, b=-k, a=k) for k in range(101)]
+    more = {"a": -1.0} if shared else {}
+    messages += [joints(k / 5 + 0.011, grip=10 * k, **more) for k in range(26)]
+    messages += [command(k / 10, k) for k in range(51)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    mapping = MAPPING.replace(
+        '["/pose:position.x", "/pose:joints"]',
+        '["/joints:position[a]", "/joints:position[b]", "/joints:position[grip]"]',
+    )
+    dataset, _ = imported(tmp_path, path, mapping)
+    [episode] = dataset.episodes()
+    a, b, grip = episode.columns["observation.state"].T
+    assert len(episode) == 50
+    assert set(np.diff(b)) == {-2} and set(np.unique(grip) % 10) == {0} and (np.diff(grip) >= 0).all()
+    assert (-1 in a) == shared
+    if not shared:
+        np.testing.assert_array_equal(a, -b)
+    alone, _ = imported(tmp_path / "arm", path, mapping.replace(', "/joints:position[grip]"', ""))
+    assert alone.schema[0].size == 2
+    with pytest.raises(BadInputError, match=r"no 'thumb' in /joints:position"):
+        imported(tmp_path / "none", path, mapping.replace("[grip]", "[thumb]"))
