@@ -29,23 +29,6 @@ def recipe_at(path: Path) -> Path:
     return path
 
 
-def recipes_at(paths: list[Path]) -> list[Path]:
-    """Refuse paths as `recipe_at` does; list them all.
-
-    Raises:
-        RecipeError: as `recipe_at`.
-    """
-    faults = []
-    for path in paths:
-        try:
-            recipe_at(path)
-        except RecipeError as error:
-            faults.append(str(error))
-    if faults:
-        raise RecipeError("\n".join(faults))
-    return paths
-
-
 def run_at(folder: Path) -> Path:
     """Refuse what is no folder of a run.
 
@@ -73,17 +56,6 @@ def task_at(name: str) -> str:
     if file.suffix == ".py" and not file.is_file():
         raise BadInputError(f"{name}: expected a file {file}, found none: write path.py:TASK")
     return name
-
-
-def dataset_at(name: str) -> Path:
-    """Return the folder of a dataset, for commands whose work takes long to load.
-
-    Raises:
-        BadInputError: as `versions.locate`.
-    """
-    from astra_data.dataset.versions import locate
-
-    return locate(name)
 
 
 def _stage(name: str | None) -> str | None:

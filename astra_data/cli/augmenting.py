@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.arguments import DatasetName, NewName, Out, dataset_at
+from astra_data.cli.arguments import DatasetName, NewName, Out
 from astra_data.cli.settings import with_settings
 
 
@@ -24,7 +24,9 @@ def augment(
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
 ) -> None:
     """Add rotated and shifted copies of episodes; the dataset must not be paired yet."""
-    root = dataset_at(dataset)
+    from astra_data.dataset.versions import locate
+
+    root = locate(dataset)
     from astra_data.core.config import validated
     from astra_data.experiments.display import shown
     from astra_data.stages.augment import AugmentConfig

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.arguments import Jobs, NewName, Out, Root, Seeds, Source, dataset_at, task_at
+from astra_data.cli.arguments import Jobs, NewName, Out, Root, Seeds, Source, task_at
 from astra_data.cli.recipes import refuse, resumable, run_stage
 from astra_data.cli.settings import with_settings
 from astra_data.core.errors import BadInputError
@@ -103,7 +103,9 @@ def pair(
     if simulator is None:
         raise BadInputError("pair: expected --simulator: a task or path.py:MySimulator")
     task_at(simulator)
-    source = dataset_at(dataset)
+    from astra_data.dataset.versions import locate
+
+    source = locate(dataset)
     from astra_data.core.config import validated
     from astra_data.experiments.display import shown
     from astra_data.stages.pair import PairConfig

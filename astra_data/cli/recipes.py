@@ -18,7 +18,6 @@ from astra_data.cli.arguments import (
     Until,
     check_asked,
     recipe_at,
-    recipes_at,
 )
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS
@@ -59,7 +58,8 @@ def check(
     ] = False,
 ) -> None:
     """Check recipes without running them, and list which artifacts are finished, damaged or stale."""
-    recipes_at(recipes)
+    for recipe in recipes:
+        recipe_at(recipe)
     from astra_data.experiments.recipe_file import is_gap_recipe
     from astra_data.experiments.run import check as check_recipe
 

@@ -63,7 +63,7 @@ def sweep(
         ),
     ] = None,
 ) -> None:
-    """Run a recipe over rows, seeds and dataset sizes, with a live table; run it again to continue."""
+    """Run a recipe over rows, seeds and dataset sizes; run it again to continue."""
     if address is not None and engine is not Engine.ray:
         raise BadInputError("sweep: --address is for --engine ray")
     check_asked(recipe_at(recipe), methods, seeds, percents)

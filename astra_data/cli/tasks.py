@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from astra_data.cli.arguments import DatasetName, NewName, Out, dataset_at, task_at
+from astra_data.cli.arguments import DatasetName, NewName, Out, task_at
 from astra_data.cli.showing import show_table
 from astra_data.core.wording import first_few
 
@@ -81,7 +81,9 @@ def label(
 ) -> None:
     """Compute the goals, rewards, successes and failures that a log lacks, as a task defines them."""
     task_at(task)
-    data = dataset_at(dataset)
+    from astra_data.dataset.versions import locate
+
+    data = locate(dataset)
     from astra_data.experiments.display import shown
     from astra_data.stages.label import label as label_dataset
 

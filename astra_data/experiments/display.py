@@ -7,8 +7,7 @@ from datetime import timedelta
 from functools import partial
 from statistics import fmean
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
+from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TaskProgressColumn, TextColumn
 from rich.table import Column
 from rich.text import Text
@@ -23,8 +22,8 @@ _BAR_WIDTH = 20
 
 
 @contextmanager
-def display(keys: Collection[str], console: Console, above: RenderableType = "") -> Iterator[Watcher]:
-    """Show the progress of the items of these `keys` on `console`; in a terminal, below `above`.
+def display(keys: Collection[str], console: Console) -> Iterator[Watcher]:
+    """Show the progress of the items of these `keys` on `console`.
 
     Where lines are too long for the terminal, names and notes are cut off, never bar, share and time left.
     """
@@ -38,8 +37,7 @@ def display(keys: Collection[str], console: Console, above: RenderableType = "")
         _TimeLeft(table_column=Column(width=7, no_wrap=True)),
         _Cropped("{task.fields[note]}", markup=False, table_column=Column()),
     )
-    progress = Progress(*columns, console=console)
-    with Live(Group(above, progress) if above else progress, console=console):
+    with Progress(*columns, console=console) as progress:
         yield LiveDisplay(keys, progress)
 
 

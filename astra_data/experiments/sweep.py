@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS, stage_of_key
 from astra_data.core.optional import optional
-from astra_data.experiments.board import board, progress_text
 from astra_data.experiments.display import display
 from astra_data.experiments.execution import Item, Watcher
 from astra_data.experiments.experiment import Experiment, load_experiment
@@ -111,7 +109,7 @@ def _left(
 
 
 class PointTable:
-    """The finished points of a recipe: `sweep.csv`, and a table of the selected ones in the terminal.
+    """The finished points of a recipe, in `sweep.csv`.
 
     Attributes:
         shown: the selected points.
@@ -145,10 +143,8 @@ class PointTable:
     def message(self, point: RunPoint) -> str:
         """Return one line for a point that has just finished."""
         score = self._headline.text(self.means[point])
-        return f"{point.key}  done {score}  ({progress_text(self.shown, self.means)})"
-
-    def __rich__(self) -> Table:
-        return board(self.shown, self.means, self._headline)
+        done = sum(one in self.means for one in self.shown)
+        return f"{point.key}  done {score}  ({done} of {len(self.shown)} points)"
 
     def _line(self, point: RunPoint) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
@@ -188,9 +184,9 @@ def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
 
 @contextmanager
 def _shown(table: PointTable, log: Log | None, keys: Collection[str], console: Console) -> Iterator[Watcher]:
-    """Show the points above the running items, and keep `sweep.csv` up to date."""
+    """Show the running items, and keep `sweep.csv` up to date."""
     table.write()
-    with display(keys, console, above=table) as watch:
+    with display(keys, console) as watch:
         yield _PointWatcher(watch, table, log, console)
 
 

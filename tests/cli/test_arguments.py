@@ -8,9 +8,11 @@ from typer.main import get_command
 from astra_data.cli.app import app
 from astra_data.cli.settings import settings_of
 from astra_data.core.config import Config
+from astra_data.core.naming import STAGE_NAMES
 from astra_data.stages.augment import AugmentConfig
 from astra_data.stages.collect import CollectConfig
 from astra_data.stages.pair import PairConfig
+from astra_data.stages.registry import STAGES
 
 
 @pytest.mark.parametrize(
@@ -27,6 +29,10 @@ def test_a_command_has_an_option_for_each_setting(command: str, model: type[Conf
         option, kind = options[one.name], type(one.default)
         assert option.help.split() == one.about.replace("`", "").split() != []
         assert option.default is None and (one.default is None or one.kind in (kind, tuple[float, float]))
+
+
+def test_the_stages_that_help_lists_are_those_of_the_pipeline() -> None:
+    assert tuple(STAGES) == STAGE_NAMES
 
 
 def test_settings_are_read_without_their_stages() -> None:

@@ -72,16 +72,6 @@ def test_the_time_left_counts_work_not_items() -> None:
     assert estimate.left() == pytest.approx(100)
 
 
-def test_in_a_terminal_something_may_stand_above_the_items() -> None:
-    file = StringIO()
-    terminal = Console(file=file, width=120, force_terminal=True, no_color=True)
-    with display(["train/nas/seed_0"], terminal, above="all points") as watch:
-        watch.started("train/nas/seed_0")
-        watch.failed("train/nas/seed_0")
-    _, above, last = file.getvalue().rpartition("all points")
-    assert above and "train/nas/seed_0" in last and "failed" in last
-
-
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_an_item_may_fail_before_it_has_begun(is_terminal: bool) -> None:
     console = Console(file=StringIO(), force_terminal=is_terminal)

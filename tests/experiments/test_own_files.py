@@ -199,7 +199,7 @@ def test_a_run_of_an_older_version_has_no_record(made: Path) -> None:
         "deploy runs/rail --row nas --out out",
         "select runs/rail",
         "select runs/rail --trials 50",
-        "view runs/rail --save out",
+        "view runs/rail --save out.rrd",
     ],
 )
 def test_no_command_takes_a_run_of_another_task(
