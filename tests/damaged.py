@@ -7,7 +7,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH
+from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.seal import sealed
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -41,13 +42,10 @@ def retype(name: str, column: str, value: object) -> Callable[[Path], None]:
     return damage
 
 
-def as_in_0_1(root: Path) -> None:
-    """Take digests and sums away, which version 0.1 did not write."""
+def reseal(root: Path) -> None:
+    """Let the description agree with files that were changed."""
     path = root / DATASET_PATH
-    description = json.loads(path.read_text())
-    del description["sums"]
-    path.write_text(json.dumps(description))
-    (root / DIGESTS_PATH).unlink()
+    path.write_text(json.dumps(sealed(root, json.loads(path.read_text()))))
 
 
 def edit(name: str, **changes: object) -> Callable[[Path], object]:

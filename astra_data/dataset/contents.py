@@ -66,8 +66,7 @@ def read_contents(root: Path) -> Contents:
     Raises:
         CorruptDatasetError: files are missing or contradict each other; lists every fault.
     """
-    needed = [layout.DATASET_PATH, *(path for path in SEALED if path != layout.DIGESTS_PATH)]
-    missing = [path for path in needed if not (root / path).is_file()]
+    missing = [path for path in (layout.DATASET_PATH, *SEALED) if not (root / path).is_file()]
     if missing:
         raise CorruptDatasetError(f"{', '.join(missing)} missing")
     info, description, subsets = read_info(root), read_description(root), read_subsets(root)
@@ -107,9 +106,7 @@ def read_contents(root: Path) -> Contents:
     if lengths.sum() != info["total_frames"] or (starts != np.cumsum(lengths) - lengths).any():
         faults.append(f"meta/episodes adds up to {lengths.sum()} frames, expected {info['total_frames']}")
     faults += _file_faults(root, columns, rows)
-    # Without digests, the values can still be compared with the content hash.
-    altered = [path for path in altered_files(root, description) if path != layout.DIGESTS_PATH]
-    if faults := faults or [f"{path} was altered" for path in altered]:
+    if faults := faults or [f"{path} was altered" for path in altered_files(root, description)]:
         raise CorruptDatasetError("; ".join(faults))
     position = {uid: episode for episode, uid in enumerate(uids.tolist())}
     return Contents(

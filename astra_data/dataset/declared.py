@@ -25,8 +25,11 @@ def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainC
     """
     features, fps = info.get("features"), info.get("fps")
     columns = plain_columns(features)[0] if isinstance(features, dict) else []
-    missing = sorted({c.name for c in DEFAULT_COLUMNS} - {column.name for column in columns})
+    found = {column.name: column for column in columns}
+    missing = sorted({c.name for c in DEFAULT_COLUMNS} - found.keys())
     faults = [f"lacks the columns {', '.join(missing)}, which are LeRobot's own"] if missing else []
+    if strange := [c.name for c in DEFAULT_COLUMNS if c.name in found and not _fits(found[c.name], c)]:
+        faults.append(f"has no single number a step as {', '.join(strange)}")
     if not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
         faults.append(f"has fps {fps!r}, expected a whole number of frames per second")
     if faults:
@@ -43,6 +46,12 @@ def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainC
         }
         specs.append(Column.from_feature(column.name, known))
     return columns, specs, int(fps)
+
+
+def _fits(stored: PlainColumn, own: Column) -> bool:
+    """Return whether a column can be one of LeRobot's own."""
+    kinds = "f" if own.dtype == "float32" else "iu"
+    return stored.size == 1 and np.dtype(stored.dtype).kind in kinds
 
 
 def name_of(folder: Path) -> str:

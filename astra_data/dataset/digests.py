@@ -71,12 +71,12 @@ def write_digests(root: Path, digests: Mapping[str, ArrayLike]) -> None:
 
 def read_digests(
     root: Path, sums: Mapping[str, str], columns: Collection[str], episodes: int | None = None
-) -> dict[str, NDArray[np.uint64]] | None:
-    """Return the digests of `columns`; None if the dataset was written without any.
+) -> dict[str, NDArray[np.uint64]]:
+    """Return the digests of `columns`.
 
     Args:
         root: folder of the dataset.
-        sums: those of its description, see `seal`.
+        sums: those of its description, see `seal`; empty if they are not known.
         columns: names of all stored columns.
         episodes: their number, if it is known.
 
@@ -84,8 +84,6 @@ def read_digests(
         CorruptDatasetError: the file is missing, was altered, or has other columns or rows.
     """
     path = root / DIGESTS_PATH
-    if DIGESTS_PATH not in sums and not path.exists():
-        return None
     table = read_small_table(path)
     if isinstance(table, str):
         raise CorruptDatasetError(f"{DIGESTS_PATH} {table}")

@@ -70,7 +70,7 @@ class _Description(_Open):
     packages: dict[str, str]
     git_commit: str | None
     content_hash: str
-    sums: dict[str, str] = Field(default_factory=dict)
+    sums: dict[str, str]
 
 
 class _Subsets(_Open):

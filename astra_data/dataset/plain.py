@@ -46,6 +46,7 @@ _FORMAT_2 = {
 """Files of LeRobot's formats 2.0 and 2.1: one of the data for each episode."""
 PLAIN_STATISTICS = ("min", "max", "mean", "std", "count")
 """Those that every file of the format has of every column."""
+_MOST_ROWS = 10**12
 _MOST_BYTES = 2**28
 """Of a file of metadata in JSON."""
 
@@ -162,10 +163,10 @@ def read_places(root: Path, info: Mapping[str, Any]) -> tuple[dict[int, Place], 
         rows = _read_lines(root / _FORMAT_2["episodes"])
         if isinstance(rows, str):
             return places, [f"{_FORMAT_2['episodes']} {rows}"]
-        first, chunk = 0, info.get("chunks_size", CHUNK_SIZE)
+        first, chunk = 0, _whole(info.get("chunks_size")) or CHUNK_SIZE
         for row in rows:
-            number, length = row.get("episode_index"), row.get("length")
-            if type(number) is not int or type(length) is not int or type(chunk) is not int or chunk < 1:
+            number, length = (_whole(row.get(key)) for key in ("episode_index", "length"))
+            if number is None or length is None:
                 return places, [f"{_FORMAT_2['episodes']} has no whole numbers as episode_index and length"]
             path = root / _FORMAT_2["data"].format(number // chunk, number)
             places[number] = Place(length, first, path)
@@ -183,9 +184,14 @@ def read_places(root: Path, info: Mapping[str, Any]) -> tuple[dict[int, Place], 
                     inside = str(pattern).format(chunk_index=chunk, file_index=file) if located else None
                     start = first if type(first) is int else None
                     places[number] = Place(length, start, root / inside if inside else None)
-        except CorruptDatasetError as error:
-            faults.append(str(error))
+        except (*UNREADABLE, CorruptDatasetError) as error:
+            faults.append(f"{path.name}: {in_short(error)}")
     return places, faults
+
+
+def _whole(value: object) -> int | None:
+    """Return a number of rows, episodes or files; None if it is none."""
+    return value if type(value) is int and 0 <= value < _MOST_ROWS else None
 
 
 def missing_files(root: Path, places: Mapping[int, Place]) -> list[str]:
@@ -216,10 +222,11 @@ def read_tasks(root: Path) -> dict[int, str] | str:
         rows = _read_lines(root / (name := _FORMAT_2["tasks"]))
         if isinstance(rows, str):
             return f"is not there in format 2, and {name} {rows}"
-        listed = {row.get("task_index"): row.get("task") for row in rows}
-        if not all(type(key) is int and isinstance(text, str) for key, text in listed.items()):
+        if not rows or not all(
+            type(row.get("task_index")) is int and isinstance(row.get("task"), str) for row in rows
+        ):
             return f"is not there in format 2, and {name} has no text for each task_index"
-        return {int(str(key)): str(text) for key, text in listed.items()}
+        return {row["task_index"]: row["task"] for row in rows}
     table = read_small_table(root / TASKS_PATH)
     if isinstance(table, str):
         return table

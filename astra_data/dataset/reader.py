@@ -1,6 +1,5 @@
 """Read a dataset: whole columns as contiguous arrays, or one episode at a time."""
 
-import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -26,8 +25,6 @@ from astra_data.dataset.values import alterations, measure, read_values
 if TYPE_CHECKING:
     import datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-_LOG = logging.getLogger(__name__)
 
 
 class Dataset(Contents):
@@ -209,12 +206,13 @@ class Dataset(Contents):
         """
         try:
             found, digests = measure(self)
-            stored = self._stored_digests()
+            altered = altered_columns(digests, self._digests)
         except CorruptDatasetError as error:
             return [str(error)]
-        altered = {} if stored is None else altered_columns(digests, stored)
         faults = list(alterations(self, altered, self.selected(None)))
-        return faults if found == self.content_hash else [*faults, self._other_hash(found)]
+        if found != self.content_hash:
+            faults.append(f"the content hash is {found}, expected {self.content_hash}")
+        return faults
 
     def require_whole(self) -> None:
         """Read every value, for what states something of all of them.
@@ -242,26 +240,10 @@ class Dataset(Contents):
 
     @cached_property
     def _digests(self) -> Digests:
-        """The stored digests; where there are none, those of the values, if these have the content hash."""
+        """Those of the values as they were written, or as they were when a recording was opened."""
         if self.recorded is not None:
             return self.recorded.digests
-        try:
-            stored, lack = self._stored_digests(), "it was written without digests of its values"
-        except CorruptDatasetError as error:
-            stored, lack = None, str(error)
-        if stored is not None:
-            return stored
-        _LOG.warning("%s: %s; all values are compared with its content hash now", self.root, lack)
-        found, digests = measure(self)
-        if found != self.content_hash:
-            raise CorruptDatasetError(self._other_hash(found))
-        return digests
-
-    def _stored_digests(self) -> Digests | None:
-        return read_digests(self.root, self.description.get("sums", {}), self.features, len(self))
-
-    def _other_hash(self, found: str) -> str:
-        return f"the content hash is {found}, expected {self.content_hash}"
+        return read_digests(self.root, self.description["sums"], self.features, len(self))
 
     def _verified(self, columns: Sequence[Column], chosen: Ints) -> Iterator[tuple[dict[str, Array], Ints]]:
         """Yield blocks of whole episodes and their indices; the first one with altered values raises."""

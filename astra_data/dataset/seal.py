@@ -35,9 +35,8 @@ def sealed(root: Path, description: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_description_sealed(description: Mapping[str, Any]) -> bool:
-    """Return whether `description` is as it was sealed, or was written without sums."""
-    sums = description.get("sums", {})
-    return not sums or sums.get(layout.DATASET_PATH) == _own_sum(description)
+    """Return whether `description` is as it was sealed."""
+    return bool(description["sums"].get(layout.DATASET_PATH) == _own_sum(description))
 
 
 def is_sealed(path: Path, expected: str | None) -> bool:

@@ -58,6 +58,10 @@ def test_one_frame_per_second_is_a_rate() -> None:
         ({"fps": 9.5, "features": OWN}, [f"has fps 9.5, {WHOLE}"]),
         ({"fps": 0.5, "features": OWN}, [f"has fps 0.5, {WHOLE}"]),
         ({"fps": 2**31, "features": OWN}, [f"has fps 2147483648, {WHOLE}"]),
+        (
+            {"fps": 10, "features": OWN | {"index": {"dtype": "float64", "shape": [2]}}},
+            ["has no single number a step as index"],
+        ),
         ({}, [LACKING, f"has fps None, {WHOLE}"]),
     ],
 )

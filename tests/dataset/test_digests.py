@@ -1,4 +1,3 @@
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import xxhash
-from damaged import DATA, alter, as_in_0_1, drop
+from damaged import DATA, alter
 from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake
 
 from astra_data.core.errors import CorruptDatasetError
@@ -93,34 +92,6 @@ def test_an_altered_episode_can_be_deleted(tmp_path: Path) -> None:
     saved = Dataset.open(delete(Dataset.open(root), [6], out=tmp_path / "saved"))
     assert saved.uids.tolist() == [13, 4, 2**53 + 1, 0]
     assert saved.verify() == []
-
-
-@pytest.mark.parametrize(
-    ("change", "lack"),
-    [
-        (as_in_0_1, "it was written without digests of its values"),
-        (drop(DIGESTS_PATH), f"{DIGESTS_PATH} is missing"),
-        (alter(DIGESTS_PATH, REWARD, 0, 1), f"{DIGESTS_PATH} was altered"),
-    ],
-)
-def test_without_digests_all_values_are_compared_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: object, lack: str
-) -> None:
-    root = write_fake(tmp_path / "set").root
-    assert callable(change)
-    change(root)
-    dataset = Dataset.open(root)
-    assert caplog.messages == []
-    for _ in range(2):
-        np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], concatenated(ACTION))
-    [record] = caplog.records
-    assert record.levelno == logging.WARNING
-    assert record.getMessage() == f"{root}: {lack}; all values are compared with its content hash now"
-    alter(DATA, REWARD, 25, 9.0)(root)
-    with pytest.raises(CorruptDatasetError, match="other values than were written"):
-        dataset.columns([REWARD])  # compared with what was read the first time
-    with pytest.raises(CorruptDatasetError, match=r"the content hash is \w+, expected"):
-        Dataset.open(root).columns([ACTION])
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -92,9 +93,10 @@ def described(
 ) -> dict[str, str]:
     """Write the description of a version without its files; return its identity."""
     full = description | {"version": f"1.{version}.0", "parents": parents, "sums": {}}
+    own = hashlib.sha256(json.dumps(full, sort_keys=True).encode()).hexdigest()
     folder = root / f"home/fake/data-1.{version}.0" / DATASET_PATH
     folder.parent.mkdir(parents=True, exist_ok=True)
-    folder.write_text(json.dumps(full))
+    folder.write_text(json.dumps(full | {"sums": {DATASET_PATH: own}}))
     return {"name": "fake", "version": f"1.{version}.0", "hash": full["content_hash"]}
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from damaged import as_in_0_1
+from damaged import reseal
 from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
@@ -265,12 +265,12 @@ def test_what_tells_the_place_is_dropped_if_phi_drops_it(
     tmp_path: Path, kept: str | None, dropped: tuple[int, ...]
 ) -> None:
     root = write(tmp_path / "dataset", SIZES | {STATE: 4})
-    as_in_0_1(root)
     info = json.loads((root / "meta/info.json").read_text())
     info["features"][STATE]["astra"] = {"role": ["invariant", "position", "position", "heading"]}
     if kept:
         info["features"][ABSTRACT_STATE]["astra"] = {"role": [kept] * 4}
     (root / "meta/info.json").write_text(json.dumps(info))
+    reseal(root)
     assert PairedEpisodes.load(root).dropped_place == dropped
 
 

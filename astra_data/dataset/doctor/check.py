@@ -220,13 +220,10 @@ def _digests(
     root: Path, description: Mapping[str, Any], columns: list[PlainColumn], report: Report
 ) -> Digests:
     try:
-        digests = read_digests(root, description.get("sums", {}), [column.name for column in columns])
+        return read_digests(root, description.get("sums", {}), [column.name for column in columns])
     except CorruptDatasetError as error:
         report.note("digests", f"{error}: it is not known which values were altered, if any")
         return {}
-    if digests is None:
-        report.note("digests", "it was written without digests, which tell what values were altered")
-    return digests or {}
 
 
 def _policy_faults(root: Path, behavior: object, report: Report) -> None:

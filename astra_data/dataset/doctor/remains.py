@@ -168,8 +168,10 @@ def _altered_files(folder: Path, old: Mapping[str, Any], notes: list[str]) -> It
 def _digests(
     folder: Path, old: Mapping[str, Any], columns: Sequence[PlainColumn], notes: list[str]
 ) -> Digests:
+    if not (folder / OUR_FOLDER).is_dir():
+        return {}
     try:
-        return read_digests(folder, old.get("sums", {}), [column.name for column in columns]) or {}
+        return read_digests(folder, old.get("sums", {}), [column.name for column in columns])
     except CorruptDatasetError as error:
         notes.append(f"{error}: the values were compared with the content hash only, as a whole")
         return {}

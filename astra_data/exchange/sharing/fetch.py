@@ -10,15 +10,14 @@ from astra_data.exchange.sharing.store import RemoteFolder
 from astra_data.exchange.sharing.sums import Listed, altered
 
 
-def fetch(remote: RemoteFolder, path: str, folder: Path, listed: Listed, most: int) -> None:
+def fetch(remote: RemoteFolder, path: str, folder: Path, listed: Listed) -> None:
     """Download the file `path` into `folder`, continuing where an earlier call stopped.
 
     Args:
         remote: where it is.
         path: relative to it and to `folder`; already checked to stay inside them.
         folder: an unfinished download is kept in it as <path>.part; `refuse_planted` has looked at it.
-        listed: the file's sha256, and its size if that is known.
-        most: the most bytes that it may have, if its size is not known.
+        listed: the file's sha256, and its size, which bounds the download.
 
     Raises:
         DiskError: it cannot be written.
@@ -27,17 +26,16 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, listed: Listed, most: i
     target = folder / path
     if not altered(folder, {path: listed}):
         return
-    most = most if listed.size is None else listed.size
     part = target.with_name(f"{target.name}.part")
     try:
         with writing(part, place=False):
             part.parent.mkdir(parents=True, exist_ok=True)
             resumed = part.exists()
-            _append(remote, path, part, most)
+            _append(remote, path, part, listed.size)
             is_whole = file_digest(part) == listed.digest
             if resumed and not is_whole:
                 part.unlink()
-                _append(remote, path, part, most)
+                _append(remote, path, part, listed.size)
                 is_whole = file_digest(part) == listed.digest
     except AstraDataError:
         raise
@@ -46,9 +44,11 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, listed: Listed, most: i
             f"{remote.name}: {path} cannot be downloaded ({type(error).__name__}: {error}); "
             "run the same command again to continue."
         ) from error
-    if part.stat().st_size > most:
+    if part.stat().st_size > listed.size:
         part.unlink()
-        raise SharingError(f"{remote.name}: {path} is larger than {most} bytes, as which it was taken.")
+        raise SharingError(
+            f"{remote.name}: {path} is larger than {listed.size} bytes, as which it was taken."
+        )
     if not is_whole:
         part.unlink()
         raise SharingError(

@@ -122,11 +122,9 @@ def _fetch_all(
     with held(partial) as ours:
         if not ours:
             raise BadInputError(f"{target} is being pulled right now; wait or choose another folder.")
-        left = max_bytes
         for number, (path, listed) in enumerate(sums.items()):
             progress(number / len(sums), path)
-            fetch(remote, path, partial, listed, left)
-            left -= (partial / path).stat().st_size
+            fetch(remote, path, partial, listed)
         for file in [file for file in partial.rglob("*") if file.is_file()]:
             if file.relative_to(partial).as_posix() not in sums:
                 file.unlink()
@@ -141,11 +139,11 @@ def _refuse_sizes(remote: RemoteFolder, sums: Mapping[str, Listed], max_bytes: i
     wrong = [
         f"{path} has {found[path]} bytes, listed are {listed.size}"
         for path, listed in sums.items()
-        if found.get(path) is not None and listed.size not in (None, found[path])
+        if found.get(path) is not None and listed.size != found[path]
     ]
     if wrong:
         raise SharingError(f"{remote.name} was altered: {'; '.join(wrong)}. Nothing was downloaded.")
-    total = sum(found.get(path) or listed.size or 0 for path, listed in sums.items())
+    total = sum(listed.size for listed in sums.values())
     if total > max_bytes:
         raise SharingError(
             f"{remote.name} has {total} bytes, of which at most {max_bytes} are taken; nothing was "

@@ -1,11 +1,11 @@
 """SHA256SUMS: the files of a shared dataset, their checksums and sizes, in the format of `sha256sum`.
 
-Sizes are in comments, which `sha256sum` skips: "# 1234 bytes  meta/info.json". Files of 0.1 have none.
+Sizes are in comments, which `sha256sum` skips: "# 1234 bytes  meta/info.json".
 """
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from astra_data.core.digest import file_digest
@@ -29,10 +29,10 @@ _SIZE = re.compile(r"# (?P<size>[0-9]{1,18}) bytes  (?P<path>.+)")
 
 @dataclass(frozen=True)
 class Listed:
-    """A file as it should be: its sha256, and its size in bytes, None where it is not listed."""
+    """A file as it should be: its sha256, and its size in bytes."""
 
     digest: str
-    size: int | None = None
+    size: int
 
 
 def dataset_files(root: Path) -> list[str]:
@@ -56,7 +56,7 @@ def parse_sums(text: str, source: str) -> dict[str, Listed]:
         SharingError: a line is malformed, or a path is not one of a dataset, such as a script or one that
             leads out of the folder; lists every fault.
     """
-    sums: dict[str, Listed] = {}
+    sums: dict[str, str] = {}
     sizes: dict[str, int] = {}
     faults = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -72,13 +72,14 @@ def parse_sums(text: str, source: str) -> dict[str, Listed]:
         elif found["path"] in sums:
             faults.append(f"line {number} lists {found['path']} again")
         else:
-            sums[found["path"]] = Listed(found["digest"])
-    faults += [f"the size of {path} is listed without its sha256" for path in sizes.keys() - sums.keys()]
+            sums[found["path"]] = found["digest"]
+    halves = sorted(sizes.keys() ^ sums.keys())
+    faults += [f"{path} is listed without {'sha256' if path in sizes else 'size'}" for path in halves]
     if faults:
         raise SharingError(
             f"{source}: {SUMS_PATH} cannot be trusted: {'; '.join(faults)}. Nothing was downloaded."
         )
-    return {path: replace(listed, size=sizes.get(path)) for path, listed in sums.items()}
+    return {path: Listed(digest, sizes[path]) for path, digest in sums.items()}
 
 
 def altered(root: Path, sums: Mapping[str, Listed]) -> list[str]:
@@ -87,6 +88,6 @@ def altered(root: Path, sums: Mapping[str, Listed]) -> list[str]:
 
 
 def _is_whole(file: Path, listed: Listed) -> bool:
-    if not file.is_file() or listed.size not in (None, file.stat().st_size):
+    if not file.is_file() or listed.size != file.stat().st_size:
         return False
     return file_digest(file) == listed.digest

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES, alter, as_in_0_1, drop, edit, retype, truncate, write
+from damaged import DATA, EPISODES, alter, drop, edit, reseal, retype, truncate, write
 from fake_dataset import fake_columns, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -150,7 +150,7 @@ def test_statistics_that_only_together_are_right_are_found(tmp_path: Path) -> No
             edit("meta/astra/dataset.json", parents=[{"name": "x"}], stage=""),
             ["dataset.json has 3 errors: parents.0.version: expected a value", "parents.0.hash", "stage: "],
         ),
-        (write("meta/astra/dataset.json", b"{}"), ["dataset.json has 11 errors: name: expected a value"]),
+        (write("meta/astra/dataset.json", b"{}"), ["dataset.json has 12 errors: name: expected a value"]),
         (edit("meta/astra/subsets.json", seed="0"), ["subsets.json: seed: expected a whole number"]),
         (edit("meta/info.json", data_path="/etc/file.parquet"), ["expected a path inside the folder"]),
         (edit("meta/info.json", data_path="../file.parquet"), ["expected a path inside the folder"]),
@@ -197,14 +197,6 @@ def test_what_was_altered_is_named(tmp_path: Path, damage: Callable[[Path], obje
     assert faults in check(root).faults
     # Nothing else is named so.
     assert sum("other values" in fault or "was altered" in fault for fault in check(root).faults) == 1
-
-
-def test_a_dataset_of_version_0_1_is_whole_too(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    as_in_0_1(root)
-    report = check(root)
-    assert report.faults == []
-    assert report.notes == ["it was written without digests, which tell what values were altered"]
 
 
 def test_the_policy_that_acted_is_compared_with_what_was_recorded_of_it(tmp_path: Path) -> None:
@@ -323,7 +315,6 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
 
 def test_ours_has_no_columns_of_other_types(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
-    as_in_0_1(root)
     table = pq.read_table(root / DATA)
     at = table.column_names.index("next.reward")
     wide = table.column("next.reward").cast(pa.float64())
@@ -331,7 +322,11 @@ def test_ours_has_no_columns_of_other_types(tmp_path: Path) -> None:
     features = json.loads((root / "meta/info.json").read_text())["features"]
     features["next.reward"]["dtype"] = "float64"
     edit("meta/info.json", features=features)(root)
-    assert "dtype 'float64' is not one of float32, int64, bool" in "\n".join(check(root).faults)
+    reseal(root)
+    with pytest.raises(
+        CorruptDatasetError, match=r"next\.reward\.dtype: expected 'float32', 'int64' or 'bool'"
+    ):
+        Dataset.open(root)
 
 
 def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> None:

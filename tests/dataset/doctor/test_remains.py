@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from damaged import alter, as_in_0_1, drop, edit, retype, write
+from damaged import alter, drop, edit, reseal, retype, write
 from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
@@ -100,8 +100,8 @@ def test_what_is_missing_or_altered_is_noted(
 
 @pytest.mark.parametrize("seed", ["7", None, 7.5])
 def test_a_seed_that_is_no_number_is_noted(seed: object, whole: Dataset) -> None:
-    as_in_0_1(whole.root)  # without sums it is not known whether it was altered
     edit(SUBSETS_PATH, seed=seed)(whole.root)
+    reseal(whole.root)
     found, notes = seen(whole.root)
     assert notes == [f"{SUBSETS_PATH} has no whole number as its seed: {SEED_0}"]
     assert found.subset_seed == 0
@@ -109,8 +109,8 @@ def test_a_seed_that_is_no_number_is_noted(seed: object, whole: Dataset) -> None
 
 @pytest.mark.parametrize("uid", [None, "7", [7]])
 def test_metadata_without_uids_are_noted(uid: object, whole: Dataset) -> None:
-    as_in_0_1(whole.root)
     retype(METADATA_PATH, "episode_uid", uid)(whole.root)
+    reseal(whole.root)
     found, notes = seen(whole.root)
     assert notes == [f"{METADATA_PATH} has no uids: {LOST}"]
     assert found.metadata == {}

@@ -18,7 +18,6 @@ from astra_data.exchange.sharing.sums import Listed
 
 CONTENT = bytes(range(256)) * 40
 LISTED = Listed(hashlib.sha256(CONTENT).hexdigest(), len(CONTENT))
-MOST = 10**6
 
 
 @pytest.fixture
@@ -44,7 +43,7 @@ def appended(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_a_file_is_fetched_once(remote: RemoteFolder, tmp_path: Path, appended: list[int]) -> None:
     for _ in range(2):
-        fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
+        fetch(remote, "data/file", tmp_path / "here", LISTED)
     assert (tmp_path / "here/data/file").read_bytes() == CONTENT
     assert [path.name for path in (tmp_path / "here/data").iterdir()] == ["file"]
     assert appended == [0]
@@ -59,7 +58,7 @@ def test_only_what_is_missing_is_read(
     (tmp_path / "here/data/file.part").write_bytes(CONTENT[:5000])
     digested = Mock(wraps=file_digest)
     monkeypatch.setattr(module, "file_digest", digested)
-    fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
+    fetch(remote, "data/file", tmp_path / "here", LISTED)
     assert (tmp_path / "here/data/file").read_bytes() == CONTENT
     assert appended == [5000]
     digested.assert_called_once()
@@ -72,27 +71,24 @@ def test_a_part_of_another_file_is_fetched_from_the_start(
     (tmp_path / "here/data").mkdir(parents=True)
     (tmp_path / "here/data/file.part").write_bytes(left)
     (tmp_path / "here/data/file").write_bytes(left)
-    fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
+    fetch(remote, "data/file", tmp_path / "here", LISTED)
     assert (tmp_path / "here/data/file").read_bytes() == CONTENT
     assert appended == [len(left), 0]
 
 
 def test_another_content_than_listed_is_refused_and_not_kept(remote: RemoteFolder, tmp_path: Path) -> None:
     with pytest.raises(SharingError, match=r"there: data/file does not have the sha256"):
-        fetch(remote, "data/file", tmp_path / "here", Listed("0" * 64), MOST)
+        fetch(remote, "data/file", tmp_path / "here", Listed("0" * 64, len(CONTENT)))
     assert not list((tmp_path / "here/data").iterdir())
 
 
 def test_a_file_that_is_not_there_is_told(remote: RemoteFolder, tmp_path: Path) -> None:
     with pytest.raises(SharingError, match=r"data/none cannot be downloaded \(FileNotFoundError.*run"):
-        fetch(remote, "data/none", tmp_path / "here", LISTED, MOST)
+        fetch(remote, "data/none", tmp_path / "here", LISTED)
 
 
-@pytest.mark.parametrize(
-    ("listed", "most"), [(Listed(LISTED.digest, 5000), MOST), (Listed(LISTED.digest), 5000)]
-)
-def test_no_more_is_fetched_than_is_listed_or_asked_for(
-    remote: RemoteFolder, tmp_path: Path, listed: Listed, most: int, monkeypatch: pytest.MonkeyPatch
+def test_no_more_is_fetched_than_is_listed(
+    remote: RemoteFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[int] = []
     blocks = RemoteFolder.blocks
@@ -104,7 +100,7 @@ def test_no_more_is_fetched_than_is_listed_or_asked_for(
 
     monkeypatch.setattr(RemoteFolder, "blocks", watched)
     with pytest.raises(SharingError, match="data/file is larger than 5000 bytes"):
-        fetch(remote, "data/file", tmp_path / "here", listed, most)
+        fetch(remote, "data/file", tmp_path / "here", Listed(LISTED.digest, 5000))
     assert sum(written) == 5001
     assert not list((tmp_path / "here/data").iterdir())
 
@@ -114,7 +110,7 @@ def test_a_link_in_the_unfinished_folder_is_not_written_through(remote: RemoteFo
     (tmp_path / "prey").write_text("prey")
     (tmp_path / "here/data/file.part").symlink_to(tmp_path / "prey")
     with pytest.raises(SharingError, match="cannot be downloaded"):
-        fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
+        fetch(remote, "data/file", tmp_path / "here", LISTED)
     assert (tmp_path / "prey").read_text() == "prey"
 
 
@@ -127,8 +123,8 @@ def test_a_full_disk_is_told_and_what_was_fetched_stays(
     with monkeypatch.context() as patched:
         patched.setattr(module, "_append", full)
         with pytest.raises(DiskError, match=r"here/data/file\.part cannot be written: the disk is full"):
-            fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
-    fetch(remote, "data/file", tmp_path / "here", LISTED, MOST)
+            fetch(remote, "data/file", tmp_path / "here", LISTED)
+    fetch(remote, "data/file", tmp_path / "here", LISTED)
     assert (tmp_path / "here/data/file").read_bytes() == CONTENT
 
 
