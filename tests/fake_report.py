@@ -7,7 +7,7 @@ import numpy as np
 from fake_runs import FakeRecipe
 
 from astra_data.reports.command_replay import CommandReplay
-from astra_data.reports.files import FIGURES as ALL_FIGURES
+from astra_data.reports.results import Results, read_results
 from astra_data.stages.report import ReportConfig, report
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.score import SUCCESS
@@ -15,11 +15,9 @@ from astra_data.worlds.score import SUCCESS
 REPLAY = CommandReplay(
     np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4))
 )
-
-LASTING_FIGURES = {"steps", "return", "learning_steps"}
-FIGURES = {*ALL_FIGURES} - LASTING_FIGURES - {"strips", "data_efficiency"}
-
-CONFIG = ReportConfig(bootstrap_replicates=100, trajectory_episodes=2)
+FIGURES = {"success", "trajectories", "mismatch", "learning", "gap", "validity"}
+CONFIG = ReportConfig(trajectory_episodes=2)
+COMMAND = "astra-data run recipes/antmaze_u.toml"
 
 
 def task(**changes: object) -> SimpleNamespace:
@@ -30,8 +28,9 @@ def task(**changes: object) -> SimpleNamespace:
         "plane": object(),
         "ball_index": None,
         "facts": {},
+        "timestep_s": 0.1,
     }
-    objective = SimpleNamespace(scores=(SUCCESS,), action_size=2)
+    objective = SimpleNamespace(scores=(SUCCESS,), action_size=2, horizon=100)
     return SimpleNamespace(**usual | {"objective": objective, "make_target": object()} | changes)
 
 
@@ -43,18 +42,16 @@ def make(
     root: Path,
     publish: Path | None = None,
     recipe: FakeRecipe | None = None,
-    add_to: Path | None = None,
-    note: str = "best: Careful follower  success 1.00",
-) -> None:
-    notes: list[tuple[float, str]] = []
+    published: tuple[Path, ...] = (),
+    config: ReportConfig = CONFIG,
+) -> Results:
+    """Write the report, and return its results."""
     report(
         recipe or FakeRecipe(),
         root=root,
-        command="astra-data run recipes/antmaze_u.toml",
+        command=COMMAND,
         publish=publish,
-        add_to=add_to,
-        progress=lambda fraction, note: notes.append((fraction, note)),
-        config=CONFIG,
+        published=published,
+        config=config,
     )
-    if recipe is None:
-        assert notes[-1] == (1.0, note)
+    return read_results(root / "report/results.json")

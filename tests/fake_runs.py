@@ -10,8 +10,8 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from astra_data.core.naming import seed_folder
+from astra_data.reports.results import TESTED, Line, Results
 from astra_data.reports.runs import Reported
-from astra_data.reports.schema import MethodResults, Results
 
 ROWS = ("direct_transfer", "astra", "astra_plus", "follower")
 SEEDS = (0, 1, 2)
@@ -153,31 +153,16 @@ def write_elsewhere(root: Path, name: str, like: str = "direct_transfer") -> Non
 
 def bare_results(recipe: str, rows: Mapping[str, list[int]], settings: dict[str, Any]) -> Results:
     """Return results of some seeds of rows that say hardly more than that."""
-    zeros = {row: [0.0] * len(seeds) for row, seeds in rows.items()}
     return Results(
         recipe=recipe,
         task="maze",
         command="",
+        rows=tuple(rows),
         settings=settings,
-        origins=[],
-        wall_seconds={"total": 0.0},
-        cpu_seconds={"total": 0.0},
-        datasets=[],
-        evaluated_with=[],
         episodes=1,
-        methods={
-            row: MethodResults.model_validate(
-                {
-                    "title": row,
-                    "role": None,
-                    "seeds": seeds,
-                    **dict.fromkeys(("success", "failed", "wall_contact", "steps"), zeros[row]),
-                    **{"return": zeros[row], "distance": zeros[row], "simulated_success": None},
-                    **{"simulator_returns": {}, "encoders": {}, "grounding": None, "gap": None},
-                    **{"learning": [], "cost": {}},
-                }
-            )
+        lines=[
+            Line(row=row, seed=seed, where=TESTED, values={"success": 0.0})
             for row, seeds in rows.items()
-        },
-        throughput={},
+            for seed in seeds
+        ],
     )

@@ -6,7 +6,7 @@ Spawned processes find them by name; nothing slow is imported.
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -321,11 +321,11 @@ def report(
     root: Path,
     command: str,
     publish: Path | None,
-    add_to: Path | None,
+    published: Sequence[Path],
     progress: Progress,
     config: FakeConfig,
 ) -> None:
     asked: dict[str, Any] = {"name": recipe.name, "methods": recipe.methods, "seeds": recipe.seeds}
-    asked |= {"command": command, "publish": publish, "add_to": add_to}
+    asked |= {"command": command, "publish": publish, "published": list(published)}
     shutil.rmtree(root / "report", ignore_errors=True)
     _write(config, root / "report", progress, **asked)

@@ -34,6 +34,4 @@ window = 20
 [evaluate]
 episodes = 3
 
-[report]
-bootstrap_replicates = 100
 """

@@ -23,10 +23,8 @@ from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS
 
 Publish = Annotated[
-    bool, typer.Option("--publish", help="Also copy the results to the folder results/ next to the recipe.")
-]
-Add = Annotated[
-    bool, typer.Option("--add", help="Add to the published results; keep those that are not in --root.")
+    bool,
+    typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe."),
 ]
 
 
@@ -161,11 +159,9 @@ def evaluate(
     typer.echo(f"finished: {out}")
 
 
-def report(
-    recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, add: Add = False, root: Root = RUNS
-) -> None:
+def report(recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, root: Root = RUNS) -> None:
     """Write the recipe's tables and figures."""
-    run_stage(recipe, "report", seeds=seeds or (), publish=publish, add=add, root=root)
+    run_stage(recipe, "report", seeds=seeds or (), publish=publish, root=root)
 
 
 def run_stage(
@@ -178,7 +174,6 @@ def run_stage(
     jobs: int | None = None,
     device: str = "cpu",
     publish: bool = False,
-    add: bool = False,
 ) -> None:
     """Run one stage of a recipe, and print the folder of its artifacts."""
     check_asked(recipe_at(recipe), [*methods], [*seeds])
@@ -194,28 +189,44 @@ def run_stage(
             jobs=jobs,
             device=device,
             publish=publish,
-            add=add,
         )
-        typer.echo(f"finished: {folder}")
+        if stage == "report":
+            show_made(folder.parent, None)
+        else:
+            typer.echo(f"finished: {folder}")
 
 
 def show_made(folder: Path, until: str | None, *others: Path) -> None:
-    """Print what a run that went on `until` a stage has written: its pages and `others` to look at.
+    """Print what a run that went on `until` a stage has found, and the paths of its pages and of `others`.
 
-    Where it ends with its groundings, print the page of their held-out errors.
+    After the report: the verdict, best method, floor and the interval between them, and the command that
+    deploys it. Where it ends with its groundings: the page of their held-out errors.
     """
     from astra_data.experiments.plan import stages_until
     from astra_data.reports.held_out import PAGE
-    from astra_data.reports.html_page import HTML
+    from astra_data.reports.results import read_results
+    from astra_data.reports.verdict import verdict_of
+    from astra_data.stages.report import HTML, JSON
 
     made = stages_until(until)
-    pages = [
-        folder / page for stage, page in (("ground", PAGE), ("report", f"report/{HTML}")) if stage in made
-    ]
-    written = [str(file) for file in (*pages, *others) if file.is_file()]
-    if until == "ground" and pages[0].is_file():
-        typer.echo(pages[0].read_text())
-    typer.echo(f"finished: {folder}" + (f" (see {', '.join(written)})" if written else ""))
+    if until == "ground" and (folder / PAGE).is_file():
+        typer.echo((folder / PAGE).read_text())
+    typer.echo(f"finished: {folder}")
+    found = folder / "report" / JSON
+    verdict = verdict_of(read_results(found)) if "report" in made and found.is_file() else None
+    if verdict:
+        typer.echo(verdict.text.replace("**", ""))
+        for label, text in verdict.lines:
+            typer.echo(f"  {label:8}  {text}")
+        if verdict.row is None:
+            for remark in verdict.remarks:
+                typer.echo(f"  {remark}")
+    pages = {"ground": folder / PAGE, "report": folder / "report" / HTML}
+    for file in (*(page for stage, page in pages.items() if stage in made), *others):
+        if file.is_file():
+            typer.echo(str(file))
+    if verdict and (command := verdict.command(folder)):
+        typer.echo(command)
 
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:

@@ -36,12 +36,6 @@ def sweep(
         list[int] | None,
         typer.Option("--percent", help="Run only this dataset size; may be repeated.", show_default=False),
     ] = None,
-    unpublished: Annotated[
-        bool,
-        typer.Option(
-            "--unpublished", help="Run only points that are not yet in results/ next to the recipe."
-        ),
-    ] = False,
     jobs: Jobs = None,
     device: Device = "cpu",
     until: Until = None,
@@ -75,7 +69,6 @@ def sweep(
             methods=methods or (),
             seeds=seeds or (),
             percents=percents or (),
-            unpublished=unpublished,
             root=root,
             jobs=jobs,
             device=device,

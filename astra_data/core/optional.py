@@ -17,7 +17,7 @@ EXTRAS = {
     "scipy": "sim",
     "matplotlib": "report",
     "PIL": "report",
-    "rliable": "report",
+    "pandas": "report",
     "jinja2": "report",
     "onnxruntime": "deploy",
     "onnxscript": "deploy",

@@ -19,7 +19,7 @@ CODE = ("astra_data", "pyproject.toml", "uv.lock")
 
 PACKAGES = (
     *("astra-data", "gymnasium", "gymnasium-robotics", "lerobot", "mujoco"),
-    *("numpy", "rliable", "scipy", "torch"),
+    *("numpy", "pandas", "scipy", "torch"),
 )
 """Packages whose versions can change a result."""
 

@@ -21,8 +21,9 @@ class Stopwatch:
         return time.perf_counter() - self._wall_began
 
     def spent(self) -> dict[str, float]:
-        """Return `wall_seconds`, and `cpu_seconds` of all threads of this process."""
-        return {"wall_seconds": self.seconds, "cpu_seconds": time.process_time() - self._cpu_began}
+        """Return `wall_seconds`, `cpu_seconds` of all threads, and `finished_at`: now, in s since 1970."""
+        cpu_seconds = time.process_time() - self._cpu_began
+        return {"wall_seconds": self.seconds, "cpu_seconds": cpu_seconds, "finished_at": time.time()}
 
 
 class Alarm:

@@ -19,13 +19,11 @@ from astra_data.core.errors import RecipeError
 from astra_data.core.naming import RECORD, base_method, reference_of, stage_of_key
 from astra_data.experiments.changed_settings import differences, restated, share_target
 from astra_data.experiments.own_files import changed_code
-from astra_data.experiments.points import RunPoint
 from astra_data.experiments.recipe import Recipe
 from astra_data.experiments.recipe_file import read_tables, recorded_settings
 from astra_data.experiments.staleness import ROWS_TABLES, reads, stale_stages
 from astra_data.methods import method_named
-from astra_data.reports.files import read_published
-from astra_data.reports.sizes import by_size, points_of
+from astra_data.reports.results import read_results
 from astra_data.stages.registry import STAGES
 
 ALWAYS_NEW = {"report"}
@@ -157,31 +155,30 @@ class Experiment:
         """The folder of published results."""
         return self.path.parent / "results"
 
-    @property
-    def published_in(self) -> Path:
-        """The file of published results with its points: the base's, if it borrows the evaluations."""
-        return self.results / f"{self.maker('evaluate').path.stem}.json"
+    def published(self) -> list[Path]:
+        """Return the files of published results that those of this recipe are added to.
 
-    def published(self) -> set[RunPoint]:
-        """Return the points in its published results.
+        They are its own and, if it borrows the evaluations, the base's, as far as they are there.
 
         Raises:
-            BadInputError: there are no such results.
+            BadInputError: one does not hold results.
             RecipeError: they were made with other settings.
         """
-        published = read_published(self.published_in)
-        for found in by_size(published).values():
+        names = dict.fromkeys((self.maker("evaluate").path.stem, self.path.stem))
+        files = [file for name in names if (file := self.results / f"{name}.json").exists()]
+        for file in files:
+            found = read_results(file)
             changed = differences(found.settings, self.recipe).keys() - ALWAYS_NEW - {"select"}
-            tested = {*found.methods, *filter(None, [reference_of(self.recipe.methods)])}
+            tested = {*found.tested(), *filter(None, [reference_of(self.recipe.methods)])}
             changed -= {table for table in ROWS_TABLES if not any(reads(row, table) for row in tested)}
             own = restated(found.settings, self.recipe) & {*map(base_method, tested)}
             changed |= {f"own_methods.{name}" for name in own}
             if changed:
                 raise RecipeError(
-                    f"{' and '.join(sorted(changed))} changed in {self.path} since its results in "
-                    f"{self.results} were made: run all rows again and publish the new results instead"
+                    f"{' and '.join(sorted(changed))} changed in {self.path} since the results in {file} "
+                    "were made: move them away to publish the new ones without them"
                 )
-        return {RunPoint(method, seed, percent) for percent, method, seed in points_of(published)}
+        return files
 
     def _rows_of(self, table: str, stage: str) -> list[Path]:
         """Return the folders in `stage` of the rows that depend on `table`; its own where all do."""

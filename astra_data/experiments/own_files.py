@@ -7,7 +7,7 @@ from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import CODE
 from astra_data.experiments.recipe import Recipe
-from astra_data.reports.origins import recorded_code
+from astra_data.reports.runs import recorded_code
 from astra_data.worlds.code_digest import code_digest
 from astra_data.worlds.registry import place_of
 

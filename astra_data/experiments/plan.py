@@ -12,7 +12,7 @@ and everything from ground on is made for each.
 """
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -41,7 +41,7 @@ def plan(
     *,
     device: str = "cpu",
     publish: Path | None = None,
-    add_to: Path | None = None,
+    published: Sequence[Path] = (),
 ) -> tuple[Item, ...]:
     """Return every artifact of `recipe`, each after those it reads, seed after seed.
 
@@ -52,7 +52,7 @@ def plan(
         selection: the points to make and to report; by default all.
         device: torch device of the networks.
         publish: a folder that the report copies its results to, if any.
-        add_to: a file of results that the report adds to, if any.
+        published: files of results that the report adds to.
     """
     selection = selection or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
@@ -75,7 +75,7 @@ def plan(
         root=folder,
         command=_command(recipe, path, selection),
         publish=publish,
-        add_to=add_to,
+        published=published,
         config=recipe.report,
     )
     return (*items, Item("report", keys, call))

@@ -29,6 +29,7 @@ from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
 from astra_data.methods import grounded_as, method_named
 from astra_data.stages.registry import STAGES
+from astra_data.stages.report import is_current
 from astra_data.worlds.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
 
@@ -94,12 +95,10 @@ def run_stage(
     jobs: int | None = None,
     device: str = "cpu",
     publish: bool = False,
-    add: bool = False,
 ) -> Path:
     """Make the artifacts of one stage of a recipe, of some `methods` and `seeds` only where given.
 
-    With `publish`, the report is also copied to the published results; with `add`, it includes the results
-    that are published already.
+    With `publish`, the results of the report are added to the published ones.
 
     Raises:
         MissingStageError: an artifact that the stage reads is not finished.
@@ -108,8 +107,6 @@ def run_stage(
         AstraDataError: an item failed.
     """
     check_stage(stage)
-    if add and seeds:
-        raise BadInputError("--add keeps the published results of all seeds: leave out --seed")
     experiment = load_experiment(recipe_path, root)
     maker = experiment.maker(stage)
     if maker is not experiment:
@@ -120,8 +117,6 @@ def run_stage(
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
     part = Selection.of(recipe, methods, seeds)
-    if add:
-        experiment.published()
     planned = plan(
         recipe,
         recipe_path,
@@ -129,7 +124,7 @@ def run_stage(
         part,
         device=device,
         publish=experiment.results if publish else None,
-        add_to=experiment.published_in if add else None,
+        published=experiment.published() if publish else (),
     )
     make(experiment, _selected(planned, stage, methods), planned, jobs=jobs, device=device)
     return folder / stage
@@ -225,6 +220,8 @@ def make(
                     "a copy, recover its intact episodes with `astra-data repair`, or remove it"
                 )
         items = [item for item in items if item.key in again or not finished(item, experiment)]
+        if [stage_of(item) for item in items] == ["report"] and _is_reported(items[0]):
+            items = []
         data = data_condition(recipe) if any(stage_of(item) == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
@@ -244,6 +241,14 @@ def make(
             else:
                 items = [with_threads(item, 1) for item in items]
                 execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+
+
+def _is_reported(item: Item) -> bool:
+    """Return whether the report is there already, made of what it would be made of."""
+    call = item.call
+    if not isinstance(call, partial) or call.keywords["publish"] is not None:
+        return False
+    return is_current(*call.args, **call.keywords)
 
 
 def _prepare(own_methods: dict[str, OwnMethod]) -> None:

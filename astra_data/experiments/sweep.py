@@ -15,7 +15,6 @@ from typing import Any
 from rich.console import Console
 
 from astra_data.core.durable import write_file
-from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS, stage_of_key
 from astra_data.core.optional import optional
 from astra_data.experiments.display import display
@@ -46,7 +45,6 @@ def sweep(
     methods: Sequence[str] = (),
     seeds: Sequence[int] = (),
     percents: Sequence[int] = (),
-    unpublished: bool = False,
     root: Path = RUNS,
     jobs: int | None = None,
     device: str = "cpu",
@@ -61,7 +59,6 @@ def sweep(
         methods: rows of the recipe to make and to report; by default all.
         seeds: seeds of the recipe; by default all.
         percents: sizes of the recipe; by default all.
-        unpublished: leave out the points that are in its published results.
         root: folder with the recipe's folder.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
@@ -71,8 +68,8 @@ def sweep(
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
-        BadInputError: the recipe has no such row, seed or size, nothing unpublished or no published results,
-            Ray or trackio is not installed, or another process runs in the recipe's folder.
+        BadInputError: the recipe has no such row, seed or size, Ray or trackio is not installed, or another
+            process runs in the recipe's folder.
         AstraDataError: an item failed.
     """
     stages = stages_until(until)
@@ -81,31 +78,12 @@ def sweep(
     log = _tracked(trackio, experiment.folder.name) if trackio else None
     items = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     points = part.points()
-    if unpublished:
-        points, items = _left(points, items, experiment.published())
     wanted = [item for item in items if stage_of(item) in stages - experiment.borrowed]
     show = partial(_shown, PointTable(experiment, points), log)
     make(experiment, wanted, items, jobs=jobs, device=device, cluster=cluster, show=show)
     if any(stage_of(item) == "ground" for item in wanted):
         write_errors(experiment, part)
     return experiment.folder
-
-
-def _left(
-    points: Sequence[RunPoint], items: Sequence[Item], published: Collection[RunPoint]
-) -> tuple[tuple[RunPoint, ...], tuple[Item, ...]]:
-    """Return the unpublished points, and the items that they and the report need."""
-    left = tuple(point for point in points if point not in published)
-    if not left:
-        raise BadInputError("all of these points are published: leave out --unpublished to run them again")
-    inputs = {item.key: item.inputs for item in items}
-    needs, to_look_at = {"report"}, [point.key for point in left]
-    while to_look_at:
-        key = to_look_at.pop()
-        if key not in needs:
-            needs.add(key)
-            to_look_at += inputs[key]
-    return left, tuple(item for item in items if item.key in needs)
 
 
 class PointTable:

@@ -13,10 +13,18 @@ from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
 from astra_data.experiments.selecting import select
 from astra_data.experiments.trained_policy import task_of, trained_policy
-from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged
-from astra_data.reports.choice_page import select_page
-from astra_data.reports.halving import PSEUDO_TRIALS, halve, least_trials, widest_field
-from astra_data.reports.trials import TRIALS, TrialRound, TrialsFile, Tried, read_trials
+from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, select_page
+from astra_data.reports.trials import (
+    PSEUDO_TRIALS,
+    TRIALS,
+    TrialRound,
+    TrialsFile,
+    Tried,
+    halve,
+    least_trials,
+    read_trials,
+    widest_field,
+)
 from astra_data.stages.evaluate import EvaluateConfig
 from astra_data.training.simulator_episodes import started
 from astra_data.training.target_episodes import in_target

@@ -1,6 +1,5 @@
 """Files that the other stages write: a missing key is an error, an extra one is not."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, Self
 
@@ -13,7 +12,6 @@ from safetensors.numpy import load_file
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import check_intact
-from astra_data.reports.schema import Machine
 
 EVALUATION = "evaluation.json"
 TRAJECTORIES = "trajectories.safetensors"
@@ -28,11 +26,23 @@ class WrittenPart(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
+class Machine(WrittenPart):
+    """The machine that a stage ran on."""
+
+    cpu: str
+    cores: int
+    memory_gib: float
+    gpu: str | None = None
+    """None where the networks ran on the CPU."""
+
+
 class Artifact(WrittenPart):
     """A file that a stage wrote, with its time and origin if recorded."""
 
     wall_seconds: float | None = None
     """Run time of the stage, in s."""
+    finished_at: float | None = None
+    """When the stage ended, in s since 1970."""
     cpu_seconds: float | None = None
     """CPU time of all its threads, in s."""
     git_commit: str | None = None
@@ -132,7 +142,7 @@ class CurveFile(Artifact):
 
 
 class Foresight(WrittenPart):
-    """How well failures are foreseen on held-out episodes."""
+    """How well failures are predicted on held-out episodes."""
 
     failures: int
     auc: dict[str, float | None] | None = None
@@ -147,8 +157,10 @@ class Metrics(Artifact):
     windows_per_second: float | None = None
     episodes_per_second: float | None = None
     replays_per_second: float | None = None
+    epochs: list[dict[str, JsonValue]] = Field(default_factory=list)
+    """Losses and R² on held-out episodes during the fit; the last are those of the grounding."""
     failures: dict[str, Foresight] = Field(default_factory=dict)
-    """By what foresees them; empty without a failure model."""
+    """By what predicts them; empty without a failure model."""
 
 
 class Band(WrittenPart):
@@ -167,7 +179,7 @@ class Gap(Artifact):
     grounded: dict[str, Band]
     raw: dict[str, Band]
     still: dict[str, Band] | None = None
-    """Of who expects the robot to stay where it is; None where it was not measured."""
+    """Of the persistence baseline, which predicts no motion; None where it was not measured."""
 
     @model_validator(mode="after")
     def _one_number_per_horizon(self) -> Self:
@@ -217,39 +229,6 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.flo
     if missing:
         raise BadInputError(f"{path}: expected tensors {missing}, got {sorted(tensors)}; run its stage again")
     return {name: tensor.astype(np.float64) for name, tensor in tensors.items()}
-
-
-def files_of(evaluations: Mapping[str, Mapping[int, Evaluation]]) -> list[Evaluation]:
-    """Return the evaluations of all rows and seeds."""
-    return [file for of_seeds in evaluations.values() for file in of_seeds.values()]
-
-
-def check_alike(evaluations: Mapping[str, Mapping[int, Evaluation]], task: str) -> int:
-    """Return the number of episodes per row and seed, the same for all.
-
-    Raises:
-        BadInputError: rows were evaluated differently.
-    """
-    files = files_of(evaluations)
-    episodes = files[0].episodes
-    wrong = [f"{file.method} seed {file.seed} on {file.task}" for file in files if file.task != task]
-    wrong += [
-        f"{file.method} seed {file.seed} with {file.episodes} episodes"
-        for file in files
-        if file.episodes != episodes
-    ]
-    legs = files[0].leg_scale
-    wrong += [
-        f"{file.method} seed {file.seed} with legs {file.leg_scale:g} times as long"
-        for file in files
-        if file.leg_scale != legs
-    ]
-    if wrong:
-        raise BadInputError(
-            f"expected every row evaluated on {task} with {episodes} episodes, got {', '.join(wrong)}; "
-            "evaluate those rows again"
-        )
-    return episodes
 
 
 def way_to_success(path: Path, evaluation: Evaluation) -> float:

@@ -1,25 +1,24 @@
 """The choice of a policy without the target: who was judged how, and what the choice is worth there."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 from pydantic import Field
 
+from astra_data.methods import method_title
 from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
-from astra_data.reports.schema import Calibration, Choice, Ranked
-from astra_data.reports.statistics import Correlation, mean_interval, mean_rank_correlation
+from astra_data.reports.blocks import Section, Table, Text, markdown
+from astra_data.reports.formatting import interval
+from astra_data.reports.statistics import LEAST_SEEDS, Estimate, mean_interval, mean_rank_correlation
+from astra_data.reports.trials import TrialsFile, posterior
 
 FOLDER = "select"
 SELECTED = "select.json"
-LEAST = 3
-"""Judges of a policy whose predicted success has an interval; seeds of a row whose ranks are compared."""
 _QUANTILE = 0.25
 """Of the success over the judges, by which policies are ranked: one that a single judge likes is a risk."""
-
-Measured = Mapping[tuple[str, int], float]
-"""Row and seed → the success in the target."""
 
 
 class Candidate(WrittenPart):
@@ -41,15 +40,6 @@ class Candidate(WrittenPart):
     def lower(self) -> float:
         """The lower quartile of the success over the judges."""
         return float(np.quantile([*self.success.values()], _QUANTILE))
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """The 95 % interval of `predicted`, None with fewer judges than `LEAST`.
-
-        Judges are the sampling unit.
-        """
-        values = [*self.success.values()]
-        return mean_interval(values) if len(values) >= LEAST else None
 
 
 class Judged(Artifact):
@@ -74,6 +64,53 @@ class Judged(Artifact):
         return sorted(those, key=lambda one: (one.lower, one.predicted), reverse=True)
 
 
+@dataclass(frozen=True)
+class Ranked:
+    """A policy as its judges see it.
+
+    Attributes:
+        row: its method. seed: its seed. judges: how many.
+        lower: lower quartile of its success over the judges, by which policies are ranked.
+        predicted: mean over the judges, with its interval.
+        target: success in the target; None where it was not tested there.
+    """
+
+    row: str
+    seed: int
+    judges: int
+    lower: float
+    predicted: Estimate
+    target: float | None
+
+    @property
+    def name(self) -> str:
+        """What it is called on a page."""
+        return f"{method_title(self.row)}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A choice without the target, and what it is worth there, as far as that is tested.
+
+    Attributes:
+        judged: what the judges found.
+        candidates: best first; the first is chosen.
+        rank_correlation: Spearman's with the target, mean over methods; its interval resamples seeds.
+        regret: success in the target of the best there, less that of the chosen.
+        random_regret: the same of one drawn at random, on average.
+        calibration: method → seeds, mean and mean absolute error of the predicted success.
+        missing: why a figure is None.
+    """
+
+    judged: Judged
+    candidates: tuple[Ranked, ...]
+    rank_correlation: Estimate | None = None
+    regret: float | None = None
+    random_regret: float | None = None
+    calibration: Mapping[str, tuple[int, float, float]] = field(default_factory=dict)
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+
 def read_judged(root: Path) -> Judged | None:
     """Read what the stage `select` left in a run's folder; None if it was not run.
 
@@ -85,106 +122,177 @@ def read_judged(root: Path) -> Judged | None:
 
 
 def choice_of(
-    judged: Judged,
-    percent: int | None,
-    *,
-    measured: Measured,
-    rows: Sequence[str] = (),
-    seeds: Sequence[int] = (),
-    replicates: int,
+    judged: Judged, percent: int | None, *, measured: Mapping[tuple[str, int], float]
 ) -> Choice | None:
-    """Return the choice among the policies of some rows and seeds, by default all, and compare it.
+    """Return the choice among the policies of a size, and compare it; None where there is no candidate.
 
     Args:
         judged: all candidates.
-        percent: the size of the dataset, if there are several.
-        measured: success in the target, as far as it is there; it has no say in the ranking.
-        rows: of the candidates.
-        seeds: of the candidates.
-        replicates: bootstrap resamples.
-
-    Returns:
-        None if there is no candidate.
+        percent: the size of the dataset; None where there are no sizes.
+        measured: method and seed → success in the target; it has no say in the ranking.
     """
-    ranked = [
-        _ranked(one, measured.get((one.row, one.seed)))
-        for one in judged.ranked(percent)
-        if (not rows or one.row in rows) and (not seeds or one.seed in seeds)
-    ]
+    ranked = tuple(
+        _ranked(one, judged.episodes, measured.get((one.row, one.seed))) for one in judged.ranked(percent)
+    )
     if not ranked:
         return None
-    withheld = {}
-    if any(one.low is None for one in ranked):
-        withheld["interval"] = f"fewer than {LEAST} judges"
-    found = Choice(
-        judge=judged.judge,
-        episodes=judged.episodes,
-        shares_episodes=judged.shares_episodes,
-        candidates=ranked,
-        withheld=withheld,
-    )
     tested = [one for one in ranked if one.target is not None]
-    return _compared(found, tested, replicates) if tested else found
+    return _compared(Choice(judged, ranked), tested) if tested else Choice(judged, ranked)
 
 
-def within_rows(tested: Sequence[Ranked], replicates: int) -> Correlation | None:
-    """Correlate ranks within rows of `LEAST` tested seeds or more (Spearman): the mean over these rows.
+def _ranked(one: Candidate, episodes: int, target: float | None) -> Ranked:
+    ends = mean_interval([*one.success.values()], limit=1.0, trials=episodes) or (None, None)
+    return Ranked(one.row, one.seed, len(one.success), one.lower, Estimate(one.predicted, *ends), target)
 
-    The interval resamples seeds, the same for all rows, since these share a seed's episodes. None if no row
-    has enough seeds, or one side does not vary in any.
+
+def _compared(choice: Choice, tested: Sequence[Ranked]) -> Choice:
+    """Add what the choice is worth in the target, by the candidates that were tested there."""
+    missing = {}
+    targets = [one.target for one in tested if one.target is not None]
+    chosen = choice.candidates[0].target
+    if chosen is None:
+        missing["regret"] = "the chosen policy was not tested in the target"
+    correlation = within_rows(tested)
+    if correlation is None:
+        few = all(sum(one.row == row for one in tested) < LEAST_SEEDS for row in {one.row for one in tested})
+        missing["rank_correlation"] = (
+            f"no method has {LEAST_SEEDS} tested seeds" if few else "in no method do both sides vary"
+        )
+    errors: dict[str, list[float]] = {}
+    for one in tested:
+        errors.setdefault(one.row, []).append(one.predicted.value - (one.target or 0.0))
+    return replace(
+        choice,
+        rank_correlation=correlation,
+        regret=None if chosen is None else max(targets) - chosen,
+        random_regret=max(targets) - fmean(targets),
+        calibration={row: (len(of), fmean(of), fmean(map(abs, of))) for row, of in errors.items()},
+        missing=missing,
+    )
+
+
+def within_rows(tested: Sequence[Ranked]) -> Estimate | None:
+    """Correlate ranks within methods of `LEAST_SEEDS` tested seeds or more (Spearman): the mean over these.
+
+    The interval resamples seeds, the same for all methods, since these share a seed's episodes. None if no
+    method has enough seeds, or one side does not vary in any.
     """
-    keys = [(one.lower, one.predicted) for one in tested]
+    keys = [(one.lower, one.predicted.value) for one in tested]
     places = sorted(set(keys))
     rows: dict[str, dict[int, tuple[float, float]]] = {}
     for one, key in zip(tested, keys, strict=True):
         rows.setdefault(one.row, {})[one.seed] = (places.index(key), one.target or 0.0)
-    return mean_rank_correlation(rows.values(), least=LEAST, replicates=replicates)
+    return mean_rank_correlation(rows.values(), least=LEAST_SEEDS)
 
 
-def _ranked(one: Candidate, target: float | None) -> Ranked:
-    low, high = one.interval or (None, None)
-    return Ranked(
-        row=one.row,
-        seed=one.seed,
-        judges=len(one.success),
-        lower=one.lower,
-        predicted=one.predicted,
-        low=low,
-        high=high,
-        target=target,
+def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table]:
+    """Return what a page says of a choice, with the first `shown` of its candidates, by default all."""
+    best, judged = choice.candidates[0], choice.judged
+    predicted = best.predicted
+    episodes = (
+        "the same episodes, from other seeds" if judged.shares_episodes else "the episodes of other seeds"
     )
-
-
-def _compared(choice: Choice, tested: Sequence[Ranked], replicates: int) -> Choice:
-    """Add what the choice is worth in the target, by the candidates that were tested there."""
-    withheld = dict(choice.withheld)
-    targets = [one.target for one in tested if one.target is not None]
-    chosen = choice.candidates[0].target
-    if chosen is None:
-        withheld["regret"] = "the chosen policy was not tested in the target"
-    correlation = within_rows(tested, replicates)
-    if correlation is None:
-        counts = [sum(one.row == row for one in tested) for row in {one.row for one in tested}]
-        few = max(counts) < LEAST
-        withheld["rank_correlation"] = (
-            f"no row has {LEAST} tested seeds" if few else "in no row do both sides vary"
+    blocks: list[Text | Table] = [
+        Text(
+            f"**{best.name}**, chosen from {len(choice.candidates)} policies: predicted success "
+            f"{interval(predicted.value, predicted.low, predicted.high)}."
+        ),
+        Table(
+            "Best first, ranked by the lower quartile of success over judges",
+            ["method", "seed", "lower quartile", "predicted [95 %]", "judges", "in the target"],
+            [
+                [
+                    *(method_title(one.row), f"{one.seed}", f"{one.lower:.2f}"),
+                    *(interval(one.predicted.value, one.predicted.low, one.predicted.high), f"{one.judges}"),
+                    "-" if one.target is None else f"{one.target:.2f}",
+                ]
+                for one in choice.candidates[:shown]
+            ],
+        ),
+        Text(
+            "A judge is a simulator that did not train the policy: a policy's judges are the groundings of "
+            f"{method_title(judged.judge)} that were fitted to {episodes}, with {judged.episodes} episodes "
+            "each. The judge's failure model ends episodes; if it has none, states are scattered as much as "
+            f"the target's. Intervals need {LEAST_SEEDS} judges. The target is not used."
+        ),
+    ]
+    if judged.shares_episodes:
+        blocks.append(
+            Text(
+                "All seeds of this run have the same episodes, so no judge is independent of the policies it "
+                "judges: an error that all groundings share goes unnoticed."
+            )
         )
-    return choice.model_copy(
-        update={
-            "rank_correlation": correlation,
-            "regret": None if chosen is None else max(targets) - chosen,
-            "random_regret": max(targets) - fmean(targets),
-            "calibration": {
-                row: _calibration([one for one in tested if one.row == row])
-                for row in dict.fromkeys(one.row for one in tested)
-            },
-            "withheld": withheld,
-        }
+    if not choice.calibration:
+        return blocks
+    found, missing = choice.rank_correlation, choice.missing
+    rank = (
+        interval(found.value, found.low, found.high) if found else f"unknown ({missing['rank_correlation']})"
     )
+    regret = f"unknown ({missing['regret']})" if choice.regret is None else f"{choice.regret:.2f}"
+    return [
+        *blocks,
+        Text(
+            f"Regret of the chosen policy, in success in the target: {regret}; of a random policy: "
+            f"{choice.random_regret:.2f}. Rank correlation with the target within methods (Spearman): {rank}."
+        ),
+        Table(
+            "Error of the predicted success, means over seeds",
+            ["method", "seeds", "predicted \N{MINUS SIGN} measured", "absolute error"],
+            [
+                [method_title(row), f"{seeds}", f"{signed:+.2f}", f"{absolute:.2f}"]
+                for row, (seeds, signed, absolute) in choice.calibration.items()
+            ],
+        ),
+    ]
 
 
-def _calibration(tested: Sequence[Ranked]) -> Calibration:
-    errors = [one.predicted - one.target for one in tested if one.target is not None]
-    return Calibration(
-        seeds=len(errors), signed=fmean(errors), absolute=fmean(abs(error) for error in errors)
-    )
+def select_page(recipe: str, judged: Judged, trials: TrialsFile | None = None) -> str:
+    """Return the page of all candidates, size by size, and of trials in the target where there are any."""
+    sections = [
+        Section(f"{percent} %" if percent else "", choice_blocks(choice))
+        for percent in judged.percents
+        if (choice := choice_of(judged, percent, measured={}))
+    ]
+    if trials:
+        sections.append(Section("Trials in the target", _trial_blocks(judged, trials)))
+    return markdown(f"{recipe}: choice without the target", sections)
+
+
+def _trial_blocks(judged: Judged, trials: TrialsFile) -> list[Text | Table]:
+    state = "Not finished: run the same command again."
+    if trials.chosen and trials.mean is not None:
+        row, seed = trials.chosen
+        name = f"**{method_title(row)}, seed {seed}**"
+        state = f"{name}: success {trials.mean:.2f}, estimated from the prediction and the trials."
+    size = f" at {trials.percent} %" if trials.percent else ""
+    return [
+        Text(
+            f"{state} {trials.spent} of {trials.trials} episodes were used, on the {trials.field} candidates "
+            f"that the prediction ranks highest{size}."
+        ),
+        Table(
+            "", ["round", "method", "seed", "succeeded", "of", "mean"], trial_lines(judged, trials), words=2
+        ),
+        Text(
+            "Trials are split equally over rounds, and within a round over its candidates, which get the "
+            "same starts and goals. After each round, the better half goes on. Mean: mean success over all "
+            "trials of a candidate so far, with the judges' lower quartile as a prior worth "
+            f"{trials.pseudo_trials} trials."
+        ),
+    ]
+
+
+def trial_lines(judged: Judged, trials: TrialsFile) -> list[list[str]]:
+    """Return a line for each candidate of each round, as far as it was tried."""
+    priors = {(one.row, one.seed): one.lower for one in judged.ranked(trials.percent)}
+    counts = dict.fromkeys(priors, (0, 0))
+    lines = []
+    for number, of in enumerate(trials.rounds, start=1):
+        for one in of.tried:
+            key = (one.row, one.seed)
+            counts[key] = (counts[key][0] + sum(one.success), counts[key][1] + len(one.success))
+            mean = posterior(priors[key], *counts[key])
+            cells = (f"{number}", method_title(one.row), f"{one.seed}", f"{sum(one.success)}")
+            lines.append([*cells, f"{len(one.success)}", f"{mean:.2f}"])
+    return lines

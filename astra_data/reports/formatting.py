@@ -54,19 +54,17 @@ def table(head: Sequence[str], lines: Iterable[Iterable[str]], *, words: int = 1
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *lines))
 
 
-def spread(summary: Summary, digits: int) -> str:
-    """Return mean ± standard deviation."""
-    return _mean_std(summary.mean, summary.std, digits)
+def spread(summary: Summary | None, digits: int) -> str:
+    """Return mean ± standard deviation; a dash for None."""
+    if summary is None:
+        return "-"
+    deviation = "" if summary.std is None else f" ± {summary.std:.{digits}f}"
+    return f"{summary.mean:.{digits}f}{deviation}"
 
 
-def mean_std(values: list[float], digits: int) -> str:
-    """Return mean ± standard deviation of one value per seed."""
-    std = float(np.std(values, ddof=1)) if len(values) > 1 else None
-    return _mean_std(float(np.mean(values)), std, digits)
-
-
-def _mean_std(mean: float, std: float | None, digits: int) -> str:
-    return f"{mean:.{digits}f}" + ("" if std is None else f" ± {std:.{digits}f}")
+def listed(words: Sequence[str]) -> str:
+    """Return words as a list within a sentence."""
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
 
 
 def interval(value: float, low: float | None, high: float | None, digits: int = 2) -> str:
@@ -75,9 +73,9 @@ def interval(value: float, low: float | None, high: float | None, digits: int = 
     return f"{value:.{digits}f}{ends}"
 
 
-def measured(value: float, low: float | None, high: float | None) -> str:
+def measured(value: float, low: float, high: float) -> str:
     """Return a measured value with three significant digits and, if it has one, its interval."""
-    return f"{value:.3g}" if low is None or high is None else f"{value:.3g} [{low:.3g}, {high:.3g}]"
+    return f"{value:.3g}" if np.isnan([low, high]).any() else f"{value:.3g} [{low:.3g}, {high:.3g}]"
 
 
 def short(rate: float) -> str:

@@ -1,28 +1,34 @@
 """How good corrections are, and how much data is enough: errors on held-out episodes, without a target."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from statistics import fmean
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.durable import write_file
-from astra_data.core.naming import artifact_key
 from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
-from astra_data.reports.artifacts import GAP, METRICS, Foresight, Gap, Metrics, read_json
-from astra_data.reports.assembly import mean_gap
-from astra_data.reports.formatting import fill, measured
-from astra_data.reports.schema import GapMeans, judged_horizon, shared_horizons
+from astra_data.reports.blocks import Block, Section, Table, Text, markdown
+from astra_data.reports.formatting import measured
+from astra_data.reports.results import WHOLE, Results, judged_horizon
+from astra_data.reports.runs import read_errors, read_grounding
 
-Measured = Mapping[int | None, Mapping[str, Mapping[str, Sequence[Foresight]]]]
-"""How failures are foreseen on each seed, by size (the largest last), grounding, and part of it."""
+if TYPE_CHECKING:
+    import pandas as pd
 
 PAGE = "gap.md"
 RELIABILITY = "gap_reliability.png"
 _SURE = 0.1
 """Probability of a failure soon above which predictions are compared with what happened."""
+_FITS = {
+    "r2_state": "state",
+    "r2_reward": "reward of steps that go on",
+    "r2_final_reward": "reward of failures",
+    "r2_latent": "latent",
+}
+"""R² of a grounding's heads, and their titles."""
 
 
 def write_held_out(
@@ -36,7 +42,7 @@ def write_held_out(
 ) -> Path | None:
     """Write the page of all finished groundings to `root`; return it, None where there is no grounding.
 
-    Beside it is a figure where groundings have failure models.
+    Beside it is a figure where groundings predict failures.
 
     Args:
         recipe: its name.
@@ -49,125 +55,255 @@ def write_held_out(
     Raises:
         BadInputError: a file of errors is malformed.
     """
-    found: dict[str, dict[int | None, GapMeans]] = {}
-    for method in groundings:
-        for percent in sorted(percents) or (None,):
-            files = {
-                seed: root / artifact_key("ground", method, seed, percent) / GAP for seed in sorted(seeds)
-            }
-            gaps = {seed: read_json(Gap, file) for seed, file in files.items() if file.is_file()}
-            if gaps:
-                found.setdefault(method, {})[percent] = mean_gap(gaps)
-    if not found:
+    places = [
+        (root, row, seed, percent)
+        for row in groundings
+        for percent in sorted(percents) or (None,)
+        for seed in sorted(seeds)
+    ]
+    results = Results(
+        recipe=recipe,
+        task="",
+        command="",
+        rows=tuple(groundings),
+        episodes=0,
+        timestep_s=timestep_s,
+        lines=[line for place in places for line in read_grounding(*place)],
+        errors=[error for place in places for error in read_errors(*place)],
+    )
+    if not results.errors:
         return None
-    every = [gap for sizes in found.values() for gap in sizes.values()]
-    horizons = shared_horizons([gap.horizons for gap in every])
-    by_size = {percent or 0: gap for sizes in found.values() for percent, gap in sizes.items()}
-    foreseen = measured_foresight(root, groundings, seeds, percents)
-    rates = failure_rates(foreseen)
-    if rates:
-        from astra_data.reports.figures import png, reliability
+    seeds_text = ", ".join(map(str, sorted({one.seed for one in results.errors})))
+    blocks: list[Block] = [
+        Text(
+            "Errors of the simulators on episodes that no grounding was fitted to. Each simulator starts in "
+            "a state of the robot and receives its recorded actions. Mean [95 % interval over episodes], "
+            f"averaged over seeds {seeds_text}."
+        ),
+        *gap_blocks(results),
+    ]
+    figures = {}
+    if rates := failure_rates(results):
+        from astra_data.reports.figures import pictures, png, reliability
 
         write_file(root / RELIABILITY, png(reliability(rates)))
-    page = fill(
-        "held_out.md.jinja",
-        recipe=recipe,
-        seeds=sorted({seed for gap in every for seed in gap.seeds}),
-        head=[*(["size"] if percents else []), "simulator"],
-        horizons=[f"{h} step{'s' if h > 1 else ''} ({h * timestep_s:g} s)" for h in horizons],
-        tables={name: _lines(found, name, horizons, has_sizes=bool(percents)) for name in every[0].raw},
-        astray=astray(by_size[max(by_size)]),
-        worse=[line for method, sizes in found.items() for line in worse(method_title(method), sizes)],
-        foresight=foresight_lines(foreseen),
-        reliability=RELIABILITY if rates else None,
-        enough=[
-            enough(method_title(method), name, sizes, horizons)
-            for method, sizes in found.items()
-            for name in every[0].raw
-            if len(sizes) > 1
-        ],
-    )
-    write_file(root / PAGE, page)
+        blocks += pictures(results, "failures")
+        figures["reliability"] = RELIABILITY
+    write_file(root / PAGE, markdown(f"{recipe}: held-out errors", [Section("", blocks)], figures))
     return root / PAGE
 
 
-def astray(gap: GapMeans) -> list[str]:
-    """Return the quantities in which the raw simulator is no better than who expects the robot to stay.
+def gap_blocks(results: Results) -> Iterator[Block]:
+    """Yield errors by horizon, what they mean, and how well rewards and failures are predicted."""
+    if not results.errors:
+        return
+    sizes = results.percents
+    means = {percent: results.mean_errors(percent) for percent in sizes}
+    horizons = sorted(set.intersection(*(set(of.index.get_level_values("horizon")) for of in means.values())))
+    quantities = list(dict.fromkeys(error.quantity for error in results.errors))
+    swept = len(sizes) > 1
+    step_s = results.timestep_s
+    titles = [
+        f"{steps} step{'s' if steps > 1 else ''}{f' ({steps * step_s:g} s)' if step_s else ''}"
+        for steps in horizons
+    ]
+    for quantity in quantities:
+        lines = [
+            [*([f"{percent} %"] if swept else []), *line]
+            for percent in sizes
+            for line in _error_lines(results, means[percent], quantity, horizons)
+        ]
+        head = [*(["size"] if swept else []), "simulator", *titles]
+        yield Table(f"Error of `{quantity}`", head, lines, words=len(head) - len(horizons))
+    last = means[sizes[-1]]
+    if still := no_better_than_still(last):
+        names = ", ".join(f"`{name}`" for name in still)
+        yield Text(
+            f"**In {names}, the simulator without grounding is no better than predicting that the state "
+            "does not change.** If it should be better, check the units and the order of states and "
+            "commands, the rate, and the abstraction φ (phi), which maps the robot's states to the "
+            "simulator's.",
+            warns=True,
+        )
+    if worse := [*_regressions(results, last)]:
+        yield Text(
+            "**Here the correction makes the simulator worse.** More data, or other settings of `[ground]`, "
+            "may help; policies that are trained in it learn its errors.",
+            worse,
+            warns=True,
+        )
+    if swept:
+        yield Text("How much data is enough:", [*_sufficient_sizes(results, means, quantities, horizons)])
+        yield Text(
+            "Each size holds out a share of its own episodes, so smaller sizes are measured on fewer of "
+            "them: compare with the line without grounding of the same size."
+        )
+    yield from _fit_blocks(results)
+    yield from _failure_blocks(results)
+
+
+def _error_lines(
+    results: Results, means: "pd.DataFrame", quantity: str, horizons: Sequence[int]
+) -> Iterator[list[str]]:
+    """Yield a line for each simulator at a size; what all groundings share, once."""
+    groundings = [row for row in results.groundings() if (row, "grounded") in means.index]
+
+    def cells(row: str, simulator: str) -> list[str]:
+        at = [means.loc[(row, simulator, quantity, horizon)] for horizon in horizons]
+        return [measured(one["mean"], one["low"], one["high"]) for one in at]
+
+    if (groundings[0], "still") in means.index:
+        yield ["No motion (persistence baseline)", *cells(groundings[0], "still")]
+    raw = {row: cells(row, "raw") for row in groundings}
+    shared = len(set(map(tuple, raw.values()))) == 1
+    if shared:
+        yield ["No grounding", *raw[groundings[0]]]
+    for row in groundings:
+        if not shared:
+            yield [f"{method_title(row)}, no grounding", *raw[row]]
+        yield [f"{method_title(row)}, grounded", *cells(row, "grounded")]
+
+
+def no_better_than_still(means: "pd.DataFrame") -> list[str]:
+    """Return the quantities in which the raw simulator is no better than the persistence baseline.
 
     Not after the first step: a robot that lags behind its commands hardly leaves its state in one.
     """
-    horizon = judged_horizon(gap.horizons)
-    return [
-        name
-        for name, band in (gap.still or {}).items()
-        if gap.at(gap.raw[name], horizon)[0] >= gap.at(band, horizon)[0]
-    ]
+    found = means["mean"].groupby(["simulator", "quantity", "horizon"], sort=False).first()
+    if "still" not in found.index:
+        return []
+    horizon = judged_horizon(found.index.get_level_values("horizon"))
+    raw, still = (found[simulator].xs(horizon, level="horizon") for simulator in ("raw", "still"))
+    return [quantity for quantity in still.index if raw[quantity] >= still[quantity]]
 
 
-def worse(title: str, sizes: Mapping[int | None, GapMeans]) -> list[str]:
-    """Say where a grounding, fitted to the most data, has larger errors than the simulator without one."""
-    gap = sizes[max(sizes, key=lambda percent: percent or 0)]
-    lines = []
-    for name, band in gap.grounded.items():
-        found = [
-            f"{horizon} step{'s' if horizon > 1 else ''} ahead ({ours:.3g}, without {its:.3g})"
-            for horizon in gap.horizons
-            if (ours := gap.at(band, horizon)[0]) > (its := gap.at(gap.raw[name], horizon)[0])
-        ]
-        if found:
-            lines.append(f"`{name}`, {title}: {', '.join(found)}")
-    return lines
+def _regressions(results: Results, means: "pd.DataFrame") -> Iterator[str]:
+    """Yield where a grounding, fitted to the most data, has larger errors than the simulator without one."""
+    for row in results.groundings():
+        if row not in means.index:
+            continue
+        of = means.loc[row, "mean"].unstack("simulator")
+        worse = of[of["grounded"] > of["raw"]]
+        for quantity, lines in worse.groupby(level="quantity", sort=False):
+            found = [
+                f"{steps} step{'s' if steps > 1 else ''} ahead ({line['grounded']:.3g}, without "
+                f"{line['raw']:.3g})"
+                for (_, steps), line in lines.iterrows()
+            ]
+            yield f"`{quantity}`, {method_title(row)}: {', '.join(found)}"
 
 
-def measured_foresight(
-    root: Path, groundings: Sequence[str], seeds: Sequence[int], percents: Sequence[int]
-) -> Measured:
-    """Read how well groundings foresee failures, on the seeds where some were held out.
+def _sufficient_sizes(
+    results: Results, means: "dict[int, pd.DataFrame]", quantities: Sequence[str], horizons: Sequence[int]
+) -> Iterator[str]:
+    """Yield from which size on more data makes no difference that the intervals show.
 
-    Raises:
-        BadInputError: a file of figures is malformed.
+    That is the smallest one whose error, and those of all larger ones, are at most the upper end of the
+    interval of the largest.
     """
+    horizon = judged_horizon(horizons)
+    for row in results.groundings():
+        of = {percent: found.loc[row] for percent, found in means.items() if row in found.index}
+        *smaller, largest = sorted(of)
+        for quantity in quantities if smaller else ():
+            at = {percent: found.loc[("grounded", quantity, horizon)] for percent, found in of.items()}
+            limit, least = at[largest]["high"], largest
+            where = f"{method_title(row)}, `{quantity}`, {horizon} steps ahead: "
+            if np.isnan(limit):
+                yield f"{where}unknown: at {largest} %, a seed has only one held-out episode of that length."
+                continue
+            for percent in reversed(smaller):
+                if at[percent]["mean"] > limit:
+                    break
+                least = percent
+            if least == largest:
+                yield f"{where}the error still decreases up to {largest} %: more data may help."
+            else:
+                yield f"{where}from {least} % on, the error is within the interval of {largest} %."
+
+
+def _fit_blocks(results: Results) -> Iterator[Block]:
+    """Yield the R² of the heads of each grounding on held-out episodes."""
+    rows = results.groundings()
+    found = {row: {name: results.summary(row, name, "ground") for name in _FITS} for row in rows}
+    shown = [name for name in _FITS if any(of[name] for of in found.values())]
+    lines = [
+        [method_title(row), *("-" if (one := of[name]) is None else f"{one.mean:.2f}" for name in shown)]
+        for row, of in found.items()
+    ]
+    if shown:
+        yield Table(
+            "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the "
+            "mean)",
+            ["grounding", *(_FITS[name] for name in shown)],
+            lines,
+        )
+
+
+def _predicted_failures(results: Results) -> "dict[tuple[int, str, str], pd.DataFrame]":
+    """Return the figures of predicted failures by size, grounding and part of it: name → seed → value."""
+    table = results.table
+    of = table[(table["where"] == "ground") & table["measure"].str.startswith("failures.")]
+    if of.empty:
+        return {}
+    names = of["measure"].str.split(".", n=2, expand=True)
+    of = of.assign(part=names[1], measure=names[2])
     return {
-        percent: {method: _measured(root, method, seeds, percent) for method in groundings}
-        for percent in sorted(percents) or (None,)
+        key: group.pivot_table(index="measure", columns="seed", values="value", sort=False)
+        for key, group in of.groupby(["percent", "row", "part"], sort=False)
+        if group["measure"].str.startswith("auc").any()
     }
 
 
-def foresight_lines(measured: Measured) -> list[list[str]]:
-    """Return a line for each size, grounding and part of it that foresees failures, with means over seeds."""
-    lines = []
-    for percent, of_methods in measured.items():
-        for method, parts in of_methods.items():
-            for part, found in parts.items():
-                title = f"{method_title(method)}: {part.replace('_', ' ')}"
-                size = [] if percent is None else [f"{percent} %"]
-                lines.append([*size, title, *_foresight_cells(found)])
-    return lines
+def _failure_blocks(results: Results) -> Iterator[Block]:
+    lines, swept = [], len(results.percents) > 1
+    for (percent, row, part), of in _predicted_failures(results).items():
+        means = of.mean(axis=1)
+        aucs = [f"{value:.2f}" for name, value in means.items() if str(name).startswith("auc.")]
+        skill = f"{means['brier_skill']:.2f}" if "brier_skill" in means else "-"
+        bins = _bins(of)
+        sure = bins[bins[:, 0] > _SURE]
+        happens = "-"
+        if len(sure):
+            predicted, observed = np.average(sure[:, :2], axis=0, weights=sure[:, 2])
+            happens = f"{observed:.2f} of {predicted:.2f}"
+        title = f"{method_title(row)}: {part.replace('_', ' ')}"
+        size = [f"{percent} %"] if swept else []
+        lines.append([*size, title, f"{of.loc['failures'].sum():.0f}", *aucs, skill, happens])
+    if not lines:
+        return
+    windows = ("AUC 1\N{EN DASH}20 steps", "11\N{EN DASH}30", "21\N{EN DASH}40")
+    head = [*(["size"] if swept else []), "predicted by", "failures", *windows, "Brier skill"]
+    head = [*head, "observed of predicted"]
+    yield Table("Failures, predicted on held-out episodes; means over seeds", head, lines, words=1 + swept)
+    yield Text(
+        "AUC: the probability that a step this many steps before a failure ranks above a step with no "
+        "failure in the next 40. Brier skill: the share of squared error removed, compared with always "
+        "predicting the mean rate. Observed of predicted: over the steps with a predicted probability above "
+        "0.1, the share before a failure, and the mean predicted probability. With few failures, these "
+        "numbers mean little."
+    )
 
 
-def _measured(
-    root: Path, method: str, seeds: Sequence[int], percent: int | None
-) -> dict[str, list[Foresight]]:
-    measured: dict[str, list[Foresight]] = {}
-    for seed in seeds:
-        file = root / artifact_key("ground", method, seed, percent) / METRICS
-        for part, one in read_json(Metrics, file).failures.items() if file.is_file() else ():
-            if one.auc:
-                measured.setdefault(part, []).append(one)
-    return measured
+def _bins(of: "pd.DataFrame") -> Floats:
+    """Return predicted and observed rates and number of steps of all bins and seeds, (N, 3)."""
+    rows = of[of.index.str.startswith("reliability.")]
+    bins = rows.groupby([name.split(".")[1] for name in rows.index], sort=False)
+    found = [values.to_numpy().T for _, values in bins]
+    stacked = np.concatenate(found) if found else np.empty((0, 3))
+    return np.asarray(stacked[~np.isnan(stacked).any(axis=1)], dtype=np.float64)
 
 
-def failure_rates(measured: Measured) -> dict[str, dict[str, Floats]]:
-    """Return rates by part that foresees failures and grounding, as a figure takes them.
+def failure_rates(results: Results) -> dict[str, dict[str, Floats]]:
+    """Return rates over all seeds at the largest size: what predicts failures → grounding → (3, bins).
 
-    They are over all seeds, at the largest size.
+    The three are predicted rate, observed rate and number of steps.
     """
     parts: dict[str, dict[str, Floats]] = {}
-    largest = [*measured.values()][-1]
-    for method, of_parts in largest.items():
-        for part, found in of_parts.items():
-            rows = np.array([row for one in found for row in one.reliability or ()])
-            parts.setdefault(part.replace("_", " "), {})[method] = _pooled(rows.reshape(-1, 3))
+    for (percent, row, part), of in _predicted_failures(results).items():
+        rows = _bins(of)
+        if percent == (results.percents or [WHOLE])[-1] and len(rows):
+            parts.setdefault(part.replace("_", " "), {})[row] = _pooled(rows)
     return parts
 
 
@@ -177,60 +313,3 @@ def _pooled(rows: Floats) -> Floats:
     steps = np.array([rows[bins == one, 2].sum() for one in np.unique(bins)])
     rates = [rows[bins == one, :2].T @ rows[bins == one, 2] for one in np.unique(bins)]
     return np.vstack([np.reshape(rates, (-1, 2)).T / steps, steps])
-
-
-def _foresight_cells(found: Sequence[Foresight]) -> list[str]:
-    known = [
-        [value for one in found if one.auc and (value := one.auc[window]) is not None]
-        for window in found[0].auc or ()
-    ]
-    aucs = [f"{fmean(values):.2f}" if values else "-" for values in known]
-    skills = [one.brier_skill for one in found if one.brier_skill is not None]
-    skill = f"{fmean(skills):.2f}" if skills else "-"
-    sure = [row for one in found for row in one.reliability or () if row[0] > _SURE]
-    steps = sum(count for *_, count in sure)
-    means = [sum(row[index] * row[2] for row in sure) / steps for index in (0, 1)] if steps else []
-    happens = f"{means[1]:.2f} of {means[0]:.2f}" if means else "-"
-    return [f"{sum(one.failures for one in found)}", *aucs, skill, happens]
-
-
-def enough(title: str, quantity: str, sizes: Mapping[int | None, GapMeans], horizons: Sequence[int]) -> str:
-    """Say from which size on more data makes no difference that the intervals show.
-
-    That is the smallest one whose error, and those of all larger ones, are at most the upper end of the
-    interval of the largest.
-    """
-    horizon = judged_horizon(horizons)
-    errors = {size: gap.at(gap.grounded[quantity], horizon) for size, gap in sizes.items()}
-    *smaller, largest = errors
-    limit, least = errors[largest][2], largest
-    where = f"{title}, `{quantity}`, {horizon} steps ahead: "
-    if limit is None:
-        return f"{where}withheld: at {largest} %, a seed has only one held-out episode of that length."
-    for size in reversed(smaller):
-        if errors[size][0] > limit:
-            break
-        least = size
-    if least == largest:
-        return f"{where}the error still decreases up to {largest} %: more data may help."
-    return f"{where}from {least} % on, the error is within the interval of {largest} %."
-
-
-def _lines(
-    found: Mapping[str, Mapping[int | None, GapMeans]],
-    quantity: str,
-    horizons: Sequence[int],
-    *,
-    has_sizes: bool,
-) -> list[list[str]]:
-    lines = []
-    for size in sorted({size for sizes in found.values() for size in sizes}, key=lambda size: size or 0):
-        sized = {method_title(method): sizes[size] for method, sizes in found.items() if size in sizes}
-        first = next(iter(sized.values()))
-        bands = {"Standing still": (first.still[quantity], first)} if first.still else {}
-        bands |= {"No grounding": (first.raw[quantity], first)}
-        bands |= {title: (gap.grounded[quantity], gap) for title, gap in sized.items()}
-        for title, (band, gap) in bands.items():
-            cells = [measured(*gap.at(band, horizon)) for horizon in horizons]
-            lines.append([*([f"{size} %"] if has_sizes else []), title, *cells])
-    return lines

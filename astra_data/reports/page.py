@@ -1,183 +1,495 @@
-"""Results → Markdown; the text is in `templates/recipe.md.jinja`."""
+"""Results → sections of a page, which `blocks` writes as Markdown and as HTML.
 
-from collections.abc import Callable, Mapping
+A column of the table of methods is a line of `COLUMNS`; its measure is what a stage writes. A figure is a
+line of `figures.FIGURES`.
+"""
 
-from astra_data.core.naming import is_plus, reference_of
-from astra_data.methods import method_title
-from astra_data.reports.choice_page import choice_values
-from astra_data.reports.cost_and_origin import (
-    COSTED,
-    dataset_lines,
-    machines,
-    provenance,
-    row_costs,
-    stage_costs,
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from astra_data.core.naming import base_method, is_plus, reference_of
+from astra_data.methods import grounded_as, method_named, method_role, method_title
+from astra_data.reports.blocks import Block, Code, Section, Table, Text, code
+from astra_data.reports.choice import choice_blocks
+from astra_data.reports.figures import pictures
+from astra_data.reports.formatting import duration, interval, short, spread
+from astra_data.reports.held_out import gap_blocks
+from astra_data.reports.results import (
+    SIMULATED,
+    TESTED,
+    WHOLE,
+    Origin,
+    Results,
+    contenders,
+    elapsed_seconds,
+    stage_seconds,
+    titled,
 )
-from astra_data.reports.formatting import fill, interval, mean_std, measured, spread
-from astra_data.reports.schema import BandMeans, GapMeans, MethodResults, Results, shared_horizons
-from astra_data.reports.statistics import Correlation
-from astra_data.reports.tested import warning, where
-from astra_data.worlds.score import SUCCESS
+from astra_data.reports.runs import DATASET_STAGES, SHARED_WORLDS
+from astra_data.reports.statistics import (
+    LEAST_SEEDS,
+    Estimate,
+    correlation,
+    probability_of_improvement,
+)
+from astra_data.reports.verdict import verdict_of
 
-BESIDE = {
-    "success": (
-        *("failed", "wall_contact", "steps", "distance", "return"),
-        *("simulated_success", "tries", "beyond_recorded"),
-    ),
-    "steps": ("failed", "simulated_steps", "tries", "beyond_recorded"),
+COSTED = ("ground", "train", "align", "evaluate")
+"""Stages that run once for each method and seed."""
+LEAST_POLICIES = 5
+"""Policies below which no correlation over them is shown."""
+WORDS = {
+    "astra": "ASTRA: the paper's correction, prediction of rewards and aligned encoder",
+    "nas": "NAS: neural-augmented simulation, a correction of the simulator's next state alone",
+    "iql": "IQL: implicit Q-learning, from the recorded steps alone",
+    "rma": "RMA: rapid motor adaptation",
+    "compass": "COMPASS: simulator parameters fitted to the episodes",
+    "compass_uniform": "COMPASS, uniform: simulator parameters drawn from wide ranges",
 }
-"""Headline → the other measures in the table of scores; beside another one, those of success."""
-OF_PLANES = {"wall_contact", "distance"}
-"""Of these, what tasks without walls and places do not have."""
-NEGLIGIBLE = {"beyond_recorded": 0.01, "tries": 1.0}
-"""Up to which value a measure is left out if no row has more; by default 0."""
-
-COLUMNS = {
-    "failed": ("failed", 2),
-    "wall_contact": ("wall contact", 2),
-    "steps": ("steps", 0),
-    "distance": ("path length to success (m)", 1),
-    "return": ("return", 1),
-    "simulated_success": ("success in its simulator", 2),
-    "simulated_steps": ("survived steps in its simulator", 0),
-    "tries": ("training runs", 1),
-    "beyond_recorded": ("beyond recorded commands", 2),
-}
-"""Column title and digits of such a measure."""
+"""What the names of methods stand for."""
 
 
-def render(results: Results, figures: Mapping[str, str]) -> str:
-    """Return the page.
+@dataclass(frozen=True)
+class Column:
+    """A column of the table of methods.
 
-    Args:
-        results: all numbers on it.
-        figures: name → file name of each figure that was drawn; names as in `files.FIGURES`.
+    Attributes:
+        measure: its name in `Results.lines`. title: above it. digits: behind the decimal point.
+        note: what it means; empty where its title says it.
+        negligible: it is left out where no method has more.
+        where: the place of the measure.
     """
-    rows = results.methods
-    seeds = ", ".join(map(str, results.seeds))
-    if any(row.seeds != results.seeds for row in rows.values()):
-        seeds += " (the table has the number of seeds of each row)"
-    stages = [made for made in results.origins if made.machine and made.stages != ["report"]]
-    reference = reference_of(rows)
-    return fill(
-        "recipe.md.jinja",
-        results=results,
-        figures=figures,
-        rows=rows,
-        seeds=seeds,
-        headline=results.headline.measure,
-        warning=warning(results),
-        where=where(results),
-        machines=machines(stages),
-        scores=score_table(results),
-        has_plus=any(map(is_plus, rows)),
-        hand_written=hand_written(results),
-        encoders=encoder_lines(results),
-        horizons=horizon_titles(results),
-        gaps=gap_tables(results),
-        correlation=correlation_text,
-        grounding=f"{method_title(reference)}'s, of the same seed" if reference else "each row's own",
-        untested=[row.title for row in rows.values() if "raw" not in row.simulator_returns],
-        choice=choice_values(results.choice),
-        costed=COSTED,
-        stage_costs=stage_costs(results),
-        row_costs=row_costs(results),
-        made=provenance(results.origins, results.own_code),
-        datasets=dataset_lines(results),
-    )
+
+    measure: str
+    title: str
+    digits: int
+    note: str = ""
+    negligible: float = 0.0
+    where: str = TESTED
 
 
-def hand_written(results: Results) -> str | None:
-    """Return the title of a hand-written row that was tested in the grounded simulator, if there is one."""
-    ceilings = [row for row in results.methods.values() if row.role == "ceiling" and row.simulated_success]
-    return f"the {ceilings[0].title[0].lower()}{ceilings[0].title[1:]}" if ceilings else None
+COLUMNS = (
+    Column("failed", "failed", 2, "Failed: share of episodes that ended in a failure, such as a fall."),
+    Column("wall_contact", "wall contact", 2, "Wall contact: share of steps."),
+    Column("steps", "steps", 0),
+    Column("distance", "path length to success (m)", 1),
+    Column("return", "return", 1, negligible=-np.inf),
+    Column("tries", "training runs", 1, negligible=1.0, where="train"),
+    Column(
+        "beyond_recorded",
+        "beyond recorded commands",
+        2,
+        "Beyond recorded commands: share of steps whose command is outside the recorded range. The data "
+        "does not show what such commands do: narrow the bounds of the task's commands, or record more.",
+        negligible=0.01,
+    ),
+)
 
 
-def score_table(results: Results) -> tuple[list[str], list[list[str]]]:
-    """Return head and lines of the table of scores."""
-    rows, scores = results.methods, results.scores
-    beside = BESIDE.get(results.headline.measure, BESIDE["success"])
-    bare = OF_PLANES | NEGLIGIBLE.keys() if results.tested_in == "target" else set(beside)
-    beside = tuple(
-        measure for measure in beside if measure not in bare or any(map(_some(measure), rows.values()))
-    )
-    best = {
-        score: max((row.summary[score.measure].mean for row in rows.values() if not row.role), default=None)
-        for score in scores
-    }
-    head = ["method", "seeds"]
-    for score in scores:
-        head += [score.title, "IQM [95 %]"]
-    head += [COLUMNS[measure][0] for measure in beside]
-    lines = []
-    for row in rows.values():
-        cells = [f"{row.title} ({row.role})" if row.role else row.title, str(len(row.seeds))]
-        for score in scores:
-            summary = row.summary[score.measure]
-            mean = spread(summary, score.digits)
-            cells.append(f"**{mean}**" if not row.role and summary.mean == best[score] else mean)
-            cells.append(interval(summary.iqm, summary.low, summary.high, score.digits))
-        cells += [
-            spread(row.summary[measure], COLUMNS[measure][1]) if measure in row.summary else "-"
-            for measure in beside
-        ]
-        lines.append(cells)
-    paper = results.paper_success
-    if paper:
-        place = head.index(SUCCESS.title) + 1
-        head.insert(place, "paper")
-        for method, cells in zip(rows, lines, strict=True):
-            cells.insert(place, f"{paper[method]:.2f}" if method in paper else "-")
-    return head, lines
-
-
-def _some(measure: str) -> Callable[[MethodResults], bool]:
-    """Return whether a row has values of a measure to speak of: a robot without walls touches none."""
-    least = NEGLIGIBLE.get(measure, 0.0)
-    return lambda row: measure in row.summary and abs(row.summary[measure].mean) > least
-
-
-def encoder_lines(results: Results) -> list[list[str]]:
-    """Return the scores by encoder of the rows that have several."""
+def sections_of(results: Results, run: str) -> list[Section]:
+    """Return the sections of the page of results, whose run is in the folder `run`."""
+    sections = [
+        Section("", [*_facts(results)]),
+        Section("Verdict", [*_verdict(results, run)]),
+        Section("Methods", [*_methods(results)]),
+        Section("The gap", [*_gap(results), *_validity(results)]),
+    ]
+    if len(results.percents) > 1 or results.percents[0] != WHOLE:
+        sections.append(Section("Size of the data", [*_sizes(results)]))
+    if choice := results.choice():
+        sections.append(Section("Chosen without the target", choice_blocks(choice, shown=8)))
     return [
-        [row.title, encoder, *(mean_std(values[score.measure], score.digits) for score in results.scores)]
-        for row in results.methods.values()
-        for encoder, values in row.encoders.items()
-        if len(row.encoders) > 1
+        *sections,
+        Section("Training and cost", [*pictures(results, "training"), *_costs(results)]),
+        Section("Every seed", [*_every_seed(results)], folded=True),
+        Section("Provenance", [*_provenance(results)], folded=True),
     ]
 
 
-def horizon_titles(results: Results) -> list[str]:
-    """Return the head of the tables of `gap_tables` behind their first column."""
-    every = [gap.horizons for gap in results.gaps().values()]
-    return [f"{steps} step{'s' if steps > 1 else ''}" for steps in (shared_horizons(every) if every else ())]
+def _facts(results: Results) -> Iterator[Block]:
+    if results.warning:
+        yield Text(results.warning, warns=True)
+    if results.stand_in:
+        yield Text(
+            f"**A simulated stand-in ({code(results.stand_in)}) replaces the physical robot: no number is "
+            "from a real robot, and none is comparable to one in absolute terms.**",
+            warns=True,
+        )
+    seeds = ", ".join(map(str, results.seeds))
+    text = f"Task {code(results.task)}, seeds {seeds}, {results.episodes} episodes per method and seed"
+    if results.percents[-1] != WHOLE:
+        text += f"; unless stated otherwise, with {results.percents[-1]} % of the data"
+    text += "."
+    if results.leg_scale != 1:
+        text += f" The target's legs are {results.leg_scale:g} times as long."
+    if unfinished := _unfinished(results):
+        text += f" Not finished yet: {unfinished}."
+    yield Text(text)
 
 
-def gap_tables(results: Results) -> dict[str, list[list[str]]]:
-    """Return quantity → lines of the table of open-loop errors, the raw simulator once if all share it."""
-    gaps = {method_title(name): gap for name, gap in results.gaps().items()}
-    if not gaps:
-        return {}
-    first = next(iter(gaps.values()))
-    horizons = shared_horizons([gap.horizons for gap in gaps.values()])
-
-    def cells(gap: GapMeans, band: BandMeans) -> list[str]:
-        return [measured(*gap.at(band, horizon)) for horizon in horizons]
-
-    tables = {}
-    for quantity in first.grounded:
-        raw = {title: cells(gap, gap.raw[quantity]) for title, gap in gaps.items()}
-        shared = len(set(map(tuple, raw.values()))) == 1
-        lines = [["Standing still", *cells(first, first.still[quantity])]] if first.still else []
-        lines += [["No grounding", *next(iter(raw.values()))]] if shared else []
-        for title, gap in gaps.items():
-            if not shared:
-                lines.append([f"{title}, no grounding", *raw[title]])
-            lines.append([f"{title}, grounded", *cells(gap, gap.grounded[quantity])])
-        tables[quantity] = lines
-    return tables
+def _unfinished(results: Results) -> str:
+    every = set(results.rows)
+    lacking = {
+        percent: [method_title(row) for row in results.rows if row in every - set(results.tested(percent))]
+        for percent in results.percents
+    }
+    sizes = {percent: f" at {percent} %" if len(results.percents) > 1 else "" for percent in lacking}
+    return "; ".join(f"{', '.join(rows)}{sizes[percent]}" for percent, rows in lacking.items() if rows)
 
 
-def correlation_text(found: Correlation | None) -> str:
-    """Return a coefficient with its interval; a dash where it is undefined."""
+def _verdict(results: Results, run: str) -> Iterator[Block]:
+    verdict = verdict_of(results)
+    yield Text(verdict.text)
+    items = [f"**{label.capitalize()}**: {text}" for label, text in verdict.lines]
+    yield Text("", [*items, *verdict.remarks])
+    if command := verdict.command(run):
+        yield Code(command)
+
+
+def _methods(results: Results) -> Iterator[Block]:
+    rows, where = results.tested(), results.where
+    percent = results.percents[-1]
+    shown = [column for column in COLUMNS if _is_shown(results, column)]
+    head, lines = ["method"], [[titled(row)] for row in rows]
+    beside = {score.measure for score in results.scores}
+
+    def add(title: str, cells: Sequence[str]) -> None:
+        head.append(title)
+        for line, cell in zip(lines, cells, strict=True):
+            line.append(cell)
+
+    for score in results.scores:
+        found = [results.summary(row, score.measure) for row in rows]
+        add(f"{score.title} {where}", [spread(one, score.digits) for one in found])
+        add("95 % interval", [_ends(one.low, one.high, score.digits) if one else "-" for one in found])
+    if results.paper_success:
+        printed = results.paper_success
+        add("paper", [f"{printed[row]:.2f}" if row in printed else "-" for row in rows])
+    headline = results.headline
+    learned = {row: results.score_of(row, SIMULATED) for row in rows}
+    add("in its simulator", [spread(learned[row], headline.digits) for row in rows])
+    lost = [(learned[row], results.score_of(row)) for row in rows]
+    # A minus sign of a rounded zero says nothing.
+    add(
+        "lost",
+        [
+            f"{round(own.mean - found.mean, headline.digits) + 0.0:.{headline.digits}f}"
+            if own and found
+            else "-"
+            for own, found in lost
+        ],
+    )
+    for column in shown:
+        if column.measure not in beside:
+            found = [results.summary(row, column.measure, column.where) for row in rows]
+            add(column.title, [spread(one, column.digits) for one in found])
+    add("seeds", [f"{len(results.values(row, headline.measure, percent=percent))}" for row in rows])
+    best = max(contenders(results, percent), key=lambda row: _mean(results, row), default=None)
+    for row, line in zip(rows, lines, strict=True):
+        if row == best:
+            line[0] = f"**{line[0]}**"
+    yield Table("", head, lines)
+    notes = [
+        f"Mean ± standard deviation over seeds, {where}, and the 95 % interval of the mean (Student's t, "
+        f"for shares of episodes widened to Wilson's), which needs {LEAST_SEEDS} seeds.",
+        "In its simulator: the same policies in the simulator of their training; lost: how much less it is "
+        f"{where}.",
+        *(column.note for column in shown if column.note),
+        "Floor: what is reached without any correction. Ceiling: what a controller reaches that knows the "
+        "task. The best of the other methods is bold.",
+    ]
+    if any(method_role(row) == "trained there" for row in rows):
+        notes.append("Methods marked “trained there” learned in the target, for as long as the recipe says.")
+    if any(map(is_plus, rows)):
+        notes.append("A plus sign marks the same method trained with the recipe's `[plus]` settings.")
+    if results.paper_success:
+        notes.append(
+            "The paper's success rates come from its own robot, maze and tuning, which it does not print in "
+            "full: compare their order, not their values."
+        )
+    yield Text(" ".join(notes), [WORDS[name] for name in WORDS if name in map(base_method, rows)])
+    yield from _comparisons(results)
+    yield from _encoders(results)
+    yield from pictures(results, "methods")
+
+
+def _is_shown(results: Results, column: Column) -> bool:
+    """Return whether a method has values of a column to speak of: a robot without walls touches none."""
+    found = [results.summary(row, column.measure, column.where) for row in results.tested()]
+    return any(one is not None and one.mean > column.negligible for one in found)
+
+
+def _mean(results: Results, row: str) -> float:
+    found = results.score_of(row)
+    return found.mean if found else -np.inf
+
+
+def _ends(low: float | None, high: float | None, digits: int) -> str:
+    return "-" if low is None or high is None else f"[{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def compared(results: Results) -> list[tuple[str, str]]:
+    """Return which methods are compared: those of `compare` with all that are trained alike.
+
+    That is with the [plus] settings, or without; those that are trained in no simulator are compared with
+    both.
+    """
+    rows = [row for row in results.tested() if method_role(row) in (None, "floor")]
+    ours = [row for row in rows if base_method(row) in results.compare]
+    return [
+        (row, other)
+        for row in ours
+        for other in rows
+        if other != row
+        and (is_plus(other) == is_plus(row) or not results.values(other, "success", SIMULATED))
+    ]
+
+
+def _comparisons(results: Results) -> Iterator[Block]:
+    headline, lines = results.headline, []
+    for row, other in compared(results):
+        ours, theirs = (np.array([*results.values(one, headline.measure).values()]) for one in (row, other))
+        better, by = probability_of_improvement(ours, theirs), results.difference(row, other)
+        if better and by:
+            lines.append(
+                [
+                    *(
+                        method_title(row),
+                        method_title(other),
+                        interval(better.value, better.low, better.high),
+                    ),
+                    interval(by.value, by.low, by.high, headline.digits),
+                ]
+            )
+    head = ["method", "beats", "probability [95 %]", "difference, paired by seed [95 %]"]
+    yield Table("Probability of improvement", head, lines, words=2)
+    if lines:
+        yield Text(
+            f"Probability that a seed of the first method has a higher {headline.quantity} than a seed of "
+            "the second; ties count half; its interval is a bootstrap over seeds. The difference is the "
+            "mean over the seeds that both have, which share data, starts and goals, with Student's t "
+            "interval. Only methods that are trained alike are compared."
+        )
+
+
+def _encoders(results: Results) -> Iterator[Block]:
+    places = sorted({line.where for line in results.lines if line.where.startswith("encoder ")})
+    lines = [
+        [method_title(row), place.removeprefix("encoder "), *(spread(one, digits) for one, digits in found)]
+        for row in results.tested()
+        for place in places
+        for found in [[(results.summary(row, of.measure, place), of.digits) for of in results.scores]]
+        if any(one for one, _ in found)
+    ]
+    title = "The same policy with the simulator's encoder (source) or with the one aligned to the target"
+    yield Table(title, ["method", "encoder", *(score.title for score in results.scores)], lines, words=2)
+
+
+def _gap(results: Results) -> Iterator[Block]:
+    if results.errors:
+        yield Text(
+            "How far simulators drift from the target on held-out episodes when they start in its state and "
+            "receive its actions: mean [95 % interval over episodes], averaged over seeds."
+        )
+    yield from gap_blocks(results)
+    for section in ("failures", "gap"):
+        yield from pictures(results, section)
+
+
+def _validity(results: Results) -> Iterator[Block]:
+    """Yield how well returns in a simulator predict those in the target."""
+    lines, few = [], []
+    for world in SHARED_WORLDS if results.tested_in == "target" else ():
+        pairs = [
+            np.array([[there[seed], values[seed]] for seed in there if seed in values]).T
+            for row in results.tested()
+            if (there := results.values(row, "return", world)) and (values := results.values(row, "return"))
+        ]
+        policies = sum(pair.shape[1] for pair in pairs)
+        if not policies:
+            continue
+        if policies < LEAST_POLICIES:
+            few.append(world)
+            continue
+        sides = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        found = [correlation(*sides), correlation(*sides, ranks=True)]
+        lines.append([world, f"{policies}", *map(_estimate, found)])
+    title = "Does a simulator show which policy is better? Correlation with the return in the target"
+    yield Table(title, ["simulator", "policies", "Pearson [95 %]", "Spearman [95 %]"], lines)
+    if lines:
+        reference = reference_of(results.rows)
+        grounding = f"{method_title(reference)}'s, of the same seed" if reference else "each method's own"
+        yield Text(
+            "Each method and seed is one policy, tested from the task's starts with the task's reward. "
+            f"Intervals resample methods, and seeds within each. The grounding is {grounding}."
+        )
+    elif few:
+        yield Text(f"No correlation of returns is shown: it needs {LEAST_POLICIES} policies.")
+    yield from pictures(results, "validity") if lines else ()
+
+
+def _estimate(found: Estimate | None) -> str:
     return interval(found.value, found.low, found.high) if found else "-"
+
+
+def _sizes(results: Results) -> Iterator[Block]:
+    score, seeds = results.headline, len(results.seeds)
+    head = ["method", *(f"{percent} %" for percent in results.percents)]
+    means, ends = [], []
+    for row in results.tested():
+        found = [results.score_of(row, percent=percent) for percent in results.percents]
+        few = [
+            "" if one is None or one.seeds == seeds else f" ({one.seeds} of {seeds} seeds)" for one in found
+        ]
+        title = method_title(row)
+        means.append(
+            [title, *(f"{spread(one, score.digits)}{of}" for one, of in zip(found, few, strict=True))]
+        )
+        ends.append([title, *(_ends(one.low, one.high, score.digits) if one else "-" for one in found)])
+    title = f"{score.title.capitalize()} {results.where}, mean ± standard deviation over seeds"
+    yield Table(title, head, means)
+    yield Table("95 % interval of the mean", head, ends)
+    yield from pictures(results, "sizes")
+    chosen = [(percent, choice) for percent in results.percents if (choice := results.choice(percent))]
+    lines = []
+    for percent, choice in chosen:
+        best = choice.candidates[0]
+        known = (best.target, choice.regret, choice.random_regret)
+        predicted = interval(best.predicted.value, best.predicted.low, best.predicted.high)
+        cells = ("-" if value is None else f"{value:.2f}" for value in known)
+        lines.append([f"{percent} %", best.name, predicted, *cells])
+    head = ["size", "chosen", "predicted [95 %]", "in the target", "regret", "regret at random"]
+    yield Table("Chosen without the target, by the groundings of other seeds", head, lines, words=2)
+
+
+def _costs(results: Results) -> Iterator[Block]:
+    wall, cpu = (stage_seconds(results, clock) for clock in ("wall_seconds", "cpu_seconds"))
+    speeds = _speeds(results)
+    stages = (*DATASET_STAGES, "ground", "train", "align", "select", "evaluate")
+    lines = [
+        [stage, duration(wall.get(stage)), duration(cpu.get(stage)), speeds.get(stage, "")]
+        for stage in stages
+        if stage in wall or stage in speeds
+    ]
+    elapsed = elapsed_seconds(results)
+    total = ["whole recipe", duration(sum(wall.values())), duration(sum(cpu.values()) or None), ""]
+    yield Text(
+        f"Wall time of the whole recipe: {duration(elapsed)}, in which several stages may run at once."
+    )
+    yield Table("Time of each stage, added up over methods and seeds", _COST_HEAD, [*lines, total])
+    per_row = []
+    for row in results.tested():
+        found = [_cost(results, stage, row, "wall_seconds") for stage in COSTED]
+        spent = [_cost(results, stage, row, "cpu_seconds") for stage in COSTED]
+        sums = [sum(value for value in of if value is not None) for of in (found, spent)]
+        per_row.append([method_title(row), *map(duration, found), *(duration(one or None) for one in sums)])
+    head = ["method", *COSTED, "in all", "CPU time"]
+    yield Table(
+        "Time for one seed of each method, with the grounding and alignment that it uses", head, per_row
+    )
+    yield Text(
+        "A dash: no time was recorded. CPU time: of all threads. Speed: of one item while others run, "
+        "averaged over seeds. Simulator steps/s: without learning; training steps/s: with learning."
+    )
+
+
+_COST_HEAD = ["stage", "time", "CPU time", "speed"]
+
+
+def _cost(results: Results, stage: str, row: str, clock: str) -> float | None:
+    """Return the mean time of a stage for one seed of a method, with the training it starts from."""
+    owners = [grounded_as(row) if stage in ("ground", "align") else row]
+    if stage == "train" and (initial := method_named(row).initial):
+        owners.append(initial)
+    found = [results.summary(owner, clock, stage) for owner in owners]
+    known = [one.mean for one in found if one]
+    return sum(known) if known else None
+
+
+def _speeds(results: Results) -> dict[str, str]:
+    """Return the speeds of each stage, as text."""
+    table = results.table
+    found = table[table["measure"].str.endswith("_per_second")]
+    texts: dict[str, list[str]] = {}
+    for (stage, figure), of in found.groupby(["where", "measure"], sort=False):
+        means = of.groupby("row", sort=False)["value"].mean()
+        low, high = means.idxmin(), means.idxmax()
+        text = short(means[low])
+        if short(means[low]) != short(means[high]):
+            text = f"{text} ({method_title(low)}) to {short(means[high])} ({method_title(high)})"
+        steps = figure.removesuffix("_per_second").replace("_", " ")
+        texts.setdefault(stage, []).append(f"{text} {'training ' if steps == 'steps' else ''}{steps}/s")
+    return {stage: "; ".join(of) for stage, of in texts.items()}
+
+
+def _every_seed(results: Results) -> Iterator[Block]:
+    table = results.table
+    found = table[(table["where"] == TESTED) & table["row"].isin(results.tested())]
+    wide = found.pivot_table(index=["row", "percent", "seed"], columns="measure", values="value", sort=False)
+    swept = len(results.percents) > 1
+    order = [key for row in results.tested() for key in wide.index if key[0] == row]
+    lines = [
+        [
+            *(method_title(row), *([f"{percent} %"] if swept else []), f"{seed}"),
+            *("-" if np.isnan(value) else f"{value:.4g}" for value in wide.loc[(row, percent, seed)]),
+        ]
+        for row, percent, seed in order
+    ]
+    names = [str(name).replace("_", " ") for name in wide.columns]
+    yield Table("", ["method", *(["size"] if swept else []), "seed", *names], lines, words=1 + swept)
+
+
+def _provenance(results: Results) -> Iterator[Block]:
+    yield Text("Produced by")
+    yield Code(results.command)
+    texts = {"Code": _commit, "Machine": _machine, "Versions": _versions}
+    items = [f"{what}: {_by_stage(results.origins, text)}." for what, text in texts.items()]
+    if results.user_code:
+        items.append(
+            "User code: " + ", ".join(f"{name} `{hash_}`" for name, hash_ in results.user_code.items()) + "."
+        )
+    uses: dict[tuple[str, str, str], list[str]] = {}
+    for one in results.datasets:
+        key = (one.stage, one.name, one.version)
+        uses.setdefault(key, []).append(f"`{one.content_hash}` (seed {one.seed})")
+    for (stage, name, version), contents in uses.items():
+        named = " ".join(filter(None, (name, version)))
+        what = "Dataset named by evaluations" if stage == "evaluate" else f"Dataset of `{stage}`"
+        items.append(f"{what}: {named}, content {', '.join(contents)}.")
+    yield Text("", items)
+    yield Text(
+        "With this machine and these versions, the same seeds give the same numbers. All numbers and "
+        "settings are in `results.json`."
+    )
+
+
+def _by_stage(origins: Sequence[Origin], text: Callable[[Origin], str]) -> str:
+    """Return the text that all origins share, or each text with its stages."""
+    stages: dict[str, list[str]] = {}
+    for origin in origins:
+        stages.setdefault(text(origin), []).extend(origin.stages)
+    if len(stages) == 1:
+        return next(iter(stages))
+    return "; ".join(f"{shared} ({', '.join(dict.fromkeys(of))})" for shared, of in stages.items())
+
+
+def _commit(origin: Origin) -> str:
+    if origin.commit is None:
+        return "not recorded"
+    commit = origin.commit.removesuffix("-dirty")
+    return f"commit `{commit}`{' with uncommitted changes' if commit != origin.commit else ''}"
+
+
+def _machine(origin: Origin) -> str:
+    made_on = origin.machine
+    if made_on is None:
+        return "not recorded"
+    gpu = f", {made_on.gpu}" if made_on.gpu else ""
+    return f"{made_on.cpu}, {made_on.cores} cores, {made_on.memory_gib:g} GiB of memory{gpu}"
+
+
+def _versions(origin: Origin) -> str:
+    known = (f"{name} {version}" for name, version in origin.packages.items() if version is not None)
+    return ", ".join(known) or "not recorded"

@@ -1,38 +1,28 @@
-"""Which row of results to deploy, in a sentence or two, and what stands beside that."""
+"""Which method to deploy, by a short rule, and the lines that the page and the terminal show of it.
+
+The best method is the one with the highest mean score over seeds, references apart. It is deployed if it
+succeeds in half of the episodes or more (for scores without a limit: always), and no floor does as well.
+Otherwise none is, for the first of these reasons: a method did not learn to do the task in the simulator of
+its training; what was learned there is lost in the target.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf
-from statistics import fmean
+from pathlib import Path
 
-from astra_data.reports.choice_page import named
-from astra_data.reports.formatting import interval, spread
-from astra_data.reports.schema import MethodResults, Ranked, Results
-from astra_data.reports.statistics import share_interval
-from astra_data.reports.tested import where
-from astra_data.worlds.score import SUCCESS
+import numpy as np
 
-_PERCENT = "\N{NO-BREAK SPACE}%"
-_SURE = f"95{_PERCENT}"
-_ENOUGH_SEEDS = 4
-"""With fewer, an interval over seeds is no wider than the seeds lie apart."""
-_MOSTLY = 0.5
-"""A verdict warns where more episodes fail, or fewer succeed in the policy's own simulator."""
+from astra_data.methods import grounded_as, method_role, method_title
+from astra_data.reports.formatting import interval, listed
+from astra_data.reports.results import JUDGED, SIMULATED, WHOLE, Results, contenders, judged_horizon
+from astra_data.reports.statistics import LEAST_SEEDS, Summary, summarize
 
-
-@dataclass(frozen=True)
-class Fact:
-    """A number beside the verdict.
-
-    Attributes:
-        label: what it is of.
-        value: as text.
-        note: its interval, and what it was measured on.
-    """
-
-    label: str
-    value: str
-    note: str
+ENOUGH = 0.5
+"""Share of the largest possible score from which a method can be deployed, and has learned its own
+simulator."""
+EXPLAINED = 0.5
+"""R² of rewards on held-out episodes below which a grounding does not tell what its policies are rewarded
+for."""
 
 
 @dataclass(frozen=True)
@@ -40,261 +30,196 @@ class Verdict:
     """What to deploy.
 
     Attributes:
-        row: name of the row; None where all rows are references.
-        opening: what comes before the title in the verdict.
-        title: of the row, with the seed of a chosen policy.
-        reason: what comes behind it.
-        remarks: what limits it.
-        facts: the numbers that it rests on, and those of the references.
+        row: the method; None where none is to be deployed.
+        seed: of its policy. percent: size of its dataset.
+        text: the verdict, in a sentence.
+        lines: best method, floor, and the difference between them, each with its label.
+        remarks: causes, what helps, and what limits the verdict.
     """
 
     row: str | None
-    opening: str
-    title: str
-    reason: str
+    seed: int
+    percent: int
+    text: str
+    lines: list[tuple[str, str]]
     remarks: list[str]
-    facts: list[Fact]
+
+    def command(self, run: Path | str) -> str | None:
+        """Return the command that deploys the policy of the run at `run`; None where none is to be."""
+        if self.row is None:
+            return None
+        size = "" if self.percent == WHOLE else f" --percent {self.percent}"
+        out = f"{Path(run).name}_{self.row}"
+        return f"astra-data deploy {run} --row {self.row} --seed {self.seed}{size} --out {out}"
 
 
-def verdict_of(results: Results, percent: int | None = None) -> Verdict:
-    """Name the row to deploy: that of the chosen policy, or else the one with the best mean over seeds.
-
-    A row with a role is a reference and not the one, unless a policy of the floor was chosen: then grounding
-    gained nothing. Where nothing was tested in the target, rows are compared by what judges predict, if a
-    policy was chosen: they foresee failures.
-
-    Args:
-        results: of all rows.
-        percent: the size of the dataset, if there are several.
-    """
-    references = {name: _of_row(results, row) for name, row in results.methods.items() if row.role}
-    if len(references) == len(results.methods):
-        return Verdict(None, "No row to deploy: all rows are references.", "", "", [], [*references.values()])
-    chosen = chosen_of(results)
-    name = chosen.row if chosen else best_of(results)
-    row = results.methods[name]
-    references.pop(name, None)
-    worth = _worth(results)
-    as_good = [floor.title for key, floor in _floors(results) if worth.get(key, -inf) >= worth[name]]
-    opening = "Deploy"
-    if chosen and chosen.predicted == 0:
-        opening = "Deploy none: all are predicted to fail. The first in the ranking is"
-    elif row.role:
-        opening = "No gain over the floor: the policy to deploy is"
-    elif as_good:
-        opening = (
-            f"No gain over the floor: {' and '.join(as_good)} does as well or better. "
-            "Of the other rows, deploy"
+def verdict_of(results: Results) -> Verdict:
+    """Return which method of results to deploy, at the largest size of the dataset."""
+    percent = results.percents[-1]
+    worth = {row: found for row in results.tested() if (found := _worth(results, row))}
+    rivals = [row for row in contenders(results, percent) if row in worth]
+    if not rivals:
+        return Verdict(
+            None, 0, percent, "No method to deploy: all of them are references (floor or ceiling).", [], []
         )
-    facts = [_of_row(results, row), *references.values()]
-    remarks = [*_remarks(results, name, chosen)]
-    if chosen:
-        title, reason = named(chosen.row, chosen.seed), _why_chosen(results, chosen, percent)
-        return Verdict(name, opening, title, reason, remarks, [*_of_choice(results, chosen), *facts])
-    return Verdict(name, opening, row.title, _why_best(results, row, percent), remarks, facts)
-
-
-def best_of(results: Results, otherwise: str = "") -> str:
-    """Return the row with the best mean over seeds that is no reference; else `otherwise`."""
-    worth = _worth(results)
-    rivals = [name for name in worth if not results.methods[name].role]
-    return max(rivals, key=lambda name: worth[name], default=otherwise)
-
-
-def chosen_of(results: Results) -> Ranked | None:
-    """Return the best candidate of `select` whose row is tested and no ceiling; None without one."""
-    candidates = results.choice.candidates if results.choice else []
-    return next((one for one in candidates if not _passed_over(results, one)), None)
-
-
-def _passed_over(results: Results, one: Ranked) -> str:
-    """Return why a candidate is not the one to deploy; empty if it may be."""
-    row = results.methods.get(one.row)
-    if row is None:
-        return "has not been tested yet"
-    return f"belongs to a reference row ({row.role})" if row.role not in (None, "floor") else ""
-
-
-def _remarks(results: Results, name: str, chosen: Ranked | None) -> Iterator[str]:
-    worth, is_predicted = _worth(results), _is_predicted(results)
-    ahead = best_of(results, name)
-    row, best = results.methods[name], results.methods[ahead]
-    if chosen and results.choice:
-        candidates = results.choice.candidates
-        for one in candidates[: candidates.index(chosen)]:
-            yield f"select ranks {named(one.row, one.seed)} higher, but it {_passed_over(results, one)}."
-        level = sum((one.lower, one.predicted) == (chosen.lower, chosen.predicted) for one in candidates)
-        if level > 1:
-            yield f"{level} policies, including this one, tie in the ranking."
-        if worth[ahead] > worth[name]:
-            score = f"predicted success {worth[ahead]:.2f}" if is_predicted else _score(results, best)
-            yield f"By the mean over seeds, {best.title} is ahead: {score}."
-        if results.choice.regret and chosen is candidates[0]:
-            yield (
-                "In hindsight, another policy is better in the target by "
-                f"{results.choice.regret:.2f}, the regret of the choice."
-            )
-        for figure, why in results.choice.withheld.items():
-            yield f"Withheld for the choice: {figure.replace('_', ' ')} ({why})."
-        if results.choice.shares_episodes:
-            yield "All seeds have the same episodes, so no judge is independent of the policies it judges."
+    best = max(rivals, key=lambda row: worth[row].mean)
+    floors = [row for row in worth if method_role(row) == "floor"]
+    floor = max(floors, key=lambda row: worth[row].mean, default=None)
+    title, score = method_title(best), _text(results, worth[best])
+    lines = [("best", f"{title}: {score}")]
+    if floor:
+        note = "what no correction of the simulator reaches"
+        lines.append(("floor", f"{method_title(floor)} ({note}): {_text(results, worth[floor])}"))
+    lines.append(("interval", _difference(results, best, floor, worth)))
+    remarks = [*_limits(results, best, floor)]
+    unlearned = [row for row in _in_order(results, rivals) if not _has_learned(results, row)]
+    causes = [cause for row in unlearned for cause in _causes(results, row)]
+    is_good = _share(results, worth[best]) >= ENOUGH
+    chosen: str | None = best
+    if floor and worth[floor].mean >= worth[best].mean and _share(results, worth[floor]) >= ENOUGH:
+        chosen, text = floor, f"Deploy **{method_title(floor)}**, the floor: no method does better."
+    elif is_good and not (floor and worth[floor].mean >= worth[best].mean):
+        text = f"{'Deploy' if results.tested_in == 'target' else 'Try first'} **{title}**: {score}."
     else:
-        ties = [
-            of.title
-            for of in results.methods.values()
-            if of is not row and not of.role and _mean(results, of) == _mean(results, row)
+        chosen = None
+        why = [
+            f"{method_title(row)} did not learn its own simulator ({_learned(results, row)})"
+            for row in unlearned
         ]
-        if ties:
-            yield f"Equal by the mean: {', '.join(ties)}."
-    for key, floor in _floors(results):
-        if floor is row:
-            continue
-        if not is_predicted:
-            yield from _against(results, row, floor)
-        elif key in worth:
-            yield f"Predicted success of {floor.title}: {worth[key]:.2f}, the mean over its seeds."
-    if unjudged := [
-        of.title for key, of in results.methods.items() if of.role != "ceiling" and key not in worth
-    ]:
-        yield f"Not judged, so not compared: {', '.join(unjudged)}."
-    own = zip(row.seeds, row.simulated_success or (), strict=False) if results.headline == SUCCESS else ()
-    reached = [success for seed, success in own if not chosen or seed == chosen.seed]
-    if reached and fmean(reached) < _MOSTLY:
-        yield (
-            f"In the simulator of its training, it succeeds in {100 * fmean(reached):.0f}{_PERCENT} of the "
-            "episodes: it did not learn to do the task there."
-        )
-    failed = row.summary["failed"].mean
-    if failed >= _MOSTLY:
-        yield (
-            f"{row.title} fails in {100 * failed:.0f}{_PERCENT} of its episodes: "
-            "look at these failures before you deploy it."
-        )
+        if not why:
+            why = [f"the best method, {title}, has {score}"]
+            causes = [*_lost(results, best)]
+        text = f"**Deploy none yet**: {listed(why)}."
+    seed = _seed(results, chosen) if chosen else 0
+    return Verdict(chosen, seed, percent, text, lines, [*causes, *remarks])
 
 
-def _against(results: Results, row: MethodResults, floor: MethodResults) -> Iterator[str]:
-    """Yield a warning if the seeds do not show a difference to the floor."""
-    measure = results.headline.measure
-    ours, its = row.summary[measure], floor.summary[measure]
-    if ours.low is None or ours.high is None or its.low is None or its.high is None:
-        yield (
-            f"With one seed, there is no interval for the difference between {row.title} and {floor.title}: "
-            "another seed may give a different result."
-        )
-    elif ours.low <= its.high and its.low <= ours.high:
-        yield (
-            f"The {_SURE} intervals of {row.title} and {floor.title} overlap: these seeds do not show "
-            "that they differ."
-        )
-    elif (seeds := min(len(row.seeds), len(floor.seeds))) < _ENOUGH_SEEDS:
-        yield (
-            f"{row.title} and {floor.title} are compared over only {seeds} seeds: equal rows may differ as "
-            "much by chance."
-        )
+def _worth(results: Results, row: str) -> Summary | None:
+    """Return by what methods are compared: the score in the target, else the success that judges predict."""
+    if results.tested_in == "target" or not results.judges:
+        return results.score_of(row)
+    line = [np.mean([*one.values.values()]) for one in results.lines if (one.row, one.where) == (row, JUDGED)]
+    return summarize(np.array(line), limit=1.0, trials=results.judges.episodes) if line else None
 
 
-def _floors(results: Results) -> list[tuple[str, MethodResults]]:
-    return [(name, row) for name, row in results.methods.items() if row.role == "floor"]
+def _text(results: Results, found: Summary) -> str:
+    headline = results.headline
+    is_predicted = results.tested_in != "target" and results.judges
+    what = "predicted success" if is_predicted else headline.title
+    value = interval(found.mean, found.low, found.high, 2 if is_predicted else headline.digits)
+    place = "" if is_predicted else f" {results.where}"
+    return f"{what} {value}{place} ({found.seeds} seed{'s' if found.seeds > 1 else ''})"
 
 
-def _is_predicted(results: Results) -> bool:
-    """Whether rows are compared by what judges predict: the target told nothing, and a policy was chosen."""
-    return results.tested_in != "target" and chosen_of(results) is not None
+def _share(results: Results, found: Summary) -> float:
+    """Return a score as a share of the largest possible one; 1 where there is no limit."""
+    return found.mean / results.headline.limit if results.headline.limit else 1.0
 
 
-def _worth(results: Results) -> dict[str, float]:
-    """Return by what rows are compared: the mean of the score, or of the predicted success where that is."""
-    if not _is_predicted(results) or results.choice is None:
-        return {name: _mean(results, row) for name, row in results.methods.items()}
-    predicted: dict[str, list[float]] = {}
-    for one in results.choice.candidates:
-        if one.row in results.methods:
-            predicted.setdefault(one.row, []).append(one.predicted)
-    return {name: fmean(values) for name, values in predicted.items()}
-
-
-def _mean(results: Results, row: MethodResults) -> float:
-    return row.summary[results.headline.measure].mean
-
-
-def _why_chosen(results: Results, chosen: Ranked, percent: int | None) -> str:
-    predicted = _with_interval(chosen.predicted, chosen.low, chosen.high)
-    text = f". Its success, predicted without the target, is {predicted}"
-    if chosen.target is None:
-        text += "; it was not measured in the target"
-    else:
-        measured = _with_interval(chosen.target, *_ends(results, chosen.target))
-        text += f"; measured in the target, it is {measured} over {results.episodes} episodes"
-    count = len(results.choice.candidates) if results.choice else 0
-    return f"{text}. The select stage chose it from {count} policies{_trained(results, percent)}."
-
-
-def _why_best(results: Results, row: MethodResults, percent: int | None) -> str:
-    seeds = "best mean over seeds" if len(results.seeds) > 1 else "best result"
-    return (
-        f": {_score(results, row)}. This row has the {seeds}{_trained(results, percent)}; "
-        "the select stage chose no policy."
+def _difference(results: Results, best: str, floor: str | None, worth: dict[str, Summary]) -> str:
+    if floor is None:
+        return "no floor to compare with: add `direct_transfer` to `methods`"
+    found = results.difference(best, floor)
+    if found is None:
+        return f"{method_title(best)} and {method_title(floor)} share no seed"
+    digits = results.headline.digits
+    value = interval(found.value, found.low, found.high, digits)
+    text = f"{method_title(best)} less {method_title(floor)}: {value}"
+    if found.low is None or found.high is None:
+        return f"{text}, of too few seeds for an interval: run {LEAST_SEEDS} or more"
+    return f"{text}, 95 %" + (
+        ": these seeds do not show a difference" if found.low <= 0 <= found.high else ""
     )
 
 
-def _trained(results: Results, percent: int | None) -> str:
-    """Return on how much data the policies were trained; empty if the results do not tell."""
-    share = "" if percent is None else f"{percent}{_PERCENT} of "
-    if source := results.settings.get("data"):
-        return f", trained on {share}the episodes of {source}"
-    collect = results.settings.get("collect")
-    if not isinstance(collect, dict) or not collect.get("episodes"):
-        return ""
-    steps, seeds = collect.get("least_steps"), len(results.seeds)
-    amount = f"{steps:,} steps" if isinstance(steps, int) else f"{collect['episodes']} episodes"
-    return f", trained on {share}{amount} of data{f' for each of {seeds} seeds' if seeds > 1 else ''}"
+def _in_order(results: Results, rows: list[str]) -> list[str]:
+    """Return the methods that the results compare with the others first."""
+    return sorted(rows, key=lambda row: row not in results.compare)
 
 
-def _with_interval(share: float, low: float | None, high: float | None) -> str:
-    ends = "interval withheld" if low is None else f"{_SURE} interval {low:.2f} to {high:.2f}"
-    return f"{share:.2f} ({ends})"
+def _has_learned(results: Results, row: str) -> bool:
+    found = results.score_of(row, SIMULATED)
+    return found is None or _share(results, found) >= ENOUGH
 
 
-def _seeds(row: MethodResults) -> str:
-    return "one seed" if len(row.seeds) == 1 else f"{len(row.seeds)} seeds"
+def _learned(results: Results, row: str) -> str:
+    found = results.score_of(row, SIMULATED)
+    return results.headline.text(found.mean) if found else "-"
 
 
-def _score(results: Results, row: MethodResults) -> str:
-    score = results.headline
-    summary = row.summary[score.measure]
-    middle = ""
-    if summary.low is not None and summary.high is not None:
-        ends = f"{_SURE} interval {score.text(summary.low)} to {score.text(summary.high)}"
-        middle = f"; interquartile mean {score.text(summary.iqm)}, {ends}"
-    tested = f"{_seeds(row)} with {results.episodes} episodes{' each' if len(row.seeds) > 1 else ''}"
-    return f"{score.title} {spread(summary, score.digits)} {where(results)} ({tested}{middle})"
+def _causes(results: Results, row: str) -> Iterator[str]:
+    """Yield why a method did not learn its own simulator, and what helps."""
+    title, grounding = method_title(row), grounded_as(row)
+    names = {"r2_reward": "of steps that go on", "r2_final_reward": "of failures"}
+    found = {name: results.summary(grounding, name, "ground") for name in names}
+    poor = {name: one.mean for name, one in found.items() if one and one.mean < EXPLAINED}
+    if poor:
+        values = listed([f"{value:.2f} {names[name]}" for name, value in poor.items()])
+        yield (
+            f"{title}: its rewards are predicted poorly on held-out episodes (R² {values}; 1 is perfect, 0 "
+            "is no better than the mean). Record more episodes, above all such as succeed and fail "
+            "(`episodes` of `[collect]`, or more logs)."
+        )
+        return
+    yield (
+        f"{title}: train it longer (`total_steps` of `[train]`), or look at its learning curve below for a "
+        "training that collapsed."
+    )
 
 
-def _ends(results: Results, share: float) -> tuple[float, float]:
-    """Return the 95 % interval of a policy's success over its episodes."""
-    return share_interval(round(share * results.episodes), results.episodes)
+def _lost(results: Results, row: str) -> Iterator[str]:
+    """Yield why what a method learned does not hold in the target, and what helps."""
+    title, grounding = method_title(row), grounded_as(row)
+    learned = results.score_of(row, SIMULATED)
+    if learned:
+        score = _learned(results, row)
+        yield f"{title} learned the simulator of its training ({score}), and loses it {results.where}."
+    errors = results.mean_errors()
+    worse = []
+    if grounding in errors.index.get_level_values("row"):
+        of = errors.loc[grounding, "mean"].unstack("simulator")
+        horizon = judged_horizon(of.index.get_level_values("horizon"))
+        at = of.xs(horizon, level="horizon")
+        worse = [f"`{quantity}`" for quantity in at.index if at["grounded"][quantity] >= at["raw"][quantity]]
+    if worse:
+        yield (
+            f"{title}: on held-out episodes its correction is no better than none in {listed(worse)}: "
+            "record more episodes, or longer ones."
+        )
+    failed = results.summary(row, "failed")
+    if failed and failed.mean >= ENOUGH:
+        yield f"{title} fails in {100 * failed.mean:.0f} % of its episodes: look at these first."
 
 
-def _of_choice(results: Results, chosen: Ranked) -> Iterator[Fact]:
-    ends = "interval withheld" if chosen.low is None else f"{_SURE} [{chosen.low:.2f}, {chosen.high:.2f}]"
-    judges = f"{chosen.judges} judge{'s' if chosen.judges > 1 else ''}"
-    yield Fact("Predicted success", f"{chosen.predicted:.2f}", f"{ends}, by {judges}")
-    if chosen.target is None:
-        yield Fact("Measured success", "-", "not tested in the target")
-    else:
-        low, high = _ends(results, chosen.target)
-        note = f"{_SURE} [{low:.2f}, {high:.2f}], {results.episodes} episodes of this policy"
-        yield Fact("Measured success", f"{chosen.target:.2f}", note)
+def _limits(results: Results, best: str, floor: str | None) -> Iterator[str]:
+    """Yield what limits the comparison."""
+    worth = results.score_of(best)
+    if worth and worth.seeds < LEAST_SEEDS:
+        count = f"{method_title(best)} has {worth.seeds}"
+        yield f"Intervals are not shown: they need {LEAST_SEEDS} seeds, {count}."
+    choice = results.choice()
+    if choice and results.tested_in == "target" and choice.candidates[0].row != best:
+        first = choice.candidates[0]
+        yield (
+            f"Without the target, the judges (simulators that did not train a policy) choose {first.name}, "
+            f"with a predicted success of {first.predicted.value:.2f}."
+        )
+    unjudged = [row for row in contenders(results) if results.judges and not _is_judged(results, row)]
+    if unjudged and results.tested_in != "target":
+        yield f"Not judged, so not compared: {', '.join(map(method_title, unjudged))}."
 
 
-def _of_row(results: Results, row: MethodResults) -> Fact:
-    score = results.headline
-    summary = row.summary[score.measure]
-    place = "" if results.tested_in == "target" else f" {where(results)}"
-    if summary.low is None or summary.high is None:
-        note = f"{score.title}{place}, {_seeds(row)}: no interval"
-    else:
-        ends = interval(summary.iqm, summary.low, summary.high, score.digits)
-        note = f"{score.title}{place}, {_seeds(row)}; IQM {ends}"
-    label = f"{row.title} ({row.role})" if row.role else row.title
-    return Fact(label, spread(summary, score.digits), note)
+def _is_judged(results: Results, row: str) -> bool:
+    return any(line.row == row and line.where == JUDGED for line in results.lines)
+
+
+def _seed(results: Results, row: str) -> int:
+    """Return the seed whose policy to deploy: the one that judges prefer, else the best one."""
+    choice = results.choice()
+    if (
+        choice
+        and (preferred := next((one.seed for one in choice.candidates if one.row == row), None)) is not None
+    ):
+        return preferred
+    scores = results.values(row, results.headline.measure)
+    return max(scores, key=lambda seed: scores[seed])

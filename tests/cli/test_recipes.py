@@ -51,8 +51,8 @@ def test_a_run_ends_with_the_pages_to_look_at(
     for page in (tmp_path / "report/results.html", others[0]):
         page.touch()
     show_made(tmp_path, until, *others)
-    listed = ", ".join(str(tmp_path / page) for page in looked_at)
-    assert capsys.readouterr().out == f"{shown}finished: {tmp_path} (see {listed})\n"
+    listed = "".join(f"{tmp_path / page}\n" for page in looked_at)
+    assert capsys.readouterr().out == f"{shown}finished: {tmp_path}\n{listed}"
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_a_run_ends_with_the_pages_to_look_at(
         ("train", {"methods", "seeds", "jobs", "device"}),
         ("align", {"methods", "seeds", "jobs", "device"}),
         ("evaluate", {"methods", "seeds", "jobs"}),
-        ("report", {"seeds", "publish", "add"}),
+        ("report", {"seeds", "publish"}),
         ("pair", {"seeds", "jobs"}),
         ("subset", {"seeds", "jobs"}),
     ],
@@ -84,12 +84,11 @@ def test_a_command_passes_its_options_to_its_stage(
         "jobs": (["--jobs", "3"], 3),
         "device": (["--device", "cuda:1"], "cuda:1"),
         "publish": (["--publish"], True),
-        "add": (["--add"], True),
     }
     given = [word for name in sorted(takes) for word in words[name][0]]
     result = CliRunner().invoke(cli.app, [stage, str(recipe), "--root", str(tmp_path), *given])
-    assert result.output == f"finished: {tmp_path / 'made'}\n"
-    defaults = {"methods": (), "seeds": (), "jobs": None, "device": "cpu", "publish": False, "add": False}
+    assert result.output == f"finished: {tmp_path if stage == 'report' else tmp_path / 'made'}\n"
+    defaults = {"methods": (), "seeds": (), "jobs": None, "device": "cpu", "publish": False}
     expected = defaults | {name: words[name][1] for name in takes} | {"root": tmp_path}
     assert asked == [(recipe, stage, expected)]
 

@@ -30,7 +30,7 @@ def asked_of(recipe: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> di
     monkeypatch.setattr("astra_data.experiments.sweep.sweep", sweep)
     result = CliRunner().invoke(cli.app, ["sweep", str(recipe), *options])
     folder = recipe.parent / "r"
-    assert result.output == f"finished: {folder} (see {folder / 'sweep.csv'})\n"
+    assert result.output == f"finished: {folder}\n{folder / 'sweep.csv'}\n"
     return asked[0]
 
 
@@ -38,17 +38,17 @@ def test_all_is_made_by_processes_here_unless_told_otherwise(
     recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert asked_of(recipe, monkeypatch) == {
-        **{"methods": (), "seeds": (), "percents": (), "unpublished": False, "root": Path("runs")},
+        **{"methods": (), "seeds": (), "percents": (), "root": Path("runs")},
         **{"jobs": None, "device": "cpu", "cluster": None, "trackio": None, "until": None},
     }
 
 
 def test_options_choose_points_and_where_they_are_made(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    points = ["--method", "nas", "--seed", "1", "--seed", "0", "--percent", "50", "--unpublished"]
+    points = ["--method", "nas", "--seed", "1", "--seed", "0", "--percent", "50"]
     others = ["--jobs", "3", "--device", "cuda", "--root", "elsewhere", "--trackio", "ants"]
     others += ["--until", "ground"]
     assert asked_of(recipe, monkeypatch, *points, *others) == {
-        **{"methods": ["nas"], "seeds": [1, 0], "percents": [50], "unpublished": True},
+        **{"methods": ["nas"], "seeds": [1, 0], "percents": [50]},
         **{
             "root": Path("elsewhere"),
             "jobs": 3,

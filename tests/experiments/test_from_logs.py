@@ -46,8 +46,6 @@ batch_windows = 4
 window = 5
 [evaluate]
 episodes = 3
-[report]
-bootstrap_replicates = 100
 """
 
 

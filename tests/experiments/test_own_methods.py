@@ -1,15 +1,16 @@
 """Methods of one's own, as recipes name them."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
+from fake_runs import bare_results
 
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.experiments import run
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.own_methods import OwnMethod, add_all, looked_up, with_offered
 from astra_data.methods import METHODS
+from astra_data.reports.results import results_json
 
 EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"
 pytestmark = pytest.mark.usefixtures("forgotten_methods")
@@ -119,20 +120,24 @@ def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_r
     recipe = tmp_path / "own.toml"
     recipe.write_text(OWN.format(place=DELTA, memory=32))
     settings = load_experiment(recipe, tmp_path).recipe.settings
-    place = "astra_data.experiments.experiment"
-    monkeypatch.setattr(f"{place}.read_published", lambda path: path)
-    monkeypatch.setattr(f"{place}.points_of", lambda published: [])
-    found = SimpleNamespace(settings=settings, methods=["delta"])
-    monkeypatch.setattr(f"{place}.by_size", lambda published: {None: found})
-    assert load_experiment(recipe, tmp_path).published() == set()
+
+    def published(**changes: object) -> None:
+        row = "nas" if changes.pop("other", None) else "delta"
+        (tmp_path / "results").mkdir(exist_ok=True)
+        found = bare_results("own", {row: [0]}, settings | changes)
+        (tmp_path / "results/own.json").write_text(results_json(found))
+
+    published()
+    assert len(load_experiment(recipe, tmp_path).published()) == 1
     recipe.write_text(OWN.format(place=DELTA, memory=8))
-    with pytest.raises(RecipeError, match=r"^own_methods\.delta changed in .* since its results"):
+    with pytest.raises(RecipeError, match=r"^own_methods\.delta changed in .* since the results"):
         load_experiment(recipe, tmp_path).published()
-    found.settings = settings | {"own_methods": {"delta": {"method": DELTA, "no_setting": 3}}}
+    other = {"own_methods": {"delta": {"method": DELTA, "no_setting": 3}}}
+    published(**other)
     with pytest.raises(RecipeError, match=r"^own_methods\.delta changed"):
         load_experiment(recipe, tmp_path).published()
-    found.methods = ["nas"]
-    assert load_experiment(recipe, tmp_path).published() == set()
+    published(other=True, **other)
+    assert len(load_experiment(recipe, tmp_path).published()) == 1
 
 
 @pytest.mark.parametrize("row", ["delta", "delta_plus", "astra"])

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_runs import bare_results, write_json
+from fake_runs import bare_results
 from fake_stages import asked
 
 from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.run import check, make, run, run_stage
+from astra_data.reports.results import results_json
 from astra_data.worlds.task import Task
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
@@ -255,23 +256,17 @@ def test_a_report_is_published_beside_the_recipe_and_added_to_what_is_there(
     results = tmp_path / "results"
     run_stage(recipe, "report", root=tmp_path, jobs=1, publish=True)
     told = asked(tmp_path / "r/report")
-    assert (told["publish"], told["add_to"]) == (str(results), None)
-    with pytest.raises(BadInputError, match=r"expected published results in .*, found none"):
-        run_stage(recipe, "report", root=tmp_path, add=True)
+    assert (told["publish"], told["published"]) == (str(results), [])
     settings = load_experiment(recipe, tmp_path).recipe.settings
-    write_json(
-        results / "r.json", bare_results("r", {"astra": [0]}, settings).model_dump(mode="json", by_alias=True)
-    )
-    run_stage(recipe, "report", root=tmp_path, jobs=1, add=True)
-    told = asked(tmp_path / "r/report")
-    assert (told["publish"], told["add_to"]) == (None, str(results / "r.json"))
-    with pytest.raises(
-        BadInputError, match="--add keeps the published results of all seeds: leave out --seed"
-    ):
-        run_stage(recipe, "report", root=tmp_path, add=True, seeds=[1])
+    results.mkdir(exist_ok=True)
+    (results / "r.json").write_text(results_json(bare_results("r", {"astra": [0]}, settings)))
+    run_stage(recipe, "report", root=tmp_path, jobs=1, publish=True)
+    assert asked(tmp_path / "r/report")["published"] == [str(results / "r.json")]
+    run_stage(recipe, "report", root=tmp_path, jobs=1)
+    assert (told := asked(tmp_path / "r/report"))["publish"] is None and told["published"] == []
     recipe.write_text(recipe.read_text() + "[evaluate]\nsteps = 7\n")
-    with pytest.raises(RecipeError, match=r"^evaluate changed in .* since its results in"):
-        run_stage(recipe, "report", root=tmp_path, add=True)
+    with pytest.raises(RecipeError, match=r"^evaluate changed in .* since the results in .*r.json were made"):
+        run_stage(recipe, "report", root=tmp_path, publish=True)
 
 
 def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, tmp_path: Path) -> None:

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fake_runs import bare_results, write_json
+from fake_runs import bare_results
 
 from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
 from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.points import RunPoint, Selection
+from astra_data.experiments.points import Selection
 from astra_data.experiments.sweep import sweep
-from astra_data.reports.sizes import SizesResults
+from astra_data.reports.results import results_json
 
 pytestmark = pytest.mark.usefixtures("fake_recipe")
 
@@ -118,62 +118,39 @@ def test_points_outlive_what_they_were_made_of(recipe: Path, tmp_path: Path) -> 
     assert float(times["follower"]) > 0
 
 
-def publish(recipe: Path, points: dict[int, dict[str, list[int]]]) -> Path:
-    """Write results of some seeds of rows, by size; return their file."""
+def publish(recipe: Path, rows: dict[str, list[int]]) -> Path:
+    """Write results of some seeds of rows; return their file."""
     settings = load_experiment(recipe, recipe.parent).recipe.settings
-    sizes = [
-        {"percent": percent, "results": bare_results("r", rows, settings)} for percent, rows in points.items()
-    ]
     path = recipe.parent / "results" / "r.json"
-    whole = {"recipe": "r", "task": "maze", "command": "", "sizes": sizes}
-    write_json(path, SizesResults.model_validate(whole).model_dump(mode="json", by_alias=True))
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(results_json(bare_results("r", rows, settings)))
     return path
 
 
-def test_only_points_that_are_not_published_are_made(recipe: Path, tmp_path: Path) -> None:
-    publish(recipe, {50: {"nas": [0, 1], "astra": [0]}, 150: {"nas": [1], "follower": [0, 1]}})
-    folder = sweep(recipe, methods=["nas", "follower"], unpublished=True, root=tmp_path, jobs=2)
-    made = [tuple(line[key] for key in ("method", "percent", "seed")) for line in lines(folder)]
-    assert made == [("nas", "150", "0"), ("follower", "50", "0"), ("follower", "50", "1")]
-    # Only what they need: of seed 1 no policy, hence no grounding but for the simulators of the follower.
-    keys = set(attempts(folder))
-    assert {key for key in keys if key.startswith("train")} == {"train/nas/percent_150/seed_0"}
-    assert not {key for key in keys if key.startswith("align")}
-    publish(recipe, {50: {"nas": [0, 1]}, 150: {"nas": [0, 1]}})
-    with pytest.raises(BadInputError, match="all of these points are published"):
-        sweep(recipe, methods=["nas"], unpublished=True, root=tmp_path)
-
-
-def test_points_published_with_other_settings_do_not_count(recipe: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"expected published results in .*r.json, found none"):
-        sweep(recipe, unpublished=True, root=tmp_path)
-    publish(recipe, {50: {"nas": [0]}})
-    recipe.write_text(recipe.read_text() + "[report]\nsteps = 7\n[train]\nsteps = 7\n")
-    with pytest.raises(RecipeError, match=r"^train changed in .*r.toml since its results in"):
-        sweep(recipe, unpublished=True, root=tmp_path)
-    assert not (tmp_path / "r").exists()
-
-
-def test_settings_of_rows_that_are_not_published_may_change(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text(recipe.read_text().replace('"astra"', '"full_obs"'))
-    publish(recipe, {50: {"nas": [0, 1], "follower": [0, 1]}, 150: {"nas": [0, 1], "follower": [0, 1]}})
-    recipe.write_text(recipe.read_text() + "[target]\nnum_envs = 7\n")
-    folder = sweep(recipe, seeds=[0], unpublished=True, root=tmp_path, jobs=2)
-    assert {line["method"] for line in lines(folder)} == {"full_obs"}
-    publish(recipe, {50: {"full_obs": [0]}})
-    recipe.write_text(recipe.read_text().replace("num_envs = 7", "num_envs = 8"))
-    with pytest.raises(RecipeError, match=r"^target changed in .*r.toml since its results in"):
-        load_experiment(recipe, tmp_path).published()
-
-
-def test_plus_settings_may_change_until_such_rows_are_published(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text(recipe.read_text().replace('"astra"', '"astra", "astra_plus"') + "[plus]\nsteps = 7\n")
-    publish(recipe, {50: {"astra": [0]}})
-    recipe.write_text(recipe.read_text().replace("steps = 7", "steps = 8"))
-    assert load_experiment(recipe, tmp_path).published() == {RunPoint("astra", 0, 50)}
-    publish(recipe, {50: {"astra": [0], "astra_plus": [0]}})
-    recipe.write_text(recipe.read_text().replace("steps = 8", "steps = 9"))
-    with pytest.raises(RecipeError, match=r"^plus changed in .*r.toml since its results in"):
+@pytest.mark.parametrize(
+    ("row", "table", "counts"),
+    [
+        ("nas", "[report]\nsteps = {}\n", False),
+        ("nas", "[train]\nsteps = {}\n", True),
+        ("nas", "[target]\nnum_envs = {}\n", False),
+        ("full_obs", "[target]\nnum_envs = {}\n", True),
+        ("astra", "[plus]\nsteps = {}\n", False),
+        ("astra_plus", "[plus]\nsteps = {}\n", True),
+    ],
+)
+def test_settings_of_published_rows_may_not_change(
+    recipe: Path, tmp_path: Path, row: str, table: str, counts: bool
+) -> None:
+    assert load_experiment(recipe, tmp_path).published() == []
+    rows = '"astra", "astra_plus"' if "plus" in table else '"astra", "full_obs"'
+    text = recipe.read_text().replace('"astra"', rows)
+    recipe.write_text(text + table.format(7))
+    file = publish(recipe, {row: [0]})
+    recipe.write_text(text + table.format(8))
+    if not counts:
+        assert load_experiment(recipe, tmp_path).published() == [file]
+        return
+    with pytest.raises(RecipeError, match=r"^\w+ changed in .*r.toml since the results in .*r.json"):
         load_experiment(recipe, tmp_path).published()
 
 

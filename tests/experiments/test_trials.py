@@ -19,8 +19,7 @@ from astra_data.experiments.recipe_file import recorded_settings
 from astra_data.experiments.selecting import select
 from astra_data.experiments.trained_policy import TrainedPolicy, trained_policy
 from astra_data.experiments.trials import choose_by_trials
-from astra_data.reports.halving import halve
-from astra_data.reports.trials import TrialsFile
+from astra_data.reports.trials import TrialsFile, halve
 from astra_data.training.judging import Judge
 from astra_data.training.running_policy import RunningPolicy
 

@@ -47,8 +47,6 @@ hidden_sizes = [8]
 memory_size = 4
 [evaluate]
 episodes = 3
-[report]
-bootstrap_replicates = 100
 """
 
 

@@ -12,7 +12,6 @@ from astra_data.reports.artifacts import (
     CurveFile,
     Evaluation,
     Gap,
-    check_alike,
     read_json,
     read_tensors,
     way_to_success,
@@ -100,17 +99,6 @@ def test_tensors_are_checked_and_become_float64(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-8])
     with pytest.raises(BadInputError, match="not a complete safetensors file"):
         read_tensors(path, ("goal",))
-
-
-def test_rows_must_be_evaluated_alike(path: Path) -> None:
-    file = read_json(Evaluation, path)
-    assert check_alike({"astra": {1: file, 2: file}}, "antmaze-u") == 4
-    others: tuple[dict[str, object], ...] = {"task": "antmaze-long"}, {"leg_scale": 1.25}, {"episodes": 9}
-    rows = {"astra": {1: file}, "nas": {seed: file.model_copy(update=one) for seed, one in enumerate(others)}}
-    with pytest.raises(BadInputError) as error:
-        check_alike(rows, "antmaze-u")
-    for fault in ("seed 1 on antmaze-long", "legs 1.25 times as long", "with 9 episodes"):
-        assert fault in str(error.value)
 
 
 def test_the_way_is_that_of_the_robot_in_episodes_that_succeed(path: Path) -> None:

@@ -2,13 +2,11 @@ import json
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
 import pytest
-from scipy.stats import t
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.choice import Candidate, Judged, choice_of, read_judged
-from astra_data.reports.schema import Choice
+from astra_data.reports.choice import Candidate, Choice, Judged, choice_of, read_judged
+from astra_data.reports.statistics import mean_interval
 
 Line = tuple[str, int, float, float | None]
 
@@ -23,7 +21,7 @@ def judged(*lines: Line, judges: int = 1) -> Judged:
 
 def choice(*lines: Line, judges: int = 1) -> Choice:
     measured = {(row, seed): target for row, seed, _, target in lines if target is not None}
-    found = choice_of(judged(*lines, judges=judges), None, measured=measured, replicates=200)
+    found = choice_of(judged(*lines, judges=judges), None, measured=measured)
     assert found is not None
     return found
 
@@ -42,26 +40,19 @@ def test_the_lower_quartile_is_what_counts_then_the_mean() -> None:
     assert found.ranked() == [steady, liked_by_one, level]
 
 
-def test_an_interval_takes_judges_as_the_sampling_unit() -> None:
-    success = [0.5, 0.6, 0.4, 0.5]
-    one = Candidate(row="a", seed=0, success=dict(enumerate(success)))
-    low, high = t.interval(0.95, 3, loc=0.5, scale=np.std(success, ddof=1) / 2)
-    assert one.interval == pytest.approx((low, high))
-    assert Candidate(row="a", seed=0, success={1: 0.1, 2: 0.9, 3: 0.5}).interval == (0.0, 1.0)
-    assert Candidate(row="a", seed=0, success={1: 0.1, 2: 0.9}).interval is None
-    assert choice(*A, judges=2).withheld["interval"] == "fewer than 3 judges"
-    assert "interval" not in choice(*A, judges=3).withheld
-
-
-def test_an_interval_that_a_single_policy_lacks_is_withheld() -> None:
+def test_an_interval_takes_judges_as_the_sampling_unit_and_needs_three() -> None:
+    success = {1: 0.1, 2: 0.9, 3: 0.5}
     candidates = [
-        Candidate(row="a", seed=seed, success=dict.fromkeys(range(judges), 0.5))
-        for seed, judges in ((0, 3), (1, 2))
+        Candidate(row="a", seed=0, success=success),
+        Candidate(row="a", seed=1, success={judge: success[judge] for judge in (1, 2)}),
     ]
-    of = Judged(judge="nas", episodes=5, candidates=candidates)
-    found = choice_of(of, None, measured={}, replicates=100)
-    assert found is not None and [one.low is None for one in found.candidates] == [False, True]
-    assert found.withheld["interval"] == "fewer than 3 judges"
+    found = choice_of(Judged(judge="nas", episodes=100, candidates=candidates), None, measured={})
+    assert found is not None
+    three, two = sorted(found.candidates, key=lambda one: one.seed)
+    assert (three.predicted.low, three.predicted.high) == mean_interval(
+        [0.1, 0.9, 0.5], limit=1.0, trials=100
+    )
+    assert (two.predicted.low, two.predicted.high) == (None, None)
 
 
 def test_a_choice_is_worth_its_rank_correlation_and_its_regret() -> None:
@@ -76,44 +67,36 @@ def test_a_choice_is_worth_its_rank_correlation_and_its_regret() -> None:
 
 def test_predictions_are_compared_row_by_row() -> None:
     found = choice(("a", 0, 0.9, 0.7), ("a", 1, 0.1, 0.2), ("b", 0, 0.5, 0.9)).calibration
-    assert (found["a"].seeds, found["a"].signed, found["a"].absolute) == pytest.approx((2, 0.05, 0.15))
-    assert found["b"].signed == pytest.approx(-0.4) and found["b"].absolute == pytest.approx(0.4)
+    assert found["a"] == pytest.approx((2, 0.05, 0.15))
+    assert found["b"] == pytest.approx((1, -0.4, 0.4))
 
 
 def test_the_mean_over_judges_is_what_is_compared() -> None:
     one = Candidate(row="a", seed=0, success={1: 0.0, 2: 1.0})
     of = Judged(judge="nas", episodes=5, candidates=[one])
-    found = choice_of(of, None, measured={("a", 0): 0.5}, replicates=100)
-    assert found is not None and found.calibration["a"].signed == 0.0 and found.candidates[0].lower == 0.25
+    found = choice_of(of, None, measured={("a", 0): 0.5})
+    assert found is not None and found.calibration["a"] == (1, 0.0, 0.0) and found.candidates[0].lower == 0.25
 
 
-def test_what_cannot_be_known_is_withheld_with_the_reason() -> None:
+def test_what_cannot_be_known_is_missing_with_the_reason() -> None:
     untested = choice(("a", 0, 0.9, None))
     assert untested.regret is None and untested.calibration == {}
-    assert untested.withheld.keys() == {"interval"}
+    assert untested.missing == {}
     few = choice(*A[:2], B[0])
     assert few.rank_correlation is None
-    assert few.withheld["rank_correlation"] == "no row has 3 tested seeds"
+    assert few.missing["rank_correlation"] == "no method has 3 tested seeds"
     level = choice(("a", 0, 0.9, 0.3), ("a", 1, 0.9, 0.2), ("a", 2, 0.9, 0.1))
-    assert level.withheld["rank_correlation"] == "in no row do both sides vary"
+    assert level.missing["rank_correlation"] == "in no method do both sides vary"
     first = choice(("a", 0, 0.9, None), ("a", 1, 0.8, 0.2))
     assert first.regret is None and first.random_regret == 0.0
-    assert first.withheld["regret"] == "the chosen policy was not tested in the target"
-    assert choice(*A).withheld.keys() == {"interval"}
+    assert first.missing["regret"] == "the chosen policy was not tested in the target"
+    assert choice(*A).missing == {}
 
 
 def test_the_target_has_no_say_in_the_ranking() -> None:
     reversed_there: list[Line] = [(row, seed, lower, 1 - lower) for row, seed, lower, _ in A + B]
     orders = [[(one.row, one.seed) for one in choice(*lines).candidates] for lines in (A + B, reversed_there)]
     assert orders[0] == orders[1] == [(row, seed) for row, seed, *_ in A + B]
-
-
-def test_candidates_are_those_of_rows_and_seeds_and_of_a_size() -> None:
-    of = judged(*A, *B)
-    found = choice_of(of, None, measured={}, rows=("b",), seeds=(1, 2), replicates=100)
-    assert found is not None and [(one.row, one.seed) for one in found.candidates] == [("b", 1), ("b", 2)]
-    assert choice_of(of, None, measured={}, rows=("c",), replicates=100) is None
-    assert choice_of(of, 50, measured={}, replicates=100) is None
 
 
 def test_what_the_stage_wrote_is_read(tmp_path: Path) -> None:
@@ -134,7 +117,7 @@ def test_level_quartiles_are_told_apart_by_the_mean() -> None:
     ]
     of = Judged(judge="nas", episodes=5, candidates=candidates)
     measured = {("a", seed): 0.1 * seed for seed in range(3)}
-    found = choice_of(of, None, measured=measured, replicates=50)
+    found = choice_of(of, None, measured=measured)
     assert found is not None and found.rank_correlation is not None
     assert found.rank_correlation.value == pytest.approx(1.0)
 
@@ -142,4 +125,4 @@ def test_level_quartiles_are_told_apart_by_the_mean() -> None:
 def test_a_row_with_enough_seeds_that_does_not_vary_is_not_said_to_have_too_few() -> None:
     level: list[Line] = [("a", seed, 0.9, 0.1 * seed) for seed in range(3)]
     found = choice(*level, ("b", 0, 0.5, 0.2))
-    assert found.withheld["rank_correlation"] == "in no row do both sides vary"
+    assert found.missing["rank_correlation"] == "in no method do both sides vary"

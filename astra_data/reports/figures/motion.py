@@ -1,7 +1,6 @@
-"""Where policies go: trajectories in the maze, and identical commands in simulator and target."""
+"""Where policies go: trajectories in the maze, pictures, and identical commands in simulator and target."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +10,21 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from astra_data.core.arrays import Bools, Floats
-from astra_data.reports.figures.style import DEPLOYED, FAINT, INK, SIMULATED, WALL, method_title, style
+from astra_data.core.errors import BadInputError
+from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
+from astra_data.reports.command_replay import CommandReplay, can_replay, replay_commands
+from astra_data.reports.figures.scene import Scene
+from astra_data.reports.figures.style import (
+    DEPLOYED,
+    FAINT,
+    INK,
+    SIMULATED,
+    WALL,
+    method_color,
+    method_title,
+    style,
+)
+from astra_data.reports.results import Results
 from astra_data.worlds.plane.mazes import Maze
 
 COLUMNS = 4
@@ -25,56 +38,40 @@ TITLE_POINTS = 10.0
 
 TITLE_LETTERS = 17
 
+TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
+"""Times at which pictures of an episode are taken, in addition to the time limit."""
+
+PICTURE_INCHES = 0.95
+"""Width of such a picture."""
+
 RIM = 0.35
 """Visible width of the outer walls, in cells."""
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One row's episodes; positions in m of the robot, and of its ball if it has one; NaN after the end.
-
-    Attributes:
-        method: name of the row.
-        success: the row's success rate in the target, over all its episodes.
-        target: positions in the target, (N, T, 2) or (N, T, 4).
-        target_success: which of them reached the goal, (N,).
-        simulated: positions in the simulator that the policy was trained in, likewise (M, ...); M may be 0.
-        simulated_success: which of them reached the goal, (M,).
-        goal: goals of the episodes in the target, (N, 2).
-    """
-
-    method: str
-    success: float
-    target: Floats
-    target_success: Bools
-    simulated: Floats
-    simulated_success: Bools
-    goal: Floats
-
-
-def trajectories(maze: Maze, panels: Sequence[Panel], tested: str = "in the target") -> Figure:
-    """Draw one maze per row: dashed in the simulator, solid where tested; failures end with a cross."""
-    columns = min(len(panels), COLUMNS)
-    rows = -(-len(panels) // columns)
+def trajectories(results: Results, scene: Scene) -> Figure | None:
+    """Draw one maze per method: dashed in the simulator, solid where tested; failures end with a cross."""
+    folders = scene.folders(results)
+    if scene.task.plane is None or not folders:
+        return None
+    maze = scene.task.maze
+    columns = min(len(folders), COLUMNS)
+    rows = -(-len(folders) // columns)
     across, up = (float(np.ptp(ends)) for ends in _view(maze))
     with style():
         height = (PANEL_INCHES * up / across + 0.3) * rows + 0.35
         figure = Figure(figsize=(max(4.2, PANEL_INCHES * columns), height), layout="constrained")
-        for place, panel in enumerate(panels):
+        for place, (row, folder) in enumerate(folders.items()):
             axes = figure.add_subplot(rows, columns, place + 1)
-            draw_walls(axes, maze)
-            _paths(axes, panel.target, panel.target_success, DEPLOYED, "-")
-            _paths(axes, panel.simulated, panel.simulated_success, SIMULATED, "--")
-            for x, y in _goals(maze, panel.goal):
-                axes.plot(x, y, "*", ms=13, mfc="#FFD23F", mec=INK, mew=0.8, zorder=6)
-            title = method_title(panel.method)
+            _maze_panel(axes, maze, folder, scene.episodes)
+            title = method_title(row)
             # The number has to find room beside it.
             size = TITLE_POINTS * min(1.0, TITLE_LETTERS / len(title))
             axes.set_title(title, loc="left", fontsize=size)
-            axes.set_title(f"{panel.success:.2f}", loc="right", fontweight="normal")
+            success = results.summary(row, "success")
+            axes.set_title(f"{success.mean:.2f}" if success else "", loc="right", fontweight="normal")
         handles = [
             Line2D([], [], color=SIMULATED, ls="--", label="in its simulator"),
-            Line2D([], [], color=DEPLOYED, label=tested),
+            Line2D([], [], color=DEPLOYED, label=results.where),
             Line2D([], [], color=INK, marker="x", ls="", mew=1.8, label="failed here"),
             Line2D([], [], marker="*", ls="", ms=11, mfc="#FFD23F", mec=INK, mew=0.8, label="goal"),
         ]
@@ -83,15 +80,66 @@ def trajectories(maze: Maze, panels: Sequence[Panel], tested: str = "in the targ
         return figure
 
 
-def dynamics_mismatch(time_s: Floats, command: Floats, simulated: Floats, target: Floats) -> Figure:
-    """Draw what the same commands do in the simulator and in the target, over time.
+def _maze_panel(axes: Axes, maze: Maze, folder: Path, episodes: int) -> None:
+    """Draw the first episodes of an evaluation; in m, of the robot and of a ball."""
+    evaluation = read_json(Evaluation, folder / EVALUATION)
+    tested = f"{evaluation.tested_in}.position"
+    tensors = read_tensors(folder / TRAJECTORIES, (tested, "goal"))
+    draw_walls(axes, maze)
+    success = np.array(evaluation.outcomes.success[:episodes], dtype=bool)
+    _paths(axes, tensors[tested][:episodes], success, DEPLOYED, "-")
+    if evaluation.simulated is not None and "simulated.position" in tensors:
+        success = np.array(evaluation.simulated.success[:episodes], dtype=bool)
+        _paths(axes, tensors["simulated.position"][: len(success)], success, SIMULATED, "--")
+    for x, y in _goals(maze, tensors["goal"][:episodes]):
+        axes.plot(x, y, "*", ms=13, mfc="#FFD23F", mec=INK, mew=0.8, zorder=6)
 
-    Args:
-        time_s: at the end of each step, (T,).
-        command: the velocities commanded, ±1 per axis, (T, 2).
-        simulated: x, y, vx, vy in m and m/s, (T, 4).
-        target: the same for each repetition in the target, (N, T, 4); NaN after an episode's end.
-    """
+
+def strips(results: Results, scene: Scene) -> Figure | None:
+    """Draw the first episode of each method in pictures at the same times; None if nothing can render."""
+    task, folders = scene.task, scene.folders(results)
+    if task.photograph is None or not folders:
+        return None
+    longest_s = task.objective.horizon * task.timestep_s
+    times_s = [time_s for time_s in TIMES_S if time_s < longest_s] + [longest_s]
+    found = {}
+    for row, folder in folders.items():
+        states = read_tensors(folder / TRAJECTORIES, ("target.state",))["target.state"]
+        moments = [round(time_s / task.timestep_s) for time_s in times_s]
+        try:
+            pictures = task.photograph(states[[moment for moment in moments if moment < len(states)]])
+        except BadInputError:
+            return None
+        failed = bool(read_json(Evaluation, folder / EVALUATION).outcomes.failed[0])
+        ended_s = (len(states) - 1) * task.timestep_s
+        found[row] = (pictures, f"fell after {ended_s:.1f} s" if failed else f"{ended_s:.0f} s")
+    height, width = next(iter(found.values()))[0].shape[1:3]
+    with style():
+        size = (1.7 + PICTURE_INCHES * len(times_s), 0.3 + PICTURE_INCHES * height / width * len(found))
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(len(found), len(times_s), squeeze=False)
+        for line, (row, (pictures, ended)) in zip(grid, found.items(), strict=True):
+            for axes in line:
+                axes.set_axis_off()
+            for axes, picture in zip(line, pictures, strict=False):
+                axes.imshow(picture)
+            place = {"transform": line[0].transAxes, "ha": "right"}
+            name = method_title(row).replace(" + ", " +\n").replace(", ", ",\n")
+            line[0].text(-0.08, 0.55, name, va="bottom", weight="bold", color=method_color(row), **place)
+            line[0].text(-0.08, 0.5, ended, va="top", color=FAINT, size=8, **place)
+        for axes, time_s in zip(grid[0], times_s, strict=True):
+            axes.set_title(f"{time_s:g} s", size=8, weight="normal")
+        return figure
+
+
+def mismatch(_: Results, scene: Scene) -> Figure | None:
+    """Draw what the same commands do in the simulator and in the target, over time (the paper's Fig. 1)."""
+    return dynamics_mismatch(replay_commands(scene.task)) if can_replay(scene.task) else None
+
+
+def dynamics_mismatch(replay: CommandReplay) -> Figure:
+    """Draw a replay of the same commands."""
+    time_s, command, simulated, target = replay.time_s, replay.command, replay.simulated, replay.target
     alive = np.isfinite(target).all(axis=-1).any(axis=0)
     with style():
         figure = Figure(figsize=(7.6, 4.3), layout="constrained")

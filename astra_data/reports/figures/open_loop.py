@@ -1,8 +1,5 @@
 """How fast a simulator drifts from the target under the target's own actions."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,50 +7,38 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
+from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import INK, method_color, method_title, style
+from astra_data.reports.results import Results
 
 SAME = 0.01
 """Ungrounded simulators whose errors differ by less than this share are drawn once."""
 
 
-@dataclass(frozen=True)
-class OpenLoop:
-    """One row's open-loop error.
-
-    Attributes:
-        horizons: steps ahead, (K,).
-        grounded: mean, low, high for each quantity after grounding, (3, K).
-        raw: mean, low, high for each quantity before grounding, (3, K).
-    """
-
-    horizons: Floats
-    grounded: Mapping[str, Floats]
-    raw: Mapping[str, Floats]
-
-
-def open_loop_error(gaps: Mapping[str, OpenLoop]) -> Figure:
-    """Draw the error over the horizon, one panel per quantity, on logarithmic axes.
-
-    Args:
-        gaps: one per grounding, all with the same quantities, named with their unit ("position_m").
-    """
-    quantities = list(next(iter(gaps.values())).grounded)
+def open_loop_error(results: Results, _: Scene) -> Figure | None:
+    """Draw the error over the horizon, one panel per quantity (named with its unit), on logarithmic axes."""
+    if not results.errors:
+        return None
+    means = results.mean_errors()
+    rows = [row for row in results.groundings() if (row, "grounded") in means.index]
+    quantities = list(dict.fromkeys(means.index.get_level_values("quantity")))
     with style():
         figure = Figure(figsize=(1.7 + 2.9 * len(quantities), 3.3), layout="constrained")
         grid = figure.subplots(1, len(quantities), squeeze=False)[0]
         for axes, quantity in zip(grid, quantities, strict=True):
             drawn: list[Floats] = []
-            for gap in gaps.values():
-                raw = gap.raw[quantity]
-                if not any(raw.shape == seen.shape and np.allclose(raw, seen, rtol=SAME) for seen in drawn):
-                    drawn.append(raw)
+            for row in rows:
+                raw = means.loc[(row, "raw", quantity)]
+                values = raw.to_numpy().T
+                if not any(np.allclose(values, seen, rtol=SAME, equal_nan=True) for seen in drawn):
+                    drawn.append(values)
                     label = "no grounding" if len(drawn) == 1 else None
-                    _line(axes, gap.horizons, raw, color=INK, dashes=":", label=label)
-            for method, gap in gaps.items():
-                dashes = "--" if is_plus(method) else "-"
-                color, label = method_color(method), method_title(method)
-                _line(axes, gap.horizons, gap.grounded[quantity], color=color, dashes=dashes, label=label)
-            horizons = np.unique(np.concatenate([gap.horizons for gap in gaps.values()]))
+                    _line(axes, raw.index.to_numpy(), values, color=INK, dashes=":", label=label)
+            for row in rows:
+                band = means.loc[(row, "grounded", quantity)]
+                look = {"color": method_color(row), "dashes": "--" if is_plus(row) else "-"}
+                _line(axes, band.index.to_numpy(), band.to_numpy().T, label=method_title(row), **look)
+            horizons = means.index.get_level_values("horizon").unique()
             axes.set(xscale="log", yscale="log", xlabel="horizon (steps)", ylabel=_label(quantity))
             axes.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
             axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))

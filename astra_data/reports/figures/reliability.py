@@ -8,9 +8,18 @@ from matplotlib.figure import Figure
 
 from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
+from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import FAINT, method_color, method_title, style
+from astra_data.reports.held_out import failure_rates
+from astra_data.reports.results import Results
 
 _TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
+
+
+def reliability_of(results: Results, _: Scene) -> Figure | None:
+    """Draw the `reliability` of the groundings of results; None where none predicts failures."""
+    rates = failure_rates(results)
+    return reliability(rates) if rates else None
 
 
 def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
@@ -19,7 +28,7 @@ def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
     Both rates are drawn by their square roots, as most are small.
 
     Args:
-        parts: what foresees failures → row → predicted rates, observed rates and numbers of steps, (3, bins).
+        parts: what predicts failures → row → predicted rates, observed rates and numbers of steps, (3, bins).
     """
     rows = list(dict.fromkeys(row for rates in parts.values() for row in rates))
     with style():

@@ -1,7 +1,6 @@
-"""Scores of each row: final, and during training."""
+"""Scores of each method: final, during training, and over the size of the dataset."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,89 +10,100 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from astra_data.core.arrays import Floats
-from astra_data.core.naming import base_method, is_plus
+from astra_data.core.naming import artifact_key, base_method, is_plus
+from astra_data.dataset.inspection import Map, visited
+from astra_data.dataset.reader import Dataset
+from astra_data.reports.figures.coverage import draw_visits
+from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import FAINT, INK, method_color, method_title, score_axis, style
-from astra_data.worlds.score import Score
+from astra_data.reports.results import SIMULATED, TESTED, Results, titled
 
 CURVE_POINTS = 200
 """Points at which curves of different seeds are interpolated."""
-
 PANELS_ACROSS = 4
 """Learning-curve panels side by side, at most."""
 
 
-@dataclass(frozen=True)
-class Curve:
-    """One seed's training.
+def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
+    """Return how to draw one bar per method, with a dot per seed, of the score with this measure."""
 
-    Attributes:
-        steps: simulator steps so far, (K,), increasing.
-        score: of the training episodes that ended, (K,); NaN where none ended.
+    def draw(results: Results, _: Scene) -> Figure | None:
+        score = next((score for score in results.scores if score.measure == measure), None)
+        if score is None:
+            return None
+        rows = results.tested()
+        with style():
+            figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(rows)), layout="constrained")
+            axes = figure.add_subplot()
+            labels, diamonds = [], False
+            for place, row in enumerate(rows):
+                found, own = results.summary(row, measure), results.summary(row, measure, SIMULATED)
+                # Beside the title, where no dot or diamond can stand in front of it or be taken for it.
+                labels.append(f"{titled(row)}   {score.text(found.mean) if found else '-'}")
+                _bar(axes, place, row, results, measure)
+                if own is not None and score == results.headline:
+                    diamonds = True
+                    (diamond,) = axes.plot(own.mean, place, "D", mfc="white", mec=INK, ms=5, zorder=5)
+                    diamond.set_clip_on(False)
+            axes.set_yticks(range(len(rows)), labels)
+            axes.tick_params(axis="y", length=0)
+            axes.set_ylim(len(rows) - 0.4, -0.6)
+            if score.limit is not None:
+                axes.set_xlim(0, score.limit)
+                axes.set_xticks(np.linspace(0, score.limit, 6))
+            axes.set_xlabel(f"{score.quantity} {results.where}")
+            axes.grid(visible=False, axis="y")
+            axes.grid(visible=True, axis="x")
+            handles = [
+                Patch(fc=FAINT, ec="none", label="mean over seeds"),
+                Line2D([], [], color=INK, lw=1.6, label="95 % interval"),
+                Line2D([], [], marker="o", ls="", mfc="white", mec=INK, mew=0.9, ms=4.5, label="one seed"),
+            ]
+            if diamonds:
+                label = "in its own simulator"
+                handles.append(Line2D([], [], marker="D", ls="", mfc="white", mec=INK, ms=5, label=label))
+            figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
+            return figure
+
+    return draw
+
+
+def _bar(axes: Axes, place: int, row: str, results: Results, measure: str) -> None:
+    found = results.summary(row, measure)
+    if found is None:
+        return
+    color, hatch = method_color(row), "////" if is_plus(row) else None
+    axes.barh(place, found.mean, height=0.68, color=color, ec=(1, 1, 1, 0.4), hatch=hatch, lw=0, zorder=2)
+    if found.low is not None and found.high is not None:
+        axes.plot([found.low, found.high], [place, place], color=INK, lw=1.6, zorder=3)
+    seeds = [*results.values(row, measure).values()]
+    spread = np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1)
+    # Not clipped: the axis would cut what lies on 0 in half.
+    (dots,) = axes.plot(seeds, place + spread, "o", mfc="white", mec=INK, mew=0.9, ms=3.5, zorder=4)
+    dots.set_clip_on(False)
+
+
+def learning_curves(results: Results, _: Scene) -> Figure | None:
+    """Draw the headline score of training episodes over steps: mean over seeds, band from worst to best.
+
+    Each method has a panel; its variant with the [plus] settings is dashed. Methods with a seed without
+    scores are left out.
     """
-
-    steps: Floats
-    score: Floats
-
-
-def score_bars(
-    score: Score,
-    scores: Mapping[str, Floats],
-    intervals: Mapping[str, tuple[float, float, float]],
-    simulated: Mapping[str, float],
-    where: str = "in the target",
-) -> Figure:
-    """Draw one bar per row, with a dot per seed.
-
-    Args:
-        score: what is drawn.
-        scores: those of each row's seeds, (seeds,).
-        intervals: (interquartile mean, low, high) of each row; low and high are NaN for a single seed.
-        simulated: mean score of a row in the simulator that it was trained in, if any.
-        where: the scores were measured.
-    """
+    curves: dict[str, list[tuple[Floats, Floats]]] = {}
+    for one in results.trainings:
+        if one.percent == results.percents[-1] and one.row in results.rows:
+            curves.setdefault(one.row, []).append((np.array(one.steps), np.array(one.score)))
+    curves = {
+        row: curves[row]
+        for row in results.rows
+        if row in curves and all(np.isfinite(scores).any() for _, scores in curves[row])
+    }
+    if not curves:
+        return None
+    panels = list(dict.fromkeys(map(base_method, curves)))
+    columns = min(len(panels), PANELS_ACROSS)
+    lines = -(-len(panels) // columns)
     with style():
-        figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(scores)), layout="constrained")
-        axes = figure.add_subplot()
-        for place, (method, seeds) in enumerate(scores.items()):
-            _bar(axes, place, method, score, seeds, intervals[method])
-            if method in simulated:
-                (diamond,) = axes.plot(simulated[method], place, "D", mfc="white", mec=INK, ms=5, zorder=5)
-                diamond.set_clip_on(False)
-        axes.set_yticks(range(len(scores)), [_tick_label(method) for method in scores])
-        axes.tick_params(axis="y", length=0)
-        axes.set_ylim(len(scores) - 0.4, -0.6)
-        if score.limit is not None:
-            axes.set_xlim(0, score.limit)
-            axes.set_xticks(np.linspace(0, score.limit, 6))
-        axes.set_xlabel(f"{score.quantity} {where}")
-        axes.grid(visible=False, axis="y")
-        axes.grid(visible=True, axis="x")
-        handles = [
-            Patch(fc=FAINT, ec="none", label="interquartile mean over seeds"),
-            Line2D([], [], color=INK, lw=1.6, label="95 % interval"),
-            Line2D([], [], marker="o", ls="", mfc="white", mec=INK, mew=0.9, ms=4.5, label="one seed"),
-        ]
-        if simulated:
-            handles.append(
-                Line2D([], [], marker="D", ls="", mfc="white", mec=INK, ms=5, label="in its own simulator")
-            )
-        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
-        return figure
-
-
-def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figure:
-    """Draw a score of the training episodes over steps: mean over seeds, band from the worst to the best.
-
-    Each method has a panel; its row with the [plus] settings is dashed.
-
-    Args:
-        score: what is drawn.
-        curves: each row's seeds, at least one.
-    """
-    with style():
-        panels = list(dict.fromkeys(map(base_method, curves)))
-        columns = min(len(panels), PANELS_ACROSS)
-        lines = -(-len(panels) // columns)
         figure = Figure(figsize=(0.6 + 2.1 * max(columns, 2), 0.6 + 1.7 * lines), layout="constrained")
         every = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
         for axes, base in zip(every, panels, strict=False):
@@ -102,70 +112,30 @@ def learning_curves(score: Score, curves: Mapping[str, Sequence[Curve]]) -> Figu
             axes.set_axis_off()
         for axes in every[max(0, len(panels) - columns) : len(panels)]:
             axes.tick_params(labelbottom=True)
-        for method, seeds in curves.items():
-            axes = every[panels.index(base_method(method))]
+        for row, seeds in curves.items():
+            axes = every[panels.index(base_method(row))]
             steps, scores = on_one_grid(seeds)
-            color, dashes = method_color(method), "--" if is_plus(method) else "-"
+            color = method_color(row)
             if len(seeds) > 1:
-                low, high = scores.min(axis=0), scores.max(axis=0)
-                axes.fill_between(steps, low, high, color=color, alpha=0.15, lw=0)
-            axes.plot(steps, scores.mean(axis=0), dashes, color=color)
-        score_axis(every[0], score)
-        every[0].set_xlim(0, max(float(seed.steps[-1]) for seeds in curves.values() for seed in seeds))
+                axes.fill_between(steps, scores.min(0), scores.max(0), color=color, alpha=0.15, lw=0)
+            axes.plot(steps, scores.mean(axis=0), "--" if is_plus(row) else "-", color=color)
+        score_axis(every[0], results.headline)
+        every[0].set_xlim(0, max(float(steps[-1]) for seeds in curves.values() for steps, _ in seeds))
         every[0].xaxis.set_major_formatter(_steps_label)
         every[0].xaxis.set_major_locator(MaxNLocator(4))
         figure.supxlabel("steps of training")
         # In two lines, since a single row of panels is low.
-        figure.supylabel(f"{score.title} of training\nepisodes, from all starts")
+        figure.supylabel(f"{results.headline.title} of training\nepisodes, from all starts")
         if any(map(is_plus, curves)):
-            handles = [
-                Line2D([], [], color=INK, label="without the [plus] settings"),
-                Line2D([], [], color=INK, ls="--", label="with the [plus] settings"),
-            ]
+            looks = {"without the [plus] settings": "-", "with the [plus] settings": "--"}
+            handles = [Line2D([], [], color=INK, ls=dashes, label=label) for label, dashes in looks.items()]
             figure.legend(handles=handles, loc="outside upper center", ncols=2, handlelength=2.4)
         return figure
 
 
-def _bar(
-    axes: Axes, place: int, method: str, score: Score, seeds: Floats, interval: tuple[float, float, float]
-) -> None:
-    iqm, low, high = interval
-    hatch = "////" if is_plus(method) else None
-    axes.barh(
-        place, iqm, height=0.68, color=method_color(method), ec=(1, 1, 1, 0.4), lw=0, hatch=hatch, zorder=2
-    )
-    if np.isfinite(low):
-        axes.plot([low, high], [place, place], color=INK, lw=1.6, zorder=3)
-    spread = np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1)
-    # Not clipped: the axis would cut what lies on 0 in half.
-    (dots,) = axes.plot(seeds, place + spread, "o", mfc="white", mec=INK, mew=0.9, ms=3.5, zorder=4)
-    dots.set_clip_on(False)
-    # Beyond the axis, where neither dots nor diamonds can cover the number.
-    axes.annotate(
-        score.text(iqm),
-        (1, place),
-        xycoords=axes.get_yaxis_transform(),
-        xytext=(10, 0),
-        textcoords="offset points",
-        ha="left",
-        va="center",
-        fontweight="bold",
-        fontsize=9.5,
-        annotation_clip=False,
-    )
-
-
-def _tick_label(method: str) -> str:
-    from astra_data.methods import method_role
-
-    title = method_title(method)
-    return f"{title} ({role})" if (role := method_role(method)) else title
-
-
-def on_one_grid(seeds: Sequence[Curve]) -> tuple[Floats, Floats]:
+def on_one_grid(seeds: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
     """Return steps (K,) that all seeds cover, and their scores there, (seeds, K)."""
-    known = [np.isfinite(seed.score) for seed in seeds]
-    parts = [(seed.steps[keep], seed.score[keep]) for seed, keep in zip(seeds, known, strict=True)]
+    parts = [(steps[known], scores[known]) for steps, scores in seeds for known in [np.isfinite(scores)]]
     first, last = max(steps[0] for steps, _ in parts), min(steps[-1] for steps, _ in parts)
     grid = np.linspace(first, last, CURVE_POINTS)
     return grid, np.stack([np.interp(grid, steps, scores) for steps, scores in parts])
@@ -176,3 +146,77 @@ def _steps_label(steps: float, _: float) -> str:
         if abs(steps) >= size:
             return f"{steps / size:g} {unit}"
     return f"{steps:g}"
+
+
+def data_efficiency(results: Results, scene: Scene) -> Figure | None:
+    """Draw the headline score over the size of the dataset, under what each size covers (the paper's figure).
+
+    Coverage is drawn if a seed has the datasets of all sizes in the folder of runs.
+    """
+    percents, score = results.percents, results.headline
+    if len(percents) < 2:
+        return None
+    covered = _covered(results, scene)
+    with style():
+        ratios = [1.0] * len(covered) + [2.2]
+        figure = Figure(figsize=(1.0 + 1.5 * max(4, len(percents)), 1.6 * sum(ratios)), layout="constrained")
+        grid = figure.add_gridspec(len(ratios), len(percents), height_ratios=ratios)
+        for line, (label, visits) in enumerate(covered.items()):
+            first = figure.add_subplot(grid[line, 0])
+            shared = {"sharex": first, "sharey": first}
+            others = [figure.add_subplot(grid[line, k], **shared) for k in range(1, len(percents))]
+            _maps([first, *others], visits, label)
+            if line == 0:
+                for axes, percent in zip([first, *others], percents, strict=True):
+                    axes.set_title(f"{percent} %")
+        axes = figure.add_subplot(grid[len(covered), :])
+        for row in results.tested():
+            _band(axes, results, row)
+        axes.set_xticks(percents, [f"{percent} %" for percent in percents])
+        axes.set_xlabel("size of the dataset")
+        score_axis(axes, score)
+        axes.set_ylabel(f"{score.quantity} {results.where}")
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+        return figure
+
+
+def _covered(results: Results, scene: Scene) -> Mapping[str, list[Map]]:
+    """Return the visits of each size of the first seed that has all of them; empty without one."""
+    for seed in results.seeds:
+        folders = [scene.root / artifact_key("subset", "", seed, percent) for percent in results.percents]
+        if all(folder.is_dir() for folder in folders):
+            break
+    else:
+        return {}
+    datasets = [Dataset.open(folder) for folder in folders]
+    roles = {"position (m)": "position", "velocity (m/s)": "vector"}
+    found = {label: [visited(dataset, role) for dataset in datasets] for label, role in roles.items()}
+    return {label: [one for one in of if one] for label, of in found.items() if all(of)}
+
+
+def _maps(panels: Sequence[Axes], visits: Sequence[Map], label: str) -> None:
+    """Draw one map per panel, with the colors and the limits of the one that covers most."""
+    most = max(int(visit.counts.max()) for visit in visits)
+    extents = np.array([visit.extent for visit in visits])
+    for axes, visit in zip(panels, visits, strict=True):
+        draw_visits(axes, visit.counts, visit.extent, most)
+        axes.tick_params(labelleft=axes is panels[0], labelsize=6.5)
+    panels[0].set_xlim(extents[:, 0].min(), extents[:, 1].max())
+    panels[0].set_ylim(extents[:, 2].min(), extents[:, 3].max())
+    panels[0].set_ylabel(label)
+
+
+def _band(axes: Axes, results: Results, row: str) -> None:
+    found = {percent: results.score_of(row, TESTED, percent) for percent in results.percents}
+    known = {percent: one for percent, one in found.items() if one}
+    color, percents = method_color(row), [*known]
+    if all(one.low is not None for one in known.values()):
+        low, high = ([getattr(one, end) for one in known.values()] for end in ("low", "high"))
+        axes.fill_between(percents, low, high, color=color, alpha=0.18, lw=0)
+    dashes = "--" if is_plus(row) else "-"
+    means = [one.mean for one in known.values()]
+    axes.plot(percents, means, dashes, color=color, marker="o", ms=4, label=method_title(row))
+    for percent in percents:
+        seeds = [*results.values(row, results.headline.measure, TESTED, percent).values()]
+        axes.plot([percent] * len(seeds), seeds, ".", color=color, alpha=0.45, ms=4, zorder=1)

@@ -1,43 +1,34 @@
 """How well simulators predict returns in the target: one dot per policy."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
+from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import FAINT, method_color, method_title, style
+from astra_data.reports.results import Results
+from astra_data.reports.runs import SHARED_WORLDS
 
 
-@dataclass(frozen=True)
-class SimulatorReturns:
-    """Returns in one simulator and in the target.
-
-    Attributes:
-        title: of the panel.
-        returns: row → mean returns of its seeds' policies in the simulator and in the target, (2, seeds).
-    """
-
-    title: str
-    returns: Mapping[str, Floats]
-
-
-def predictive_validity(simulators: list[SimulatorReturns]) -> Figure:
+def predictive_validity(results: Results, _: Scene) -> Figure | None:
     """Draw the return in the target against that in each simulator; on the dashed line they are equal."""
-    rows = list(dict.fromkeys(row for simulator in simulators for row in simulator.returns))
+    worlds = [world for world in SHARED_WORLDS if any(line.where == world for line in results.lines)]
+    if results.tested_in != "target" or not worlds:
+        return None
+    rows = results.tested()
     with style():
         height = max(3.7, 0.6 + 0.19 * len(rows))
-        figure = Figure(figsize=(2.4 + 3.0 * len(simulators), height), layout="constrained")
-        grid = figure.subplots(1, len(simulators), squeeze=False, sharey=True)[0]
-        for axes, simulator in zip(grid, simulators, strict=True):
+        figure = Figure(figsize=(2.4 + 3.0 * len(worlds), height), layout="constrained")
+        grid = figure.subplots(1, len(worlds), squeeze=False, sharey=True)[0]
+        for axes, world in zip(grid, worlds, strict=True):
             axes.axline((0, 0), slope=1, color=FAINT, ls="--", lw=0.9, zorder=1)
-            for row, (simulated, target) in simulator.returns.items():
-                axes.plot(
-                    simulated, target, _marker(row), color=method_color(row), mec="white", mew=0.6, ms=6
-                )
-            axes.set_title(simulator.title, loc="left")
+            for row in rows:
+                target, there = results.values(row, "return"), results.values(row, "return", world)
+                pairs = [(there[seed], target[seed]) for seed in there if seed in target]
+                if pairs:
+                    look = {"color": method_color(row), "mec": "white", "mew": 0.6, "ms": 6}
+                    axes.plot(*zip(*pairs, strict=True), _marker(row), **look)
+            axes.set_title(f"{world} simulator".capitalize(), loc="left")
             axes.set_xlabel("return in this simulator")
             axes.grid(visible=True, axis="both")
         grid[0].set_ylabel("return in the target")

@@ -1,49 +1,102 @@
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from safetensors.numpy import save_file
 
-from astra_data.reports.figures.motion import Panel, dynamics_mismatch, trajectories
+from astra_data.core.errors import BadInputError
+from astra_data.reports.command_replay import CommandReplay
+from astra_data.reports.figures.motion import dynamics_mismatch, strips, trajectories
+from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import DEPLOYED, SIMULATED
+from astra_data.reports.results import TESTED, Line, Results
 from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.registry import TASKS
 
 
-def panel(method: str, *, in_simulator: bool = True) -> Panel:
+def results(*rows: str, **changes: object) -> Results:
+    lines = [Line(row=row, seed=0, where=TESTED, values={"success": 1 / 3}) for row in rows]
+    facts = {"recipe": "r", "task": "t", "command": "c", "rows": rows, "episodes": 3, "lines": lines}
+    return Results.model_validate(facts | changes)
+
+
+def paths() -> NDArray[np.float64]:
     target = np.full((3, 10, 2), np.nan)
     target[0] = np.linspace([-4, 4], [4, 4], 10)
     target[1, :4] = np.linspace([-4, 4], [0, 4], 4)
     target[2, :6] = np.linspace([-4, 4], [1, 4], 6)
-    simulated = target[:1] if in_simulator else np.empty((0, 1, 2))
-    return Panel(
-        method=method,
-        success=1 / 3,
-        target=target,
-        target_success=np.array([True, False, False]),
-        simulated=simulated,
-        simulated_success=np.ones(len(simulated), dtype=bool),
-        goal=np.full((3, 2), -4.0),
-    )
+    return target
 
 
-def test_trajectories_draw_a_panel_per_row_with_crosses_where_episodes_fail() -> None:
-    figure = trajectories(U_MAZE, [panel("astra"), panel("follower", in_simulator=False)])
+def write(
+    root: Path,
+    row: str,
+    *,
+    goal: NDArray[np.float64] | None = None,
+    ball: bool = False,
+    simulated: bool = True,
+) -> None:
+    folder = root / f"evaluate/{row}/seed_0"
+    folder.mkdir(parents=True)
+    outcomes = {
+        "success": [1, 0, 0],
+        **{measure: [0, 1, 1] for measure in ("failed", "wall_contact", "steps", "return")},
+    }
+    values = {"task": "t", "method": row, "seed": 0, "episodes": 3, "target": outcomes}
+    target = np.concatenate([paths(), paths() + 0.5], axis=-1) if ball else paths()
+    tensors = {"target.position": target, "goal": np.full((3, 2), -4.0) if goal is None else goal}
+    if simulated:
+        values["simulated"] = outcomes
+        tensors["simulated.position"] = paths()
+    tensors["target.state"] = np.zeros((40, 4))
+    (folder / "evaluation.json").write_text(json.dumps(values))
+    save_file(tensors, folder / "trajectories.safetensors")
+
+
+def drawn(figure: Figure | None) -> Figure:
+    assert figure is not None
+    return figure
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return Scene(tmp_path, replace(TASKS["antmaze-umaze"]), episodes=3)
+
+
+def test_trajectories_draw_a_panel_per_method_with_crosses_where_episodes_fail(scene: Scene) -> None:
+    assert trajectories(results("astra", "follower"), scene) is None
+    write(scene.root, "astra")
+    # Where a method has none, there is no figure.
+    assert trajectories(results("astra", "follower"), scene) is None
+    write(scene.root, "follower", simulated=False)
+    figure = drawn(trajectories(results("astra", "follower"), scene))
     told = [text.get_text() for text in figure.legends[0].get_texts()]
     assert told[1] == "in the target"
-    elsewhere = trajectories(U_MAZE, [panel("astra")], "in a simulator").legends[0].get_texts()
-    assert elsewhere[1].get_text() == "in a simulator"
     astra, follower = figure.axes
     assert (astra.get_title(loc="left"), astra.get_title(loc="right")) == ("ASTRA", "0.33")
     assert follower.get_title(loc="left") == "Careful follower"
-    paths = [line for line in astra.lines if line.get_linestyle() != "None"]
-    looks = [(line.get_color(), line.get_linestyle()) for line in paths]
-    assert looks == [(DEPLOYED, "-")] * 3 + [(SIMULATED, "--")]
+    solid = [line for line in astra.lines if line.get_linestyle() != "None"]
+    looks = [(line.get_color(), line.get_linestyle()) for line in solid]
+    assert looks == [(DEPLOYED, "-")] * 3 + [(SIMULATED, "--")] * 3
     crosses = [line for line in astra.lines if line.get_marker() == "x" and line.get_color() == DEPLOYED]
     assert [(line.get_xdata()[0], line.get_ydata()[0]) for line in crosses] == [(0.0, 4.0), (1.0, 4.0)]  # type: ignore[index]
     assert sum(line.get_marker() == "*" for line in astra.lines) == 1
     assert not [line for line in follower.lines if line.get_color() == SIMULATED]
     (walls,) = astra.collections
     assert len(walls.get_paths()) == len(U_MAZE.wall_cells())
+    assert trajectories(results("astra"), replace(scene, task=TASKS["humanoid-walker2d"])) is None
+
+
+def test_the_methods_that_are_named_are_drawn(scene: Scene) -> None:
+    write(scene.root, "astra")
+    named = replace(scene, methods=("astra", "nas"))
+    assert len(drawn(trajectories(results("astra", "follower"), named)).axes) == 1
 
 
 def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:
@@ -51,7 +104,7 @@ def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:
     simulated = np.tile([1.0, 2.0, 3.0, 4.0], (5, 1))
     target = np.stack([simulated, simulated + 1])
     target[1, 4] = np.nan
-    figure = dynamics_mismatch(time_s, np.zeros((5, 2)), simulated, target)
+    figure = dynamics_mismatch(CommandReplay(time_s, np.zeros((5, 2)), simulated, target))
     x, y, speed, command = figure.axes
     labels = [axes.get_ylabel() for axes in (x, y, speed, command)]
     assert labels == ["x (m)", "y (m)", "speed (m/s)", "command (±1 per axis)"]
@@ -66,25 +119,60 @@ def test_dynamics_mismatch_draws_mean_and_two_bands_for_x_y_and_speed() -> None:
     assert np.asarray(speed.lines[1].get_ydata()).tolist() == [5.0] * 5
 
 
-def test_a_star_stands_at_the_mean_goal_of_each_cell_and_a_ball_has_a_path_of_its_own() -> None:
+def test_a_star_stands_at_the_mean_goal_of_each_cell_and_a_ball_has_a_path_of_its_own(scene: Scene) -> None:
     goals = np.array([[-4.0, -4.0], [-3.0, -3.6], [4.0, 4.0]])
-    one = panel("astra", in_simulator=False)
-    with_ball = np.concatenate([one.target, one.target + 0.5], axis=-1)
-    figure = trajectories(U_MAZE, [replace(one, target=with_ball, goal=goals)])
-    (axes,) = figure.axes
+    write(scene.root, "astra", goal=goals, ball=True, simulated=False)
+    (axes,) = drawn(trajectories(results("astra"), scene)).axes
     stars = [line.get_xydata() for line in axes.lines if line.get_marker() == "*"]
     assert np.concatenate(stars) == pytest.approx(np.array([[-3.5, -3.8], [4.0, 4.0]]))
     dotted = [line for line in axes.lines if line.get_linestyle() == ":"]
-    np.testing.assert_allclose(np.asarray(dotted[0].get_xydata()), one.target[0] + 0.5)
+    np.testing.assert_allclose(np.asarray(dotted[0].get_xydata()), paths()[0] + 0.5)
 
 
-def test_rows_of_mazes_are_four_wide_and_long_titles_small() -> None:
-    names = ["direct_transfer_iql_plus", *(f"m{number}" for number in range(4))]
-    figure = trajectories(U_MAZE, [panel(name, in_simulator=False) for name in names])
+def test_mazes_are_four_wide_and_long_titles_small(scene: Scene) -> None:
+    rows = ["direct_transfer_iql_plus", *("nas", "astra", "iql", "rma")]
+    for row in rows:
+        write(scene.root, row, simulated=False)
+    figure = drawn(trajectories(results(*rows), scene))
     grid = figure.axes[0].get_subplotspec()
     assert grid is not None and grid.get_gridspec().get_geometry() == (2, 4)
     sizes = [axes._left_title.get_fontsize() for axes in figure.axes[:2]]  # type: ignore[attr-defined]
     assert sizes[0] < sizes[1] == 10.0
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """A task that is photographed."""
+
+    photograph: Any
+    timestep_s: float = 0.1
+    objective: Any = TASKS["humanoid-walker2d"].objective
+
+
+def test_strips_have_a_picture_for_each_moment_until_the_end(scene: Scene) -> None:
+    write(scene.root, "nas")
+    write(scene.root, "astra")
+    taken = []
+
+    def photograph(states: NDArray[np.float64]) -> NDArray[np.uint8]:
+        taken.append(len(states))
+        return np.zeros((len(states), 8, 6, 3), dtype=np.uint8)
+
+    filmed = replace(scene, task=Filmed(photograph))  # type: ignore[arg-type]
+    figure = drawn(strips(results("nas", "astra"), filmed))
+    figure.canvas.draw()
+    # 40 states, 0.1 s apart: at 0, 0.5, 1, 1.5 and 2 s.
+    assert taken == [5, 5]
+    titles = [axes.get_title() for axes in figure.axes[:8]]
+    assert titles == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s", "4 s", "8 s", "100 s"]
+    assert [len(axes.images) for axes in figure.axes[:8]] == [1] * 5 + [0] * 3
+    assert [text.get_text() for text in figure.axes[0].texts] == ["NAS", "4 s"]
+
+    def cannot(_: NDArray[np.float64]) -> NDArray[np.uint8]:
+        raise BadInputError("no display")
+
+    assert strips(results("nas"), replace(scene, task=Filmed(cannot))) is None  # type: ignore[arg-type]
+    assert strips(results("nas"), replace(scene, task=Filmed(None))) is None  # type: ignore[arg-type]
 
 
 def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
@@ -93,7 +181,7 @@ def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
     # 101 robots, a meter apart in x, two in y.
     shift = np.arange(101.0)[:, None, None] * np.array([1.0, 2.0, 0.0, 0.0])
     command = np.tile([0.8, -0.5], (3, 1))
-    x, y, _, sent = dynamics_mismatch(time_s, command, simulated, simulated + shift).axes
+    x, y, _, sent = dynamics_mismatch(CommandReplay(time_s, command, simulated, simulated + shift)).axes
     for axes, at, apart in ((x, 1.0, 1.0), (y, 2.0, 2.0)):
         mean, one = (np.asarray(line.get_ydata()) for line in axes.lines)
         assert one == pytest.approx(at) and mean == pytest.approx(at + 50 * apart)

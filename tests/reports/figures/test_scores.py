@@ -1,97 +1,121 @@
-from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_dataset import write_fake
 from figures_shown import legend
-from matplotlib.colors import to_hex
-from matplotlib.text import Text
+from matplotlib.figure import Figure
 
-from astra_data.reports.figures.scores import Curve, learning_curves, score_bars
-from astra_data.reports.figures.style import method_color
-from astra_data.worlds.score import SUCCESS, SURVIVED_STEPS, Score
+from astra_data.reports.figures.scene import Scene
+from astra_data.reports.figures.scores import data_efficiency, learning_curves, on_one_grid, score_bars
+from astra_data.reports.results import SIMULATED, TESTED, Line, Results, Training
+from astra_data.worlds.registry import TASKS
+from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS
 
 
-def test_success_bars_show_bars_seeds_and_intervals() -> None:
-    scores = {"nas": np.array([0.2, 0.4, 0.3]), "astra_plus": np.array([0.8]), "follower": np.array([1.0])}
-    intervals = {
-        "nas": (0.3, 0.2, 0.4),
-        "astra_plus": (0.8, np.nan, np.nan),
-        "follower": (1.0, np.nan, np.nan),
-    }
-    figure = score_bars(SUCCESS, scores, intervals, {"nas": 0.9, "astra_plus": 0.95})
-    axes = figure.axes[0]
-    assert [bar.get_width() for bar in axes.patches] == [0.3, 0.8, 1.0]  # type: ignore[attr-defined]
-    assert [bool(bar.get_hatch()) for bar in axes.patches] == [False, True, False]
-    assert [to_hex(bar.get_facecolor()) for bar in axes.patches] == [method_color(row) for row in scores]
-    dots = [line for line in axes.lines if line.get_marker() == "o"]
-    assert [sorted(np.asarray(line.get_xdata())) for line in dots] == [[0.2, 0.3, 0.4], [0.8], [1.0]]
-    assert sum(line.get_marker() == "D" for line in axes.lines) == 2
-    assert not any(line.get_clip_on() for line in axes.lines if line.get_marker() in ("o", "D"))
-    assert sum(line.get_marker() == "None" for line in axes.lines) == 1  # one interval
-    labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert labels == ["NAS", "ASTRA+", "Careful follower (ceiling)"]
-    assert axes.yaxis_inverted()  # the first row on top
-    assert [text.get_text() for text in axes.texts] == ["0.30", "0.80", "1.00"]
+def results(*lines: Line, **changes: object) -> Results:
+    rows = tuple(dict.fromkeys(line.row for line in lines)) or ("nas", "astra", "astra_plus")
+    facts = {"recipe": "r", "task": "t", "command": "c", "rows": rows, "episodes": 4}
+    return Results.model_validate(facts | {"lines": lines} | changes)
+
+
+def line(row: str, seed: int, where: str = TESTED, percent: int = 100, **values: float) -> Line:
+    return Line(row=row, seed=seed, percent=percent, where=where, values=values)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return Scene(tmp_path, TASKS["antmaze-umaze"])
+
+
+def drawn(figure: Figure | None) -> Figure:
+    assert figure is not None
+    return figure
+
+
+def test_bars_show_mean_interval_seeds_and_the_own_simulator(scene: Scene) -> None:
+    found = results(
+        *(line("direct_transfer", seed, success=0.0) for seed in range(3)),
+        *(line("astra_plus", seed, success=share) for seed, share in enumerate((0.0, 0.03, 0.06))),
+        *(line("astra_plus", seed, SIMULATED, success=1.0) for seed in range(3)),
+    )
+    figure = drawn(score_bars("success")(found, scene))
+    (axes,) = figure.axes
+    # The number of a bar stands beside its name: a diamond at 1.00 is not taken for what it says.
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert labels == ["Direct transfer (floor)   0.00", "ASTRA+   0.03"]
+    assert not axes.texts
+    assert [patch.get_width() for patch in axes.patches] == pytest.approx([0.0, 0.03])  # type: ignore[attr-defined]
+    summary = found.score_of("astra_plus")
+    assert summary is not None
+    lines = [np.asarray(of.get_xdata()) for of in axes.lines if len(np.asarray(of.get_xdata())) == 2]
+    assert lines[1].tolist() == [summary.low, summary.high]
+    (diamond,) = [of for of in axes.lines if of.get_marker() == "D"]
+    assert np.asarray(diamond.get_xydata()).tolist() == [[1.0, 1.0]]
+    assert axes.get_xlim() == (0.0, 1.0) and axes.get_xlabel() == "success rate in the target"
     assert "in its own simulator" in legend(figure)
+    assert score_bars("return")(found, scene) is None
 
 
-def test_survived_steps_have_no_limit_and_no_decimals() -> None:
-    steps = {"nas": np.array([63.0, 61.4]), "astra": np.array([310.0])}
-    intervals = {"nas": (62.2, 61.4, 63.0), "astra": (310.0, np.nan, np.nan)}
-    axes = score_bars(SURVIVED_STEPS, steps, intervals, {"astra": 1000.0}).axes[0]
-    left, right = axes.get_xlim()
-    assert left == 0 and 1000 < right < 1100
-    assert axes.get_xlabel() == "number of survived steps in the target"
-    assert [text.get_text() for text in axes.texts] == ["62", "310"]
-    curve = Curve(np.array([0.0, 100.0]), np.array([20.0, 400.0]))
-    figure = learning_curves(SURVIVED_STEPS, {"nas": [curve]})
-    low, high = figure.axes[0].get_ylim()
-    assert low == 0 and 400 < high < 450
-    assert figure.get_supylabel() == "survived steps of training\nepisodes, from all starts"
+def test_seeds_without_interval_and_scores_without_limit(scene: Scene) -> None:
+    found = results(line("nas", 0, steps=300.0, **{"return": 1.0}), scores=(SURVIVED_STEPS, RETURN))
+    figure = drawn(score_bars("steps")(found, scene))
+    assert not [of for of in figure.axes[0].lines if len(np.asarray(of.get_xdata())) == 2]
+    assert figure.axes[0].get_xlim()[1] > 300 and "in its own simulator" not in legend(figure)
+    assert drawn(score_bars("return")(found, scene)).axes[0].get_yticklabels()[0].get_text() == "NAS   1.0"
 
 
-def test_learning_curves_average_over_seeds_on_steps_that_all_have() -> None:
-    curves = {
-        "nas": [
-            Curve(np.array([0.0, 100.0]), np.array([0.0, 1.0])),
-            Curve(np.array([0.0, 50.0, 200.0]), np.array([np.nan, 0.5, 0.5])),
-        ],
-        "nas_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
-        "astra_plus": [Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))],
-    }
-    figure = learning_curves(SUCCESS, curves)
-    assert [axes.get_title(loc="left") for axes in figure.axes] == ["NAS", "ASTRA"]
-    first, second = figure.axes
-    assert legend(figure) == ["without the [plus] settings", "with the [plus] settings"]
-    assert (len(first.collections), len(second.collections)) == (1, 0)  # a band needs two seeds
-    (nas, nas_plus), (astra,) = first.lines, second.lines
-    assert nas_plus.get_linestyle() == "--"
-    assert (nas.get_linestyle(), astra.get_linestyle()) == ("-", "--")
-    steps, success = np.asarray(nas.get_xdata()), np.asarray(nas.get_ydata())
-    assert (steps[0], steps[-1]) == (50.0, 100.0)
-    assert (success[0], success[-1]) == pytest.approx((0.5, 0.75))
+def training(row: str, seed: int, *scores: float) -> Training:
+    return Training(row=row, seed=seed, steps=[1000.0 * k for k in range(len(scores))], score=[*scores])
 
 
-def test_many_rows_get_a_panel_each_and_readable_bars() -> None:
-    rows = [f"method_{number}" for number in range(14)]
-    curve = Curve(np.array([0.0, 100.0]), np.array([0.2, 0.4]))
-    figure = learning_curves(SUCCESS, {row: [curve] for row in rows})
-    drawn = [axes for axes in figure.axes if axes.axison]
-    assert [axes.get_title(loc="left") for axes in drawn] == [f"Method {number}" for number in range(14)]
-    assert not figure.legends
-    bars = score_bars(SUCCESS, dict.fromkeys(rows, np.ones(10)), dict.fromkeys(rows, (1.0, 0.9, 1.0)), {})
-    bars.draw_without_rendering()
-    labels = [label.get_window_extent() for label in bars.axes[0].get_yticklabels()]
-    assert all(upper.y0 > lower.y1 for upper, lower in pairwise(labels))
-    assert min(label.x0 for label in labels) >= 0
+def test_curves_have_a_panel_per_method_and_a_band_from_worst_to_best(scene: Scene) -> None:
+    trainings = [
+        training("astra", 0, 0.0, 0.5, 1.0),
+        training("astra", 1, 0.2, 0.3, 0.4),
+        training("astra_plus", 0, 0.1, 0.1, 0.1),
+        training("nas", 0, float("nan"), float("nan"), float("nan")),
+    ]
+    found = results(line("astra", 0, success=1.0), trainings=trainings, rows=("nas", "astra", "astra_plus"))
+    figure = drawn(learning_curves(found, scene))
+    axes = next(axes for axes in figure.axes if axes.get_title(loc="left"))
+    assert axes.get_title(loc="left") == "ASTRA" and [of.get_linestyle() for of in axes.lines] == ["-", "--"]
+    mean = np.asarray(axes.lines[0].get_ydata())
+    assert mean[[0, -1]] == pytest.approx([0.1, 0.7])
+    band = np.asarray(axes.collections[0].get_paths()[0].vertices)[:, 1]
+    assert (band.min(), band.max()) == pytest.approx((0.0, 1.0))
+    assert figure.get_supylabel() == f"{SUCCESS.title} of training\nepisodes, from all starts"
+    assert "with the [plus] settings" in legend(figure)
+    assert learning_curves(results(line("astra", 0, success=1.0)), scene) is None
 
 
-@pytest.mark.parametrize("rows", [("nas",), ("nas", "astra", "compass", "rma", "iql")])
-@pytest.mark.parametrize("score", [SUCCESS, SURVIVED_STEPS])
-def test_labels_of_learning_curves_lie_within_the_figure(score: Score, rows: tuple[str, ...]) -> None:
-    curve = Curve(np.array([0.0, 1e6]), np.array([0.0, 1.0]))
-    figure = learning_curves(score, {row: [curve] for row in rows})
-    figure.canvas.draw()
-    (label,) = [text for text in figure.findobj(Text) if text.get_text() == figure.get_supylabel()]
-    box = label.get_window_extent()
-    assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1 and box.x0 >= 0
+def test_curves_are_compared_where_all_seeds_have_scores() -> None:
+    nan = float("nan")
+    steps, scores = on_one_grid(
+        [
+            (np.array([0.0, 10.0, 20.0]), np.array([nan, 1.0, 2.0])),
+            (np.array([5.0, 15.0]), np.array([0.0, 1.0])),
+        ]
+    )
+    assert (steps[0], steps[-1]) == (10.0, 15.0)
+    np.testing.assert_allclose(scores[:, [0, -1]], [[1.0, 1.5], [0.5, 1.0]])
+
+
+def test_data_efficiency_has_a_map_per_size_and_a_band_per_method(scene: Scene) -> None:
+    found = results(
+        *(line("nas", seed, percent=25, success=share) for seed, share in enumerate((0.1, 0.2, 0.3))),
+        *(line("nas", seed, percent=100, success=share) for seed, share in enumerate((0.7, 0.8, 0.9))),
+        line("astra", 0, percent=100, success=0.5),
+    )
+    for percent in (25, 100):
+        write_fake(scene.root / f"subset/percent_{percent:03d}/seed_0")
+    *maps, success = drawn(data_efficiency(found, scene)).axes
+    assert [axes.get_title() for axes in maps[:2]] == ["25 %", "100 %"]
+    assert np.asarray(success.lines[0].get_xydata()) == pytest.approx(np.array([[25, 0.2], [100, 0.8]]))
+    # A seed alone has no interval, so ASTRA has no band.
+    (band,) = success.collections
+    at = {size: found.score_of("nas", percent=size) for size in (25, 100)}
+    ends = {(x, y) for x, y in np.asarray(band.get_paths()[0].vertices).tolist()}
+    assert ends == {(size, end) for size, one in at.items() if one for end in (one.low, one.high)}
+    assert success.get_ylim() == (-0.02, 1.02) and success.get_ylabel() == "success rate in the target"
+    assert data_efficiency(results(line("nas", 0, success=1.0)), scene) is None

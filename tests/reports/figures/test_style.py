@@ -1,17 +1,29 @@
 from io import BytesIO
+from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from astra_data.methods import METHODS
+from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import score_bars
 from astra_data.reports.figures.style import method_color, method_title, png, style
-from astra_data.worlds.score import SUCCESS
+from astra_data.reports.results import TESTED, Line, Results
+from astra_data.worlds.registry import TASKS
 
 ROWS = ("direct_transfer", "nas", "astra", "direct_transfer_plus", "nas_plus", "astra_plus", "follower")
+
+
+def bars(*rows: str) -> Figure:
+    lines = [Line(row=row, seed=0, where=TESTED, values={"success": 0.5}) for row in rows]
+    results = Results(recipe="r", task="t", command="", rows=rows, episodes=1, lines=lines)
+    figure = score_bars("success")(results, Scene(Path(), TASKS["antmaze-umaze"]))
+    assert figure is not None
+    return figure
 
 
 def test_titles_follow_from_the_names() -> None:
@@ -41,14 +53,13 @@ def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     before = dict(matplotlib.rcParams)
-    image = png(score_bars(SUCCESS, {"nas": np.array([0.5])}, {"nas": (0.5, np.nan, np.nan)}, {}))
+    image = png(bars("nas"))
     assert image.startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
 
 
 def test_a_palette_keeps_the_colors_of_methods() -> None:
-    scores = {method: np.array([0.5]) for method in ROWS}
-    figure = score_bars(SUCCESS, scores, {method: (0.5, np.nan, np.nan) for method in ROWS}, {})
+    figure = bars(*ROWS)
     everything = BytesIO()
     with style():
         figure.savefig(everything, format="png")

@@ -82,8 +82,6 @@ window = 20
 [evaluate]
 episodes = 2
 
-[report]
-bootstrap_replicates = 100
 """
 LASTING = "humanoid-short"
 HORIZON = 12

@@ -1,0 +1,149 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.reports.results import (
+    SIMULATED,
+    TESTED,
+    DatasetUse,
+    Errors,
+    Line,
+    Results,
+    Training,
+    elapsed_seconds,
+    judged_horizon,
+    merge,
+    read_results,
+    replaced,
+    results_json,
+    stage_seconds,
+)
+from astra_data.worlds.score import SURVIVED_STEPS
+
+
+def line(row: str, seed: int, where: str = TESTED, percent: int = 100, **values: float) -> Line:
+    return Line(row=row, seed=seed, percent=percent, where=where, values=values)
+
+
+def results(*lines: Line, **changes: object) -> Results:
+    facts = {"recipe": "r", "task": "t", "command": "c", "rows": ("direct_transfer", "astra"), "episodes": 4}
+    return Results.model_validate(facts | {"lines": lines} | changes)
+
+
+def error(row: str, seed: int, simulator: str, *mean: float, horizons: tuple[int, ...] = (1, 10)) -> Errors:
+    ends = {"low": [0.5 * one for one in mean], "high": [2 * one for one in mean]}
+    return Errors(
+        row=row, seed=seed, simulator=simulator, quantity="x_m", horizons=[*horizons], mean=[*mean], **ends
+    )
+
+
+def test_numbers_are_found_by_method_place_and_size() -> None:
+    found = results(
+        line("astra", 1, success=0.5),
+        line("astra", 0, success=1.0),
+        line("astra", 0, SIMULATED, success=0.25),
+        line("astra", 0, percent=20, success=0.0),
+        line("nas", 0, success=0.0),
+    )
+    assert found.values("astra", "success") == {0: 1.0, 1: 0.5}
+    assert found.values("astra", "success", SIMULATED) == {0: 0.25}
+    assert found.values("astra", "success", TESTED, 20) == {0: 0.0}
+    assert (found.percents, found.seeds, found.tested()) == ([20, 100], [0, 1], ["astra"])
+    summary = found.score_of("astra")
+    assert summary and (summary.mean, summary.seeds) == (0.75, 2)
+    assert found.summary("astra", "failed") is None
+    assert found.table[found.table["where"] == SIMULATED]["value"].tolist() == [0.25]
+
+
+def test_the_interval_of_a_score_stays_within_what_it_can_be() -> None:
+    steps = [line("astra", seed, steps=10.0 * seed) for seed in range(3)]
+    (score,) = (SURVIVED_STEPS,)
+    found = results(*steps, scores=(score,)).score_of("astra")
+    assert found and found.low is not None and found.low < 0
+    shares = results(*(line("astra", seed, success=0.5 * seed) for seed in range(3))).score_of("astra")
+    assert shares and (shares.low, shares.high) == (0.0, 1.0)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    training = Training(row="astra", seed=0, steps=[1.0, 2.0], score=[float("nan"), 0.5])
+    found = results(line("astra", 0, success=0.5), errors=[error("nas", 0, "raw", 1.0, 2.0)])
+    found = found.model_copy(update={"trainings": [training]})
+    path = tmp_path / "r.json"
+    path.write_text(results_json(found))
+    again = read_results(path)
+    assert again.model_dump_json() == found.model_dump_json()
+    assert json.loads(path.read_text())["trainings"][0]["score"] == [None, 0.5]
+    assert '    {"row": "astra", "seed": 0, "percent": 100, "where": "tested"' in path.read_text()
+    path.write_text("{}")
+    with pytest.raises(BadInputError, match="does not hold results in the current format"):
+        read_results(path)
+    with pytest.raises(BadInputError, match="found none"):
+        read_results(tmp_path / "none.json")
+
+
+def test_merging_loses_nothing_and_says_what_it_replaces() -> None:
+    first = results(
+        line("astra", 0, success=0.25),
+        line("astra", 1, success=0.5),
+        line("nas", 0, success=1.0),
+        rows=("nas", "astra"),
+        errors=[error("nas", 0, "raw", 1.0, 2.0)],
+    )
+    second = results(line("astra", 1, success=0.75), line("astra", 2, success=1.0), rows=("astra",))
+    merged = merge([first, second])
+    assert merged.rows == ("astra", "nas")
+    assert merged.values("astra", "success") == {0: 0.25, 1: 0.75, 2: 1.0}
+    assert merged.values("nas", "success") == {0: 1.0} and merged.errors == first.errors
+    assert replaced(first, second) == ["astra seed 1 (success 0.5, now 0.75)"]
+    assert replaced(first, first) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"episodes": 9}, "got episodes 4 and 9"),
+        ({"task": "u"}, "got task t and u"),
+        ({"leg_scale": 1.5}, "got leg_scale 1.0 and 1.5"),
+        (
+            {"datasets": [DatasetUse(stage="pair", seed=0, version="1", content_hash="b")]},
+            "pair seed 0 with content a and b",
+        ),
+    ],
+)
+def test_results_that_were_made_differently_are_not_merged(changes: dict[str, object], message: str) -> None:
+    uses = [DatasetUse(stage="pair", seed=0, version="1", content_hash="a")]
+    with pytest.raises(BadInputError, match=message):
+        merge([results(datasets=uses), results(**changes)])
+
+
+def test_errors_are_averaged_over_seeds_where_all_know_them() -> None:
+    found = results(
+        errors=[
+            *(error("nas", seed, "grounded", 1.0 + seed, 10.0) for seed in (0, 1)),
+            *(error("nas", seed, "raw", 4.0, 40.0) for seed in (0, 1)),
+            error("astra", 0, "grounded", 0.5, horizons=(1,)),
+        ]
+    )
+    means = found.mean_errors()
+    assert means.loc[("nas", "grounded", "x_m", 1)].tolist() == [1.5, 0.75, 3.0]
+    assert set(means.index.get_level_values("horizon")) == {1}
+    assert found.groundings() == ["astra", "nas"]
+
+
+@pytest.mark.parametrize(("horizons", "expected"), [((1, 10, 50), 10), ((1, 5, 20), 5), ((20, 50), 20)])
+def test_simulators_are_judged_ten_steps_ahead_or_less(horizons: tuple[int, ...], expected: int) -> None:
+    assert judged_horizon(horizons) == expected
+
+
+def test_what_runs_at_once_takes_its_wall_time_once() -> None:
+    found = results(
+        line("a", 0, "train", wall_seconds=10.0, finished_at=110.0),  # 100 to 110
+        line("a", 1, "train", wall_seconds=10.0, finished_at=115.0),  # 105 to 115
+        line("b", 0, "train", wall_seconds=2.0, finished_at=109.0),
+        line("b", 1, "evaluate", wall_seconds=5.0, finished_at=130.0),
+        line("b", 2, "evaluate", wall_seconds=7.0),  # when is unknown
+    )
+    assert elapsed_seconds(found) == pytest.approx(15 + 5 + 7)
+    assert stage_seconds(found, "wall_seconds") == {"train": 22.0, "evaluate": 12.0}
