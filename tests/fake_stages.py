@@ -34,15 +34,7 @@ class FakeConfig(Config):
     rate: float = 0.5
     fails: bool = False
     learner: str = "ppo"
-    limits_commands: bool = False
-    disagreement_penalty: float = 0.0
-    keep_member: bool = False
-    ramp_while: float = 0.0
     held_out_share: float = 0.1
-    reward: str | None = None
-    topple: bool = False
-    correction_heads: int = 1
-    members: int = 0
 
 
 class FakeCollectConfig(FakeConfig):
@@ -65,7 +57,6 @@ CONFIGS["select"] = FakeSelectConfig
 @dataclass(frozen=True)
 class FakeTable:
     name: str
-    ranges: None = None
 
 
 class FakeMethod:
@@ -84,9 +75,6 @@ class FakeMethod:
         self.trains_without_target = trains and not steps_target
         self.steps_target, self.table, self.configures = steps_target, table, "train"
         self.grounded_as, self.initial = grounded_as, initial
-
-    def accepts(self, reward: str | None) -> bool:
-        return True
 
 
 METHODS = {

@@ -26,4 +26,4 @@ def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
 
 def fit_failures_quickly(patch: pytest.MonkeyPatch) -> None:
     """Make failure models of a few updates, which foresee nothing."""
-    patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=3))
+    patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=3, learning_rate=1e-3))

@@ -16,7 +16,6 @@ hold_s = [0.1, 0.4]
 updates = 3
 window = 5
 held_out_share = 0.25
-failure_members = 2
 [train]
 num_envs = 4
 rollout_steps = 8

@@ -20,8 +20,8 @@ SHIFT_M = 0.01
 class ShiftedSimulator(EpisodeSimulator):
     """Adds a shift (X,) to each step."""
 
-    def __init__(self, simulator: PlacedSimulator, shift: Tensor, scatter: Tensor | None) -> None:
-        super().__init__(simulator, scatter=scatter)
+    def __init__(self, simulator: PlacedSimulator, shift: Tensor) -> None:
+        super().__init__(simulator)
         self.shift = shift
 
     def step(self, action: Tensor) -> Tensor:
@@ -36,11 +36,8 @@ class Shifted(FittedGrounding):
     kind = "shifted"
     shift: Tensor
 
-    def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> EpisodeSimulator:
-        return ShiftedSimulator(simulator, self.shift, scatter)
-
-    def scatter(self, episodes: PairedEpisodes) -> Tensor:
-        return torch.eye(len(self.shift))
+    def corrected(self, simulator: PlacedSimulator) -> EpisodeSimulator:
+        return ShiftedSimulator(simulator, self.shift)
 
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         return {"shift": self.shift}, {}
@@ -88,8 +85,8 @@ class Narrow(Shifted):
 
     kind = "shifted, narrow"
 
-    def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> EpisodeSimulator:
-        return NarrowSimulator(simulator, self.shift, scatter)
+    def corrected(self, simulator: PlacedSimulator) -> EpisodeSimulator:
+        return NarrowSimulator(simulator, self.shift)
 
 
 NARROW = Method(

@@ -48,14 +48,6 @@ batch_windows = 4
 window = 20
 latent_size = 16
 held_out_share = 0.25
-members = 2
-scatter = true
-[plus]
-reward = "blend"
-command_limit = 1.0
-change_penalty = 0.02
-support_penalty = 0.1
-data_start_share = 0.5
 [align]
 updates = 3
 batch_windows = 4
@@ -90,7 +82,7 @@ def make(place: Path, rows: tuple[str, ...], settings: str) -> Path:
 @pytest.mark.parametrize(
     ("rows", "settings"),
     [
-        (ROWS, f"{PPO}{TABLES}[iql]{IQL}[direct_transfer_iql]{IQL}"),
+        (ROWS, f"{PPO}{TABLES}[iql]{IQL}"),
         (("direct_transfer", "nas", "astra"), SAC),
     ],
     ids=["ppo", "sac"],

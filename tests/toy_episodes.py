@@ -15,19 +15,22 @@ def toy_episodes(
     simulated_next: Tensor | None = None,
     goal: Tensor | None = None,
     mask: Tensor | None = None,
-    parts: Tensor | None = None,
     reward: Tensor | None = None,
+    failed: Tensor | None = None,
     terminated: Tensor | None = None,
     target_state: Tensor | None = None,
 ) -> PairedEpisodes:
     """Return E episodes of T steps with `state` (E, T, X) and `action` (E, T, A).
 
-    The other shapes are as in `PairedEpisodes` and `PairedWindows`, whose `reward` is `parts` here. By
-    default the simulator lands where the target does, and every step is real.
+    The other shapes are as in `PairedEpisodes` and `PairedWindows`. By default the simulator lands where the
+    target does, every step is real, and what fails is terminated.
     """
     nothing = torch.zeros(state.shape[:2])
     none = torch.zeros(*state.shape[:2], 2)
-    ended = nothing.bool() if terminated is None else terminated
+    failed = nothing if failed is None else failed
+    ended = failed.bool() if terminated is None else terminated
+    real = torch.ones_like(nothing) if mask is None else mask
+    paid = nothing if reward is None else reward
     windows = PairedWindows(
         state=state,
         action=action,
@@ -35,15 +38,15 @@ def toy_episodes(
         goal=none if goal is None else goal,
         simulated_next=next_state if simulated_next is None else simulated_next,
         next_state=next_state,
-        reward=none if parts is None else parts,
-        goes_on=1.0 - ended.float(),
-        failed=nothing if parts is None else (parts[..., 1] != 0).float(),
+        reward=paid,
+        goes_on=real * (1.0 - ended.float()),
+        failed=failed,
         fails_soon=nothing,
-        mask=torch.ones_like(nothing) if mask is None else mask,
+        mask=real,
     )
     return PairedEpisodes(
         target_state=torch.zeros(*state.shape[:2], 29) if target_state is None else target_state,
-        reward=nothing if reward is None else reward,
+        reward=paid,
         terminated=ended,
         windows=windows,
         reference="toy@data-1.0.0",

@@ -1,8 +1,13 @@
 """Batched environments so small that what a learner should make of them is known."""
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
+from kept_states import came_back
 from torch import Tensor
 
+from astra_data.learning.learner import Learner
 from astra_data.worlds.batched import Step
 
 
@@ -119,3 +124,25 @@ class EndsAtZero(GoToZero):
         super().step(action)
         self.steps.append(self.outcome(-self.state[:, 0].square(), self.state[:, 0].abs() < 0.15))
         return self.steps[-1]
+
+
+def train(learner: Learner) -> list[dict[str, float]]:
+    """Return the figures of all iterations."""
+    metrics = []
+    while not learner.done:
+        metrics.append(learner.iterate())
+    return metrics
+
+
+def whole_and_resumed(begin: Callable[[], Any]) -> tuple[Any, Any]:
+    """Train one in one go, and another after half of its steps from what the disk gives back of it."""
+    whole, begun, resumed = begin(), begin(), begin()
+    train(whole)
+    while begun.share < 0.5:
+        begun.iterate()
+    saved = came_back({"learner": begun.state_dict(), "world": begun.env.state_dict()})
+    begun.iterate()  # goes on elsewhere; must not reach into what was saved
+    resumed.load_state_dict(saved["learner"], resumed.env.load_state_dict(saved["world"]))
+    assert resumed.steps == whole.steps / 2
+    train(resumed)
+    return whole, resumed

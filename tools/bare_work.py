@@ -10,14 +10,14 @@ from torch import Tensor
 
 from astra_data.learning.networks.actor_critic import ActorCritic
 from astra_data.learning.networks.history import mlp
-from astra_data.learning.ppo import PpoConfig
+from astra_data.learning.ppo import EPOCHS, MINIBATCHES, PpoConfig
 from astra_data.training.simulator_env import SimulatorEnv
 
 
 def bare_ppo(env: SimulatorEnv, policy: ActorCritic, config: PpoConfig) -> Stretch:
     """Step the simulator, and pass a rollout through actor, critic and memory as often as PPO does."""
-    envs, steps, updates = env.num_envs, config.rollout_steps, config.epochs * config.minibatches
-    rows = envs // config.minibatches
+    envs, steps, updates = env.num_envs, config.rollout_steps, EPOCHS * MINIBATCHES
+    rows = envs // MINIBATCHES
     observation, action = torch.randn(envs, env.observation_size), torch.zeros(envs, env.action_size)
     window = torch.randn(rows, steps, env.observation_size), torch.zeros(rows, steps, env.action_size)
     nothing, first = policy.initial_hidden(rows), torch.zeros(rows, steps)

@@ -207,8 +207,6 @@ def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]
             experience,
             IqlConfig(
                 critic_updates=critic_updates,
-                critic_batch=256,
-                critic_sizes=(256, 256),
                 return_steps=1,
                 policy_updates=1_000_000,
                 batch_windows=256,

@@ -14,7 +14,7 @@ def step_by_step(
     shape: GroundingShape, weights: LossWeights, episodes: PairedEpisodes, config: GroundConfig
 ) -> Stretch:
     """Learn from one trajectory after another; each call returns the windows' worth of steps of one."""
-    model = GroundingModel(shape, "online")
+    model = GroundingModel(shape)
     optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     order = cycle(range(len(episodes)))
 
@@ -32,11 +32,11 @@ def step_by_step(
             latent = model.encoder.latent(hidden)
             if expected is not None:
                 mean, log_variance = expected
-                surprise = (latent - mean).square() / log_variance.exp() + log_variance
-                loss = loss + weights.latent * 0.5 * surprise.mean()
+                nll = (latent - mean).square() / log_variance.exp() + log_variance
+                loss = loss + weights.latent * 0.5 * nll.mean()
             expected = model.predict_latent(latent, action)
             reward = model.predict_reward(latent, action)
-            loss = loss + weights.reward * (reward - windows.reward[:, step].sum(-1)).square().mean()
+            loss = loss + weights.reward * (reward - windows.reward[:, step]).square().mean()
             corrected = model.correct(latent, action, windows.simulated_next[:, step])
             loss = loss + weights.state * (corrected - windows.next_state[:, step]).square().mean()
         optimizer.zero_grad()

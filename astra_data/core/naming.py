@@ -1,6 +1,6 @@
 """Names of result rows, and of what the folder of a run holds: its record, and folders of seeds.
 
-A row is a method's name, or that name followed by `_plus`: the method trained with the `[plus]` settings.
+A row is a method's name, or that name followed by `_plus`: the method trained with the plus settings.
 """
 
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ STAGE_NAMES = (
 
 
 def is_plus(row: str) -> bool:
-    """Return whether a row is trained with the `[plus]` settings."""
+    """Return whether a row is trained with the plus settings."""
     return row.endswith(PLUS)
 
 

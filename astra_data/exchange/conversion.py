@@ -57,7 +57,7 @@ class Converter:
             raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
         columns, bad = {}, dict[str, Mask]()
         for name in (*self._mapping.split.ends, *([self._mapping.time] if self._mapping.time else [])):
-            bad[name] = ~np.isfinite(fields[name]).all(axis=1)
+            bad[name] = np.asarray(~np.isfinite(fields[name]).all(axis=1))
         for name, spec in self._mapping.columns.items():
             try:
                 values = _transformed(np.concatenate([fields[f] for f in spec.fields], axis=1), spec)
@@ -201,7 +201,8 @@ def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
             )
     elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():
         raise BadInputError("expected whole numbers below 2^63")
-    return np.where(finite.all(axis=1)[:, None], values, 0).astype(column.dtype), finite
+    whole = np.asarray(finite.all(axis=1))
+    return np.where(whole[:, None], values, 0).astype(column.dtype), finite
 
 
 class _Rounding:

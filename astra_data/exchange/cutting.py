@@ -148,7 +148,7 @@ class Cutter:
         own = counts[:-1].sum(axis=0)
         before = np.maximum.accumulate(np.where(table["finite"], np.arange(len(own)), -1))
         follows = (before >= 0) & (own[before] == own)
-        starts = [0, *(_first_row(int(kept[at]), before, own) for at in begins), len(own)]
+        starts: list[int] = [0, *(_first_row(int(kept[at]), before, own) for at in begins), len(own)]
         self._keep_ends(table, before, follows)
         ends = len(starts) - 1 if is_last else max(len(starts) - 2, 0)
         until = len(own) if is_last else starts[ends]
@@ -156,7 +156,7 @@ class Cutter:
         for reason in np.argmax(reasons[:, begins], axis=0):
             name = REASONS[reason]
             self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
-        is_new = [False, *reasons[: REASONS.index("end"), begins].any(axis=0).tolist()]
+        is_new = [False, *map(bool, np.atleast_1d(reasons[: REASONS.index("end"), begins].any(axis=0)))]
         columns = {column.name: table[column.name] for column in self.columns if column.name in table}
         for number in range(ends):
             self._ended &= not is_new[number]
@@ -179,7 +179,7 @@ class Cutter:
         time, and held over rows that are dropped, too; NaN where a file or an episode of the format begins.
         """
         n, split, drops = len(table["row"]), self._mapping.split, self._mapping.not_finite == "drop"
-        masks = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
+        masks: dict[str, Array] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
         apart = table["file"] | table["source"] | table["back"]
         for key, values in table.items():
             if key.startswith("ends "):
@@ -198,7 +198,7 @@ class Cutter:
             steps_s[apart] = np.nan
             masks["back"] = steps_s[:, 1] < 0
             if split.gap_s is not None:
-                masks["gap"] = (steps_s[:, 1:] > split.gap_s).any(axis=1)
+                masks["gap"] = np.asarray((steps_s[:, 1:] > split.gap_s).any(axis=1))
         for reason in ("end", "field"):
             masks[reason] &= ~apart
         masks["file"], masks["source"] = table["file"], table["source"]
@@ -213,7 +213,7 @@ class Cutter:
         if not jump:
             return np.zeros(len(kept), bool)
         [column] = (column for column in self.columns if column.name == jump.column)
-        where = as_rows(table[jump.column])[np.ix_(kept, list(jump.values))].astype(np.float64)
+        where = as_rows(table[jump.column])[np.ix_(kept, np.array(jump.values))].astype(np.float64)
         steps = shortest(np.diff(where, axis=0, prepend=where[:1]), full_turns(column)[list(jump.values)])
         return np.asarray(np.linalg.norm(steps, axis=1) > jump.above)
 
@@ -234,7 +234,8 @@ class Cutter:
 
     def _place(self, table: Table, at: int) -> str:
         """Name the row `at` of the table."""
-        return self._parts[table["part"][at]].row_name(int(table["row"][at]))
+        named: str = self._parts[table["part"][at]].row_name(int(table["row"][at]))
+        return named
 
     def _count(self, table: Table, steps_s: Array, until: int, *, is_last: bool) -> None:
         """Tally what the clock does up to the row `until`, and in the step to it."""

@@ -35,8 +35,6 @@ def differences(before: Mapping[str, Any], recipe: Recipe) -> dict[str, str]:
     }
     if "task" in changed and share_target(str(before.get("task")), recipe.task):
         changed[SIMULATOR] = changed.pop("task")
-    if "train" in changed:
-        changed.pop("plus", None)  # which takes over "train"
     return changed
 
 

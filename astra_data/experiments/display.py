@@ -62,7 +62,7 @@ class _TimeLeft(ProgressColumn):
         return Text("-:--:--" if seconds is None else str(timedelta(seconds=round(seconds))))
 
 
-class Estimate:
+class TimeEstimate:
     """The time that a run of items has left, by their work: how long an item of a stage takes.
 
     An item that runs takes what its share done says; one that waits, what others of its stage take.
@@ -165,7 +165,7 @@ class LiveDisplay:
 
     def __init__(self, keys: Collection[str], progress: Progress) -> None:
         self._total, self._progress = len(keys), progress
-        self._finished, self._estimate = 0, Estimate(keys)
+        self._finished, self._estimate = 0, TimeEstimate(keys)
         text = f"0 of {self._total} finished"
         self._whole = progress.add_task(text, total=self._total, note="", left=self._estimate.left)
         self._tasks: dict[str, TaskID] = {}

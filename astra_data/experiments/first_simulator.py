@@ -54,7 +54,7 @@ Drive = tuple[str, dict[str, str], tuple[str, ...], Fit]
 
 
 @dataclass(frozen=True)
-class Entry:
+class StateEntry:
     """A part of abstract states, a value, or an angle that is kept as cosine and sine.
 
     `code` is one expression of the variables of its `fields`, or two for an angle.
@@ -76,23 +76,23 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Simulator:
+class SimulatorKind:
     """An abstract simulator of X values and A commands, as code.
 
     Attributes:
         driven: variables of the commands that it uses, by a command's name.
         lines: of a step.
         constants: what was fitted to the logs.
-        doubts: what to check.
+        remarks: what to check.
     """
 
     logs: Logs
     called: str
-    entries: tuple[Entry, ...]
+    entries: tuple[StateEntry, ...]
     driven: dict[str, str]
     lines: tuple[str, ...]
     constants: dict[str, float] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def names(self) -> list[str]:
@@ -106,7 +106,7 @@ class Simulator:
         by = ", ".join(field.short for field in self.logs.of("command") if field.name in self.driven)
         fitted = [f"{name.lower()} {value:g}" for name, value in self.constants.items()]
         return "; ".join(
-            [f"{self.called}: {states}, moved by {by}", *fitted, *map("CHECK: {}".format, self.doubts)]
+            [f"{self.called}: {states}, moved by {by}", *fitted, *map("CHECK: {}".format, self.remarks)]
         )
 
     def code(self) -> str:
@@ -123,7 +123,7 @@ class Simulator:
             "inputs": unpacked([names[field.name] for field in fields]),
             "indices": repr(tuple(order.index(field.name) for field in fields)),
             "abstract": ", ".join(code for entry in self.entries for code in entry.code),
-            "doubts": "".join(f"; {doubt}" for doubt in self.doubts),
+            "remarks": "".join(f"; {remark}" for remark in self.remarks),
             "variables": unpacked(self.names),
             "commands": unpacked(used),
             "lines": "\n        ".join(self.lines),
@@ -195,7 +195,7 @@ class Simulator:
         return [float(f"{slope:.3g}") for slope in slopes]
 
 
-def first_simulator(logs: Logs) -> Simulator:
+def first_simulator(logs: Logs) -> SimulatorKind:
     """Return a simulator of the first kind that no other predicts `logs` clearly better than.
 
     Raises:
@@ -214,7 +214,7 @@ def first_simulator(logs: Logs) -> Simulator:
     if not good:
         return rest
     merged = {
-        name: getattr(good[0], name) + getattr(rest, name) for name in ("entries", "lines", "doubts")
+        name: getattr(good[0], name) + getattr(rest, name) for name in ("entries", "lines", "remarks")
     } | {name: getattr(good[0], name) | getattr(rest, name) for name in ("driven", "constants")}
     return replace(good[0], **merged)
 
@@ -241,18 +241,20 @@ def unpacked(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) > 1 else f"({names[0]},)"
 
 
-def _planar(logs: Logs) -> list[Simulator]:
+def _planar(logs: Logs) -> list[SimulatorKind]:
     """Return simulators of robots on a plane, if there are a position and a heading that commands move."""
     states, names = {one.plain: one for one in logs.of("state")}, identifiers(logs.of("state"))
     position = _position(logs, states)
     if position is None:
         return []
-    place = [Entry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", position, strict=True)]
+    place = [
+        StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", position, strict=True)
+    ]
     found = []
-    for heading, doubts in _headings(states, names, position[0].plain):
+    for heading, remarks in _headings(states, names, position[0].plain):
         for called, driven, lines, fit in _drives(logs.of("command")):
             step = ("heading = torch.atan2(heading_y, heading_x)", *lines)
-            kind = Simulator(logs, called, (*place, heading), driven, step, fit(1.0, 1.0), doubts)
+            kind = SimulatorKind(logs, called, (*place, heading), driven, step, fit(1.0, 1.0), remarks)
             speed, turn = kind.slopes(_forward_and_turn, JUDGED_STEPS)
             is_off = any(not 0.5 < slope < 2 for slope in (speed, turn))
             if kind.constants and speed and turn and (is_off or "TURN_PER_COMMAND" not in kind.constants):
@@ -277,19 +279,19 @@ def _position(logs: Logs, states: dict[str, Field]) -> tuple[Field, Field] | Non
 
 def _headings(
     states: dict[str, Field], names: dict[str, str], beside: str
-) -> list[tuple[Entry, tuple[str, ...]]]:
-    """Return what the heading may be, of cosine and sine, an angle or a quaternion, and doubts of it."""
+) -> list[tuple[StateEntry, tuple[str, ...]]]:
+    """Return what the heading may be, of cosine and sine, an angle or a quaternion, and remarks of it."""
     near = sorted(states, key=lambda name: (-len(os.path.commonprefix([name, beside])), len(name)))  # noqa: RUF071
     for stem in (name[:-2] for name in near if HEADING.fullmatch(name[:-2])):
         if {f"{stem}_x", f"{stem}_y"} <= states.keys():
             pair = states[f"{stem}_x"], states[f"{stem}_y"]
-            return [(Entry("heading", "1", pair, (names[pair[0].name], names[pair[1].name])), ())]
+            return [(StateEntry("heading", "1", pair, (names[pair[0].name], names[pair[1].name])), ())]
     for name in filter(HEADING.fullmatch, near):
         angle, one = names[states[name].name], (states[name],)
-        doubts = (f"{states[name].short} is clockwise from the axis of y, as of a compass",)
+        remarks = (f"{states[name].short} is clockwise from the axis of y, as of a compass",)
         ways = [
-            (Entry("heading", "1", one, (f"of.cos({angle})", f"of.sin({angle})")), ()),
-            (Entry("heading", "1", one, (f"of.sin({angle})", f"of.cos({angle})")), doubts),
+            (StateEntry("heading", "1", one, (f"of.cos({angle})", f"of.sin({angle})")), ()),
+            (StateEntry("heading", "1", one, (f"of.sin({angle})", f"of.cos({angle})")), remarks),
         ]
         return ways[::-1] if re.search("compass|course|cog|azimuth|hdg", name) else ways
     for stem in (name[:-1] for name in near if QUATERNION.fullmatch(name)):
@@ -301,7 +303,7 @@ def _headings(
                     cosine += f" + {q['x']} ** 2 - {q['y']} ** 2"
                     sine += f" + 2 * {q['x']} * {q['y']}"
                 parts = tuple(states[f"{stem}{axis}"] for axis in axes)
-                return [(Entry("heading", "1", parts, (cosine, sine)), ())]
+                return [(StateEntry("heading", "1", parts, (cosine, sine)), ())]
     return []
 
 
@@ -377,7 +379,7 @@ def _forward_and_turn(before: Floats, after: Floats) -> Floats:
     return np.column_stack([dx * cos + dy * sin, turned])
 
 
-def _direct(logs: Logs, planar: Simulator | None) -> Simulator:
+def _direct(logs: Logs, planar: SimulatorKind | None) -> SimulatorKind:
     """Return the simulator of the other commands: each moves the state of the same name."""
     taken = [one for entry in planar.entries for one in entry.fields] if planar else []
     parts = {one.plain for one in logs.of("state") if QUATERNION.fullmatch(one.plain)}
@@ -388,33 +390,33 @@ def _direct(logs: Logs, planar: Simulator | None) -> Simulator:
         moves.append((command, _moved(command, left, is_alone=len(logs.of("command")) == 1)))
         left = [one for one in left if one not in moves[-1][1]]
     idle = [command.short for command, found in moves if not found]
-    doubts = [f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect"] if idle else []
+    remarks = [f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect"] if idle else []
     if turned := [one.short for one in left if HEADING.fullmatch(one.plain)]:
-        doubts.append(f"{' and '.join(turned)} {'is' if len(turned) == 1 else 'are'} not in φ")
+        remarks.append(f"{' and '.join(turned)} {'is' if len(turned) == 1 else 'are'} not in φ")
     if whole and not planar:
-        doubts.append(f"{', '.join(sorted(whole))} are a quaternion: make yaw of it in φ")
+        remarks.append(f"{', '.join(sorted(whole))} are a quaternion: make yaw of it in φ")
     moves = [(command, found) for command, found in moves if found]
     inputs, variables = identifiers(logs.of("state")), identifiers(logs.of("command"), "cmd_")
     words = {"x", "y", "heading", *(planar.driven.values() if planar else ())}
     names = {key: f"s_{name}" if planar and name in words else name for key, name in inputs.items()}
     driven = {command.name: variables[command.name] for command, _ in moves}
 
-    def simulator(rates: Sequence[bool], constants: dict[str, float]) -> Simulator:
-        entries: list[Entry] = []
+    def simulator(rates: Sequence[bool], constants: dict[str, float]) -> SimulatorKind:
+        entries: list[StateEntry] = []
         lines: list[str] = []
         for (command, found), is_rate in zip(moves, rates, strict=True):
             given, at = variables[command.name], [names[one.name] for one in found]
             for one in found:
                 angle = f"of.cos({inputs[one.name]})", f"of.sin({inputs[one.name]})"
                 code = angle if _goes_around(logs, one) else (inputs[one.name],)
-                entries.append(Entry(names[one.name], one.unit, (one,), code))
+                entries.append(StateEntry(names[one.name], one.unit, (one,), code))
             if command.unit in FORCES:
                 lines.append(f"{at[-1]} = {at[-1]} + {at[-1].upper()}_PER_FORCE * {given} * TIMESTEP_S")
                 lines += [f"{at[0]} = {at[0]} + {at[1]} * TIMESTEP_S"] if len(at) > 1 else []
             else:
                 now = f"torch.atan2({at[0]}_y, {at[0]}_x)" if len(entries[-1].code) > 1 else at[0]
                 lines.append(f"{at[0]} = {now} + {given} * TIMESTEP_S" if is_rate else f"{at[0]} = {given}")
-        return Simulator(logs, DIRECT, tuple(entries), driven, tuple(lines), constants, tuple(doubts))
+        return SimulatorKind(logs, DIRECT, tuple(entries), driven, tuple(lines), constants, tuple(remarks))
 
     if not moves:
         return simulator([], {})

@@ -21,7 +21,7 @@ from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
 from astra_data.methods.method import Method
-from astra_data.training.build_env import EnvConfig, Simulation
+from astra_data.training.build_env import Simulation
 from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.own_policy import ActingPolicy, OwnPolicy
 from astra_data.training.policy_file import PolicyFile
@@ -29,8 +29,8 @@ from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.train import InSimulator, Training
 from astra_data.worlds.registry import task_named
 
-OPTIONS = tuple(name for name in EnvConfig.model_fields if not name.startswith("ramp"))
-"""The keywords of an environment; a ramp is the training's, not the environment's."""
+OPTIONS = ("data_start_share", "episode_steps")
+"""The keywords of an environment, keys of `[train]`."""
 
 
 def grounded(
@@ -47,7 +47,7 @@ def grounded(
         row: a row that is trained in a simulator; "direct_transfer" for the raw one.
         seed: one of the recipe's seeds: that of the data and the grounding.
         percent: the size of the dataset, where the recipe sweeps over sizes.
-        options: those of `OPTIONS` that are not to be as in the recipe, see `EnvConfig`.
+        options: those of `OPTIONS` that are not to be as in the recipe, see `TrainConfig`.
 
     Raises:
         BadInputError: the row is not trained in a simulator, an artifact is not there, or an option does not
@@ -146,7 +146,7 @@ def training_of(
     percent: int | None = None,
     changes: Mapping[str, Any] = {},
 ) -> Training:
-    """Return what `train` gives the method of a row of a run, with `changes` of its `[train]`, or `[plus]`.
+    """Return what `train` gives the method of a row of a run, with `changes` of its `[train]`.
 
     The policy that another one starts from is not read.
 
@@ -164,10 +164,9 @@ def _training(
     percent: int | None,
     changes: Mapping[str, Any],
 ) -> Training:
-    table = "plus" if is_plus(row) else "train"
     if _method_of(settings, row).learn is None:
         raise BadInputError(f"{row} has no training: expected a row that is trained")
-    changed = {"methods": [row], "seeds": [seed], table: settings.get(table, {}) | dict(changes)}
+    changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | dict(changes)}
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     _check_made(of_train, ("dataset", "grounding"))
     return Training(
@@ -181,6 +180,7 @@ def _training(
         device="cpu",
         folder=Path(run),
         progress=silent,
+        is_plus=is_plus(row),
     )
 
 

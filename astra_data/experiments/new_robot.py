@@ -25,7 +25,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import locate, names_at_home
 from astra_data.exchange.guessing import guess
 from astra_data.exchange.logs import Logs, Role, csv_files, logs_of
-from astra_data.experiments.first_simulator import DIRECT, Simulator, first_simulator, unpacked
+from astra_data.experiments.first_simulator import DIRECT, SimulatorKind, first_simulator, unpacked
 
 _COLUMNS: dict[Role, str] = {
     "state": STATE,
@@ -40,7 +40,7 @@ _TAKEN = sys.stdlib_module_names | {"astra_data", "conftest", "logs", "numpy", "
 _FILES = {"task.py": "{}.py", "recipe.toml": "{}.toml", "test.py": "test_{}.py", "README.md": "README.md"}
 
 
-def write_robot(name: str, out: Path, logs: Sequence[Path]) -> Simulator:
+def write_robot(name: str, out: Path, logs: Sequence[Path]) -> SimulatorKind:
     """Write the new folder `out` of the robot `name`; return the simulator that it begins with, and its logs.
 
     Args:
@@ -123,7 +123,7 @@ def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
     }
 
 
-def _values(name: str, simulator: Simulator) -> dict[str, str]:
+def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
     """Return what the templates name."""
     logs = simulator.logs
     states, commands = logs.of("state"), logs.of("command")
@@ -175,7 +175,7 @@ def _values(name: str, simulator: Simulator) -> dict[str, str]:
     }
 
 
-def _objective(simulator: Simulator) -> dict[str, str]:
+def _objective(simulator: SimulatorKind) -> dict[str, str]:
     """Return what the template names of the objective, to come to where logs go, and its code."""
     logs, is_planar = simulator.logs, simulator.called != DIRECT
     recorded = [states for states, _ in simulator.episodes()]
@@ -232,7 +232,7 @@ def _template(name: str, values: Mapping[str, str]) -> str:
     return Template(text).substitute(values)
 
 
-def _goals_of(simulator: Simulator, *, is_planar: bool) -> list[int]:
+def _goals_of(simulator: SimulatorKind, *, is_planar: bool) -> list[int]:
     """Return which values of recorded goals are for the position, or for all states; none if none are."""
     goals = simulator.logs.of("goal")
     if not is_planar:

@@ -5,7 +5,7 @@
                                       │   (all seeds of ground and train) ── (select)
                                       └── (rows without grounding train on the pairs alone)
 
-A row named `<method>_plus` is `<method>` trained with the recipe's `[plus]` settings; it shares the
+A row named `<method>_plus` is `<method>` trained with the plus settings; it shares the
 grounding and the alignment of `<method>`. A recipe with `data` labels that, and collects nothing. Where a
 recipe sweeps over sizes, what comes before is made of the largest once, `subset` makes each size of it,
 and everything from ground on is made for each.
@@ -178,7 +178,7 @@ class _Plan:
             "task": recipe.task,
             "simulator": recipe.task,
             "method": name,
-            "config": recipe.config_of(stage.name, name),
+            "config": recipe.config_of(stage.name),
             "settings": recipe.settings_of(name, stage.name) if name else None,
             "seed": seed,
             "percent": percent,

@@ -10,7 +10,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.dataset.edit import share
 from astra_data.experiments.own_methods import OwnMethod, add_all, with_offered
-from astra_data.experiments.recipe_tables import method_field, plus_field, stage_field
+from astra_data.experiments.recipe_tables import method_field, stage_field
 from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
 from astra_data.stages.registry import STAGES, Stage
@@ -41,7 +41,7 @@ class SweepConfig(Config):
 class Recipe(Config):
     """One experiment: which methods, on which task, with which seeds and settings.
 
-    Below `seeds` come a table for each stage, `based_on`, `sweep`, `plus`, and the methods' tables; see
+    Below `seeds` come a table for each stage, `based_on`, `sweep`, and the methods' tables; see
     `with_tables`.
     """
 
@@ -72,10 +72,7 @@ class Recipe(Config):
         return task_named(self.task).objective.scores[0]
 
     def settings_of(self, row: str, stage: str) -> Config | None:
-        """Return the settings of a row's method, if it has any and `stage` takes them.
-
-        Ranges to train in are reduced to the parameters that the task's simulator has.
-        """
+        """Return the settings of a row's method, if it has any and `stage` takes them."""
         name = base_method(row)
         method = METHODS[name]
         if method.table is None or method.configures != stage:
@@ -83,18 +80,16 @@ class Recipe(Config):
         if name in self.own_methods:
             return self.own_methods[name].settings(name)
         table: Any = getattr(self, method.table.name)
-        if method.table.ranges and stage == "train":
-            table = table.of_kind(type(getattr(task_named(self.task).varied, method.table.ranges)))
         settings: Config = table
         return settings
 
-    def config_of(self, stage: str, row: str = "") -> Config | None:
-        """Return the settings of a stage, for a row where it makes a policy; None where it has none."""
+    def config_of(self, stage: str) -> Config | None:
+        """Return the settings of a stage; None where it has none."""
         if stage == "collect" and self.largest != WHOLE:
             episodes = share(self.largest, self.collect.episodes)
             collect: Config = self.collect
             return collect.model_copy(update={"episodes": episodes})
-        config: Config | None = getattr(self, "plus" if stage == "train" and is_plus(row) else stage, None)
+        config: Config | None = getattr(self, stage, None)
         return config
 
     @model_validator(mode="before")
@@ -140,7 +135,7 @@ class Recipe(Config):
                 raise ValueError(unknown) from None
             if is_plus(row) and not method_named(row).in_simulator:
                 raise ValueError(
-                    f"'{row}' trains nothing in a simulator, so [plus] settings have no effect: "
+                    f"'{row}' trains nothing in a simulator, so plus settings have no effect: "
                     f"leave out {PLUS}"
                 )
         return rows
@@ -152,30 +147,6 @@ class Recipe(Config):
         collects_by = self.collect and self.collect.behavior
         if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
             raise ValueError(f"collect: good episodes of {self.task} are short: use 'suboptimal_ppo'")
-        eases = any(table.ramp_while for table in (self.train, self.plus))
-        if eases and task_named(self.task).objective.is_lasting:
-            raise ValueError(f"ramp_while: no episode of {self.task} succeeds before its end: expected 0")
-        return self
-
-    @model_validator(mode="after")
-    def _has_several_corrections(self) -> Self:
-        ground = self.ground
-        for table in (self.train, self.plus):
-            if table.keep_member and ground.members < 2:
-                raise ValueError(f"keep_member: expected ground.members of 2 or more, got {ground.members}")
-            if table.disagreement_penalty and not table.keep_member and ground.correction_heads < 2:
-                raise ValueError(
-                    "disagreement_penalty: expected ground.correction_heads of 2 or more, or keep_member"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _has_rewards_to_learn_from(self) -> Self:
-        initial = [method_named(row).initial for row in self.methods]
-        for row in (*self.methods, *filter(None, initial)):
-            table = "plus" if is_plus(row) else "train"
-            if not method_named(row).accepts(getattr(self, table).reward):
-                raise ValueError(f"{table}.reward: {row} predicts no reward: expected 'abstract' or 'blend'")
         return self
 
     @model_validator(mode="after")
@@ -193,17 +164,6 @@ class Recipe(Config):
             )
         if not any(method_named(row).trains_without_target for row in self.methods):
             raise ValueError("select: expected a row with policies of abstract states, got none")
-        return self
-
-    @model_validator(mode="after")
-    def _limits_all_commands(self) -> Self:
-        rows = {row: method_named(row) for row in self.methods}
-        elsewhere = [row for row, method in rows.items() if method.trains and not method.in_simulator]
-        if self.train.limits_commands and elsewhere:
-            raise ValueError(
-                f"train.command_limit: has no effect on {', '.join(elsewhere)}, which no simulator "
-                "trains: leave these rows out, or set it in [plus]"
-            )
         return self
 
     @model_validator(mode="after")
@@ -228,13 +188,8 @@ class Recipe(Config):
         faults = [f"methods: {row}" for row in self.methods if method_named(row).planar]
         asked = {
             "augment": self.augment is not None,
-            'collect.start = "anywhere" (the default: write start = "task")': self.collect
-            and self.collect.start == "anywhere",
+            'collect.start = "anywhere"': self.collect and self.collect.start == "anywhere",
             "collect.clearance_m": self.collect and self.collect.clearance_m > 0,
-            "train.support_penalty": self.train.support_penalty > 0,
-            "train.command_limit": self.train.limits_commands,
-            "plus.support_penalty": self.plus.support_penalty > 0,
-            "plus.command_limit": self.plus.limits_commands,
             "evaluate.leg_scale": self.evaluate.leg_scale != 1.0,
             "report.paper_success": bool(self.report.paper_success),
         }
@@ -283,13 +238,12 @@ def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[T
     """Return the model of recipes with the tables of `stages` and those that `methods` read.
 
     Further keys: `based_on`, the recipe that provides the settings not given here and the artifacts that do
-    not change; `sweep`; and `plus`, the training of `_plus` rows, which is laid over `train`.
+    not change; and `sweep`.
     """
     fields: dict[str, Any] = {stage.name: stage_field(stage) for stage in stages if stage.config}
     about = "The recipe of the settings that are not given here, and of the artifacts that do not change."
     fields["based_on"] = (str | None, Field(default=None, description=about))
     fields["sweep"] = (SweepConfig, SweepConfig())
-    fields["plus"] = plus_field(*fields["train"])
     fields |= {table.name: method_field(table) for table in methods}
     return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.lock import alone_in
-from astra_data.core.naming import RECORD, RUNS, is_plus, row_of_key, stage_of_key
+from astra_data.core.naming import RECORD, RUNS, row_of_key, stage_of_key
 from astra_data.experiments.condition import Condition, can_be_made_again, condition, spoilt, to_make_again
 from astra_data.experiments.data_check import data_condition
 from astra_data.experiments.devices import check_device, default_jobs, share_cores, with_threads
@@ -27,7 +27,7 @@ from astra_data.experiments.own_methods import OwnMethod, add_all
 from astra_data.experiments.plan import check_stage, plan, stage_of, stages_until
 from astra_data.experiments.points import Selection
 from astra_data.experiments.ray_executor import execute_on_cluster
-from astra_data.methods import grounded_as, method_named
+from astra_data.methods import grounded_as
 from astra_data.stages.registry import STAGES
 from astra_data.stages.report import is_current
 from astra_data.worlds.registry import TASKS, task_named
@@ -142,7 +142,6 @@ def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict
     """
     experiment = load_experiment(recipe_path, root)
     _check_task(experiment)
-    _warn_of_free_risk(experiment)
     data = data_condition(experiment.recipe)
     planned = plan(experiment.recipe, recipe_path, experiment.folder)
     conditions = {item.key: condition(item, experiment, verify=verify) for item in planned}
@@ -154,19 +153,6 @@ def _check_task(experiment: Experiment, device: str = "cpu") -> None:
     name = experiment.recipe.task
     if name not in TASKS and (faults := check_task(task_named(name), device)):
         raise BadInputError("\n".join(f"{experiment.path}: task {name}: {fault}" for fault in faults))
-
-
-def _warn_of_free_risk(experiment: Experiment) -> None:
-    """Tell that a reward prices no risk beside topples that are drawn, where rows are trained so."""
-    recipe = experiment.recipe
-    rows = [row for row in recipe.methods if method_named(row).in_simulator]
-    for table in dict.fromkeys("plus" if is_plus(row) else "train" for row in rows):
-        config = getattr(recipe, table)
-        if config.topple and config.reward == "blend":
-            _log.warning(
-                f'{experiment.path}: {table}: with topple = true, reward = "blend" is the task\'s own and '
-                "prices no risk, as topples that are drawn cost what failures do: leave out one of the two"
-            )
 
 
 Show = Callable[[Collection[str], Console], AbstractContextManager[Watcher]]
@@ -210,7 +196,6 @@ def make(
     with folder_for(folder / RECORD), alone_in(folder):
         experiment.check_unchanged()
         _check_task(experiment, "cpu" if cluster else device)
-        _warn_of_free_risk(experiment)
         clean(folder)
         again = to_make_again(items, experiment)
         for key, reason in again.items():

@@ -99,8 +99,8 @@ def view_run(
         send(f"{root}/target", task.action, columns[ACTION], "1f77b4")
         for name, replay in replays.items():
             color = "ffbb78" if name == "raw" else method_color(name)[1:]
-            path = replay.state[number, : len(path)].numpy()
+            path = replay[number, : len(path)].numpy()
             send(f"{root}/open_loop/{name}", task.abstract_state, path, color)
-    if save:
+    if save and recorded is not None:
         write_file(save, recorded.read())
     stream.flush()

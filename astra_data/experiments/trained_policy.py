@@ -49,12 +49,14 @@ class TrainedPolicy:
         return least, largest
 
     def running(self) -> RunningPolicy:
-        """Return it ready to act, with its encoder if it has one."""
+        """Return it ready to act, with the encoder that it is deployed with, if it has one."""
+        encoder = load_target_encoder(self.files["align"]) if "align" in self.files else None
+        asked = self.settings.get("evaluate", {}).get("encoder")
         return running(
             task_named(self.settings["task"]),
             self.file,
             grounding_at(self.files.get("ground")),
-            load_target_encoder(self.files["align"]) if "align" in self.files else None,
+            encoder if encoder is not None and (asked or encoder.is_deployed) else None,
         )
 
 

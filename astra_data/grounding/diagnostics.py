@@ -5,7 +5,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.grounding import GroundingModel, LossWeights
+from astra_data.learning.networks.grounding import GroundingModel, LossWeights, recorded_rewards
 from astra_data.learning.networks.paired_windows import PairedWindows
 
 
@@ -32,11 +32,9 @@ def telemetry(
     corrected = model.correct(latent, windows.action, windows.simulated_next)
     figures: dict[str, float | None] = {"r2_state": correction_r2(corrected, windows, model.correction_std)}
     if weights.reward > 0:
-        going_on, failing = model.predict_reward_parts(latent, windows.action)[mask].unbind(-1)
-        reward, failed = windows.reward[mask][:, 0], windows.failed[mask]
-        goes_on = windows.goes_on[mask].bool()
-        figures["r2_reward"] = _r2(going_on[goes_on], reward[goes_on])
-        figures["r2_final_reward"] = _r2(failing, failed * model.failure_cost)
+        known = windows.goes_on.bool() & mask
+        predicted, true = model.rewards(latent, windows.action)[known], recorded_rewards(windows)[known]
+        figures["r2_reward"] = _r2(predicted[:, 0], true[:, 0])
     if weights.latent > 0:
         mean, _ = model.predict_latent(latent[:, :-1], windows.action[:, :-1])
         both = mask[:, :-1] & mask[:, 1:]

@@ -1,8 +1,9 @@
-"""Fit the failure model, and measure how well failures are foreseen."""
+"""Fit the failure model, and measure how well it predicts failures."""
 
 import copy
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.learning.descent import Descent, DescentConfig
 from astra_data.learning.generators import seeded
-from astra_data.learning.networks.failure import FailureModel, FailureShape
+from astra_data.learning.networks.failure import FAILURE_STEPS, FailureModel, FailureShape
 from astra_data.learning.networks.paired_windows import RISK_STEPS, before_failures
 from astra_data.worlds.task import Task
 
@@ -35,7 +36,7 @@ BINS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Edges of the probabilities in a reliability diagram."""
 
 
-def failing(task: Task, episodes: PairedEpisodes, risk_steps: int) -> PairedEpisodes:
+def failing(task: Task, episodes: PairedEpisodes, risk_steps: int = FAILURE_STEPS) -> PairedEpisodes:
     """Return the episodes with what a failure model learns of them as `fails_soon`.
 
     That is the last `risk_steps` before a failure that no abstract state shows. Where one does, as with a
@@ -51,54 +52,129 @@ def failing(task: Task, episodes: PairedEpisodes, risk_steps: int) -> PairedEpis
     return replace(episodes, windows=replace(windows, fails_soon=soon))
 
 
-def tells_failures(task: Task, episodes: PairedEpisodes, risk_steps: int = RISK_STEPS) -> bool:
+def has_failures(task: Task, episodes: PairedEpisodes) -> bool:
     """Whether a failure model can be fitted: some steps are before a failure, and not every one."""
-    return _tells(failing(task, episodes, risk_steps))
+    return _is_mixed(failing(task, episodes, RISK_STEPS))
 
 
-def _tells(episodes: PairedEpisodes) -> bool:
+def _is_mixed(episodes: PairedEpisodes) -> bool:
     return _has_both(episodes.steps(episodes.windows.fails_soon))
 
 
 def fit_failures(
-    task: Task,
-    grounding: HistoryGrounding,
-    training: PairedEpisodes,
-    members: int,
-    seed: int,
-    risk_steps: int = RISK_STEPS,
-) -> FailureModel:
-    """Fit a failure model of `members` networks to replays of whole episodes; calibrate it by cross-fitting.
+    task: Task, grounding: HistoryGrounding, training: PairedEpisodes, seed: int
+) -> tuple[FailureModel, dict[str, Any]]:
+    """Fit a failure model to replays of whole episodes, calibrated by cross-fitting.
 
-    The episodes are such that `tells_failures`.
+    It sees the latent if this makes the moments of failures likelier in cross-fitting. The episodes are such
+    that `has_failures`.
+
+    Returns:
+        the model; and "latent", whether it sees the latent, and "candidates" with their log-likelihood in
+        nats per failure over a constant rate, None where a single recording fails.
     """
-    training = failing(task, training, risk_steps)
-    fails = training.windows.fails_soon
     torch.manual_seed(derive(seed, "failure model"))
-    untrained = _untrained(task, training, members, risk_steps)
+    untrained = _untrained(task, grounding, training, sees_latent=True)
     inputs = replayed_inputs(task, grounding, untrained, training)
-    seen = training.steps(inputs)
-    untrained.set_input_scales(seen)
-    model = _descended(untrained, seen, training.steps(fails))
-    odds, happened = [], []
-    for fold in folds(fails.any(1), training.recordings):
-        others = training.select((~fold).nonzero().squeeze(1))
-        if not _tells(others):
-            continue
-        fitted = _descended(untrained, others.steps(inputs[~fold]), others.steps(others.windows.fails_soon))
-        own = training.select(fold.nonzero().squeeze(1))
-        odds.append(fitted.log_odds(own.steps(inputs[fold])).detach())
-        happened.append(own.steps(own.windows.fails_soon))
-    if odds and _has_both(torch.cat(happened)):
-        model.calibrate(*calibration(torch.cat(odds, dim=1), torch.cat(happened), risk_steps))
-    return model.requires_grad_(False).eval()
+    divided = folds(failing(task, training).windows.fails_soon.any(1), training.recordings)
+    compared: list[dict[str, Any]] = []
+    chosen, best = None, -math.inf
+    for sees_latent in (False, True):
+        torch.manual_seed(derive(seed, f"failure model {sees_latent}"))
+        candidate = _Candidate.of(task, grounding, training, inputs, sees_latent=sees_latent)
+        gain = candidate.cross_fit(divided)
+        compared.append({"latent": sees_latent, "nats_per_failure": gain})
+        if chosen is None or (gain is not None and gain > best):
+            chosen, best = candidate, -math.inf if gain is None else gain
+    assert chosen is not None
+    model = chosen.fitted()
+    return model, {"latent": bool(model.shape.latent_size), "candidates": compared}
+
+
+@dataclass
+class _Candidate:
+    """A failure model to fit to what is seen of each step, `inputs` (E, T, I).
+
+    Attributes:
+        odds, happened: log-odds (K, N) and outcomes (N,) of steps that were predicted in cross-fitting.
+    """
+
+    untrained: FailureModel
+    episodes: PairedEpisodes
+    inputs: Tensor
+    odds: Tensor | None = None
+    happened: Tensor | None = None
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        grounding: HistoryGrounding,
+        training: PairedEpisodes,
+        inputs: Tensor,
+        *,
+        sees_latent: bool,
+    ) -> "_Candidate":
+        """Return the candidate; `inputs` (E, T, I) end with the latent."""
+        untrained = _untrained(task, grounding, training, sees_latent=sees_latent)
+        inputs = inputs[..., : untrained.shape.input_size]
+        untrained.set_input_scales(training.steps(inputs))
+        return cls(untrained, failing(task, training), inputs)
+
+    def cross_fit(self, divided: Sequence[Tensor]) -> float | None:
+        """Predict each fold's episodes by the others; return the log-likelihood of the failures' moments.
+
+        That is of the hazard at every step, over that of a constant one, in nats per failure; None without
+        folds.
+        """
+        windows, predicted = self.episodes.windows, []
+        for fold in divided:
+            others = self.episodes.select((~fold).nonzero().squeeze(1))
+            if not _is_mixed(others):
+                continue
+            fitted = _descended(self.untrained, *_steps(others, self.inputs[~fold]))
+            mask = windows.mask[fold].bool()
+            predicted.append((fitted.log_odds(self.inputs[fold][mask]).detach(), fold, fitted.log_odds_shift))
+        if not predicted:
+            return None
+        self.odds = torch.cat([odds for odds, *_ in predicted], dim=1)
+        masks = [(windows.mask[fold].bool(), fold) for _, fold, _ in predicted]
+        self.happened = torch.cat([windows.fails_soon[fold][mask] for mask, fold in masks])
+        if not _has_both(self.happened):
+            return None
+        scale, shift = calibration(self.odds, self.happened, self.untrained.shape.risk_steps)
+        soon = (scale * self.odds + shift).sigmoid().mean(0)
+        hazard = self.untrained.hazard(soon).clamp(1e-9, 1 - 1e-9)
+        now = torch.cat([_at_last(windows.fails_soon, windows.mask)[fold][mask] for mask, fold in masks])
+        rate = now.mean()
+        constant = now.sum() * rate.log() + (len(now) - now.sum()) * (1 - rate).log()
+        likelihood = (now * hazard.log() + (1 - now) * (1 - hazard).log()).sum()
+        return float((likelihood - constant) / now.sum())
+
+    def fitted(self) -> FailureModel:
+        """Return the model fitted to all episodes, and calibrated if it was cross-fitted."""
+        model = _descended(self.untrained, *_steps(self.episodes, self.inputs))
+        if self.odds is not None and self.happened is not None and _has_both(self.happened):
+            model.calibrate(*calibration(self.odds, self.happened, model.shape.risk_steps))
+        return model.requires_grad_(False).eval()
+
+
+def _steps(episodes: PairedEpisodes, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    return episodes.steps(inputs), episodes.steps(episodes.windows.fails_soon)
+
+
+def _at_last(fails_soon: Tensor, mask: Tensor) -> Tensor:
+    """Return 1 at the last real step of each episode that fails, else 0, (E, T)."""
+    return before_failures(fails_soon.bool().any(1), mask, 1)
 
 
 def _has_both(fails: Tensor) -> bool:
     return bool(fails.any() and not fails.all())
 
 
-def _untrained(task: Task, training: PairedEpisodes, members: int, risk_steps: int) -> FailureModel:
+def _untrained(
+    task: Task, grounding: HistoryGrounding, training: PairedEpisodes, *, sees_latent: bool
+) -> FailureModel:
     windows, maze = training.windows, task.objective.layout
     shape = FailureShape(
         state_size=windows.state.shape[-1],
@@ -106,8 +182,7 @@ def _untrained(task: Task, training: PairedEpisodes, members: int, risk_steps: i
         timestep_s=task.timestep_s,
         maze_cells=(len(maze.fine_walls), len(maze.fine_walls[0])) if maze else (0, 0),
         cell_m=maze.fine_m if maze else 1.0,
-        members=members,
-        risk_steps=risk_steps,
+        latent_size=grounding.model.shape.latent_size if sees_latent else 0,
     )
     model = FailureModel(shape).to(windows.mask.device)
     if maze is not None:
@@ -143,13 +218,12 @@ def replayed_inputs(
 
     The simulator moves more smoothly than the target, so that a failure announces itself less. Replays of
     `_REPLAYED` steps begin at every `RISK_STEPS`-th recorded moment. What is seen of a step is from the one
-    that began longest before it: nearly all that the averages remember is simulated then. They go as near to
-    walls as a judge's episodes do: see `HistoryGrounding.foreseeing`.
+    that began longest before it: nearly all that the averages remember is simulated then.
     """
     windows = episodes.windows
-    grounding = grounding.foreseeing(task.objective).reduced(members=False, failures=False)
+    grounding = replace(grounding, failures=None)
     moments = Moments.every(windows, RISK_STEPS)
-    simulator = grounding.corrected(task.simulator(len(moments), str(windows.mask.device)), None)
+    simulator = grounding.corrected(task.simulator(len(moments), str(windows.mask.device)))
     hidden = grounding.hidden_before(windows, RISK_STEPS)
     moments.start(simulator, hidden[moments.episode, moments.first // RISK_STEPS])
     state = moments.state
@@ -157,8 +231,9 @@ def replayed_inputs(
     replayed = state.new_zeros(*windows.mask.shape, failures.shape.input_size)
     for count in range(_REPLAYED):
         now, action = moments.after(count), moments.action(count)
+        latent = simulator.latent
         simulator.step(action)
-        inputs, memory = failures.inputs(state, action, simulator.landed, memory)
+        inputs, memory = failures.inputs(state, action, simulator.landed, latent, memory)
         state = simulator.state
         real = now == moments.first + count
         # A replay that began earlier comes to a step later, and replaces what was seen of it.
@@ -176,36 +251,19 @@ def averages_before(
 
 
 @torch.no_grad()
-def compared_foresight(
+def failure_figures(
     task: Task,
     grounding: HistoryGrounding,
+    failures: FailureModel,
     held_out: PairedEpisodes,
-    predicts_reward: bool,
     ahead: Sequence[tuple[int, int]] = AHEAD_STEPS,
 ) -> dict[str, Any]:
-    """Return the `foresight` on held-out episodes: of R_pred, and of failure model or topple head, as fitted.
-
-    The failure model is measured on replays, the others on what was recorded.
-    """
-    windows, model, failures = held_out.windows, grounding.model, grounding.failures
-    latent, _ = model.encode(windows)
-    found = {}
-    if predicts_reward and model.failure_weight > 0:
-        parts = model.predict_reward_parts(latent, windows.action)
-        probability = (parts[..., 1] / model.failure_cost * RISK_STEPS).clamp(0.0, 1.0)
-        found["predicted_reward"] = foresight(probability, held_out, ahead)
-    if failures is not None:
-        probability = failures.probability(replayed_inputs(task, grounding, failures, held_out))
-        found["failure_model"] = foresight(
-            probability, failing(task, held_out, failures.shape.risk_steps), ahead
-        )
-    else:
-        probability = model.topple_logit(latent, windows.action, windows.next_state).sigmoid()
-        found["topple_head"] = foresight(probability, held_out, ahead)
-    return found
+    """Return the `failure_skill` of a failure model on replays of held-out episodes."""
+    probability = failures.probability(replayed_inputs(task, grounding, failures, held_out))
+    return failure_skill(probability, failing(task, held_out, failures.shape.risk_steps), ahead)
 
 
-def foresight(
+def failure_skill(
     probability: Tensor, episodes: PairedEpisodes, ahead: Sequence[tuple[int, int]] = AHEAD_STEPS
 ) -> dict[str, Any]:
     """Measure probabilities (E, T) of what `fails_soon` marks on episodes that were not fitted.

@@ -9,11 +9,10 @@ from astra_data.core.errors import BadInputError
 from astra_data.grounding.files import KINDS
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding, Grounding
-from astra_data.worlds.expecting import expect
 from astra_data.worlds.own_code import explained
 from astra_data.worlds.task import Task
 
-_WRITTEN = ("kind", "scatter", "to_file", "from_file")
+_WRITTEN = ("kind", "to_file", "from_file")
 """The parts that a grounding does not inherit."""
 _ROUNDING = 1e-6
 """Between states that are the same, relative to their size and absolute."""
@@ -82,19 +81,6 @@ def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes)
             "would go on uncorrected: expected `return self._settle(before, corrected)`, which moves the "
             "simulator to the corrected states, as far as walls allow"
         )
-
-
-def check_scatter(grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
-    """Ask for the factor of the scatter around the correction in `episodes`, as trainings and judges do.
-
-    Raises:
-        BadInputError: that fails, or it is no finite factor (X, X) where the states are.
-    """
-    state, what = episodes.windows.state, f"{type(grounding).__name__}.scatter(episodes)"
-    size = state.shape[-1]
-    with explained(what):
-        found = grounding.scatter(episodes)
-    expect(f"{what}, a factor (X, X), zeros for none", found, (size, size), state.dtype, state.device)
 
 
 def _fault(value: object) -> str:

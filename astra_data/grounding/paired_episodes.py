@@ -129,7 +129,7 @@ class PairedEpisodes:
                 goal=padded.get(GOAL, action.new_empty(*mask.shape, 0)),
                 simulated_next=padded[ABSTRACT_SIMULATED_NEXT_STATE],
                 next_state=padded[ABSTRACT_NEXT_STATE],
-                reward=torch.stack([reward * ~terminated, reward * failed], dim=-1),
+                reward=reward,
                 goes_on=(mask & ~terminated).float(),
                 failed=failed.float(),
                 fails_soon=before_failures(failed.any(1), mask, RISK_STEPS),
@@ -286,4 +286,5 @@ def _dropped_place(dataset: Dataset) -> tuple[int, ...]:
 
 
 def _gather(windows: PairedWindows, rows: Tensor | tuple[Tensor, Tensor]) -> PairedWindows:
-    return PairedWindows(**{name: values[rows] for name, values in vars(windows).items()})
+    given = {name: values for name, values in vars(windows).items() if values is not None}
+    return PairedWindows(**{name: values[rows] for name, values in given.items()})

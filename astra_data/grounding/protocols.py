@@ -5,7 +5,6 @@ from typing import Any, ClassVar, Protocol, Self
 
 from torch import Tensor
 
-from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
 from astra_data.learning.networks.history import LatentEncoder
 from astra_data.learning.networks.paired_windows import PairedWindows
@@ -28,18 +27,12 @@ class Grounding(Protocol):
         """The source encoder ψ^s, whose latents policies observe; None where there are none."""
         return None
 
-    def corrected(self, simulator: PlacedSimulator, scatter: Tensor | None) -> EpisodeSimulator:
-        """Wrap `simulator` in the correction; see `simulator` below for `scatter`."""
-        return EpisodeSimulator(simulator, scatter=scatter)
+    def corrected(self, simulator: PlacedSimulator) -> EpisodeSimulator:
+        """Wrap `simulator` in the correction."""
+        return EpisodeSimulator(simulator)
 
     def simulator(
-        self,
-        task: Task,
-        num_envs: int,
-        device: str = "cpu",
-        *,
-        variation: Variation | None = None,
-        scatter: Tensor | None = None,
+        self, task: Task, num_envs: int, device: str = "cpu", *, variation: Variation | None = None
     ) -> EpisodeSimulator:
         """Build `num_envs` abstract simulators of `task`, corrected.
 
@@ -48,9 +41,8 @@ class Grounding(Protocol):
             num_envs: B.
             device: torch device.
             variation: ranges of the simulator's parameters, unless the grounding has its own.
-            scatter: factor (X, X) of noise that is added after each step.
         """
-        return self.corrected(abstract_simulator(task, num_envs, device, variation), scatter)
+        return self.corrected(abstract_simulator(task, num_envs, device, variation))
 
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor | None:
         """Return its memory before each `every`-th step, (E, ceil(T / every), H); None if it has none.
@@ -58,14 +50,6 @@ class Grounding(Protocol):
         Histories begin where `windows` (E, T, ...) do.
         """
         return None
-
-    def scatter(self, episodes: PairedEpisodes) -> Tensor:
-        """Return the factor (X, X) of the target's scatter around the corrected simulator."""
-        ...
-
-    def reduced(self, *, members: bool, failures: bool) -> "Grounding":
-        """Return the grounding without its members, or its failure model, where they are not asked for."""
-        return self
 
     def for_replay(self) -> "Grounding":
         """Return the grounding to replay recorded actions with: without noise of sensors and actions."""

@@ -35,7 +35,7 @@ def fit_scatter(
     descent = Descent(scatters, _DESCENT)
     while not descent.is_over:
         rows = torch.randint(len(inputs), (_BATCH,), device=inputs.device)
-        descent.update(scatters.surprise(inputs[rows], residual[rows]).mean())
+        descent.update(scatters.nll(inputs[rows], residual[rows]).mean())
     scatters.requires_grad_(False).eval()
     in_units = scatters.in_units(seen, unexplained)
     scatters.forms.copy_(in_units[torch.randperm(len(seen))[:forms]])

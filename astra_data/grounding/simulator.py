@@ -1,6 +1,5 @@
-"""The abstract simulator that episodes are run in: raw, scattered or varied; groundings correct its steps."""
+"""The abstract simulator that episodes are run in: raw or varied; groundings correct its steps."""
 
-import torch
 from torch import Tensor
 
 from astra_data.worlds.protocols import PlacedSimulator, RememberingSimulator
@@ -14,16 +13,14 @@ class EpisodeSimulator:
     Attributes:
         simulator: the abstract simulator that is stepped; the parameters of a `VariedSimulator` are redrawn
             for each episode.
-        scatter: factor (X, X) of Gaussian noise that is added after each step; None for no noise.
         latent_size: Z, of the latents that policies observe; 0 where there are none.
     """
 
     latent_size: int = 0
 
-    def __init__(self, simulator: PlacedSimulator, *, scatter: Tensor | None = None) -> None:
+    def __init__(self, simulator: PlacedSimulator) -> None:
         """Wrap `simulator`."""
         self.simulator = simulator
-        self.scatter = scatter
         self._varied = simulator if isinstance(simulator, VariedSimulator) else None
         self._remembering = _remembering_within(simulator)
 
@@ -41,11 +38,6 @@ class EpisodeSimulator:
     def latent(self) -> Tensor | None:
         """The latents (B, Z) of the histories so far; None where there are none."""
         return None
-
-    @property
-    def disagreement(self) -> Tensor:
-        """By how much more than on the data an ensemble disagreed on the last step, (B,); else zero."""
-        return torch.zeros_like(self.state[:, 0])
 
     @property
     def parameters(self) -> Tensor | None:
@@ -78,26 +70,20 @@ class EpisodeSimulator:
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the new states (B, X)."""
-        before = self.simulator.state
-        landed = self.simulator.step(action)
-        return landed if self.scatter is None else self._settle(before, landed)
+        return self.simulator.step(action)
 
-    def _settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Scatter `landed` (B, X) and move there from `before` (B, X), as far as walls allow."""
-        if self.scatter is not None:
-            landed = landed + torch.randn_like(landed) @ self.scatter.T
-        return self.simulator.settle(before, landed)
+    def _settle(self, before: Tensor, corrected: Tensor) -> Tensor:
+        """Move from `before` to `corrected` (B, X), as far as walls allow; return where that is."""
+        return self.simulator.settle(before, corrected)
 
     def failure_risk(self) -> Tensor | None:
         """Return the probability (B,) that the target failed in the last step; None where unknown."""
         return None
 
-    def predicted_reward(self, own: Tensor, *, with_failures: bool = True) -> Tensor | None:
+    def predicted_reward(self, own: Tensor) -> Tensor | None:
         """Return the target's reward (B,) of the last step as predicted; None where nothing predicts it.
 
-        Args:
-            own: the task's own reward on abstract states (B,), to which residual rewards are added.
-            with_failures: whether it holds what a failure costs, times its probability.
+        `own` (B,) is the task's reward on abstract states, to which residual rewards are added.
         """
         return None
 

@@ -29,6 +29,14 @@ from astra_data.learning.networks.policy import Policy
 from astra_data.learning.recorded import Recorded
 
 _LARGEST_WEIGHT = 100.0
+_CRITIC_BATCH = 256
+"""Transitions per update of the critics."""
+_CRITIC_SIZES = (128, 128)
+_CRITIC_LEARNING_RATE = 1e-3
+_TARGET_RATE = 0.005
+"""Polyak rate of the target action values, per update."""
+_GRADIENT_NORM = 1.0
+"""The policy's gradients are clipped to this norm."""
 _ROWS_AT_ONCE = 8192
 
 
@@ -37,14 +45,6 @@ class IqlConfig(Config):
 
     critic_updates: Count = 5_000
     """Gradient updates of the critics, all before the policy's first update."""
-    critic_batch: AtOnce = 256
-    """Transitions per update of the critics."""
-    critic_sizes: tuple[AtOnce, ...] = (128, 128)
-    """Hidden layers of each critic."""
-    critic_learning_rate: Positive = 1e-3
-    """Learning rate of the critics."""
-    target_rate: Share = 0.005
-    """Polyak rate of the target action values, per update."""
     expectile: Share = 0.9
     """Expectile of the action values that the state value estimates; the authors' value for AntMaze."""
     discount: Share = 0.99
@@ -54,12 +54,12 @@ class IqlConfig(Config):
     published method: at 20 steps/s a single command hardly moves the robot, and its advantage drowns in the
     critics' errors."""
     reward_scale: Positive = 1.0
-    """Factor on the recorded reward, applied before the shift."""
-    reward_shift: float = 0.0
-    """Added to each step's reward; 0 by default because progress is rewarded in every step. The usual -1 for
-    sparse rewards would reward falling over in tasks that a fall ends."""
+    """Factor on the recorded reward."""
     policy_updates: Count = 600
-    """Gradient updates of the policy."""
+    """Gradient updates of a new policy."""
+    fine_tuning_updates: Count = 100
+    """Gradient updates of a trained policy, at a tenth of the learning rate: with more or larger ones it
+    unlearns more than it learns."""
     batch_windows: AtOnce = 24
     """Windows per update of the policy."""
     window: AtOnce = 100
@@ -71,18 +71,12 @@ class IqlConfig(Config):
     temperature: NotNegative = 10.0
     """Inverse temperature of the advantage weights, which are clipped at 100; the authors' value for AntMaze.
     """
-    gradient_norm: Positive = 1.0
-    """The policy's gradients are clipped to this norm."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:
         if self.burn_in >= self.window:
             raise ValueError(f"burn_in: expected less than the window of {self.window}, got {self.burn_in}")
         return self
-
-
-FINE_TUNING = IqlConfig(learning_rate=1e-4, policy_updates=100)
-"""For fine-tuning: small steps, since a trained policy otherwise unlearns more than it learns."""
 
 
 @dataclass(frozen=True)
@@ -151,14 +145,14 @@ class Iql:
         self._transitions = transitions(experience, config)
         torch.manual_seed(derive(seed, "critics"))
         observed, acted = experience.observation.shape[-1], experience.action.shape[-1]
-        self._critics = _Critics(observed, acted, config.critic_sizes).to(experience.observation.device)
+        self._critics = _Critics(observed, acted, _CRITIC_SIZES).to(experience.observation.device)
         slow, fast = self._critics.slow_action_values, self._critics.action_values
         # Listed once, since finding a network's parameters takes as long as updating them.
         self._slow: list[Tensor] = [*slow.parameters()]
         self._fast: list[Tensor] = [*fast.parameters()]
         self._policy_parameters = [*policy.parameters()]
         learned = [*self._critics.value.parameters(), *fast.parameters()]
-        self._critic_optimizer = torch.optim.Adam(learned, lr=config.critic_learning_rate, fused=True)
+        self._critic_optimizer = torch.optim.Adam(learned, lr=_CRITIC_LEARNING_RATE, fused=True)
         self._optimizer = torch.optim.Adam(self._policy_parameters, lr=config.learning_rate, fused=True)
         self._weights: Tensor | None = None
 
@@ -191,7 +185,7 @@ class Iql:
     def _learn_values(self) -> dict[str, float]:
         """Take a step down the losses of V, eq. 5, and Q, eq. 6; let the slow Q follow."""
         config, critics, table = self.config, self._critics, self._transitions
-        rows = torch.randint(len(table), (config.critic_batch,)).to(table.reward.device)
+        rows = torch.randint(len(table), (_CRITIC_BATCH,)).to(table.reward.device)
         observation, action = table.observation[rows], table.action[rows]
         advantage = critics.advantage(observation, action)
         weight = torch.where(advantage > 0, config.expectile, 1.0 - config.expectile)
@@ -206,7 +200,7 @@ class Iql:
         (value + action_value).backward()
         self._critic_optimizer.step()
         with torch.no_grad():
-            torch._foreach_lerp_(self._slow, self._fast, config.target_rate)
+            torch._foreach_lerp_(self._slow, self._fast, _TARGET_RATE)
         return {"value": float(value.detach()), "action_value": float(action_value.detach())}
 
     def _learn_policy(self, update: int) -> dict[str, float]:
@@ -227,7 +221,7 @@ class Iql:
         loss = -(self._weights[steps][learned] * likelihood).mean()
         self._optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(self._policy_parameters, config.gradient_norm)
+        nn.utils.clip_grad_norm_(self._policy_parameters, _GRADIENT_NORM)
         self._optimizer.step()
         return {"policy": float(loss.detach())}
 
@@ -275,7 +269,7 @@ def transitions(experience: Experience, config: IqlConfig) -> Transitions:
     """
     count, lengths = config.return_steps, experience.lengths[:, None]
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
-    reward = (experience.reward * config.reward_scale + config.reward_shift) * (step < lengths)
+    reward = (experience.reward * config.reward_scale) * (step < lengths)
     weights = config.discount ** torch.arange(count, device=reward.device)
     summed = (nn.functional.pad(reward, (0, count - 1)).unfold(1, count, 1) * weights).sum(-1)
     last = (step + count - 1).minimum(lengths - 1)

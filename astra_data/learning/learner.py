@@ -10,6 +10,9 @@ from torch import Tensor
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
 
+_ROUNDING = 1e-9
+"""Of a sum of shares."""
+
 
 class Resumable(Protocol):
     """What checkpoints of a training hold, such as a network or an optimizer."""
@@ -31,7 +34,9 @@ class Learner(ABC):
 
     Attributes:
         env: the environment. acting: how a policy acts in it.
-        total_steps: environment steps in all. steps: those done.
+        total_steps: environment steps at most. steps: those done.
+        share: of the training that is done, from 0 to 1, which schedules follow.
+        pace: of the training; at 2 it ends after half of the steps that are left.
         rollout_steps: batched steps per iteration.
     """
 
@@ -49,23 +54,24 @@ class Learner(ABC):
         Args:
             acting: the environment and the policy's memory.
             parts: all else that learning changes, by name.
-            total_steps: environment steps in all.
+            total_steps: environment steps at most.
             rollout_steps: batched steps per iteration.
             seed: of all randomness.
         """
         self.env, self.acting = acting.env, acting
         self.total_steps, self.rollout_steps, self.steps = total_steps, rollout_steps, 0
+        self.share, self.pace = 0.0, 1.0
         self._parts, self._seed, self._iteration = parts, seed, 0
 
     @property
     def done(self) -> bool:
-        """Whether all steps are done."""
-        return self.steps >= self.total_steps
+        """Whether the training is over."""
+        return self.share >= 1.0 - _ROUNDING
 
     @property
     def share_left(self) -> float:
-        """Share of the steps that are not done yet."""
-        return 1.0 - self.steps / self.total_steps
+        """Share of the training that is not done yet."""
+        return 1.0 - self.share
 
     def iterate(self) -> dict[str, float]:
         """Take `rollout_steps` batched steps and learn.
@@ -78,7 +84,9 @@ class Learner(ABC):
         """
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
         figures = self._iterate()
-        self.steps += self.env.num_envs * self.rollout_steps
+        taken = self.env.num_envs * self.rollout_steps
+        self.steps += taken
+        self.share = min(1.0, self.share + self.pace * taken / self.total_steps)
         self._iteration += 1
         return self.acting.figures() | figures
 
@@ -88,7 +96,12 @@ class Learner(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state; see `load_state_dict`."""
-        progress = {"steps": self.steps, "iteration": self._iteration, "acting": self.acting.state_dict()}
+        progress = {
+            "steps": self.steps,
+            "share": self.share,
+            "iteration": self._iteration,
+            "acting": self.acting.state_dict(),
+        }
         return {name: part.state_dict() for name, part in self._parts.items()} | progress
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor, *, goes_on: bool = True) -> None:
@@ -98,7 +111,7 @@ class Learner(ABC):
         """
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
-        self.steps, self._iteration = state["steps"], state["iteration"]
+        self.steps, self.share, self._iteration = state["steps"], state["share"], state["iteration"]
         if goes_on:
             self.acting.load_state_dict(state["acting"], observation)
         else:

@@ -9,10 +9,10 @@ import math
 import torch
 from torch import Tensor, nn
 
-from astra_data.core.config import Config, Count, NotNegative, Positive, Share
+from astra_data.core.config import Config, Count, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
-from astra_data.learning.acting import Acting, Taken
+from astra_data.learning.acting import Acting
 from astra_data.learning.divergence import refuse_divergence
 from astra_data.learning.learner import Learner, Resumable
 from astra_data.learning.networks.actor_critic import ActorCritic
@@ -20,8 +20,20 @@ from astra_data.learning.networks.policy import gaussian_log_prob
 from astra_data.learning.return_scale import ReturnScale
 from astra_data.worlds.batched import BatchedEnv
 
+EPOCHS, MINIBATCHES = 5, 16
+"""Passes over a rollout, and updates per pass, each on the complete rollouts of some environments."""
+GAE_LAMBDA, CLIP, VALUE_WEIGHT, GRADIENT_NORM = 0.95, 0.2, 0.5, 0.5
+_CRITIC_GAIN = 0.01
+"""Initial gain of the critic's last layer. With 1, its values exceed small returns, so the first advantages
+reflect the untrained critic instead of the rewards."""
+_MAX_KL = 0.03
+"""An iteration's passes stop once a minibatch's policy has diverged this far from the one that collected the
+rollout: as action noise fades, ever smaller updates undo learning."""
+_FINAL_STD, _FADE_SHARE = 0.15, 0.5
+"""The limit of the actions' standard deviation falls to this, by equal factors, over this share of the
+training, so that the policy is trained as it is tested."""
 _PULL = 0.05
-"""Weight in the loss of the square by which means that are clipped are beyond ±1."""
+"""Weight in the loss of the square by which clipped means are beyond ±1."""
 
 _SEEN = ("observation", "previous_action", "hidden", "start")
 _LEARNED = ("action", "action_log_prob", "advantage", "value_target")
@@ -30,46 +42,14 @@ _LEARNED = ("action", "action_log_prob", "advantage", "value_target")
 class PpoConfig(Config):
     """Settings of proximal policy optimization."""
 
-    total_steps: Count = 4_000_000
-    """Total number of environment steps."""
+    total_steps: Count = 2_000_000
+    """Maximum number of environment steps; a training whose episodes succeed ends earlier."""
     rollout_steps: Count = 64
     """Steps of each environment per iteration."""
-    epochs: Count = 5
-    """Passes over the collected steps per iteration."""
-    minibatches: Count = 4
-    """Updates per pass; each uses the complete rollouts of part of the environments."""
     learning_rate: Positive = 5e-4
     """Learning rate at the start; decays linearly to zero."""
     discount: Share = 0.99
     """Discount factor per step."""
-    gae_lambda: Share = 0.95
-    """λ of generalized advantage estimation."""
-    clip: Positive = 0.2
-    """Range around 1 of an action's probability ratio within which the objective is not clipped."""
-    entropy_weight: NotNegative = 0.003
-    """Weight of the policy's entropy in the loss."""
-    value_weight: NotNegative = 0.5
-    """Weight of the critic's squared error in the loss."""
-    gradient_norm: Positive = 0.5
-    """Gradients are clipped to this norm."""
-    reward_scale: Positive = 0.1
-    """Factor on the reward that the critic learns from."""
-    normalize_returns: bool = False
-    """Divide rewards by the running standard deviation of the discounted return; `reward_scale` then has no
-    effect."""
-    critic_gain: Positive = 1.0
-    """Initial gain of the critic's last layer. With 1, its values exceed small returns, so the first
-    advantages reflect the untrained critic instead of the rewards."""
-    clipped_mean: bool = False
-    """Clip the mean of the actions to ±1 instead of using a tanh, which is flat near full speed."""
-    most_kl: Positive | None = None
-    """Stop an iteration's passes once a minibatch's policy has diverged this far (KL) from the one that
-    collected the rollout; by default all passes are made."""
-    final_std: Positive | None = None
-    """Maximum standard deviation of the actions at the end; the limit falls to it by equal factors, so that
-    the policy is trained as it is tested. By default the policy keeps the deviation it has learned."""
-    std_fade: Share = 1.0
-    """Fraction of the training over which the deviation falls to `final_std`."""
 
 
 class Ppo(Learner):
@@ -98,14 +78,15 @@ class Ppo(Learner):
             raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")
         self.policy, self.config = policy, config
         with torch.no_grad():
-            policy.value_layer.weight.mul_(config.critic_gain)
+            policy.value_layer.weight.mul_(_CRITIC_GAIN)
         self._first_std = float(policy.log_std.detach().exp().max())
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
-        parts: dict[str, Resumable] = {"policy": policy, "optimizer": self._optimizer}
-        self._returns = None
-        if config.normalize_returns:
-            device = policy.log_std.device
-            self._returns = parts["returns"] = ReturnScale(env.num_envs, config.discount, device)
+        self._returns = ReturnScale(env.num_envs, config.discount, policy.log_std.device)
+        parts: dict[str, Resumable] = {
+            "policy": policy,
+            "optimizer": self._optimizer,
+            "returns": self._returns,
+        }
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
             Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=True),
@@ -120,12 +101,11 @@ class Ppo(Learner):
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.learning_rate * self.share_left
         self._learn(self._collect())
-        if (final := self.config.final_std) is not None:
-            faded = min(1.0, (1.0 - self.share_left) / self.config.std_fade) if self.config.std_fade else 1.0
-            with torch.no_grad():
-                self.policy.log_std.clamp_(
-                    max=math.log(self._first_std) + faded * math.log(final / self._first_std)
-                )
+        faded = min(1.0, (1.0 - self.share_left) / _FADE_SHARE)
+        with torch.no_grad():
+            self.policy.log_std.clamp_(
+                max=math.log(self._first_std) + faded * math.log(_FINAL_STD / self._first_std)
+            )
         figures = {"std": float(self.policy.log_std.detach().exp().mean())}
         refuse_divergence(f"after step {self.steps}", figures)
         return figures
@@ -151,7 +131,7 @@ class Ppo(Learner):
                 "mean": mean,
                 "std": std,
                 "action": action,
-                "reward": self._scaled(taken),
+                "reward": self._returns.scaled(taken.step.reward, taken.done),
                 "terminated": step.terminated,
                 "done": taken.done,
                 "beyond": torch.zeros_like(step.reward),
@@ -168,32 +148,24 @@ class Ppo(Learner):
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
         parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
-        advantage = generalized_advantages(
-            *parts, discount=self.config.discount, gae_lambda=self.config.gae_lambda
-        )
+        advantage = generalized_advantages(*parts, discount=self.config.discount, gae_lambda=GAE_LAMBDA)
         target = advantage + rollout["value"]
         return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
 
-    def _scaled(self, taken: Taken) -> Tensor:
-        """Return the rewards (B,) of a step as the critic learns from them."""
-        if self._returns is None:
-            return taken.step.reward * self.config.reward_scale
-        return self._returns.scaled(taken.step.reward, taken.done)
-
     def _learn(self, rollout: dict[str, Tensor]) -> None:
-        config, policy = self.config, self.policy
+        policy = self.policy
         advantage = rollout["advantage"]
         rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         count = len(advantage)
-        for _ in range(config.epochs):
+        for _ in range(EPOCHS):
             order = torch.randperm(count, device=advantage.device)
-            for rows in order.chunk(config.minibatches):
+            for rows in order.chunk(MINIBATCHES):
                 loss, moved = self._loss({name: rollout[name][rows] for name in _SEEN + _LEARNED})
-                if config.most_kl is not None and moved.abs() > config.most_kl:
+                if moved.abs() > _MAX_KL:
                     return
                 self._optimizer.zero_grad()
                 loss.backward()
-                nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_norm)
+                nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
                 self._optimizer.step()
 
     def _loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -201,7 +173,7 @@ class Ppo(Learner):
 
         That is an estimate of the divergence of the policy from the one that collected the rollout.
         """
-        config, policy = self.config, self.policy
+        policy = self.policy
         remembered = policy.remember_sequence(*(batch[name] for name in _SEEN))
         features, action, action_log_prob, advantage, target = (
             values.flatten(0, 1) for values in (remembered, *(batch[name] for name in _LEARNED))
@@ -210,13 +182,11 @@ class Ppo(Learner):
         mean, std = policy.gaussian(output)
         moved = gaussian_log_prob(mean, std, action) - action_log_prob
         ratio = moved.exp()
-        clipped = ratio.clamp(1.0 - config.clip, 1.0 + config.clip)
+        clipped = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
         gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
-        wrong = (policy.value(features) - target).square().mean()
-        entropy = (std.log() + math.log(2 * math.pi * math.e) / 2).sum(-1).mean()
-        loss = config.value_weight * wrong - gain - config.entropy_weight * entropy
-        if policy.shape.clips_mean:
-            loss = loss + _PULL * (output.abs() - 1.0).clamp_min(0.0).square().mean()
+        critic_loss = (policy.value(features) - target).square().mean()
+        beyond = (output.abs() - 1.0).clamp_min(0.0).square().mean()
+        loss = VALUE_WEIGHT * critic_loss - gain + _PULL * beyond
         return loss, -moved.mean()
 
 

@@ -13,9 +13,8 @@ from typing import Self
 import torch
 from pydantic import model_validator
 from torch import Tensor, nn
-from torch.nn import functional
 
-from astra_data.core.config import Config, Count, CountFromZero, NotNegative, Positive, Share
+from astra_data.core.config import Config, Count, CountFromZero, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.learning.acting import Acting
@@ -23,9 +22,15 @@ from astra_data.learning.divergence import refuse_divergence
 from astra_data.learning.learner import Learner
 from astra_data.learning.networks.policy import PolicyShape, features_of
 from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.learning.recorded import Recorded
 from astra_data.learning.replay import Replay
 from astra_data.worlds.batched import BatchedEnv
+
+_REWARD_SCALE = 0.1
+"""Factor on the reward that the critics learn from."""
+_INITIAL_TEMPERATURE = 0.2
+"""Weight of the entropy in the reward at the start."""
+_TARGET_RATE = 0.005
+"""Polyak rate of the target critics, per update."""
 
 
 class SacConfig(Config):
@@ -39,27 +44,17 @@ class SacConfig(Config):
     """Gradient updates per batched step."""
     batch_size: Count = 256
     """Steps per update; if the policy has a memory, split into windows."""
-    window: Count = 32
+    window: Count = 16
     """Consecutive steps per window, if the policy has a memory."""
-    burn_in: CountFromZero = 8
+    burn_in: CountFromZero = 4
     """Steps at the start of a window that only warm up the memory, until an episode starts."""
-    buffer_size: Count = 1_000_000
+    buffer_size: Count = 160_000
     """Number of most recent steps kept for replay."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = 3e-4
     """Learning rate of actor, critics and temperature; decays to zero over the second half of the training.
     Otherwise the quality of the final policy is left to chance."""
-    discount: Share = 0.97
+    discount: Share = 0.99
     """Discount factor per step."""
-    reward_scale: Positive = 1.0
-    """Factor on the reward that the critics learn from."""
-    initial_temperature: Positive = 0.2
-    """Weight of the entropy in the reward at the start."""
-    target_rate: Share = 0.005
-    """Polyak rate of the target critics, per update."""
-    imitation_weight: NotNegative = 0.0
-    """Weight of the mean squared distance to recorded actions in the actor's loss, relative to the magnitude
-    of the mean action value, including entropy. 0.4 is the value of Fujimoto and Gu (2021), who use the mean
-    magnitude. No effect in the target: upper bounds use no recorded data."""
 
     @model_validator(mode="after")
     def _leaves_steps_to_learn_from(self) -> Self:
@@ -85,7 +80,6 @@ class Sac(Learner):
         *,
         horizon: int,
         seed: int,
-        recorded: Recorded | None = None,
     ) -> None:
         """Prepare to train `policy` in `env`.
 
@@ -95,7 +89,6 @@ class Sac(Learner):
             config: settings.
             horizon: steps after which episodes are truncated.
             seed: of all randomness.
-            recorded: episodes to imitate, if any.
 
         Raises:
             BadInputError: the buffer is smaller than a window.
@@ -105,7 +98,7 @@ class Sac(Learner):
         device = next(policy.parameters()).device
         self._critics = _Critics(policy.shape).to(device)
         self._late_critics = copy.deepcopy(self._critics).requires_grad_(False)
-        self._log_temperature = nn.Parameter(torch.tensor(config.initial_temperature, device=device).log())
+        self._log_temperature = nn.Parameter(torch.tensor(_INITIAL_TEMPERATURE, device=device).log())
         learned = [*policy.parameters(), *self._critics.parameters(), self._log_temperature]
         self._optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
         self._window, self._burn_in = (config.window, config.burn_in) if policy.memory else (1, 0)
@@ -114,7 +107,6 @@ class Sac(Learner):
                 f"buffer_size: expected at least {(self._window + 1) * env.num_envs} steps, for a window of "
                 f"{self._window} in {env.num_envs} environments, got {config.buffer_size}"
             )
-        self._recorded = recorded
         self._replay = Replay(config.buffer_size, env, policy.shape.memory_size, device)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
@@ -163,7 +155,7 @@ class Sac(Learner):
         self._replay.add(
             **seen,
             action=taken.action,
-            reward=taken.step.reward * self.config.reward_scale,
+            reward=taken.step.reward * _REWARD_SCALE,
             terminated=taken.step.terminated,
             expired=taken.expired,
         )
@@ -174,18 +166,14 @@ class Sac(Learner):
         steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
         if not bool(learned.any()):
             return
-        wrong, costs, calm = self._losses(steps, learned)
-        total = wrong + costs + calm
-        if self._recorded is not None:
-            size = costs.detach().abs()  # almost entirely action values
-            total = total + config.imitation_weight * size * self._distance(self._recorded)
+        total = sum(self._losses(steps, learned), torch.zeros((), device=learned.device))
         refuse_divergence(f"after step {self.steps}", {"loss": float(total.detach())})
         self._optimizer.zero_grad()
         total.backward()
         self._optimizer.step()
         with torch.no_grad():
             late, now = self._late_critics.parameters(), self._critics.parameters()
-            torch._foreach_lerp_([*late], [*now], config.target_rate)
+            torch._foreach_lerp_([*late], [*now], _TARGET_RATE)
 
     def _losses(self, steps: dict[str, Tensor], learned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the losses of critics, eq. 5, actor, eq. 7, and temperature, eq. 18.
@@ -204,25 +192,14 @@ class Sac(Learner):
             late = self._late_critics.features(*seen, first)[:, 1:][learned]
             following = self._late_critics(late, action).amin(0) - temperature * log_prob
             wanted = reward + self.config.discount * ~terminated * following
-        wrong = (critics(judging, taken) - wanted).square().mean(1).sum()
+        critic_loss = (critics(judging, taken) - wanted).square().mean(1).sum()
         action, log_prob = self.policy.sample(acting[:, :-1][learned])
         # The actor must change neither the critics nor their memory to raise its own values.
         critics.requires_grad_(False)
-        costs = (temperature * log_prob - critics(judging.detach(), action).amin(0)).mean()
+        actor_loss = (temperature * log_prob - critics(judging.detach(), action).amin(0)).mean()
         critics.requires_grad_(True)
         surplus = action.shape[-1] - log_prob.detach().mean()
-        return wrong, costs, self._log_temperature * surplus
-
-    def _distance(self, recorded: Recorded) -> Tensor:
-        """Return the mean squared distance of the policy's actions from the recorded ones."""
-        steps, learned = recorded.windows(self.config.batch_size // self._window, self._window, self._burn_in)
-        features = self.policy.remember_sequence(
-            steps["observation"],
-            steps["previous_action"],
-            self.policy.initial_hidden(len(learned)),
-            torch.zeros_like(learned, dtype=torch.float32),
-        )
-        return functional.mse_loss(self.policy.act(features[learned]), steps["action"][learned])
+        return critic_loss, actor_loss, self._log_temperature * surplus
 
 
 class _Critics(nn.Module):

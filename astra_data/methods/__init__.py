@@ -10,7 +10,15 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.grounding.files import KINDS
 from astra_data.grounding.own_grounding import missing_parts
-from astra_data.methods.astra import ASTRA, ASTRA_TASK_REWARD, ASTRA_WITHOUT_LATENT, ASTRA_WITHOUT_REWARD
+from astra_data.methods.astra import (
+    ASTRA,
+    ASTRA_PRINTED,
+    ASTRA_TASK_REWARD,
+    ASTRA_WITHOUT_FAILURES,
+    ASTRA_WITHOUT_LATENT,
+    ASTRA_WITHOUT_REWARD,
+    ASTRA_WITHOUT_SCATTER,
+)
 from astra_data.methods.compass import COMPASS
 from astra_data.methods.direct_transfer import DIRECT_TRANSFER
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
@@ -43,6 +51,9 @@ METHODS: dict[str, Method] = {
         ASTRA_WITHOUT_LATENT,
         ASTRA_WITHOUT_REWARD,
         ASTRA_TASK_REWARD,
+        ASTRA_WITHOUT_FAILURES,
+        ASTRA_WITHOUT_SCATTER,
+        ASTRA_PRINTED,
         FOLLOWER,
     )
 }
@@ -106,8 +117,6 @@ def _faults(method: Method) -> Iterator[str]:
         yield f"has a grounding, {method.grounding.__name__}, without {', '.join(missing)}"
     if (table := method.table) is None:
         return
-    if table.ranges:
-        yield "has a table of ranges, which only methods of the package have"
     if not issubclass(table.model, Config):
         yield (
             f"has settings of {table.model.__name__}, which is no astra_data.core.config.Config: expected "

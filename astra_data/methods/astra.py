@@ -11,7 +11,6 @@ ASTRA = Method(
     title="ASTRA",
     color="#009E73",
     fit=HistoryFit(latent=True, reward=True),
-    predicts_reward=True,
     learn=InSimulator(reward="predicted"),
     aligns=True,
 )
@@ -32,7 +31,6 @@ ASTRA_WITHOUT_REWARD = replace(
     title="ASTRA w/o L_rew",
     color="#999933",
     fit=HistoryFit(latent=True, reward=False),
-    predicts_reward=False,
     learn=InSimulator(),
 )
 """Table II, "w/o reward". Without R_pred the policy learns from the task's own reward."""
@@ -42,7 +40,35 @@ ASTRA_TASK_REWARD = replace(
     name="astra_task_reward",
     title="ASTRA, task reward",
     color="#117733",
-    learn=InSimulator(reward="abstract"),
+    learn=InSimulator(),
     grounded_as="astra",
 )
 """ASTRA's grounding; the policy is trained with the task's own reward on corrected states."""
+
+ASTRA_WITHOUT_FAILURES = replace(
+    ASTRA,
+    name="astra_without_failures",
+    title="ASTRA w/o failure model",
+    color="#DDCC77",
+    fit=HistoryFit(latent=True, reward=True, failures=False),
+)
+"""R_pred learns failures with the rest of the reward."""
+
+ASTRA_WITHOUT_SCATTER = replace(
+    ASTRA,
+    name="astra_without_scatter",
+    title="ASTRA w/o scatter",
+    color="#CC6677",
+    fit=HistoryFit(latent=True, reward=True, scatter=False),
+)
+"""Corrected steps are as smooth as the correction is."""
+
+ASTRA_PRINTED = replace(
+    ASTRA,
+    name="astra_printed",
+    title="ASTRA as printed",
+    color="#5E4FA2",
+    fit=HistoryFit(latent=True, reward=True, failures=False, scatter=False, printed=True),
+)
+"""The paper's losses and nothing else: R_pred learns the whole reward, no failure model, no scatter, and
+corrections as close to walls as the simulator goes."""

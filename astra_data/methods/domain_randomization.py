@@ -4,14 +4,12 @@ The paper's N(0, 0.05) is read as a standard deviation of 0.05, of commands of Â
 episode. The task has the ranges.
 """
 
-from astra_data.methods.method import Method, Table
+from astra_data.methods.method import Method
 from astra_data.training.train import InSimulator
-from astra_data.worlds.variation import AnyVariation
 
 DOMAIN_RANDOMIZATION = Method(
     name="domain_randomization",
     title="Domain randomization",
     color="#CC79A7",
     learn=InSimulator(ranges="randomized"),
-    table=Table("domain_randomization", AnyVariation, ranges="randomized"),
 )

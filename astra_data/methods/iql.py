@@ -1,6 +1,6 @@
 """IQL on the target's own episodes, and direct transfer fine-tuned by it (Section V, "IQL" and "DT+IQL").
 
-And behavior cloning, IQL without its critics: the baseline for the imitation in `[plus]`.
+And behavior cloning, IQL without its critics.
 The paper does not say whether the fine-tuning interacts with the target: ours learns from the same recorded
 episodes as every other row. Critics value commands better where they see sines and cosines of the position.
 """
@@ -19,7 +19,7 @@ from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.iql import FINE_TUNING, Experience, Iql, IqlConfig
+from astra_data.learning.iql import Experience, Iql, IqlConfig
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.history import PositionFeatures
 from astra_data.learning.networks.policy import Policy
@@ -74,7 +74,12 @@ def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
 
 
 def _config(training: Training) -> IqlConfig:
-    return own_settings(training.settings, FINE_TUNING if training.initial else IqlConfig())
+    """Return the settings; a trained policy is tuned by fewer and smaller updates."""
+    config = own_settings(training.settings, IqlConfig())
+    if training.initial is None:
+        return config
+    fewer = {"policy_updates": config.fine_tuning_updates, "learning_rate": config.learning_rate / 10}
+    return config.model_copy(update=fewer)
 
 
 def experience_of(task: Task, episodes: PairedEpisodes) -> Experience:
@@ -137,7 +142,6 @@ DIRECT_TRANSFER_IQL = Method(
     learn=learn_from_episodes,
     learns_from="episodes",
     initial="direct_transfer",
-    table=Table("direct_transfer_iql", IqlConfig, default=FINE_TUNING),
+    table=Table("iql", IqlConfig),
 )
-"""Fits the critics while the policy is left as it is; then fine-tunes direct transfer's policy, gently by
-default, since it otherwise unlearns more than it learns."""
+"""Fits the critics while the policy is left as it is; then fine-tunes direct transfer's policy, gently."""

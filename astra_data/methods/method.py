@@ -6,7 +6,6 @@ from typing import Any, Literal
 from astra_data.core.config import Config
 from astra_data.grounding.fit import Fit
 from astra_data.grounding.protocols import FittedGrounding
-from astra_data.training.simulator_env import RewardSource
 from astra_data.training.train import InSimulator, Learn
 
 IN_RAW_SIMULATOR = InSimulator()
@@ -26,13 +25,11 @@ class Table:
     Attributes:
         name: its key in recipes. model: of its content.
         default: the settings where a recipe has no such table; None for those of the model.
-        ranges: the task's ranges of simulator parameters that it is laid over, if it holds ranges.
     """
 
     name: str
     model: type[Config]
     default: Config | None = None
-    ranges: Literal["randomized", "wide"] | None = None
 
     @property
     def usual(self) -> Config:
@@ -53,7 +50,6 @@ class Method:
         color: in figures, as "#rrggbb"; one of the spare colors where empty.
         role: set for rows that the others are compared with.
         fit: what it learns about the simulator from pairs; None where the simulator stays raw.
-        predicts_reward: whether that includes the target's reward.
         learn: how it learns its policy; None where there is none to learn. learns_from: from what.
         aligns: whether a target encoder is fitted for deployment.
         initial: the method from whose policy its own training starts, if any.
@@ -68,7 +64,6 @@ class Method:
     color: str = ""
     role: Role | None = None
     fit: Fit | None = None
-    predicts_reward: bool = False
     learn: Learn | None = IN_RAW_SIMULATOR
     learns_from: Source = "simulator"
     aligns: bool = False
@@ -91,7 +86,7 @@ class Method:
 
     @property
     def in_simulator(self) -> bool:
-        """Whether its policy is trained in the abstract simulator, so that `[plus]` applies."""
+        """Whether its policy is trained in the abstract simulator, so that it can have the plus settings."""
         return self.trains and self.learns_from == "simulator"
 
     @property
@@ -103,7 +98,3 @@ class Method:
     def trains_without_target(self) -> bool:
         """Whether its policy is trained without the target, and so acts on abstract states."""
         return self.trains and self.learns_from != "target"
-
-    def accepts(self, reward: RewardSource | None) -> bool:
-        """Return whether it can be trained with `reward`: "predicted" needs a grounding that predicts it."""
-        return reward != "predicted" or self.predicts_reward or not self.in_simulator

@@ -19,7 +19,6 @@ from astra_data.learning.ppo import Ppo
 from astra_data.learning.rma import Adaptation, RmaConfig
 from astra_data.methods.method import Method, Table
 from astra_data.training.policy_file import PolicyFile
-from astra_data.training.ramp import Ramp
 from astra_data.training.train import InSimulator, PpoTrainConfig, Training, optimize
 
 
@@ -40,7 +39,6 @@ class TeacherThenStudent(InSimulator):
             action_size=env.action_size,
             memory_size=config.memory_size,
             hidden_sizes=config.hidden_sizes,
-            clips_mean=config.clipped_mean,
             extrinsics_size=settings.extrinsics_size,
             history_length=settings.history_length,
         )
@@ -50,11 +48,11 @@ class TeacherThenStudent(InSimulator):
         phase_1 = replace(training, progress=part(training.progress, 0.0, first))
         phase_2 = replace(training, progress=part(training.progress, first, 1.0))
         ppo = Ppo(env, teacher, config, horizon=horizon, seed=seed)
-        curve = optimize(ppo, env, config.penalty_ramp, phase_1)
+        curve = optimize(ppo, env, phase_1)
         adaptation = Adaptation(
             env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
         )
-        curve["adaptation"] = optimize(adaptation, env, Ramp(), phase_2, f"adaptation_{CHECKPOINT}")
+        curve["adaptation"] = optimize(adaptation, env, phase_2, f"adaptation_{CHECKPOINT}")
         for clock in CLOCKS:
             curve[clock] += curve["adaptation"][clock]
         episodes = training.episodes

@@ -6,8 +6,6 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
 
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
@@ -218,6 +216,9 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.flo
     Raises:
         BadInputError: the file was altered, is no safetensors file, or lacks a tensor.
     """
+    from safetensors import SafetensorError  # noqa: PLC0415
+    from safetensors.numpy import load_file  # noqa: PLC0415
+
     check_intact(path)
     try:
         tensors = load_file(path)

@@ -36,7 +36,7 @@ class Code:
 
 
 @dataclass(frozen=True)
-class Table:
+class TableBlock:
     """A table whose first `words` columns are text."""
 
     title: str
@@ -61,7 +61,7 @@ class Picture:
     photo: bool = False
 
 
-Block = Text | Code | Table | Picture
+Block = Text | Code | TableBlock | Picture
 
 
 @dataclass(frozen=True)
@@ -162,14 +162,14 @@ def _html(block: Block, images: Mapping[str, bytes]) -> str:
     head = "".join(f'<th scope="col"{_word(block, at)}>{name}</th>' for at, name in enumerate(heads))
     lines = "\n".join(_line(block, line, labels) for line in block.lines)
     caption = f"<caption>{inline(block.title)}</caption>" if block.title else ""
-    label = re.sub(r"[`*]", "", block.title) or "Table"
+    label = re.sub(r"[`*]", "", block.title) or "TableBlock"
     return (
         f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(label)}">\n<table>{caption}\n'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{lines}\n</tbody>\n</table>\n</div>"
     )
 
 
-def _line(block: Table, line: Sequence[str], labels: Sequence[str]) -> str:
+def _line(block: TableBlock, line: Sequence[str], labels: Sequence[str]) -> str:
     cells = "".join(
         f'<td{_word(block, at)} data-label="{label}">{inline(cell)}</td>'
         for at, (cell, label) in enumerate(zip(line, labels, strict=True))
@@ -178,7 +178,7 @@ def _line(block: Table, line: Sequence[str], labels: Sequence[str]) -> str:
     return f'<tr><th scope="row">{inline(line[0])}</th>{cells}</tr>'
 
 
-def _word(block: Table, at: int) -> str:
+def _word(block: TableBlock, at: int) -> str:
     return ' class="word"' if 0 < at < block.words else ""
 
 

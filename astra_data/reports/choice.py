@@ -10,7 +10,7 @@ from pydantic import Field
 
 from astra_data.methods import method_title
 from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
-from astra_data.reports.blocks import Section, Table, Text, markdown
+from astra_data.reports.blocks import Section, TableBlock, Text, markdown
 from astra_data.reports.formatting import interval
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, mean_interval, mean_rank_correlation
 from astra_data.reports.trials import TrialsFile, posterior
@@ -185,19 +185,19 @@ def within_rows(tested: Sequence[Ranked]) -> Estimate | None:
     return mean_rank_correlation(rows.values(), least=LEAST_SEEDS)
 
 
-def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table]:
+def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | TableBlock]:
     """Return what a page says of a choice, with the first `shown` of its candidates, by default all."""
     best, judged = choice.candidates[0], choice.judged
     predicted = best.predicted
     episodes = (
         "the same episodes, from other seeds" if judged.shares_episodes else "the episodes of other seeds"
     )
-    blocks: list[Text | Table] = [
+    blocks: list[Text | TableBlock] = [
         Text(
             f"**{best.name}**, chosen from {len(choice.candidates)} policies: predicted success "
             f"{interval(predicted.value, predicted.low, predicted.high)}."
         ),
-        Table(
+        TableBlock(
             "Best first, ranked by the lower quartile of success over judges",
             ["method", "seed", "lower quartile", "predicted [95 %]", "judges", "in the target"],
             [
@@ -236,7 +236,7 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
             f"Regret of the chosen policy, in success in the target: {regret}; of a random policy: "
             f"{choice.random_regret:.2f}. Rank correlation with the target within methods (Spearman): {rank}."
         ),
-        Table(
+        TableBlock(
             "Error of the predicted success, means over seeds",
             ["method", "seeds", "predicted \N{MINUS SIGN} measured", "absolute error"],
             [
@@ -259,7 +259,7 @@ def select_page(recipe: str, judged: Judged, trials: TrialsFile | None = None) -
     return markdown(f"{recipe}: choice without the target", sections)
 
 
-def _trial_blocks(judged: Judged, trials: TrialsFile) -> list[Text | Table]:
+def _trial_blocks(judged: Judged, trials: TrialsFile) -> list[Text | TableBlock]:
     state = "Not finished: run the same command again."
     if trials.chosen and trials.mean is not None:
         row, seed = trials.chosen
@@ -271,7 +271,7 @@ def _trial_blocks(judged: Judged, trials: TrialsFile) -> list[Text | Table]:
             f"{state} {trials.spent} of {trials.trials} episodes were used, on the {trials.field} candidates "
             f"that the prediction ranks highest{size}."
         ),
-        Table(
+        TableBlock(
             "", ["round", "method", "seed", "succeeded", "of", "mean"], trial_lines(judged, trials), words=2
         ),
         Text(

@@ -10,7 +10,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.durable import write_file
 from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
-from astra_data.reports.blocks import Block, Section, Table, Text, markdown
+from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown
 from astra_data.reports.formatting import measured
 from astra_data.reports.results import WHOLE, Results, judged_horizon
 from astra_data.reports.runs import read_errors, read_grounding
@@ -114,7 +114,7 @@ def gap_blocks(results: Results) -> Iterator[Block]:
             for line in _error_lines(results, means[percent], quantity, horizons)
         ]
         head = [*(["size"] if swept else []), "simulator", *titles]
-        yield Table(f"Error of `{quantity}`", head, lines, words=len(head) - len(horizons))
+        yield TableBlock(f"Error of `{quantity}`", head, lines, words=len(head) - len(horizons))
     last = means[sizes[-1]]
     if still := no_better_than_still(last):
         names = ", ".join(f"`{name}`" for name in still)
@@ -232,7 +232,7 @@ def _fit_blocks(results: Results) -> Iterator[Block]:
         for row, of in found.items()
     ]
     if shown:
-        yield Table(
+        yield TableBlock(
             "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the "
             "mean)",
             ["grounding", *(_FITS[name] for name in shown)],
@@ -259,7 +259,8 @@ def _failure_blocks(results: Results) -> Iterator[Block]:
     lines, swept = [], len(results.percents) > 1
     for (percent, row, part), of in _predicted_failures(results).items():
         means = of.mean(axis=1)
-        aucs = [f"{value:.2f}" for name, value in means.items() if str(name).startswith("auc.")]
+        known = (means.get(f"auc.{ahead}") for ahead in ("1-20", "11-30", "21-40"))
+        aucs = ["-" if value is None else f"{value:.2f}" for value in known]
         skill = f"{means['brier_skill']:.2f}" if "brier_skill" in means else "-"
         bins = _bins(of)
         sure = bins[bins[:, 0] > _SURE]
@@ -275,7 +276,9 @@ def _failure_blocks(results: Results) -> Iterator[Block]:
     windows = ("AUC 1\N{EN DASH}20 steps", "11\N{EN DASH}30", "21\N{EN DASH}40")
     head = [*(["size"] if swept else []), "predicted by", "failures", *windows, "Brier skill"]
     head = [*head, "observed of predicted"]
-    yield Table("Failures, predicted on held-out episodes; means over seeds", head, lines, words=1 + swept)
+    yield TableBlock(
+        "Failures, predicted on held-out episodes; means over seeds", head, lines, words=1 + swept
+    )
     yield Text(
         "AUC: the probability that a step this many steps before a failure ranks above a step with no "
         "failure in the next 40. Brier skill: the share of squared error removed, compared with always "

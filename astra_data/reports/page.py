@@ -11,7 +11,7 @@ import numpy as np
 
 from astra_data.core.naming import base_method, is_plus, reference_of
 from astra_data.methods import grounded_as, method_named, method_role, method_title
-from astra_data.reports.blocks import Block, Code, Section, Table, Text, code
+from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, code
 from astra_data.reports.choice import choice_blocks
 from astra_data.reports.figures import pictures
 from astra_data.reports.formatting import duration, interval, short, spread
@@ -52,7 +52,7 @@ WORDS = {
 
 
 @dataclass(frozen=True)
-class Column:
+class PageColumn:
     """A column of the table of methods.
 
     Attributes:
@@ -71,13 +71,13 @@ class Column:
 
 
 COLUMNS = (
-    Column("failed", "failed", 2, "Failed: share of episodes that ended in a failure, such as a fall."),
-    Column("wall_contact", "wall contact", 2, "Wall contact: share of steps."),
-    Column("steps", "steps", 0),
-    Column("distance", "path length to success (m)", 1),
-    Column("return", "return", 1, negligible=-np.inf),
-    Column("tries", "training runs", 1, negligible=1.0, where="train"),
-    Column(
+    PageColumn("failed", "failed", 2, "Failed: share of episodes that ended in a failure, such as a fall."),
+    PageColumn("wall_contact", "wall contact", 2, "Wall contact: share of steps."),
+    PageColumn("steps", "steps", 0),
+    PageColumn("distance", "path length to success (m)", 1),
+    PageColumn("return", "return", 1, negligible=-np.inf),
+    PageColumn("tries", "training runs", 1, negligible=1.0, where="train"),
+    PageColumn(
         "beyond_recorded",
         "beyond recorded commands",
         2,
@@ -190,7 +190,7 @@ def _methods(results: Results) -> Iterator[Block]:
     for row, line in zip(rows, lines, strict=True):
         if row == best:
             line[0] = f"**{line[0]}**"
-    yield Table("", head, lines)
+    yield TableBlock("", head, lines)
     notes = [
         f"Mean ± standard deviation over seeds, {where}, and the 95 % interval of the mean (Student's t, "
         f"for shares of episodes widened to Wilson's), which needs {LEAST_SEEDS} seeds.",
@@ -203,7 +203,7 @@ def _methods(results: Results) -> Iterator[Block]:
     if any(method_role(row) == "trained there" for row in rows):
         notes.append("Methods marked “trained there” learned in the target, for as long as the recipe says.")
     if any(map(is_plus, rows)):
-        notes.append("A plus sign marks the same method trained with the recipe's `[plus]` settings.")
+        notes.append("A plus sign marks the same method trained with the plus settings.")
     if results.paper_success:
         notes.append(
             "The paper's success rates come from its own robot, maze and tuning, which it does not print in "
@@ -215,7 +215,7 @@ def _methods(results: Results) -> Iterator[Block]:
     yield from pictures(results, "methods")
 
 
-def _is_shown(results: Results, column: Column) -> bool:
+def _is_shown(results: Results, column: PageColumn) -> bool:
     """Return whether a method has values of a column to speak of: a robot without walls touches none."""
     found = [results.summary(row, column.measure, column.where) for row in results.tested()]
     return any(one is not None and one.mean > column.negligible for one in found)
@@ -233,7 +233,7 @@ def _ends(low: float | None, high: float | None, digits: int) -> str:
 def compared(results: Results) -> list[tuple[str, str]]:
     """Return which methods are compared: those of `compare` with all that are trained alike.
 
-    That is with the [plus] settings, or without; those that are trained in no simulator are compared with
+    That is with the plus settings, or without; those that are trained in no simulator are compared with
     both.
     """
     rows = [row for row in results.tested() if method_role(row) in (None, "floor")]
@@ -264,7 +264,7 @@ def _comparisons(results: Results) -> Iterator[Block]:
                 ]
             )
     head = ["method", "beats", "probability [95 %]", "difference, paired by seed [95 %]"]
-    yield Table("Probability of improvement", head, lines, words=2)
+    yield TableBlock("Probability of improvement", head, lines, words=2)
     if lines:
         yield Text(
             f"Probability that a seed of the first method has a higher {headline.quantity} than a seed of "
@@ -284,7 +284,7 @@ def _encoders(results: Results) -> Iterator[Block]:
         if any(one for one, _ in found)
     ]
     title = "The same policy with the simulator's encoder (source) or with the one aligned to the target"
-    yield Table(title, ["method", "encoder", *(score.title for score in results.scores)], lines, words=2)
+    yield TableBlock(title, ["method", "encoder", *(score.title for score in results.scores)], lines, words=2)
 
 
 def _gap(results: Results) -> Iterator[Block]:
@@ -317,7 +317,7 @@ def _validity(results: Results) -> Iterator[Block]:
         found = [correlation(*sides), correlation(*sides, ranks=True)]
         lines.append([world, f"{policies}", *map(_estimate, found)])
     title = "Does a simulator show which policy is better? Correlation with the return in the target"
-    yield Table(title, ["simulator", "policies", "Pearson [95 %]", "Spearman [95 %]"], lines)
+    yield TableBlock(title, ["simulator", "policies", "Pearson [95 %]", "Spearman [95 %]"], lines)
     if lines:
         reference = reference_of(results.rows)
         grounding = f"{method_title(reference)}'s, of the same seed" if reference else "each method's own"
@@ -349,8 +349,8 @@ def _sizes(results: Results) -> Iterator[Block]:
         )
         ends.append([title, *(_ends(one.low, one.high, score.digits) if one else "-" for one in found)])
     title = f"{score.title.capitalize()} {results.where}, mean ± standard deviation over seeds"
-    yield Table(title, head, means)
-    yield Table("95 % interval of the mean", head, ends)
+    yield TableBlock(title, head, means)
+    yield TableBlock("95 % interval of the mean", head, ends)
     yield from pictures(results, "sizes")
     chosen = [(percent, choice) for percent in results.percents if (choice := results.choice(percent))]
     lines = []
@@ -361,7 +361,7 @@ def _sizes(results: Results) -> Iterator[Block]:
         cells = ("-" if value is None else f"{value:.2f}" for value in known)
         lines.append([f"{percent} %", best.name, predicted, *cells])
     head = ["size", "chosen", "predicted [95 %]", "in the target", "regret", "regret at random"]
-    yield Table("Chosen without the target, by the groundings of other seeds", head, lines, words=2)
+    yield TableBlock("Chosen without the target, by the groundings of other seeds", head, lines, words=2)
 
 
 def _costs(results: Results) -> Iterator[Block]:
@@ -378,7 +378,7 @@ def _costs(results: Results) -> Iterator[Block]:
     yield Text(
         f"Wall time of the whole recipe: {duration(elapsed)}, in which several stages may run at once."
     )
-    yield Table("Time of each stage, added up over methods and seeds", _COST_HEAD, [*lines, total])
+    yield TableBlock("Time of each stage, added up over methods and seeds", _COST_HEAD, [*lines, total])
     per_row = []
     for row in results.tested():
         found = [_cost(results, stage, row, "wall_seconds") for stage in COSTED]
@@ -386,7 +386,7 @@ def _costs(results: Results) -> Iterator[Block]:
         sums = [sum(value for value in of if value is not None) for of in (found, spent)]
         per_row.append([method_title(row), *map(duration, found), *(duration(one or None) for one in sums)])
     head = ["method", *COSTED, "in all", "CPU time"]
-    yield Table(
+    yield TableBlock(
         "Time for one seed of each method, with the grounding and alignment that it uses", head, per_row
     )
     yield Text(
@@ -438,7 +438,7 @@ def _every_seed(results: Results) -> Iterator[Block]:
         for row, percent, seed in order
     ]
     names = [str(name).replace("_", " ") for name in wide.columns]
-    yield Table("", ["method", *(["size"] if swept else []), "seed", *names], lines, words=1 + swept)
+    yield TableBlock("", ["method", *(["size"] if swept else []), "seed", *names], lines, words=1 + swept)
 
 
 def _provenance(results: Results) -> Iterator[Block]:

@@ -39,13 +39,13 @@ NullableFloat = Annotated[float, BeforeValidator(lambda value: float("nan") if v
 """A float whose NaN is null in JSON."""
 
 
-class Section(BaseModel):
+class Facts(BaseModel):
     """A part of the results; frozen, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Origin(Section):
+class Origin(Facts):
     """Code, machine and packages that some stages ran with; None or empty where not recorded."""
 
     commit: str | None
@@ -56,7 +56,7 @@ class Origin(Section):
     """Names of those stages; "report" is the report itself."""
 
 
-class DatasetUse(Section):
+class DatasetUse(Facts):
     """A dataset that a stage made, or that evaluations name (stage "evaluate")."""
 
     stage: str
@@ -66,7 +66,7 @@ class DatasetUse(Section):
     name: str = ""
 
 
-class Line(Section):
+class Line(Facts):
     """What was measured of a method and seed in one place; NaN is left out."""
 
     row: str
@@ -83,7 +83,7 @@ class Line(Section):
         return (self.row, self.seed, self.percent, self.where)
 
 
-class Errors(Section):
+class Errors(Facts):
     """Open-loop error of a simulator on held-out episodes: its mean, and the ends of its 95 % interval."""
 
     row: str
@@ -105,7 +105,7 @@ class Errors(Section):
         return (self.row, self.seed, self.percent, self.simulator, self.quantity)
 
 
-class Training(Section):
+class TrainingFacts(Facts):
     """Learning curve of a method and seed."""
 
     row: str
@@ -121,7 +121,7 @@ class Training(Section):
         return (self.row, self.seed, self.percent)
 
 
-class JudgeFacts(Section):
+class JudgeFacts(Facts):
     """Who judged in the choice without the target."""
 
     judge: str
@@ -132,7 +132,7 @@ class JudgeFacts(Section):
     """Whether the judges were fitted to the same episodes as the policies."""
 
 
-class Results(Section):
+class Results(Facts):
     """All numbers on the page and in the figures."""
 
     format: Literal[2] = 2
@@ -169,7 +169,7 @@ class Results(Section):
     datasets: list[DatasetUse] = Field(default_factory=list)
     lines: list[Line] = Field(default_factory=list)
     errors: list[Errors] = Field(default_factory=list)
-    trainings: list[Training] = Field(default_factory=list)
+    trainings: list[TrainingFacts] = Field(default_factory=list)
 
     @property
     def headline(self) -> Score:

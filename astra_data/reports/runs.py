@@ -39,7 +39,7 @@ from astra_data.reports.results import (
     Line,
     Origin,
     Results,
-    Training,
+    TrainingFacts,
     merged_origins,
     without_nan,
 )
@@ -195,7 +195,7 @@ class _Run:
         self.datasets: list[DatasetUse] = []
         self.lines: list[Line] = []
         self.errors: list[Errors] = []
-        self.trainings: list[Training] = []
+        self.trainings: list[TrainingFacts] = []
 
     def read(self) -> None:
         """Read all that is there."""
@@ -285,7 +285,7 @@ class _Run:
         scores = [point.success if self._score == SUCCESS else point.episode_steps for point in file.points]
         if is_shown:
             self.trainings.append(
-                Training.model_validate(
+                TrainingFacts.model_validate(
                     {
                         "row": row,
                         "seed": seed,

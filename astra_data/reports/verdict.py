@@ -76,10 +76,11 @@ def verdict_of(results: Results) -> Verdict:
     causes = [cause for row in unlearned for cause in _causes(results, row)]
     is_good = _share(results, worth[best]) >= ENOUGH
     chosen: str | None = best
+    advice = "Deploy" if results.tested_in == "target" else "Try first"
     if floor and worth[floor].mean >= worth[best].mean and _share(results, worth[floor]) >= ENOUGH:
-        chosen, text = floor, f"Deploy **{method_title(floor)}**, the floor: no method does better."
+        chosen, text = floor, f"{advice} **{method_title(floor)}**, the floor: no method does better."
     elif is_good and not (floor and worth[floor].mean >= worth[best].mean):
-        text = f"{'Deploy' if results.tested_in == 'target' else 'Try first'} **{title}**: {score}."
+        text = f"{advice} **{title}**: {score}."
     else:
         chosen = None
         why = [

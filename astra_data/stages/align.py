@@ -9,35 +9,29 @@ from pydantic import Field
 from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT, finished_folder
-from astra_data.core.config import AtOnce, Count, NotNegative, Positive, as_json
+from astra_data.core.config import NotNegative, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_history_model, save_target_encoder
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.descent import Descent, DescentConfig
+from astra_data.learning.descent import Descent, WindowedConfig
 from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
 from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.reports.artifacts import METRICS
 
-_KEEP_EVERY = 50
+_MEASURED_EVERY = 100
+_BANDWIDTHS = (0.25, 0.5, 1.0, 2.0)
+"""Bandwidths of the MMD's kernels, in units of the square root of the latent's size."""
 
 
-class AlignConfig(DescentConfig):
+class AlignConfig(WindowedConfig):
     """How the target encoder is fitted."""
 
-    updates: Count = 600
-    """Number of gradient updates."""
-    batch_windows: AtOnce = 32
-    """Windows per update."""
-    window: AtOnce = 100
-    """Steps per window, in backpropagation through time."""
-    bandwidths: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.25, 0.5, 1.0, 2.0)
-    """Bandwidths of the MMD's kernels, in units of the square root of the latent's size."""
-    paired_weight: NotNegative = 0.0
-    """Weight of the direct distance between paired latents; 0 gives the paper's loss."""
+    paired_weight: NotNegative = 1.0
+    """Weight of the squared distance of paired latents, beside the MMD; 0 gives the paper's loss."""
     held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Fraction of the episodes to hold out for measuring the agreement, unless the dataset holds some out
     itself. In a recipe this is that of `[ground]`, whose training leaves these episodes out."""
@@ -84,29 +78,36 @@ def align(
     encoder.set_scales(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
-    bandwidths = torch.tensor(config.bandwidths, device=device) * model.shape.latent_size**0.5
+    bandwidths = torch.tensor(_BANDWIDTHS, device=device) * model.shape.latent_size**0.5
     grounding_digest = file_digest(grounding_file)
     settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
     made_from = {"dataset": episodes.content_hash, "grounding": grounding_digest}
     with finished_folder(out, config=settings_text, made_from=made_from) as folder:
-        descent = Descent(encoder, config, checkpoint=folder / CHECKPOINT)
+        fitting = config.descent(int(training.lengths.sum()))
+        descent = Descent(encoder, fitting, checkpoint=folder / CHECKPOINT)
+        window = min(config.window, training.windows.mask.shape[1])
         while not descent.is_over:
             torch.manual_seed(derive(seed, f"alignment update {descent.done}"))
-            windows, state = training.draw_windows(config.batch_windows, config.window)
+            windows, state = training.draw_windows(config.batch_windows, window)
             discrepancy, distance = _losses(model, encoder, windows, state, bandwidths)
             descent.update(discrepancy + config.paired_weight * distance)
-            if descent.done % _KEEP_EVERY == 0:
+            if descent.done % _MEASURED_EVERY == 0 or descent.done == fitting.updates:
                 agreement = _agreement(model, encoder, held_out, bandwidths)
-                descent.keep(**agreement)
+                error = agreement["mmd"] + config.paired_weight * agreement["latent_rmse"] ** 2
+                descent.keep(error, **agreement)
                 rate = descent.done * config.batch_windows / descent.stopwatch.seconds
                 note = f"{rate:,.0f} windows/s  paired latent RMSE {agreement['latent_rmse']:.3f}"
                 progress(descent.share, note)
+        descent.finish()
+        agreement = _agreement(model, encoder, held_out, bandwidths)
+        encoder.latent_r2.fill_(agreement["latent_r2"])
         save_target_encoder(folder / TARGET_ENCODER, encoder)
         metrics: dict[str, Any] = made | {
-            "windows_per_second": config.updates * config.batch_windows / descent.stopwatch.seconds,
+            "windows_per_second": descent.done * config.batch_windows / descent.stopwatch.seconds,
             **descent.stopwatch.spent(),
             "points": descent.points,
-            **_agreement(model, encoder, held_out, bandwidths),
+            **agreement,
+            "deployed": "target" if encoder.is_deployed else "source",
         }
         (folder / METRICS).write_text(json.dumps(metrics, indent=1))
 
@@ -131,4 +132,7 @@ def _agreement(
     model: GroundingModel, encoder: TargetEncoder, episodes: PairedEpisodes, bandwidths: Tensor
 ) -> dict[str, float]:
     discrepancy, distance = _losses(model, encoder, episodes.windows, episodes.target_state, bandwidths)
-    return {"mmd": float(discrepancy), "latent_rmse": float(distance.sqrt())}
+    latent, _ = model.encode(episodes.windows)
+    variance = episodes.steps(latent).var(0, correction=0).mean()
+    explained = 1.0 - distance / variance if variance > 0 else torch.zeros_like(distance)
+    return {"mmd": float(discrepancy), "latent_rmse": float(distance.sqrt()), "latent_r2": float(explained)}

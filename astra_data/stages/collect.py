@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from astra_data.core.config import AtOnce, Config, Count, NotNegative, Share
+from astra_data.core.config import Config, Count, NotNegative, Share
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, part, silent
@@ -36,6 +36,10 @@ from astra_data.worlds.task import Task
 _TRAINING_SHARE = 0.8
 """Share of the progress bar for training the suboptimal policy."""
 
+_NUM_ENVS = 200
+"""Episodes recorded in one batch."""
+_SAC_STEPS, _SAC_EPISODE_STEPS = 300_000, 500
+"""SAC's training of a suboptimal policy stops after so many steps, or once test episodes last this long."""
 MOST_STEPS = 10**10
 """Upper bound of the steps of a dataset; it would take terabytes."""
 
@@ -55,10 +59,9 @@ class CollectConfig(Config):
     different behaviors have the same size."""
     max_steps: Count = 500
     """Maximum steps per episode; longer episodes are truncated."""
-    num_envs: AtOnce = 200
-    """Episodes recorded in one batch; also affects which random numbers each episode gets."""
-    start: Literal["anywhere", "task"] = "anywhere"
-    """Where episodes start: anywhere in the free space (with a ball, near it), or where the task does."""
+    start: Literal["anywhere", "task"] | None = None
+    """Where episodes start: anywhere in the free space (with a ball, near it), or where the task does; by
+    default anywhere if the task has a maze."""
     hold_s: HoldTimes = (0.5, 3.0)
     """Range of the time that a random command is held; not in the paper."""
     clearance_m: NotNegative = 0.0
@@ -66,10 +69,6 @@ class CollectConfig(Config):
     steering the robot would; 0: never."""
     ppo_steps: Count = 300_000
     """Environment steps after which the PPO training of the suboptimal policy stops."""
-    sac_steps: Count = 300_000
-    """Environment steps after which the SAC training of the suboptimal policy stops at the latest."""
-    sac_episode_steps: Count = 500
-    """The SAC training stops as soon as test episodes of its policy last this many steps on average."""
     random_share: Share = Field(default=0.0, exclude_if=lambda share: not share)
     """Fraction of a policy's episodes that get random commands instead, spread evenly over the dataset."""
     policy: str | None = None
@@ -189,10 +188,10 @@ def _record(
     num_threads: int | None,
     progress: Progress,
 ) -> int:
-    """Record the episodes that `writer` lacks, `num_envs` at once; return the number of their steps."""
+    """Record the episodes that `writer` lacks, `_NUM_ENVS` at once; return the number of their steps."""
     steps = 0
-    for first in range(0, config.episodes, config.num_envs):
-        rows = range(first, min(first + config.num_envs, config.episodes))
+    for first in range(0, config.episodes, _NUM_ENVS):
+        rows = range(first, min(first + _NUM_ENVS, config.episodes))
         if config.least_steps and _steps_before(first, writer) >= config.least_steps:
             break
         if writer.staged.keys() >= set(rows):
@@ -201,7 +200,7 @@ def _record(
         env = world.target(
             len(rows),
             seed=derive(batch_seed, "collect"),
-            start_anywhere=config.start == "anywhere",
+            start_anywhere=world.plane is not None if config.start is None else config.start == "anywhere",
             num_threads=num_threads,
         )
         env.reset()
@@ -255,7 +254,7 @@ def _behavior(
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
         else:
-            by = partial(suboptimal_by_sac, steps=config.sac_steps, episode_steps=config.sac_episode_steps)
+            by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
         policy, metadata = by(
             task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress
         )

@@ -54,8 +54,9 @@ class EvaluateConfig(Config):
 
     episodes: AtOnce = 100
     """Episodes in the target and in each simulator, run in one batch."""
-    encoder: EncoderKind = "target"
-    """Encoder that an aligned policy uses for the headline numbers; results with both are reported."""
+    encoder: EncoderKind | None = None
+    """Encoder that an aligned policy runs with; by default ψ^t, or ψ^s where ψ^t is coarse on held-out
+    episodes. Results with both are reported."""
     leg_scale: Positive = 1.0
     """Scale of the ant's legs in the target environment; 1.25 is the paper's morphology test."""
 
@@ -116,6 +117,8 @@ def evaluate(
         "reference": reference and reference / GROUNDING,
     }
     read = {name: file for name, file in files.items() if file}
+    if missing := [f"{file}" for file in read.values() if not file.is_file()]:
+        raise BadInputError(f"{missing[0]} does not exist: run the stage that makes it first")
     made_from = {name: file_digest(file) for name, file in read.items()}
     for name in made_from.keys() & {"policy", "target_encoder"}:
         check_made_from(read[name], {"grounding": made_from.get("grounding")})
@@ -200,10 +203,12 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
     grounding = grounding_at(files.get("grounding"))
     source = running(task, trained, grounding)
     robots: dict[EncoderKind, Begin] = {"source": partial(started, source, source.act)}
+    headline: EncoderKind = "source"
     if "target_encoder" in files:
-        aligned = replace(source, target_encoder=load_target_encoder(files["target_encoder"]))
+        encoder = load_target_encoder(files["target_encoder"])
+        aligned = replace(source, target_encoder=encoder)
         robots["target"] = partial(started, aligned, aligned.act)
-    headline = config.encoder if config.encoder in robots else "source"
+        headline = config.encoder or ("target" if encoder.is_deployed else "source")
     facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, OwnPolicy) else {}
     facts |= {
         "encoder": headline,
@@ -294,7 +299,7 @@ def _careful_in_target(task: Task, goal: Tensor) -> Act:
 def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
     groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
     if reference is not None:
-        groundings["grounded"] = load_grounding(reference).reduced(members=False, failures=True)
+        groundings["grounded"] = load_grounding(reference)
     return {
         name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
         for name, grounding in groundings.items()

@@ -45,7 +45,7 @@ class ReportConfig(Config):
     """Method → the paper's success rate, shown next to ours."""
 
     compare: tuple[str, ...] = ("astra",)
-    """Methods to compare with every method trained the same way, each with and without [plus]."""
+    """Methods to compare with every method trained the same way, each with and without the plus settings."""
 
     @field_validator("trajectory_methods", "paper_success", "compare")
     @classmethod

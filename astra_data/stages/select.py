@@ -1,7 +1,6 @@
 """Select: choose among a recipe's policies without the target, by simulators of other episodes.
 
-A judge is the grounding of another seed, which has episodes of its own. A failure model ends episodes, the
-grounding's own or one that is fitted to these; where nothing fails in them, states are scattered.
+A judge is the grounding of another seed, which has episodes of its own; its failure model ends episodes.
 """
 
 import json
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.artifact import finished_folder
-from astra_data.core.config import AtOnce, Config, CountFromZero
+from astra_data.core.config import AtOnce, Config
 from astra_data.core.digest import file_digest
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
@@ -44,12 +43,6 @@ class SelectConfig(Config):
     """Episodes of each policy with each judge, run in one batch."""
     judge: str | None = None
     """Row whose groundings serve as judges; by default NAS, or else the first row that grounds."""
-    failure_members: CountFromZero = 5
-    """Number of networks in the failure model fitted for a history model that serves as judge and has none,
-    if some of the judge's episodes fail. 0: no failure model; the judge's states are then scattered around
-    the correction as the target's are."""
-    failure_steps: AtOnce = 2
-    """Number of steps within which that failure model predicts failures."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +168,7 @@ def select(
         begun = folder / _BEGUN
         known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
         for bench in contests:
-            judge_of_seed = cache(partial(_judge, bench, recipe.task, root, config))
+            judge_of_seed = cache(partial(_judge, bench, recipe.task, root))
             for entry in bench.entries:
                 policy, success = entry.load(root, recipe.task), {}
                 for other in bench.judges:
@@ -238,11 +231,11 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
         )
 
 
-def _judge(bench: Bench, task: str, root: Path, config: SelectConfig, seed: int) -> Judge:
+def _judge(bench: Bench, task: str, root: Path, seed: int) -> Judge:
     grounding, dataset = bench.judges[seed]
     made, episodes = load_grounding(root / grounding / GROUNDING), PairedEpisodes.load(root / dataset)
     check_made_from(root / grounding / GROUNDING, {"dataset": episodes.content_hash})
-    return Judge.of(task_named(task), made, episodes, config.failure_members, config.failure_steps)
+    return Judge(task_named(task), made)
 
 
 def _digest(folder: Path) -> str:

@@ -9,6 +9,7 @@ from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, as_json
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import is_plus
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
@@ -42,7 +43,7 @@ def train(
     Args:
         task: see `task_named`.
         method: a row.
-        config: the recipe's `[train]`, or `[plus]`.
+        config: the recipe's `[train]`.
         settings: the method's own table of the recipe, if it has one.
         dataset: paired.
         grounding: what `ground` made for this method, if it grounds.
@@ -71,10 +72,6 @@ def train(
         raise BadInputError(f"method '{method}' trains in a grounded simulator: run the stage `ground` first")
     if base.initial and initial is None:
         raise BadInputError(f"method '{method}' starts from the policy of {base.initial}: train that first")
-    if not base.accepts(config.reward):
-        raise BadInputError(f"'{method}' learns no reward: expected reward abstract or blend, got predicted")
-    if config.ramp_while and world.objective.is_lasting:
-        raise BadInputError(f"ramp_while: no episode of {world.name} succeeds before its end: expected 0")
     stopwatch = Stopwatch()
     episodes = PairedEpisodes.load(dataset, device)
     episodes.check(world)
@@ -117,6 +114,7 @@ def train(
             folder=folder,
             progress=progress,
             num_threads=num_threads,
+            is_plus=is_plus(method),
         )
         learn = partial(_learned, base.learn)
         if base.in_simulator:
@@ -124,6 +122,8 @@ def train(
         else:
             policy, curve = learn(training)
         policy.save(folder / POLICY)
+        if policy.simulation is not None:
+            curve["world"] = policy.simulation.world.model_dump()
         (folder / CURVE).write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
 
 

@@ -38,6 +38,7 @@ class HistoryModel(Predictor):
             latent_size=latent_size,
             head_sizes=head_sizes,
             position_octaves=0,
+            corrects_reward=False,
         )
         self.grounding = GroundingModel(shape)
         self.weights = weights
@@ -60,7 +61,7 @@ class HistoryModel(Predictor):
                 "correction": correction,
             }
         )
-        rewards = torch.stack([nearer, torch.zeros_like(nearer)], dim=-1).flatten(0, 1)
+        rewards = nearer.reshape(-1, 1)
         model.set_reward_scales(rewards, torch.ones_like(rewards[:, 0]), torch.zeros_like(rewards[:, 0]))
         model.state_mean *= model.state_mean.new_tensor(self.body.usual_motion)
         model.goal_mean *= model.goal_mean.new_tensor(self.body.usual_seen)
@@ -105,7 +106,7 @@ class HistoryModel(Predictor):
             goal=self.body.features(stretch.past_seen[:, :-1]),
             simulated_next=simulated[:, 1:],
             next_state=motion[:, 1:],
-            reward=torch.stack([nearer, torch.zeros_like(nearer)], dim=-1),
+            reward=nearer,
             goes_on=torch.ones_like(nearer),
             failed=torch.zeros_like(nearer),
             fails_soon=torch.zeros_like(nearer),

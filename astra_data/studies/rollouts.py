@@ -21,8 +21,6 @@ from astra_data.studies.windows import WindowModel
 
 STRENGTHS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Penalties of ridge regression, of which the best is chosen."""
-_EMA_RATE = 0.01
-"""By which ASTRA's target encoder follows, as `GroundConfig.ema_rate` is by default."""
 _LEAST = 1e-3
 """Least spread that errors are divided by, in the unit of motions: a joint that stands is not all."""
 
@@ -207,7 +205,7 @@ def _descend[M: (WindowModel, HistoryModel)](
         missed = error[judged].square().mean()
         descent.update(missed + own_loss(stretch))
         if isinstance(model, HistoryModel):
-            model.grounding.update_target(_EMA_RATE)
+            model.grounding.update_target()
         if descent.done % 20 == 0:
             progress(descent.share, f"error² {float(missed.detach()):.3f}")
     return model.requires_grad_(False)

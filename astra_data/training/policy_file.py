@@ -16,7 +16,7 @@ from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.policy import Policy, PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.training.build_env import EnvConfig, Simulation
+from astra_data.training.build_env import Simulation, WorldConfig
 from astra_data.training.own_policy import KINDS, OwnPolicy, SavedPolicy
 from astra_data.training.running_policy import Observed, RunningPolicy
 from astra_data.worlds.own_saving import parts_of, restored
@@ -82,9 +82,6 @@ class PolicyFile:
             "observed": self.observed,
         }
         if self.simulation:
-            tensors["scatter"] = self.simulation.scatter
-            if self.simulation.thinness is not None:
-                tensors["thinness"] = self.simulation.thinness
             variation = self.simulation.variation
             metadata["simulation"] = {
                 "world": self.simulation.world.model_dump(mode="json"),
@@ -105,9 +102,7 @@ class PolicyFile:
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
                 simulation = Simulation(
-                    tensors.get("thinness"),
-                    tensors["scatter"],
-                    EnvConfig(**recorded["world"]),
+                    WorldConfig(**recorded["world"]),
                     Variation.of_json(variation) if variation else None,
                 )
             read = cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
@@ -153,7 +148,7 @@ def running(
     Raises:
         BadInputError: it is of another task, or of another grounding.
     """
-    world = trained.simulation.world if trained.simulation else EnvConfig()
+    world = trained.simulation.world if trained.simulation else WorldConfig()
     made = RunningPolicy(
         task,
         trained.policy,

@@ -1,46 +1,36 @@
-"""How the penalties of a training grow."""
+"""How a training follows the success of its episodes: penalties grow, and a mastered one ends early."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import fmean
 
 Points = Sequence[Mapping[str, float | None]]
 
 _RECENT = 5
 """Points of the learning curve over which success is averaged."""
+MASTERED = 0.95
+"""Success of training episodes from which on a simulator counts as mastered."""
+FAST = 3.0
+"""Pace of a training that has mastered its simulator, of one that has not."""
+_GROWTH_SHARE = 0.4
+"""Share of the training over which penalties grow from 0 to full size."""
 
 
-@dataclass(frozen=True)
-class Ramp:
-    """The factor on penalties as a training goes on.
+def is_mastered(points: Points) -> bool:
+    """Return whether the last training episodes succeed as often as `MASTERED`."""
+    recent = [success for point in points[-_RECENT:] if (success := point.get("success")) is not None]
+    return bool(recent) and fmean(recent) >= MASTERED
 
-    Attributes:
-        share: of the training, over which it grows from 0 to 1; 0: it is 1 from the start.
-        while_success: success of training episodes below which it falls, as fast, in place of growing.
+
+def penalty_scale(points: Points) -> float:
+    """Return the factor on penalties, from 0 to 1, after the `points` of a learning curve.
+
+    It grows while the simulator is mastered and falls as fast while not, so that caution does not cost
+    success; at full size from the start, penalties teach the robot to stand still.
     """
-
-    share: float = 0.0
-    while_success: float = 0.0
-
-    def scale(self, points: Points, steps: int, total_steps: int) -> float:
-        """Return the factor after `steps` of `total_steps`.
-
-        Args:
-            points: the learning curve until then.
-            steps: done.
-            total_steps: of the training.
-        """
-        if not self.share:
-            return 1.0
-        if not self.while_success:
-            return min(1.0, steps / (total_steps * self.share))
-        scale, before = 0.0, 0.0
-        for number, point in enumerate(points, 1):
-            now = float(point["steps"] or 0.0)
-            change = (now - before) / (total_steps * self.share)
-            known = [one["success"] for one in points[max(0, number - _RECENT) : number]]
-            recent = [success for success in known if success is not None]
-            succeeds = bool(recent) and fmean(recent) >= self.while_success
-            scale = min(1.0, max(0.0, scale + (change if succeeds else -change)))
-            before = now
-        return scale
+    scale, before = 0.0, 0.0
+    for number, point in enumerate(points, 1):
+        now = float(point["share"] or 0.0)
+        change = (now - before) / _GROWTH_SHARE
+        scale += change if is_mastered(points[max(0, number - _RECENT) : number]) else -change
+        scale, before = min(1.0, max(0.0, scale)), now
+    return scale

@@ -11,9 +11,12 @@ from torch import Tensor
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.worlds.batched import Step
 from astra_data.worlds.objective import NO_LIMIT, Objective
-from astra_data.worlds.plane.free_space import FreeSpace
 
-RewardSource = Literal["abstract", "predicted", "blend"]
+RewardSource = Literal["abstract", "predicted", "priced"]
+
+RISK_WEIGHT = 4.0
+"""How many failures a predicted one counts as in the reward "priced": a failure also costs the rest of the
+episode."""
 
 
 @dataclass(frozen=True)
@@ -45,17 +48,16 @@ class SimulatorEnv:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", the target's as R_pred predicts it
-    (Algorithm 2); "blend", the task's own minus the predicted risk of toppling, unless topples are drawn.
+    (Algorithm 2); "priced", the task's own minus the predicted cost of failures, times `RISK_WEIGHT`.
     Where the abstract state itself decides the step (goal reached, ball out, body fallen, a wall touched that
-    must not be), "predicted" pays the task's own reward as well. With `topple`, topples are drawn from the
-    topple head and end the episode. All randomness comes from torch's global generator.
+    must not be), "predicted" pays the task's own reward as well. All randomness comes from torch's global
+    generator.
 
     Attributes:
         latent_size: Z, of the latents in the observations; 0 where there are none.
         parameter_count: P, of the parameters at the end of the observations; 0 where they are not shown.
         failed: which episodes failed in the last step, (B,) bool.
-        penalty_scale: factor on the penalties for thin data, disagreement and risk; 1 but where the training
-            ramps it up.
+        penalty_scale: factor on the price of failures; 1 but where the training ramps it up.
     """
 
     def __init__(
@@ -64,11 +66,8 @@ class SimulatorEnv:
         simulator: EpisodeSimulator,
         *,
         reward: RewardSource = "abstract",
-        topple: bool = False,
-        risk_weight: float = 1.0,
+        draws_failures: bool = False,
         command_limit: float = NO_LIMIT,
-        thinness: Tensor | None = None,
-        disagreement_penalty: float = 0.0,
         change_penalty: float = 0.0,
         starts: DataStarts | None = None,
         data_start_share: float = 0.0,
@@ -80,13 +79,9 @@ class SimulatorEnv:
             objective: of the task.
             simulator: raw or grounded.
             reward: where the reward comes from.
-            topple: end episodes by the topple head.
-            risk_weight: how many topples a predicted one counts for in the reward "blend".
-            command_limit: longer velocity commands, ±1 per axis, are shortened to this.
-            thinness: subtracted from the reward of a step to each cell of the maze's fine grid, (height,
-                width); None without a maze.
-            disagreement_penalty: subtracted from the reward, times the simulator's `disagreement`.
-            change_penalty: subtracted from it, times the squared change of the command.
+            draws_failures: whether episodes fail at random with the predicted probability, as judges' do.
+            command_limit: longer commands, ±1 per axis, are shortened to this.
+            change_penalty: subtracted from the reward, times the squared change of the command.
             starts: recorded moments to start from.
             data_start_share: share of the episodes that start from `starts`.
             shows_parameters: end observations with the normalized parameters of a simulator that varies.
@@ -94,14 +89,9 @@ class SimulatorEnv:
         self.objective = objective
         self.simulator = simulator
         self.reward = reward
-        self.topple = topple
+        self.draws_failures = draws_failures
         self.penalty_scale = 1.0
-        self.risk_weight = risk_weight
         self.command_limit = command_limit
-        maze, device = objective.layout, str(simulator.state.device)
-        self.free = None if maze is None else FreeSpace.of_maze(maze, radius_m=0.0, device=device)
-        self.thinness = thinness
-        self.disagreement_penalty = disagreement_penalty
         self.change_penalty = change_penalty
         self.starts = starts
         self.data_start_share = data_start_share
@@ -158,26 +148,18 @@ class SimulatorEnv:
         self.failed = self.objective.missed(after, self.goal)
         if self.objective.ends_at_walls:
             self.failed = self.failed | (self.simulator.blocked & ~success)
-        penalty = torch.zeros(self.num_envs, device=self.device)
-        if self.thinness is not None and self.free is not None:
-            penalty = -self.thinness[self.free.cells(after[:, :2])]
-        if self.disagreement_penalty:
-            penalty = penalty - self.disagreement_penalty * self.simulator.disagreement
-        risk = self.simulator.failure_risk() if self.topple or self.reward == "blend" else None
-        if risk is not None and self.topple:
+        risk = self.simulator.failure_risk()
+        if risk is not None and self.draws_failures:
             self.failed = self.failed | ((torch.rand_like(risk) < risk) & ~success)
-        elif risk is not None:
-            penalty = penalty + self.risk_weight * self.objective.failure_reward * risk
         reward = self.objective.reward(before, after, self.goal, self.failed)
+        if self.reward == "priced" and risk is not None:
+            reward = reward + self.penalty_scale * RISK_WEIGHT * self.objective.failure_reward * risk
         if self.reward == "predicted":
             decided = success | self.failed
-            none_failed = torch.zeros_like(decided)
-            own = self.objective.reward(before, after, self.goal, none_failed)
-            # Failures that are drawn are paid when they come.
-            predicted = self.simulator.predicted_reward(own, with_failures=not self.topple)
+            own = self.objective.reward(before, after, self.goal, torch.zeros_like(decided))
+            predicted = self.simulator.predicted_reward(own)
             if predicted is not None:
                 reward = torch.where(decided, reward, predicted)
-        reward = reward + self.penalty_scale * penalty
         if self.change_penalty:
             reward = reward - self.change_penalty * (command - self._command).square().sum(-1)
             self._command = command

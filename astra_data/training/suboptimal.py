@@ -26,7 +26,7 @@ _PPO_ENVS = 128
 _SAC_ENVS = 32
 """Target environments stepped side by side."""
 
-_SAC = SacConfig(discount=0.99, reward_scale=0.1, learning_rate=3e-4)
+_SAC = SacConfig(buffer_size=1_000_000)
 """Settings with which the humanoid learns to stay up; its rewards are 5 a step."""
 _SAC_SIZES = (256, 256)
 """Hidden layers of actor and critics."""

@@ -9,14 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Protocol
 
 import torch
-from pydantic import Discriminator, Tag, model_validator
+from pydantic import Discriminator, Tag
 from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT
-from astra_data.core.config import AtOnce, Config, CountFromZero, Share, choice
+from astra_data.core.config import AtOnce, Config, Count, CountFromZero, Share, choice
 from astra_data.core.logbook import Logbook
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
@@ -27,25 +27,24 @@ from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticSh
 from astra_data.learning.networks.policy import Policy, PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.ppo import Ppo, PpoConfig
-from astra_data.learning.recorded import Recorded
 from astra_data.learning.sac import Sac, SacConfig
 from astra_data.training.build_env import (
-    EnvConfig,
     Simulation,
+    WorldConfig,
     data_starts,
-    recorded_steps,
-    simulation_of,
+    plus,
     training_env,
 )
+from astra_data.training.command_limit import command_limit
 from astra_data.training.policy_file import PolicyFile
-from astra_data.training.ramp import Ramp
+from astra_data.training.ramp import FAST, is_mastered, penalty_scale
 from astra_data.training.simulator_env import RewardSource, SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 
 
-class TrainConfig(EnvConfig):
+class TrainConfig(Config):
     """How policies are trained, except for the learner's own settings."""
 
     num_envs: AtOnce = 256
@@ -54,15 +53,17 @@ class TrainConfig(EnvConfig):
     """Hidden layers of actor and critic."""
     memory_size: CountFromZero = 64
     """Size of the policy's own GRU, used if no grounding provides a latent."""
-    tries: AtOnce = 1
+    data_start_share: Share = 0.5
+    """Fraction of the training episodes that start from the middle of a recorded one."""
+    episode_steps: Count | None = None
+    """Steps after which simulated episodes are truncated and their values bootstrapped; by default the task's
+    horizon. In short episodes from recorded states, errors have no time to grow (Janner et al. 2019)."""
+    tries: AtOnce = 3
     """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
     the task's starts, acting by the mean of its actions) is trained again with another seed."""
-    least_success: Share = 0.9
+    least_success: Share = 0.8
     """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept.
     """
-    most_of_horizon: Share = 0.85
-    """Maximum fraction of the horizon that successful episodes may take; slower policies hardly arrive in
-    time."""
 
 
 class PpoTrainConfig(TrainConfig, PpoConfig):
@@ -80,12 +81,6 @@ class SacTrainConfig(TrainConfig, SacConfig):
     num_envs: AtOnce = 32
     """Environments stepped in parallel."""
 
-    @model_validator(mode="after")
-    def _learns_from_one_reward(self) -> Self:
-        if self.ramp:
-            raise ValueError("ramp: expected 0 with SAC, which learns from rewards of long ago as well")
-        return self
-
 
 def _learner(settings: object) -> str:
     """Return the tag of the model below that `settings` are for; by default PPO."""
@@ -101,11 +96,6 @@ AnyTrainConfig = Annotated[
 """Training by the `learner` that is named, by default PPO."""
 
 
-def imitates(config: PpoTrainConfig | SacTrainConfig) -> bool:
-    """Return whether the learner also imitates recorded actions."""
-    return isinstance(config, SacTrainConfig) and config.imitation_weight > 0
-
-
 def learner_of(
     config: PpoTrainConfig | SacTrainConfig,
     env: BatchedEnv,
@@ -114,13 +104,12 @@ def learner_of(
     *,
     horizon: int,
     seed: int,
-    recorded: Recorded | None,
 ) -> Ppo | Sac:
-    """Build the learner and a new policy of `shape`; by SAC, it may imitate the `recorded` actions."""
+    """Build the learner and a new policy of `shape`."""
     if isinstance(config, SacTrainConfig):
         actor = SoftActor(shape).to(device)
-        return Sac(env, actor, config, horizon=horizon, seed=seed, recorded=recorded)
-    policy = ActorCritic(ActorCriticShape(**asdict(shape), clips_mean=config.clipped_mean)).to(device)
+        return Sac(env, actor, config, horizon=horizon, seed=seed)
+    policy = ActorCritic(ActorCriticShape(**asdict(shape))).to(device)
     return Ppo(env, policy, config, horizon=horizon, seed=seed)
 
 
@@ -129,7 +118,7 @@ class Training:
     """What a method is given to train a policy.
 
     Attributes:
-        task: the task. config: the recipe's `[train]`, or `[plus]`.
+        task: the task. config: the recipe's `[train]`. is_plus: whether the row has the plus settings.
         settings: the method's own table of the recipe, if it has one.
         episodes: paired episodes. grounding: of the method; `NO_GROUNDING` where it fits none.
         initial: the policy that the training starts from, if the method names one.
@@ -150,6 +139,7 @@ class Training:
     folder: Path
     progress: Progress
     num_threads: int | None = None
+    is_plus: bool = False
 
     @property
     def simulated_steps(self) -> int:
@@ -165,7 +155,7 @@ class ResumableEnv(BatchedEnv, Protocol):
     """A batched environment in which a training can be resumed.
 
     Attributes:
-        penalty_scale: factor on penalties in the reward, which the training may ramp up.
+        penalty_scale: factor on penalties in the reward, which the training ramps up.
     """
 
     penalty_scale: float
@@ -184,7 +174,7 @@ class InSimulator:
     """Train in the abstract simulator.
 
     Attributes:
-        reward: where the reward comes from, unless the recipe says.
+        reward: where the reward comes from, but for the plus settings.
         ranges: which of the task's ranges the simulator's parameters are drawn from, unless the grounding has
             ranges or the method's own settings are ranges; None where they stay plain.
     """
@@ -197,22 +187,20 @@ class InSimulator:
         env, simulation = self.world(training)
         memory_size = 0 if env.latent_size else training.config.memory_size
         episodes = training.episodes
-        config, recorded = training.config, None
-        if imitates(config):
-            recorded = recorded_steps(training.task, episodes, training.grounding)
-        policy, curve = train_in(env, config, memory_size, training, training.simulated_steps, recorded)
+        policy, curve = train_in(env, training.config, memory_size, training, training.simulated_steps)
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
 
     def world(self, training: Training, *, shows_parameters: bool = False) -> tuple[SimulatorEnv, Simulation]:
         """Return the environment to train in, and what a policy file records about it."""
         config, settings = training.config, training.settings
-        switches = EnvConfig(**{name: getattr(config, name) for name in EnvConfig.model_fields})
-        switches = switches.model_copy(update={"reward": switches.reward or self.reward})
-        usual: Variation | None = getattr(training.task.varied, self.ranges) if self.ranges else None
-        variation = settings if isinstance(settings, Variation) else usual
         task, episodes, grounding = training.task, training.episodes, training.grounding
-        starts = data_starts(task, switches, episodes, grounding)
-        simulation = simulation_of(task, switches, episodes, grounding, variation)
+        world = WorldConfig(reward=self.reward, data_start_share=config.data_start_share)
+        if training.is_plus:
+            world = plus(world, command_limit(task, episodes))
+        usual: Variation | None = getattr(task.varied, self.ranges) if self.ranges else None
+        variation = settings if isinstance(settings, Variation) else usual
+        starts = data_starts(task, world, episodes, grounding)
+        simulation = Simulation(world, variation)
         env = training_env(
             task,
             simulation,
@@ -231,31 +219,29 @@ def train_in(
     memory_size: int,
     training: Training,
     horizon: int,
-    recorded: Recorded | None = None,
 ) -> tuple[Policy, dict[str, Any]]:
     """Train a new policy in `env`; return it and its learning curve.
 
-    The policy has a memory of `memory_size`; episodes are cut off after `horizon` steps. Actions that were
-    `recorded` are imitated, if the learner does that.
+    The policy has a memory of `memory_size`; episodes are cut off after `horizon` steps.
     """
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
-    learner = learner_of(
-        config, env, shape, training.device, horizon=horizon, seed=training.seed, recorded=recorded
-    )
-    return learner.policy, optimize(learner, env, config.penalty_ramp, training)
+    learner = learner_of(config, env, shape, training.device, horizon=horizon, seed=training.seed)
+    return learner.policy, optimize(learner, env, training)
 
 
 def optimize(
     learner: Learner,
     env: ResumableEnv,
-    ramp: Ramp,
     training: Training,
     checkpoint_name: str = CHECKPOINT,
 ) -> dict[str, Any]:
     """Train to the end, from the checkpoint in the folder if there is one; return the learning curve.
 
-    The last checkpoint is left in the folder, for what comes after.
+    Once training episodes succeed at penalties of full size, the rest of the training, whose schedules go on,
+    takes fewer steps. With SAC, which learns from rewards of long ago as well, penalties have full size from
+    the start, and so in tasks whose success is to last. The last checkpoint is left in the folder, for what
+    comes after.
     """
 
     def go_on(state: dict[str, Any]) -> None:
@@ -265,18 +251,20 @@ def optimize(
     logbook = Logbook(training.folder / checkpoint_name, go_on)
     points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps
     is_lasting = training.task.objective.is_lasting
+    ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting
     while not learner.done:
-        env.penalty_scale = ramp.scale(points, learner.steps, learner.total_steps)
+        env.penalty_scale = penalty_scale(points) if ramps else 1.0
+        learner.pace = FAST if env.penalty_scale == 1.0 and is_mastered(points) else 1.0
         metrics = learner.iterate()
         # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
         known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
         if is_lasting:
             # Success is to last to the horizon, which is not an end here: all ends are failures.
             known["success"] = None
-        points.append({"steps": learner.steps, **known})
+        points.append({"steps": learner.steps, "share": learner.share, **known})
         rate = learner.steps / stopwatch.seconds
         note = f"{rate:,.0f} steps/s  {lately(points, 'episode_steps' if is_lasting else 'success')}"
-        training.progress(learner.steps / learner.total_steps, note)
+        training.progress(learner.share, note)
         if logbook.is_due or learner.done:
             logbook.keep({"learner": learner.state_dict(), "world": env.state_dict()})
     taken, seconds = learner.steps - first, learner.acting.world_seconds

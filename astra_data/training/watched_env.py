@@ -4,6 +4,7 @@ from typing import Any
 
 from astra_data.core.seeding import derive
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv
+from astra_data.training.ramp import penalty_scale
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.training.train import Training, lately
 
@@ -25,12 +26,13 @@ class WatchedEnv(BatchedVectorEnv):
         super().__init__(seeded, training.simulated_steps)
         self.points: list[dict[str, Any]] = []
         self._training, self._total = training, training.config.total_steps
-        self._simulated, self._ramp = env, training.config.penalty_ramp
+        self._simulated = env
+        self._ramps = training.is_plus and not training.task.objective.is_lasting
         self._steps = self._ended = self._succeeded = self._lasted = 0
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Apply actions (B, A) for one control step."""
-        self._simulated.penalty_scale = self._ramp.scale(self.points, self._steps, self._total)
+        self._simulated.penalty_scale = penalty_scale(self.points) if self._ramps else 1.0
         ages = self._age.numpy() + 1
         stepped = super().step(actions)
         infos = stepped[-1]
@@ -54,6 +56,7 @@ class WatchedEnv(BatchedVectorEnv):
         ended, is_lasting = self._ended, self._training.task.objective.is_lasting
         point = {
             "steps": self._steps,
+            "share": min(1.0, self._steps / self._total),
             "success": None if is_lasting or not ended else self._succeeded / ended,
             "episode_steps": self._lasted / ended if ended else None,
         }

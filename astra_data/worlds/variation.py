@@ -9,7 +9,6 @@ from pydantic import AfterValidator
 from torch import Tensor
 
 from astra_data.core.config import Config, in_order
-from astra_data.core.errors import BadInputError
 from astra_data.worlds.protocols import VariableSimulator, keep_clear
 
 
@@ -159,24 +158,6 @@ class JointVariation(Variation):
     """Factor on all entries of the observed state."""
     timestep_scale: FactorRange = (1.0, 1.0)
     """Factor on the control period."""
-
-
-class AnyVariation(BallVariation, JointVariation):
-    """Ranges for any simulator, as recipes give them: parameters that it does not have stay plain."""
-
-    def of_kind[V: Variation](self, kind: type[V]) -> V:
-        """Return the ranges of the parameters that `kind` has.
-
-        Raises:
-            BadInputError: a parameter that `kind` does not have is not plain.
-        """
-        plain = AnyVariation()
-        others = [name for name in plain.names if name not in kind.model_fields]
-        foreign = [name for name in others if getattr(self, name) != getattr(plain, name)]
-        if foreign:
-            known = ", ".join(kind.model_fields)
-            raise BadInputError(f"expected ranges of {known}, got one of {', '.join(foreign)}")
-        return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 
 class VariedSimulator(ABC):

@@ -61,7 +61,7 @@ def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
             ["collect", "antmaze-umaze", "--random-share", "0.5"],
             r"random_share: expected the behavior of a pol",
         ),
-        (["collect", "antmaze-umaze", "--sac-steps", "-1"], r"sac_steps: expected greater than"),
+        (["collect", "antmaze-umaze", "--max-steps", "-1"], r"max_steps: expected greater than"),
         (
             ["collect", "humanoid-walker2d", "--clearance-m", "0.5", "--start", "task"],
             r"expected a task in a maze",

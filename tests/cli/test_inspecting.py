@@ -118,7 +118,7 @@ def test_no_name_controls_the_terminal(
     bad = "a\x1b]0;title\x07\nb\x9b31m"
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / bad))
     column = replace(COLUMNS[1], name=f"x{bad}", names=(f"x{bad}", "y"), astra={"unit": [bad, "m"]})
-    description = {**DESCRIPTION, "config": {bad: bad}, "stage": f"s{bad}"}
+    description: dict[str, object] = {**DESCRIPTION, "config": {bad: bad}, "stage": f"s{bad}"}
     root = tmp_path / bad / "fake/data-1.0.0"
     with writer(root, columns=[*COLUMNS, column], task=bad, description=description) as open_writer:
         for episode in fake_episodes():

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("fake_recipe")
 @pytest.fixture
 def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "r.toml"
-    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[plus]\nsteps = 5\n')
+    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[train]\nsteps = 5\n')
     return path
 
 
@@ -96,7 +96,7 @@ def test_a_command_passes_its_options_to_its_stage(
 def test_faults_of_all_recipes_are_told(recipe: Path, tmp_path: Path) -> None:
     broken = [tmp_path / "a.toml", tmp_path / "b.toml"]
     for path in broken:
-        path.write_text(recipe.read_text().replace("[plus]", "[pluss]"))
+        path.write_text(recipe.read_text().replace("[train]", "[trainn]"))
     paths = [broken[0], recipe, broken[1]]
     result = CliRunner().invoke(cli.app, ["check", *map(str, paths), "--root", str(tmp_path)])
     assert f"{recipe}: 0 of 9 items are finished" in result.output

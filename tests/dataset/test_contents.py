@@ -118,7 +118,8 @@ def test_rows_of_other_episodes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CorruptDatasetError, match="adds up to 55 frames, expected 55"):
         read_contents(root)
     alter_rows(root / EPISODES, "dataset_from_index", {1: 7})
-    read_contents(root)
+    with pytest.raises(CorruptDatasetError, match=r"episodes.* was altered"):
+        read_contents(root)
     alter_rows(root / EPISODES, "episode_index", {1: 2})
     with pytest.raises(CorruptDatasetError, match="meta/episodes has 5 episodes"):
         read_contents(root)

@@ -127,7 +127,7 @@ def test_where_it_does_not_fit_others_merge_says_how_it_is_imported(
 ) -> None:
     other = Dataset.open(recorded / "a")
     for sources in ([other, arm], [arm, other]):
-        with pytest.raises(BadInputError, match=r"import FOLDER/data/\*/\*\.parquet --mapping FILE`$"):
+        with pytest.raises(BadInputError, match=r"import FOLDER/data/\*/\*\.parquet --mapping FILE`"):
             merge(sources, out=tmp_path / "all")
     with pytest.raises(BadInputError, match=r"fps: 20, then 10$"):
         merge([other, write_fake(tmp_path / "slow", fps=10)], out=tmp_path / "all")

@@ -19,10 +19,10 @@ def recipe(**changes: object) -> Recipe:
         ({}, {"collect": {"episodes": 200}}, {}),  # the default
         ({}, {"collect": {"episodes": 60}}, {"collect": "episodes: 200, now 60"}),
         (
-            {"train": {"discount": 0.9, "final_std": 0.2}},
-            {"train": {"hidden_sizes": [8, 8], "tries": 3}},
+            {"train": {"discount": 0.9, "learning_rate": 0.1}},
+            {"train": {"hidden_sizes": [8, 8], "tries": 4}},
             {
-                "train": "discount: 0.9, now 0.99, final_std: 0.2, now none, "
+                "train": "learning_rate: 0.1, now 0.0005, discount: 0.9, now 0.99, "
                 "hidden_sizes: [64, 64], now [8, 8] and 1 more"
             },
         ),
@@ -34,12 +34,6 @@ def recipe(**changes: object) -> Recipe:
         ),
         ({"sweep": {"percent": [50, 100]}}, {"sweep": {"percent": [25, 100]}}, {}),
         ({"sweep": {"percent": [50]}}, {}, {"sweep": "50, now 100"}),
-        # Penalties are those of [train], where [plus] has none.
-        (
-            {"train": {"tries": 2}, "plus": {"tries": 2}},
-            {"plus": {"tries": 3}},
-            {"train": "tries: 2, now 1"},
-        ),
     ],
 )
 def test_what_changed_is_told_key_by_key(

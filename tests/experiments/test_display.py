@@ -4,7 +4,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from astra_data.experiments.display import Estimate, display, shown
+from astra_data.experiments.display import TimeEstimate, display, shown
 
 
 def test_without_a_terminal_there_are_plain_lines() -> None:
@@ -51,7 +51,7 @@ def test_in_80_columns_bar_share_and_time_left_stay() -> None:
 def test_the_time_left_counts_work_not_items() -> None:
     now = [0.0]
     keys = ["collect/seed_0", "train/nas/seed_0", "train/nas/seed_1", "evaluate/nas/seed_0"]
-    estimate = Estimate(keys, clock=lambda: now[0])
+    estimate = TimeEstimate(keys, clock=lambda: now[0])
     estimate.started("collect/seed_0")
     now[0] = 5.0
     estimate.finished("collect/seed_0", 5.0)

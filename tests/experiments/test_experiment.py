@@ -46,13 +46,13 @@ def attempts(folder: Path) -> int:
 
 def test_what_only_some_rows_read_leaves_the_others_alone(base: Path, tmp_path: Path) -> None:
     folder = run(base, root=tmp_path, jobs=2)
-    base.write_text(BASE + "[plus]\nrate = 2.0\n")
+    base.write_text(BASE + "[align]\nrate = 2.0\n")
     with pytest.raises(RecipeError) as caught:
         run(base, root=tmp_path)
-    rows = [folder / stage / "astra_plus" for stage in ("evaluate", "train")]
+    rows = [folder / "align", folder / "evaluate/astra", folder / "evaluate/astra_plus"]
     assert str(caught.value) == (
-        f"plus (rate: 0.5, now 2.0) changed in the recipe since {folder} was made: "
-        f"give the recipe another name, or remove {rows[0]} {rows[1]}"
+        f"align (rate: 0.5, now 2.0) changed in the recipe since {folder} was made: "
+        f"give the recipe another name, or remove {' '.join(map(str, rows))}"
     )
     made = attempts(folder)
     for row in rows:
@@ -79,7 +79,7 @@ def test_the_base_has_published_what_is_borrowed_of_it(base: Path, longer: Path)
         ("", ["collect", "pair", "ground", "train", "align", "evaluate"]),
         ("seeds = [1]\nmethods = ['follower']\n[report]\nsteps = 2\n[evaluate]\nsteps = 3\n", None),
         ("[evaluate]\nrate = 2.0\n", ["collect", "pair", "ground", "train", "align"]),
-        ("[plus]\nrate = 2.0\n", ["collect", "pair", "ground", "align"]),
+        ("[train]\nrate = 2.0\n", ["collect", "pair", "ground", "align"]),
         ("[target]\nnum_envs = 3\n", ["collect", "pair", "ground", "align"]),
         ("[align]\nrate = 2.0\n", ["collect", "pair", "ground", "train"]),
         ("[ground]\nrate = 2.0\n", ["collect", "pair"]),

@@ -226,4 +226,4 @@ def test_a_command_moves_the_state_of_its_name_and_no_other(
         return
     simulator = first_simulator(guess([tmp_path / "log.csv"]))
     assert ", ".join(field.short for entry in simulator.entries for field in entry.fields) == moved
-    assert "; ".join(simulator.doubts) == idle
+    assert "; ".join(simulator.remarks) == idle

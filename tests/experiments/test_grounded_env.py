@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 import astra_data.envs
 from astra_data.cli.app import app
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.manifest import read_manifest, write_manifest
 from astra_data.core.progress import silent
 from astra_data.exchange.importing import import_dataset
 from astra_data.experiments import grounded_env
@@ -23,6 +24,7 @@ from astra_data.experiments.experiment import load_experiment
 from astra_data.experiments.grounded_env import OPTIONS, evaluate_policy
 from astra_data.experiments.plan import plan, stage_of
 from astra_data.experiments.trained_policy import load_policy, settings_of
+from astra_data.grounding.files import load_target_encoder, save_target_encoder
 from astra_data.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SingleEnv
 from astra_data.training.own_policy import OwnPolicy
@@ -44,18 +46,14 @@ batch_windows = 4
 window = 5
 latent_size = 4
 held_out_share = 0.25
-correction_heads = 2
 [train]
 num_envs = 4
 rollout_steps = 8
 total_steps = 64
 hidden_sizes = [8]
 memory_size = 4
-[plus]
-reward = "blend"
-disagreement_penalty = 0.5
-data_start_share = 0.25
-residual_noise = 1.0
+data_start_share = 0.0
+tries = 1
 [align]
 updates = 2
 batch_windows = 4
@@ -114,16 +112,11 @@ def test_direct_transfer_is_the_raw_simulator_driven_in_its_units(run: Path) -> 
 
 def test_the_row_and_the_recipe_give_the_defaults_and_keywords_change_them(run: Path) -> None:
     plain, predicted, plus = (world_of(run, row) for row in ("nas", "astra", "astra_plus"))
-    assert (plain.reward, predicted.reward, plus.reward) == ("abstract", "predicted", "blend")
-    assert (plain.disagreement_penalty, plus.disagreement_penalty) == (0.0, 0.5)
-    assert (plain.data_start_share, plus.data_start_share) == (0.0, 0.25)
-    assert plain.starts is None and plus.starts is not None and plus.simulator.scatter is not None
-    changed = world_of(
-        run, "astra_plus", reward="abstract", disagreement_penalty=2, data_start_share=0.0, residual_noise=0.0
-    )
-    assert (changed.reward, changed.disagreement_penalty, changed.starts) == ("abstract", 2.0, None)
-    assert changed.simulator.scatter is None
-    assert world_of(run, "nas", data_start_share=1.0).starts is not None
+    assert (plain.reward, predicted.reward, plus.reward) == ("abstract", "predicted", "priced")
+    assert (plain.change_penalty, plus.change_penalty) == (0.0, 0.02)
+    assert plain.data_start_share == plus.data_start_share == 0.0 and plain.starts is None
+    changed = world_of(run, "nas", data_start_share=1.0)
+    assert changed.data_start_share == 1.0 and changed.starts is not None
 
 
 def test_it_is_the_environment_that_the_row_was_trained_in(
@@ -140,15 +133,15 @@ def test_it_is_the_environment_that_the_row_was_trained_in(
     monkeypatch.setattr(InSimulator, "world", kept)
     experiment = load_experiment(run.parents[1] / "cart.toml", run.parent)
     items = {item.key: item for item in plan(experiment.recipe, experiment.path, run)}
-    items["train/astra_plus/seed_0"].call(out=run.parents[1] / "again", progress=silent)
-    trained, ours = built[0], world_of(run, "astra_plus", seed=0)
+    call: Any = items["train/astra_plus/seed_0"].call
+    config = call.keywords["config"].model_copy(update={"data_start_share": 0.25})
+    call(config=config, out=run.parents[1] / "again", progress=silent)
+    trained, ours = built[0], world_of(run, "astra_plus", seed=0, data_start_share=0.25)
     plain = (str, float, int, bool)
     switches = {name: value for name, value in vars(trained).items() if isinstance(value, plain)}
-    assert {name: vars(ours)[name] for name in switches} == switches | {"num_envs": 1}
+    assert {name: vars(ours)[name] for name in switches} == switches | {"num_envs": 1, "penalty_scale": 1.0}
     assert trained.starts is not None and ours.starts is not None
     assert torch.equal(trained.starts.state, ours.starts.state)
-    assert trained.simulator.scatter is not None and ours.simulator.scatter is not None
-    assert torch.equal(trained.simulator.scatter, ours.simulator.scatter)
 
 
 def test_a_recipe_that_chooses_has_the_same_environments(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,10 +189,11 @@ def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
 
 
 def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: Path) -> None:
-    options: dict[str, Any] = {"run": run, "row": "nas", "residual_noise": 1.0}
+    options: dict[str, Any] = {"run": run, "row": "nas"}
     make: Any = gymnasium.make
     many, one = gymnasium.make_vec(ID, num_envs=1, **options), make(ID, **options)
-    quiet = gymnasium.make(ID, run=run, row="nas", residual_noise=0.0)
+    simulator: Any = world_of(run, "nas").simulator
+    assert simulator.scatter_model is not None
     action = np.array([0.5, 0.2], dtype=np.float32)
 
     def seen(env: Any, actions: Array) -> Array:  # noqa: ANN401
@@ -209,7 +203,6 @@ def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: P
     np.testing.assert_array_equal(seen(many, action[None])[:, 0], single)
     torch.rand(3)
     np.testing.assert_array_equal(seen(one, action), single)
-    assert not np.array_equal(seen(quiet, action), single)
 
 
 def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> None:
@@ -225,15 +218,13 @@ def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> N
     refused("iql is not trained in a simulator: .* direct_transfer for the raw simulator", row="iql")
     refused(r"expected .*pair/seed_3, .*ground/nas/seed_3: run the recipe first", seed=3)
     refused("the recipe has no size 50", percent=50)
-    refused("unknown option 'rewards': did you mean 'reward'", rewards="abstract")
-    refused("unknown option 'ramp'", ramp=0.5)
-    refused("nas predicts no reward", reward="predicted")
-    refused("reward: expected 'abstract', 'predicted' or 'blend', got 'none'", reward="none")
-    refused("has no maze, which these need: train.support_penalty", support_penalty=1.0)
+    refused("unknown option 'episode_step': did you mean 'episode_steps'", episode_step=3)
+    refused("unknown option 'reward'", reward="abstract")
+    refused("data_start_share: expected less than or equal to 1, got 2", data_start_share=2.0)
     settings = json.loads((run / "recipe.json").read_text())
     (tmp_path / "recipe.json").write_text(json.dumps(settings | {"sweep": {"percent": [50, 100]}}))
     refused(r"has several sizes: expected percent, one of \[50, 100\]", run=tmp_path)
-    assert "ramp" not in OPTIONS and "reward" in OPTIONS
+    assert OPTIONS == ("data_start_share", "episode_steps")
 
 
 class OurPolicyAgain:
@@ -274,14 +265,31 @@ def test_in_a_target_latents_come_from_the_aligned_encoder(run: Path, tmp_path: 
     moved.mkdir()
     for stage in ("pair", "ground", "align", "train"):
         (moved / stage).symlink_to(run / stage)
-    (moved / "recipe.json").write_text(json.dumps(settings | {"task": task}))
+    tested = settings["evaluate"] | {"encoder": "target"}
+    (moved / "recipe.json").write_text(json.dumps(settings | {"task": task, "evaluate": tested}))
     evaluate_policy(moved, "astra", OurPolicyAgain(run, "astra"), out=tmp_path / "own")
     parts = {"policy": "train", "grounding": "ground", "target_encoder": "align"}
     inputs: dict[str, Any] = {name: run / stage / "astra/seed_0" for name, stage in parts.items()}
-    evaluate(task, "astra", EvaluateConfig(episodes=3), **inputs, out=tmp_path / "row")
+    evaluate(task, "astra", EvaluateConfig(episodes=3, encoder="target"), **inputs, out=tmp_path / "row")
     own, row = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("own", "row"))
     assert own["target"] == row["target"] and own["encoders"] == row["encoders"]
     assert own["encoder"] == "target"
+
+
+@pytest.mark.parametrize(("latent_r2", "deployed"), [(0.89, False), (0.95, True)])
+def test_a_policy_is_deployed_with_the_encoder_that_explains_the_latents(
+    run: Path, tmp_path: Path, latent_r2: float, deployed: bool
+) -> None:
+    moved = Path(shutil.copytree(run, tmp_path / "cart"))
+    file = moved / "align/astra/seed_0/target_encoder.safetensors"
+    encoder = load_target_encoder(file)
+    encoder.latent_r2.fill_(latent_r2)
+    save_target_encoder(file, encoder)
+    manifest = read_manifest(file.parent)
+    assert manifest is not None
+    write_manifest(file.parent, manifest.made_from)
+    loaded = load_policy(moved, "astra").target_encoder
+    assert (loaded is not None) == deployed
 
 
 def test_a_policy_that_gives_no_actions_is_named(run: Path, tmp_path: Path) -> None:

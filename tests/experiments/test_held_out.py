@@ -34,7 +34,7 @@ def test_what_needs_a_target_is_refused_in_one_line(tmp_path: Path) -> None:
 
 def test_rows_that_share_a_grounding_are_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = '"direct_transfer", "astra_plus", "nas", "nas_plus"'
-    path, given = written(tmp_path, f'data = "logs"\nmethods = [{rows}]\n[plus]\nramp = 0.1\n'), list[Any]()
+    path, given = written(tmp_path, f'data = "logs"\nmethods = [{rows}]\n'), list[Any]()
     monkeypatch.setattr(
         "astra_data.experiments.held_out.write_held_out", lambda *of, **more: given.append(of[2])
     )

@@ -76,7 +76,7 @@ def test_a_recipe_names_task_data_methods_and_seeds_alone(tmp_path: Path) -> Non
     assert tomllib.loads(recipe) == {
         "task": "cart.py:TASK",
         "data": "cart-logs@data-1.0.0",
-        "methods": ["direct_transfer", "nas", "astra", "astra_plus"],
+        "methods": ["astra_plus", "astra", "nas", "direct_transfer"],
         "seeds": [0, 1, 2],
         "select": {},
     }
@@ -198,7 +198,8 @@ def test_a_dataset_is_taken_as_it_is(tmp_path: Path) -> None:
 def test_a_dataset_in_degrees_is_refused(
     names: tuple[str, ...], units: list[str] | None, values: float, expected: str, tmp_path: Path
 ) -> None:
-    columns = (Column(STATE, size=3, names=names, astra=units and {"unit": units}), Column(ACTION, size=2))
+    meaning = {"unit": units} if units else None
+    columns = (Column(STATE, size=3, names=names, astra=meaning), Column(ACTION, size=2))
     with DatasetWriter(
         tmp_path / "set", columns=columns, fps=10, task="drive", description=DESCRIPTION
     ) as out:

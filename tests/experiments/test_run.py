@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("fake_recipe")
 @pytest.fixture
 def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "r.toml"
-    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[plus]\nsteps = 5\n')
+    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[train]\nsteps = 5\n')
     return path
 
 
@@ -38,7 +38,7 @@ def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.Captur
     }
     assert asked(folder / "evaluate/astra/seed_0")["target_encoder"] == str(folder / "align/astra/seed_0")
     assert asked(folder / "report")["methods"] == ["astra", "astra_plus"]
-    assert json.loads((folder / "recipe.json").read_text())["plus"]["steps"] == 5
+    assert json.loads((folder / "recipe.json").read_text())["train"]["steps"] == 5
     lines = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"report  finished in [\d.]+ s  \(9 of 9\)", lines[-1])
 
@@ -274,22 +274,21 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     run(recipe, root=tmp_path, jobs=2)
     recipe.write_text(text.replace("steps = 5", "steps = 6"))
     stale = {key: found.why for key, found in check(recipe, root=tmp_path).items() if found.state == "stale"}
+    rows = ("astra", "astra_plus")
     assert stale == dict.fromkeys(
-        ("train/astra_plus/seed_0", "evaluate/astra_plus/seed_0"),
-        "plus (steps: 5, now 6) changed in the recipe since: give the recipe another name, or remove this",
+        [f"{stage}/{row}/seed_0" for stage in ("train", "evaluate") for row in rows],
+        "train (steps: 5, now 6) changed in the recipe since: give the recipe another name, or remove this",
     )
     with pytest.raises(RecipeError) as caught:
         run(recipe, root=tmp_path)
     assert str(caught.value) == (
-        f"plus (steps: 5, now 6) changed in the recipe since {folder} was made: "
-        "give the recipe another name, or remove "
-        f"{folder / 'evaluate/astra_plus'} {folder / 'train/astra_plus'}"
+        f"train (steps: 5, now 6) changed in the recipe since {folder} was made: "
+        f"give the recipe another name, or remove {folder / 'train'} {folder / 'evaluate'}"
     )
-    shutil.rmtree(folder / "train/astra_plus")
-    shutil.rmtree(folder / "evaluate/astra_plus")
+    shutil.rmtree(folder / "train")
+    shutil.rmtree(folder / "evaluate")
     assert sorted(key for key, found in check(recipe, root=tmp_path).items() if not found.is_finished) == [
-        "evaluate/astra_plus/seed_0",
-        "train/astra_plus/seed_0",
+        f"{stage}/{row}/seed_0" for stage in ("evaluate", "train") for row in rows
     ]
     recipe.write_text(text.replace("seeds = [0]", "seeds = [0, 1]"))
     assert check(recipe, root=tmp_path)["collect/seed_1"].state == "missing"
@@ -349,32 +348,3 @@ def test_a_recipe_with_data_is_labeled_and_has_nothing_to_collect(recipe: Path, 
     with pytest.raises(RecipeError, match=r'data \("me/walks", now ".*runs"\) changed'):
         run(recipe, root=tmp_path, jobs=1, until="pair")
     assert load_experiment(recipe, tmp_path).recipe.data == str(tmp_path / "runs")
-
-
-@pytest.mark.parametrize(
-    ("tables", "rows", "named"),
-    [
-        ('[plus]\ntopple = true\nreward = "blend"\n', '"astra", "astra_plus"', ["plus"]),
-        ('[train]\ntopple = true\nreward = "blend"\n', '"astra", "astra_plus"', ["train", "plus"]),
-        ('[train]\ntopple = true\n[plus]\nreward = "blend"\n', '"astra", "astra_plus"', ["plus"]),
-        ('[plus]\ntopple = true\nreward = "blend"\n', '"astra"', []),
-        ('[train]\ntopple = true\nreward = "blend"\n', '"follower"', []),
-        ("[plus]\ntopple = true\n", '"astra_plus"', []),
-        ('[plus]\nreward = "blend"\n', '"astra_plus"', []),
-    ],
-)
-def test_a_reward_that_prices_no_risk_beside_drawn_topples_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, tables: str, rows: str, named: list[str]
-) -> None:
-    recipe = tmp_path / "drawn.toml"
-    recipe.write_text(f'task = "maze"\nmethods = [{rows}]\nseeds = [0]\n{tables}')
-    told = [
-        f'{recipe}: {table}: with topple = true, reward = "blend" is the task\'s own and prices no risk, as '
-        "topples that are drawn cost what failures do: leave out one of the two"
-        for table in named
-    ]
-    check(recipe, root=tmp_path)
-    assert [record.getMessage() for record in caplog.records] == told
-    caplog.clear()
-    run(recipe, root=tmp_path, jobs=1, until="collect")
-    assert [record.getMessage() for record in caplog.records] == told

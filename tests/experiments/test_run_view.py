@@ -51,7 +51,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "cart.toml").write_text(RECIPE)
     experiment = load_experiment(folder / "cart.toml", folder / "runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=10))
+        patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=10, learning_rate=3e-3))
         for item in plan(experiment.recipe, experiment.path, experiment.folder):
             if stage_of(item) in ("collect", "pair", "ground") and item.key.endswith("seed_3"):
                 item.call(progress=silent)

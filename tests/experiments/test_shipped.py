@@ -45,7 +45,7 @@ def test_a_copy_has_all_that_it_needs(name: str, tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
     copy_recipe(name, tmp_path / "recipes")
     told = checked(tmp_path / "recipes" / shipped(name).path)
-    if name in {"cart", "push", "push_ppo", "push_random"}:
+    if name in {"cart", "fetch_push"}:
         assert "data: no dataset" in told  # it comes from elsewhere
     else:
         assert "items are finished" in told or "no errors" in told, told

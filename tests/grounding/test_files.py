@@ -28,19 +28,20 @@ def small() -> HistoryGrounding:
 
 def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
     shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), position_octaves=2)
-    model = GroundingModel(shape, "detach")
+    model = GroundingModel(shape)
     model.set_scales({"state": torch.randn(50, 4)})
-    reward = torch.stack([torch.randn(50), -10.0 * (torch.arange(50) == 7)], dim=-1)
-    model.set_reward_scales(reward, torch.ones(50), reward[:, 1])
-    assert torch.isfinite(model.failure_weight)
+    failed = (torch.arange(50) == 7).float()
+    model.set_reward_scales(torch.randn(50, 2) - 10.0 * failed[:, None], 1.0 - failed, failed)
+    model.reward_shrinkage.fill_(0.4)
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, HistoryGrounding(model), no_episodes())
     for loaded in (load_history_model(path), load_history_model(str(path))):
-        assert (loaded.shape, loaded.target, loaded.training) == (shape, "detach", False)
+        assert (loaded.shape, loaded.training) == (shape, False)
         assert not any(parameter.requires_grad for parameter in loaded.parameters())
         latent, action, state = torch.randn(3, 8), torch.randn(3, 2), torch.randn(3, 4)
         assert torch.equal(loaded.correct(latent, action, state), model.correct(latent, action, state))
         assert torch.equal(loaded.predict_reward(latent, action), model.predict_reward(latent, action))
+        assert float(loaded.failure_cost) == float(model.failure_cost) < -5.0
     tensors, metadata = load_tensors(path)
     assert tensors.keys() == model.state_dict().keys()
     assert (metadata["kind"], metadata["dataset"], metadata["hash"]) == ("history", "toy@data-1.0.0", "abc")
@@ -49,15 +50,15 @@ def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
 def test_a_grounding_of_the_users_own_is_read_once_it_is_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Own(HistoryGrounding):
-        kind = "own"
-
     path = tmp_path / "grounding.safetensors"
-    save_grounding(path, Own(small().model), no_episodes())
-    with pytest.raises(BadInputError, match="found kind own"):
+    save_grounding(path, Shifted(torch.ones(2)), no_episodes())
+    with pytest.raises(BadInputError, match="found kind shifted"):
         load_grounding(path)
-    monkeypatch.setitem(KINDS, "own", Own)
-    assert isinstance(load_grounding(path), Own)
+    monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
+    found = load_grounding(path)
+    assert isinstance(found, Shifted) and found.shift.tolist() == [1.0, 1.0]
+    with pytest.raises(BadInputError, match="expected a history model, got a grounding without latents"):
+        load_history_model(path)
 
 
 def test_a_policy_is_no_grounding(tmp_path: Path) -> None:
@@ -74,7 +75,7 @@ def test_a_policy_is_no_grounding(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("lacks", "found"),
-    [("kind", "a file without a kind"), ("shape", "no 'shape'"), ("target", "no 'target'")],
+    [("kind", "a file without a kind"), ("shape", "no 'shape'")],
 )
 def test_a_grounding_of_an_older_version_is_refused(lacks: str, found: str, tmp_path: Path) -> None:
     path = tmp_path / "grounding.safetensors"
@@ -101,10 +102,12 @@ def test_a_target_encoder_comes_back_frozen(tmp_path: Path) -> None:
     encoder = TargetEncoder(29, 2, 3, embedding_size=16, latent_size=8, position_octaves=3)
     state, goal, action = torch.randn(5, 29), torch.randn(5, 2), torch.randn(5, 3)
     encoder.set_scales(3 * state, goal)
+    encoder.latent_r2.fill_(0.95)
     path = tmp_path / "encoder.safetensors"
     save_target_encoder(path, encoder)
     loaded = load_target_encoder(str(path))
     assert not loaded.training and not any(parameter.requires_grad for parameter in loaded.parameters())
+    assert loaded.is_deployed
     inputs = loaded.encoder_input(state, goal, action)
     assert torch.equal(inputs, encoder.encoder_input(state, goal, action))
     assert torch.equal(loaded.encoder(inputs[None])[0], encoder.encoder(inputs[None])[0])

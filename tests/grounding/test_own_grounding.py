@@ -12,8 +12,7 @@ from shifted_method import Lossy, Shifted, ShiftedSimulator
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.files import KINDS
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.own_grounding import check_scatter, check_step, fitted, missing_parts
-from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.own_grounding import check_step, fitted, missing_parts
 from astra_data.grounding.protocols import FittedGrounding
 from astra_data.worlds.registry import task_named
 
@@ -27,15 +26,14 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_parts_that_a_grounding_does_not_inherit_are_to_be_written() -> None:
     class Half(FittedGrounding):
-        def scatter(self, episodes: PairedEpisodes) -> torch.Tensor:
-            return torch.eye(1)
+        pass
 
     class Alone:
         kind = "alone"
 
     assert missing_parts(Shifted) == missing_parts(Lossy) == missing_parts(HistoryGrounding) == []
     assert missing_parts(Half) == ["kind", "to_file", "from_file"]
-    assert {"scatter", "from_file", "simulator", "for_replay"} <= {*missing_parts(Alone)}
+    assert {"from_file", "simulator", "for_replay"} <= {*missing_parts(Alone)}
 
 
 def test_a_pair_of_a_grounding_and_figures_is_as_it_was(known: None) -> None:
@@ -156,33 +154,3 @@ def test_a_step_that_fails_is_told_with_its_place() -> None:
         BadInputError, match=rf"^a step of rail-cart as corrected by Shifted fails with .*\({file}"
     ):
         check_step(task_named(RAIL), Shifted(torch.zeros(3, 4, 7)), windows_of(4))
-
-
-def test_a_factor_of_scatter_passes() -> None:
-    check_scatter(SHIFTED, windows_of(4))
-
-
-@pytest.mark.parametrize(
-    ("returned", "told"),
-    [
-        (torch.ones(3, 3), r", a factor \(X, X\), zeros for none: expected shape \(1, 1\), got \(3, 3\)$"),
-        (torch.ones(1), r".*: expected shape \(1, 1\), got \(1,\)$"),
-        (None, ".*: expected a torch tensor, got a NoneType$"),
-        (np.ones((1, 1)), ".*: expected a torch tensor, got a ndarray$"),
-        (torch.ones(1, 1).double(), ".*: expected torch.float32, got torch.float64$"),
-        (torch.full((1, 1), torch.nan), ".*: expected finite numbers, got nan$"),
-        (torch.ones(1, 1, device="meta"), ".*: expected a tensor on cpu, where its inputs are, got meta$"),
-    ],
-)
-def test_what_is_no_factor_of_scatter_is_refused(
-    returned: object, told: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Shifted, "scatter", lambda self, episodes: returned)
-    with pytest.raises(BadInputError, match=rf"^Shifted.scatter\(episodes\){told}"):
-        check_scatter(SHIFTED, windows_of(4))
-
-
-def test_a_scatter_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Shifted, "scatter", lambda self, episodes: episodes.missing)
-    with pytest.raises(BadInputError, match=r"^Shifted.scatter\(episodes\) fails with AttributeError"):
-        check_scatter(SHIFTED, windows_of(4))

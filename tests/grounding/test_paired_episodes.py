@@ -90,7 +90,8 @@ def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
     assert merged.lengths.tolist() == [7, 1, 11, 29, 5]
     assert merged.terminated.nonzero().tolist() == [[2, 10], [3, 28]]
     assert merged.reward[2, :11].tolist() == [*(-label(2, step) for step in range(10)), -621.0]
-    assert merged.windows.reward[3, 28].tolist() == [0.0, -label(3, 28) - label(3, 29)]
+    assert torch.equal(merged.windows.reward, merged.reward)
+    assert merged.reward[3, 28] == -label(3, 28) - label(3, 29)
     assert merged.windows.next_state[3, 28, 0] == label(3, 28)
     assert merged.windows.failed.nonzero().tolist() == [[3, 28]]  # the third still succeeds
     assert merged.held_out is not None and merged.held_out.tolist() == [False, True, False, True, False]
@@ -116,8 +117,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_without_a_goal_all_else_is_the_same(root: Path, tmp_path: Path) -> None:
     sizes = {name: size for name, size in SIZES.items() if name != GOAL}
     aimless, usual = PairedEpisodes.load(write(tmp_path / "dataset", sizes)), PairedEpisodes.load(root)
-    for name, values in vars(usual.windows).items():
-        found = getattr(aimless.windows, name)
+    assert usual.windows.own_reward is None and aimless.windows.own_reward is None
+    for name, values in vars(replace(usual.windows, own_reward=usual.reward)).items():
+        found = getattr(replace(aimless.windows, own_reward=aimless.reward), name)
         assert found.shape == (5, 30, 0) if name == "goal" else torch.equal(found, values)
     assert aimless.draw_windows(3, 10)[0].goal.shape == (3, 10, 0)
 
@@ -145,18 +147,15 @@ def test_success_and_failure_terminate_and_time_outs_do_not(episodes: PairedEpis
     assert episodes.terminated.nonzero().tolist() == [[2, LENGTHS[2] - 1], [3, LENGTHS[3] - 1]]
 
 
-def test_rewards_of_steps_that_end_the_task_badly_stand_apart(episodes: PairedEpisodes) -> None:
-    going_on, ending = episodes.windows.reward.unbind(-1)
-    assert ending.nonzero().tolist() == [[3, LENGTHS[3] - 1]]
+def test_rewards_are_as_recorded_and_what_ends_an_episode_is_marked(episodes: PairedEpisodes) -> None:
+    windows = episodes.windows
     for episode, length in enumerate(LENGTHS):
         expected = -torch.tensor([label(episode, step) for step in range(length)])
-        shown = (going_on + ending)[episode, :length]
-        assert torch.equal(shown[:-1], expected[:-1])
-        # The step that fulfils the task is the simulator's to reward.
-        assert shown[-1] == (0.0 if episode == 2 else expected[-1])
+        assert torch.equal(windows.reward[episode, :length], expected)
         goes_on = [1.0] * (length - 1) + [0.0 if episode in (2, 3) else 1.0]
-        assert episodes.windows.goes_on[episode].tolist() == goes_on + [0.0] * (30 - length)
-    assert episodes.windows.failed.nonzero().tolist() == [[3, 29]]
+        assert windows.goes_on[episode].tolist() == goes_on + [0.0] * (30 - length)
+    assert torch.equal(windows.reward, episodes.reward)
+    assert windows.failed.nonzero().tolist() == [[3, 29]]
 
 
 def test_only_the_last_second_before_a_bad_end_fails_soon(episodes: PairedEpisodes) -> None:
@@ -201,6 +200,9 @@ def test_a_split_is_as_the_dataset_marks_it(tmp_path: Path) -> None:
 def test_copies_are_held_out_with_their_recording(tmp_path: Path) -> None:
     folder = write(tmp_path / "copies", SIZES, held_out=(), sources={1: 3, 2: 9, 4: 9})
     episodes = PairedEpisodes.load(folder)
+    assert episodes.recordings.tolist() == [0, 1, 2, 1, 2]
+    chosen = episodes.select(torch.tensor([3, 0]))
+    assert (chosen.uids.tolist(), chosen.recordings.tolist()) == ([3, 0], [1, 0])
     recorded = [{0}, {1, 3}, {2, 4}]
     splits = [episodes.split(0.34, seed) for seed in range(9)]
     numbers = [
@@ -242,14 +244,6 @@ def test_windows_hold_every_step_equally_often(episodes: PairedEpisodes, length:
     assert set(seen.tolist()) == expected
     mean = count * length / sum(steps + length - 1 for steps in LENGTHS)
     assert (times - mean).abs().max() < 5 * mean**0.5
-
-
-def test_windows_come_from_torchs_generator(episodes: PairedEpisodes) -> None:
-    torch.manual_seed(4)
-    first, _ = episodes.draw_windows(8, 6)
-    torch.manual_seed(4)
-    second, _ = episodes.draw_windows(8, 6)
-    assert torch.equal(first.state, second.state)
 
 
 def test_an_unpaired_dataset_is_refused(tmp_path: Path) -> None:
@@ -315,19 +309,6 @@ def test_an_episode_of_nothing_but_a_made_up_step_is_left_out(
     # The episode before it is as it was.
     assert left.reward[1, :3].tolist() == [-label(1, step) for step in range(3)]
     assert left.terminated.nonzero().tolist() == [[2, 28]]
-
-
-def test_chosen_episodes_keep_their_names(tmp_path: Path) -> None:
-    episodes = PairedEpisodes.load(write(tmp_path / "copies", SIZES, sources={1: 4, 3: 4}))
-    chosen = episodes.select(torch.tensor([3, 0]))
-    assert chosen.uids is not None and chosen.uids.tolist() == [3, 0]
-    assert chosen.recordings is not None and episodes.recordings is not None
-    assert chosen.recordings.tolist() == [int(episodes.recordings[one]) for one in (3, 0)]
-
-
-def test_copies_of_the_first_episode_are_of_its_recording(tmp_path: Path) -> None:
-    episodes = PairedEpisodes.load(write(tmp_path / "copies", SIZES, sources={1: 0, 3: 0}))
-    assert episodes.recordings is not None and episodes.recordings.tolist() == [0, 0, 1, 0, 2]
 
 
 def test_commands_are_multiples_of_their_bounds(root: Path, tmp_path: Path) -> None:

@@ -1,6 +1,4 @@
-import pytest
 import torch
-from torch import Tensor
 
 from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -11,9 +9,9 @@ TASK = TASKS["antmaze-umaze"]
 HERE = torch.tensor([[-4.0, 4.0, 0.0, 0.0]])
 
 
-def simulator(count: int, scatter: Tensor | None = None, start: Tensor = HERE) -> EpisodeSimulator:
-    one = EpisodeSimulator(PointMass(U_MAZE, count, timestep_s=0.05), scatter=scatter)
-    one.start(start.expand(count, 4), torch.arange(count), torch.zeros(count, 2))
+def simulator(count: int) -> EpisodeSimulator:
+    one = EpisodeSimulator(PointMass(U_MAZE, count, timestep_s=0.05))
+    one.start(HERE.expand(count, 4), torch.arange(count), torch.zeros(count, 2))
     return one
 
 
@@ -21,40 +19,16 @@ def varied(count: int) -> EpisodeSimulator:
     return EpisodeSimulator(abstract_simulator(TASK, count, "cpu", TASK.varied.wide))
 
 
-def test_without_noise_it_is_the_simulator_itself() -> None:
+def test_it_is_the_simulator_itself() -> None:
     raw = PointMass(U_MAZE, 1, timestep_s=0.05)
     raw.reset_to(HERE)
-    plain, scattered = simulator(1), simulator(1, scatter=torch.zeros(4, 4))
+    one = simulator(1)
     for _ in range(10):
         action = torch.tensor([[0.3, 0.9]])
         state = raw.step(action)
-        for one in (plain, scattered):
-            assert torch.equal(one.step(action), state)
-            assert torch.equal(one.state, state)
-            assert torch.equal(one.blocked, raw.blocked)
-
-
-def test_noise_has_the_covariance_of_its_factor() -> None:
-    torch.manual_seed(0)
-    factor = torch.tensor([[0.02, 0, 0, 0], [0.01, 0.02, 0, 0], [0.1, 0, 0.3, 0], [0, 0, 0, 0.2]])
-    one = simulator(20_000, factor)
-    state = one.step(torch.full((20_000, 2), 0.5))
-    assert state.mean(0).tolist() == pytest.approx([-3.975, 4.025, 0.5, 0.5], abs=0.01)
-    # The transposed factor would give 0.011 instead of 0.0004 as the first variance.
-    torch.testing.assert_close(torch.cov(state.T), factor @ factor.T, atol=2e-3, rtol=0.05)
-    assert float(state[:, 0].std()) == pytest.approx(0.02, rel=0.05)
-
-
-def test_scattered_positions_stay_free() -> None:
-    torch.manual_seed(0)
-    one = simulator(200, torch.diag(torch.tensor([0.05, 0.05, 0.0, 0.0])), torch.tensor([[-4.0, 5.7, 0, 0]]))
-    free = PointMass(U_MAZE, 1, timestep_s=0.05).free
-    touched = torch.zeros(200, dtype=torch.bool)
-    for _ in range(20):
-        state = one.step(torch.tensor([[0.0, 1.0]]).expand(200, 2))
-        assert not free.blocked[free.cells(state[:, :2])].any()
-        touched |= one.blocked
-    assert bool(touched.all())
+        assert torch.equal(one.step(action), state)
+        assert torch.equal(one.state, state)
+        assert torch.equal(one.blocked, raw.blocked)
 
 
 def test_the_raw_simulator_has_no_latents_and_predicts_nothing() -> None:
@@ -62,7 +36,6 @@ def test_the_raw_simulator_has_no_latents_and_predicts_nothing() -> None:
     one.step(torch.ones(3, 2))
     assert (one.latent, one.latent_size, one.parameters) == (None, 0, None)
     assert (one.failure_risk(), one.predicted_reward(torch.ones(3))) == (None, None)
-    assert one.disagreement.tolist() == [0.0, 0.0, 0.0]
 
 
 def test_a_start_draws_the_parameters_of_its_rows_anew() -> None:

@@ -40,15 +40,32 @@ def world(num_envs: int = 6) -> GoToZero:
     return GoToZero(num_envs)
 
 
-def test_it_iterates_until_all_steps_are_done() -> None:
-    learner = Noisy(world(), 3)
-    lefts, steps = [], []
-    while not learner.done:
-        lefts.append(learner.share_left)
+@pytest.mark.parametrize(
+    ("paces", "shares"),
+    [
+        ([1.0] * 4, [0.25, 0.5, 0.75, 1.0]),
+        ([1.0, 3.0], [0.25, 1.0]),
+        ([2.0, 1.0, 1.0], [0.5, 0.75, 1.0]),
+        ([0.9, 3.0, 3.0], [0.225, 0.975, 1.0]),
+    ],
+)
+def test_it_ends_after_as_many_steps_as_its_pace_asks_for(paces: list[float], shares: list[float]) -> None:
+    learner, found = Noisy(world(), 4), list[float]()
+    for number, pace in enumerate(paces, 1):
+        assert not learner.done
+        learner.pace = pace
         learner.iterate()
-        steps.append(learner.steps)
-    assert lefts == pytest.approx([1.0, 2 / 3, 1 / 3])
-    assert steps == [24, 48, 72] and learner.share_left == 0.0
+        found.append(learner.share)
+        assert learner.steps == 24 * number and learner.share_left == pytest.approx(1.0 - learner.share)
+    assert found == pytest.approx(shares) and learner.done
+
+
+def test_rounding_adds_no_iteration() -> None:
+    """Ten times a tenth is less than one."""
+    learner = Noisy(world(), 10)
+    while not learner.done:
+        learner.iterate()
+    assert learner.steps == 240
 
 
 def test_a_last_stretch_may_go_beyond_the_total() -> None:
@@ -83,12 +100,13 @@ def test_resumed_it_does_what_an_uninterrupted_one_does() -> None:
     worlds = [world() for _ in range(3)]
     whole, begun, resumed = (Noisy(one, 4) for one in worlds)
     expected = [whole.iterate() for _ in range(4)]
+    begun.pace = 1.5
     found: list[dict[str, Any]] = [begun.iterate(), begun.iterate()]
     state, at = copy.deepcopy(begun.state_dict()), copy.deepcopy(worlds[1].state_dict())
-    assert state.keys() == {"layer", "steps", "iteration", "acting"}
+    assert state.keys() == {"layer", "steps", "share", "iteration", "acting"}
     begun.iterate()  # must not reach into what was kept
     resumed.load_state_dict(state, worlds[2].load_state_dict(at))
-    assert resumed.steps == 48 and resumed.share_left == 0.5
+    assert resumed.steps == 48 and resumed.share == 0.75
     found += [resumed.iterate(), resumed.iterate()]
     assert found == expected
     assert torch.equal(resumed.layer.weight, whole.layer.weight)

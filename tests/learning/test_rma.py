@@ -2,9 +2,8 @@ import math
 
 import pytest
 import torch
-from kept_states import came_back
 from pydantic import ValidationError
-from toy_worlds import Slope
+from toy_worlds import Slope, train, whole_and_resumed
 
 from astra_data.core.errors import BadInputError
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student, Teacher
@@ -50,9 +49,7 @@ def correlation(student: Student, *, shuffled: bool) -> float:
 def test_a_student_recovers_what_its_history_shows() -> None:
     learner = begin(64, 15)
     untrained = abs(correlation(learner.student, shuffled=False))
-    points = []
-    while not learner.done:
-        points.append(learner.iterate())
+    points = train(learner)
     assert correlation(learner.student, shuffled=False) > 0.9 > untrained
     assert abs(correlation(learner.student, shuffled=True)) < 0.3
     assert points[0]["r2_extrinsics"] < 0.5 < points[-1]["r2_extrinsics"] <= 1.0
@@ -82,20 +79,7 @@ def test_the_student_acts_and_only_its_estimate_learns() -> None:
 
 
 def test_resuming_gives_the_same_parameters_to_the_bit() -> None:
-    whole, begun = begin(4, 4), begin(4, 4)
-    while not whole.done:
-        whole.iterate()
-    begun.iterate()
-    begun.iterate()
-    assert isinstance(begun.env, Slope)
-    saved = came_back({"learner": begun.state_dict(), "world": begun.env.state_dict()})
-    begun.iterate()  # goes on elsewhere; must not reach into what was saved
-    resumed = begin(4, 4)
-    assert isinstance(resumed.env, Slope)
-    resumed.load_state_dict(saved["learner"], resumed.env.load_state_dict(saved["world"]))
-    while not resumed.done:
-        resumed.iterate()
-    assert resumed.steps == whole.steps
+    whole, resumed = whole_and_resumed(lambda: begin(4, 4))
     for one, other in zip(resumed.student.parameters(), whole.student.parameters(), strict=True):
         assert torch.equal(one, other)
 

@@ -14,7 +14,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.learning.iql import IqlConfig
+from astra_data.learning.iql import Iql, IqlConfig
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.methods import METHODS, iql
 from astra_data.methods.iql import clone_behavior, experience_of, learn_from_episodes
@@ -28,9 +28,8 @@ TASK = TASKS["antmaze-umaze"]
 STEPS = 30
 CONFIG = IqlConfig(
     critic_updates=12,
-    critic_batch=16,
-    critic_sizes=(8,),
     policy_updates=8,
+    fine_tuning_updates=5,
     batch_windows=4,
     window=10,
     burn_in=2,
@@ -46,18 +45,18 @@ def episodes() -> PairedEpisodes:
     mask, terminated = torch.ones(6, STEPS), torch.zeros(6, STEPS, dtype=torch.bool)
     mask[5, 20:] = 0.0
     terminated[5, 19] = True
-    return toy_episodes(
+    made = toy_episodes(
         state[:, :-1],
         action,
         next_state=state[:, 1:],
         simulated_next=torch.full((6, STEPS, 4), torch.nan),
         goal=goal,
         mask=mask,
-        parts=torch.full((6, STEPS, 2), torch.nan),
         reward=torch.randn(6, STEPS),
         terminated=terminated,
         target_state=torch.randn(6, STEPS, 29),
     )
+    return replace(made, windows=replace(made.windows, reward=torch.full((6, STEPS), torch.nan)))
 
 
 @pytest.fixture
@@ -120,12 +119,27 @@ def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
     assert policy.act(torch.randn(3, 29), torch.randn(3, 2)).abs().max() <= 1.0
 
 
-def test_fine_tuning_begins_with_the_given_policy(learn: Learn, given: PolicyFile, tmp_path: Path) -> None:
+def test_fine_tuning_takes_fewer_and_smaller_updates_of_the_given_policy(
+    learn: Learn, given: PolicyFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    configs = list[IqlConfig]()
+
+    class Noted(Iql):
+        def __init__(self, policy: Any, experience: Any, config: IqlConfig, *, seed: int) -> None:  # noqa: ANN401
+            configs.append(config)
+            super().__init__(policy, experience, config, seed=seed)
+
+    monkeypatch.setattr(iql, "Iql", Noted)
     before = {name: value.clone() for name, value in given.policy.state_dict().items()}
-    rested, _ = learn(given, policy_updates=0)
+    rested, _ = learn(given, fine_tuning_updates=0)
     assert all(torch.equal(rested.policy.state_dict()[name], value) for name, value in before.items())
     (tmp_path / "checkpoint.safetensors").unlink()
-    tuned, _ = learn(given)
+    tuned, curve = learn(given)
+    (tmp_path / "checkpoint.safetensors").unlink()
+    learn()
+    tuning, anew = configs[1:]
+    assert (tuning.policy_updates, tuning.learning_rate) == (5, anew.learning_rate / 10)
+    assert (anew.policy_updates, curve["points"][-1]["steps"]) == (8, 12 + 5)
     assert tuned.policy.shape == given.policy.shape
     assert not torch.equal(tuned.policy.state_dict()["actor.4.weight"], before["actor.4.weight"])
     assert all(torch.equal(given.policy.state_dict()[name], value) for name, value in before.items())
@@ -133,14 +147,15 @@ def test_fine_tuning_begins_with_the_given_policy(learn: Learn, given: PolicyFil
 
 
 def test_cloning_does_what_was_recorded_whatever_it_paid(
-    learn: Learn, episodes: PairedEpisodes, tmp_path: Path
+    learn: Learn, episodes: PairedEpisodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("astra_data.learning.iql._CRITIC_LEARNING_RATE", 1e-2)
     # Going right pays, going left does not; both were recorded, left three times as often.
     rightwards = torch.rand(6, STEPS) < 0.25
     episodes.windows.action.copy_(torch.where(rightwards, 0.8, -0.8).unsqueeze(-1).expand(-1, -1, 2))
     episodes.reward.copy_(torch.where(rightwards, 10.0, -10.0))
     settings: dict[str, Any] = {"critic_updates": 200, "return_steps": 1, "policy_updates": 300}
-    settings |= {"learning_rate": 1e-2, "critic_learning_rate": 1e-2}
+    settings |= {"learning_rate": 1e-2}
     seen = experience_of(TASK, episodes)
     start = torch.zeros(6, STEPS)
     mean = {}

@@ -1,7 +1,4 @@
-import pytest
-
 from astra_data.core.config import Config
-from astra_data.grounding.fit import HistoryFit
 from astra_data.methods.method import Method, Table
 from astra_data.training.train import InSimulator
 from astra_data.training.train_in_target import InTarget
@@ -27,28 +24,6 @@ def test_where_a_policy_comes_from() -> None:
     assert recorded.trains_without_target and PLAIN.trains_without_target
 
 
-@pytest.mark.parametrize(
-    ("method", "predicted"),
-    [
-        (PLAIN, False),
-        (Method(name="mine", title="Mine", fit=HistoryFit(latent=True, reward=False)), False),
-        (
-            Method(
-                name="mine", title="Mine", fit=HistoryFit(latent=False, reward=True), predicts_reward=True
-            ),
-            True,
-        ),
-        (Method(name="mine", title="Mine", learn=InTarget("abstract"), learns_from="target"), True),
-    ],
-    ids=["raw", "without reward", "with reward", "not in a simulator"],
-)
-def test_only_a_simulator_whose_grounding_predicts_the_reward_pays_it(
-    method: Method, predicted: bool
-) -> None:
-    assert method.accepts("predicted") == predicted
-    assert method.accepts("abstract") and method.accepts("blend") and method.accepts(None)
-
-
 def test_a_table_has_the_defaults_of_its_model() -> None:
     table = Table("mine", Config)
-    assert (table.name, table.model, table.default, table.ranges) == ("mine", Config, None, None)
+    assert (table.name, table.model, table.default) == ("mine", Config, None)

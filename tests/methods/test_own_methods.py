@@ -33,7 +33,6 @@ SMALL = """
 [collect]
 episodes = 6
 max_steps = 12
-start = "task"
 hold_s = [0.1, 0.4]
 [ground]
 updates = 3
@@ -45,6 +44,7 @@ rollout_steps = 8
 total_steps = 32
 hidden_sizes = [8]
 memory_size = 4
+tries = 1
 [evaluate]
 episodes = 3
 """
@@ -74,6 +74,7 @@ def fitting(folder: Path, moved_by: float = 0.0, task: Task = TASK) -> Fitting:
     )
     episodes: Any = SimpleNamespace(
         windows=windows,
+        lengths=torch.full((8,), 20),
         steps=lambda values: values.flatten(0, 1),
         draw_windows=lambda count, length: (windows, None),
     )
@@ -135,7 +136,6 @@ def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: 
     state, action = torch.linspace(0.1, 0.9, 9)[:, None], torch.linspace(0.5, -0.5, 9)[:, None]
     expected = 0.3 * state - 0.1 * action
     torch.testing.assert_close(grounding.ensemble(state, action), expected, atol=0.03, rtol=0)
-    assert 0.0 < float(grounding.scatter(given.training)) < 0.03
 
 
 def test_golemos_lstm_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> None:
@@ -317,7 +317,7 @@ METHOD = Method(name="", title="",
             "fit=fit, table=Table('mine', Theirs), configures='ground'",
             r"has settings of Theirs, which is no .*Config: expected class Theirs\(Config\)",
         ),
-        ("fit=fit, grounding=Half", "has a grounding, Half, without scatter, to_file, from_file"),
+        ("fit=fit, grounding=Half", "has a grounding, Half, without to_file, from_file"),
         ("learn=None, grounding=Half", "learns no policy.*; .*mine.py:METHOD has a grounding, Half, without"),
     ],
 )
@@ -331,10 +331,10 @@ def test_what_a_method_lacks_is_told_before_anything_runs(tmp_path: Path, rest: 
 
 
 def test_a_kind_of_the_package_is_not_replaced(tmp_path: Path) -> None:
-    text = (EXAMPLES / "delta_action.py").read_text().replace('kind = "delta action"', 'kind = "residual"')
+    text = (EXAMPLES / "delta_action.py").read_text().replace('kind = "delta action"', 'kind = "history"')
     (tmp_path / "mine.py").write_text(text)
     with pytest.raises(
-        BadInputError, match=r"kind 'residual' are those of Residual.* in astra_data.grounding"
+        BadInputError, match=r"kind 'history' are those of HistoryGrounding in astra_data\.gr"
     ):
         add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
     assert "mine" not in METHODS

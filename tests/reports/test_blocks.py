@@ -1,6 +1,6 @@
 from html_pages import read_page
 
-from astra_data.reports.blocks import Code, Picture, Section, Table, Text, code, html, inline, markdown
+from astra_data.reports.blocks import Code, Picture, Section, TableBlock, Text, code, html, inline, markdown
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (400).to_bytes(4) + (200).to_bytes(4)
 
@@ -10,14 +10,14 @@ SECTIONS = [
         "The table",
         [
             Text("", ["one", "two"]),
-            Table("Numbers", ["method", "kind", "success"], [["A|B", "x", "0.5"]], words=2),
-            Table("Nothing", ["method"], []),
+            TableBlock("Numbers", ["method", "kind", "success"], [["A|B", "x", "0.5"]], words=2),
+            TableBlock("Nothing", ["method"], []),
             Code("astra-data run <recipe>"),
             Picture("drawn", "A figure", "It shows."),
             Picture("missing", "Not drawn", "It is left out."),
         ],
     ),
-    Section("Nothing at all", [Table("", ["method"], []), Picture("missing", "Not drawn", "")]),
+    Section("Nothing at all", [TableBlock("", ["method"], []), Picture("missing", "Not drawn", "")]),
     Section("Folded", [Text("Details")], folded=True),
 ]
 
@@ -43,7 +43,9 @@ def test_markdown_is_what_github_shows() -> None:
 def test_html_escapes_what_anybody_wrote_and_loads_nothing() -> None:
     hostile = "<script>alert(1)</script>"
     text = Text(f"Task {code(hostile)} {hostile}")
-    page = html(hostile, [Section(hostile, [text, Table(hostile, [hostile], [[hostile]]), Code(hostile)])])
+    page = html(
+        hostile, [Section(hostile, [text, TableBlock(hostile, [hostile], [[hostile]]), Code(hostile)])]
+    )
     assert "<script>" not in page
     assert "default-src 'none'" in page
     assert code("a`b\n# c") == "`ab # c`"

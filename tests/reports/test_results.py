@@ -11,7 +11,7 @@ from astra_data.reports.results import (
     Errors,
     Line,
     Results,
-    Training,
+    TrainingFacts,
     elapsed_seconds,
     judged_horizon,
     merge,
@@ -33,9 +33,16 @@ def results(*lines: Line, **changes: object) -> Results:
 
 
 def error(row: str, seed: int, simulator: str, *mean: float, horizons: tuple[int, ...] = (1, 10)) -> Errors:
-    ends = {"low": [0.5 * one for one in mean], "high": [2 * one for one in mean]}
+    low, high = [0.5 * one for one in mean], [2 * one for one in mean]
     return Errors(
-        row=row, seed=seed, simulator=simulator, quantity="x_m", horizons=[*horizons], mean=[*mean], **ends
+        row=row,
+        seed=seed,
+        simulator=simulator,
+        quantity="x_m",
+        horizons=[*horizons],
+        mean=[*mean],
+        low=low,
+        high=high,
     )
 
 
@@ -67,7 +74,7 @@ def test_the_interval_of_a_score_stays_within_what_it_can_be() -> None:
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
-    training = Training(row="astra", seed=0, steps=[1.0, 2.0], score=[float("nan"), 0.5])
+    training = TrainingFacts(row="astra", seed=0, steps=[1.0, 2.0], score=[float("nan"), 0.5])
     found = results(line("astra", 0, success=0.5), errors=[error("nas", 0, "raw", 1.0, 2.0)])
     found = found.model_copy(update={"trainings": [training]})
     path = tmp_path / "r.json"

@@ -1,4 +1,5 @@
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from astra_data.reports.results import (
 from astra_data.reports.verdict import Verdict, verdict_of
 from astra_data.worlds.score import SURVIVED_STEPS
 
-Scores = dict[str, tuple[float, ...]]
+Scores = Mapping[str, tuple[float, ...]]
 
 
 def results(

@@ -16,7 +16,7 @@ from astra_data.dataset.columns import STATE
 from astra_data.grounding.files import load_history_model, load_target_encoder, save_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.alignment import gaussian_mmd
+from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.stages.align import align
 
@@ -31,10 +31,15 @@ def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
     metrics = json.loads((aligned / "metrics.json").read_text())
     assert {"git_commit", "packages", "machine"} <= metrics.keys()
     first, last = metrics["points"]
-    assert (first["step"], last["step"]) == (50, 100)
-    assert 0 < last["mmd"] < first["mmd"]
+    assert (first["step"], last["step"]) == (100, 200)
+    assert 0 < last["held_out_error"] < first["held_out_error"]
+    for point in (first, last):
+        assert point["held_out_error"] == pytest.approx(point["mmd"] + point["latent_rmse"] ** 2)
     assert last["mmd"] == metrics["mmd"]
-    assert load_target_encoder(aligned / "target_encoder.safetensors").encoder.latent_size == 16
+    encoder = load_target_encoder(aligned / "target_encoder.safetensors")
+    assert encoder.encoder.latent_size == 16
+    assert float(encoder.latent_r2) == pytest.approx(metrics["latent_r2"])
+    assert metrics["deployed"] == ("target" if metrics["latent_r2"] >= 0.9 else "source")
 
 
 def test_the_agreement_is_that_of_held_out_episodes_alone(
@@ -43,13 +48,14 @@ def test_the_agreement_is_that_of_held_out_episodes_alone(
     model = load_history_model(grounded / "grounding.safetensors")
     encoder = load_target_encoder(aligned / "target_encoder.safetensors")
     _, held_out = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)
-    windows, squares, discrepancies = held_out.windows, [], []
-    bandwidths = 4.0 * torch.tensor(ALIGN.bandwidths)  # of 16 latents
+    windows, squares, discrepancies, latents = held_out.windows, [], [], []
+    bandwidths = 4.0 * torch.tensor((0.25, 0.5, 1.0, 2.0))  # of 16 latents
     for row, length in enumerate(held_out.lengths.tolist()):
         steps = slice(row, row + 1), slice(0, length)
         history = [windows.goal[steps], windows.previous_action[steps]]
         source, _ = model.encoder(model.encoder_input(windows.state[steps], *history))
         target, _ = encoder.encoder(encoder.encoder_input(held_out.target_state[steps], *history))
+        latents.append(source[0])
         squares.append((target - source).square().flatten())
         (mean, log_variance), (other, other_log_variance) = (
             model.predict_latent(latent, windows.action[steps]) for latent in (source, target)
@@ -58,6 +64,8 @@ def test_the_agreement_is_that_of_held_out_episodes_alone(
         discrepancies.append(apart.flatten())
     metrics = json.loads((aligned / "metrics.json").read_text())
     assert metrics["latent_rmse"] == pytest.approx(float(torch.cat(squares).mean().sqrt()), rel=1e-4)
+    unexplained = torch.cat(squares).mean() / torch.cat(latents).var(0, correction=0).mean()
+    assert metrics["latent_r2"] == pytest.approx(1 - float(unexplained), abs=1e-3)
     assert metrics["mmd"] == pytest.approx(float(torch.cat(discrepancies).mean()), rel=1e-3)
 
 
@@ -96,6 +104,14 @@ def test_the_same_seed_gives_the_same_bytes(
     align(ALIGN, **inputs, seed=0, out=out, device="cpu", progress=silent)
     name = "target_encoder.safetensors"
     assert (out / name).read_bytes() == (aligned / name).read_bytes()
+
+
+@pytest.mark.parametrize(("latent_r2", "deployed"), [(0.899, False), (0.9, True)])
+def test_a_coarse_encoder_is_not_deployed(latent_r2: float, deployed: bool) -> None:
+    encoder = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
+    assert not encoder.is_deployed  # before it was measured
+    encoder.latent_r2.fill_(latent_r2)
+    assert encoder.is_deployed == deployed
 
 
 def test_where_phi_drops_the_place_the_encoder_does_not_see_it(

@@ -10,7 +10,6 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
-from astra_data.dataset.meta_files import read_description
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
 from astra_data.stages.select import SelectConfig, benches, judge_of, select
@@ -85,10 +84,11 @@ def test_the_artifact_names_all_that_it_was_made_from(root: Path) -> None:
     manifest = read_manifest(root / "select")
     assert manifest is not None and set(manifest.files) == {"config.json", "select.json", "select.md"}
     policies = {f"train/{row}/seed_{seed}" for row in ROWS for seed in SEEDS}
-    pairs, groundings = ({f"{stage}/seed_{seed}" for seed in SEEDS} for stage in ("pair", "ground/nas"))
-    assert set(manifest.made_from) == policies | pairs | groundings
+    groundings = {f"ground/nas/seed_{seed}" for seed in SEEDS}
+    assert set(manifest.made_from) == policies | groundings
     assert manifest.made_from["train/nas/seed_1"] == file_digest(root / "train/nas/seed_1/policy.safetensors")
-    assert manifest.made_from["pair/seed_2"] == read_description(root / "pair/seed_2")["content_hash"]
+    grounding = root / "ground/nas/seed_2/grounding.safetensors"
+    assert manifest.made_from["ground/nas/seed_2"] == file_digest(grounding)
     keys = benches(reported(root), "nas")[0].keys
     assert set(keys) == set(manifest.made_from) and len(keys) == len(set(keys))
     with pytest.raises(BadInputError, match="is already finished"):
@@ -144,7 +144,8 @@ def test_policies_of_a_size_are_judged_by_groundings_of_that_size(
     loaded, told = [], list[tuple[float, str]]()
 
     def success(self: Judge, *_: object) -> float:
-        loaded.append(self.scatter)
+        model: Any = self.grounding
+        loaded.append(float(model.model.state_mean))
         return len(loaded) / 10
 
     monkeypatch.setattr(Judge, "success", success)
@@ -160,26 +161,9 @@ def test_policies_of_a_size_are_judged_by_groundings_of_that_size(
     manifest = read_manifest(root / "select")
     assert manifest is not None
     assert "ground/nas/percent_100/seed_1" in manifest.made_from
-    assert "subset/percent_150/seed_0" in manifest.made_from and "pair/seed_0" not in manifest.made_from
-    assert len({float(one.sum()) for one in loaded}) == 4
+    assert len(set(loaded)) == 4
     page = (root / "select/select.md").read_text()
     assert "## 100 %" in page and "## 150 %" in page and page.count("**NAS, seed") == 2
-
-
-def test_judges_without_a_failure_model_get_one_of_the_recipes_size_when_they_are_asked_first(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun, made = list[tuple[int, int]](), Judge.of
-
-    def of(*given: Any) -> Judge:  # noqa: ANN401
-        begun.append(given[-2:])
-        return made(*given)
-
-    monkeypatch.setattr(Judge, "of", of)
-    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
-    judged(root, failure_members=7, failure_steps=3)
-    assert begun == [(7, 3)] * 3  # once for each of three judges of six policies
-    assert (SelectConfig().failure_members, SelectConfig().failure_steps) == (5, 2)
 
 
 def test_who_learned_in_the_target_or_nowhere_is_not_judged(root: Path) -> None:
@@ -210,7 +194,6 @@ def test_what_is_not_there_is_asked_for(root: Path) -> None:
     (root / "alone").mkdir()
     alone = Path(shutil.copytree(root / "train", root / "alone/train")).parent
     shutil.copytree(root / "ground/nas/seed_1", alone / "ground/nas/seed_1")
-    shutil.copytree(root / "pair", alone / "pair")
     with pytest.raises(BadInputError, match="groundings of nas for two seeds or more, found 1"):
         select(reported(root), root=alone)
     shutil.rmtree(root / "ground/nas/seed_1")

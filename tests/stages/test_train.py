@@ -4,11 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from small_run import TRAIN
 from stopping import Stopped, stop_past
 
-from astra_data.core.checkpoint import resumed, save_state
 from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
@@ -20,11 +18,12 @@ from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.rma import RmaConfig
 from astra_data.methods import METHODS
 from astra_data.stages.train import train
+from astra_data.training.build_env import Simulation, WorldConfig, plus
+from astra_data.training.command_limit import command_limit
 from astra_data.training.policy_file import PolicyFile
 from astra_data.training.train import PpoTrainConfig, SacTrainConfig, Training
 from astra_data.worlds.registry import TASKS
 
-SWITCHES = {"topple": True, "residual_noise": 1.0, "support_penalty": 0.1, "data_start_share": 0.5}
 RMA = RmaConfig(history_length=40, adaptation_steps=64 * 4)
 """Four iterations after the six of `TRAIN`."""
 
@@ -64,46 +63,13 @@ def test_the_artifact_is_complete(task: str, grounded: Path, trained: Path) -> N
     curve = json.loads((trained / "curve.json").read_text())
     assert {"git_commit", "packages", "machine"} <= curve.keys()
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
-    assert curve["points"][0].keys() == {*("steps", "success", "episode_steps", "episodes", "reward", "std")}
+    assert [point["share"] for point in curve["points"]] == pytest.approx([n / 6 for n in range(1, 7)])
+    figures = {"steps", "share", "success", "episode_steps", "episodes", "reward", "std"}
+    assert curve["points"][0].keys() == figures
     policy = PolicyFile.load(trained / "policy.safetensors")
     assert policy.dataset == "antmaze-short-random-seed0@data-2.0.0"
     assert policy.policy.memory is None
-    assert policy.simulation is not None and not policy.simulation.scatter.any()
-
-
-def test_success_is_null_while_no_episode_has_ended(task: str, paired: Path, tmp_path: Path) -> None:
-    notes: list[str] = []
-    config = TRAIN.model_copy(update={"num_envs": 1, "rollout_steps": 2, "total_steps": 60})
-    make(
-        task, "direct_transfer", paired, None, tmp_path / "train", config, lambda _, note: notes.append(note)
-    )
-
-    def refuse(constant: str) -> None:
-        raise ValueError(f"{constant} is no JSON")
-
-    text = (tmp_path / "train" / "curve.json").read_text()
-    points = json.loads(text, parse_constant=refuse)["points"]
-    assert all((point["success"] is None) == (point["episodes"] == 0) for point in points)
-    assert {point["episodes"] for point in points} >= {0.0, 1.0}
-    assert notes[0].endswith("success of training episodes unknown yet")
-    assert notes[-1].endswith("success of training episodes 0.00")
-
-
-@pytest.mark.parametrize("method", ["direct_transfer", "rma"])
-def test_simulated_episodes_last_as_long_as_asked(
-    method: str, task: str, paired: Path, tmp_path: Path
-) -> None:
-    config = TRAIN.model_copy(update={"episode_steps": 3})
-    make(task, method, paired, None, tmp_path / "train", config)
-    points = json.loads((tmp_path / "train" / "curve.json").read_text())["points"]
-    assert all(point["episodes"] > 0 and point["episode_steps"] <= 3 for point in points)
-
-
-def test_a_raw_simulator_needs_a_memory(task: str, paired: Path, tmp_path: Path) -> None:
-    make(task, "direct_transfer", paired, None, tmp_path / "train")
-    policy = PolicyFile.load(tmp_path / "train" / "policy.safetensors").policy
-    assert policy.shape.memory_size == TRAIN.memory_size
-    assert policy.shape.observation_size == 8  # position, velocity, goal, relative goal
+    assert policy.simulation == Simulation(WorldConfig(reward="predicted", data_start_share=0.5))
 
 
 def test_the_same_seed_gives_the_same_bytes(
@@ -124,21 +90,18 @@ def test_after_an_interruption_it_goes_on(
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
     grounding = grounded if method == "astra_plus" else None
-    config = TRAIN.model_copy(update=SWITCHES)
-    expected = make(task, method, paired, grounding, tmp_path / "whole", config)
+    expected = make(task, method, paired, grounding, tmp_path / "whole")
     out = tmp_path / "interrupted"
     with pytest.raises(Stopped):
-        make(task, method, paired, grounding, out, config, stop_past(0.7))
+        make(task, method, paired, grounding, out, progress=stop_past(0.7))
     assert not out.exists()
     seen: list[float] = []
-    resumed = make(task, method, paired, grounding, out, config, lambda done, note: seen.append(done))
+    resumed = make(task, method, paired, grounding, out, progress=lambda done, note: seen.append(done))
     assert seen == pytest.approx([5 / 6, 1.0])
     assert resumed == expected
     policy = PolicyFile.load(out / "policy.safetensors")
-    assert policy.simulation is not None
-    world = policy.simulation.world.model_dump()
-    assert world == world | SWITCHES
-    assert torch.linalg.matrix_rank(policy.simulation.scatter) == 4
+    plain, limit = WorldConfig(data_start_share=0.5), command_limit(TASKS[task], PairedEpisodes.load(paired))
+    assert policy.simulation == Simulation(plus(plain, limit) if method == "astra_plus" else plain)
 
 
 @pytest.mark.parametrize("method", ["direct_transfer", "astra"])
@@ -168,36 +131,9 @@ def test_sac_goes_on_after_an_interruption(
     assert isinstance(PolicyFile.load(out / "policy.safetensors").policy, SoftActor)
 
 
-def test_a_checkpoint_of_another_version_is_told(
-    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
-    with pytest.raises(Stopped):
-        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop_past(0.7))
-    (checkpoint,) = tmp_path.rglob("checkpoint.safetensors")
-    with resumed(checkpoint) as (state, told):
-        del state["learner"]["acting"]
-    save_state(checkpoint, state, told)
-    with pytest.raises(
-        BadInputError, match=r"expected a checkpoint of this version, found .*'acting'.* remove "
-    ):
-        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN)
-
-
+@pytest.mark.parametrize("differs", ["settings", "grounding"])
 def test_what_was_begun_with_other_settings_is_left_alone(
-    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
-    with pytest.raises(Stopped):
-        make(task, "direct_transfer", paired, None, tmp_path / "out", TRAIN, stop_past(0.7))
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
-    longer = TRAIN.model_copy(update={"total_steps": 2 * TRAIN.total_steps})
-    with pytest.raises(BadInputError, match=r"partial was started with other settings .*: remove it"):
-        make(task, "direct_transfer", paired, None, tmp_path / "out", longer)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
-
-
-def test_what_was_begun_with_another_grounding_is_refused(
+    differs: str,
     task: str,
     paired: Path,
     grounded: Path,
@@ -206,11 +142,16 @@ def test_what_was_begun_with_another_grounding_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    out = tmp_path / "out"
     with pytest.raises(Stopped):
-        make(task, "nas", paired, grounded, tmp_path / "out", TRAIN, stop_past(0.7))
+        make(task, "nas", paired, grounded, out, TRAIN, stop_past(0.7))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    longer = TRAIN.model_copy(update={"total_steps": 2 * TRAIN.total_steps})
+    given = (grounded, out, longer) if differs == "settings" else (grounded_anew, out)
     with pytest.raises(BadInputError, match=r"partial was started with other settings .*: remove it"):
-        make(task, "nas", paired, grounded_anew, tmp_path / "out")
-    make(task, "nas", paired, grounded, tmp_path / "out")
+        make(task, "nas", paired, *given)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
+    make(task, "nas", paired, grounded, out)
 
 
 def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Path, tmp_path: Path) -> None:
@@ -228,7 +169,7 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
     assert [point["steps"] for point in curve["points"]] == [64 * (index + 1) for index in range(6)]
     adaptation = curve["adaptation"]["points"]
     assert [point["steps"] for point in adaptation] == [64 * (index + 1) for index in range(4)]
-    figures = {"steps", "success", "episode_steps", "episodes", "reward", "r2_extrinsics"}
+    figures = {"steps", "share", "success", "episode_steps", "episodes", "reward", "r2_extrinsics"}
     assert adaptation[0].keys() == figures
     file = PolicyFile.load(tmp_path / "train" / "policy.safetensors")
     assert isinstance(file.policy, Student)
@@ -259,14 +200,8 @@ def test_methods_that_do_not_fit_are_refused(task: str, paired: Path, tmp_path: 
         make(task, "astra", paired, None, tmp_path / "out")
     with pytest.raises(BadInputError, match="starts from the policy of direct_transfer: train that first"):
         make(task, "direct_transfer_iql", paired, None, tmp_path / "out")
-    eased = TRAIN.model_copy(update={"ramp": 0.5, "ramp_while": 0.9})
-    with pytest.raises(BadInputError, match="ramp_while: no episode of humanoid-walker2d succeeds before"):
-        make("humanoid-walker2d", "direct_transfer", paired, None, tmp_path / "out", eased)
     with pytest.raises(BadInputError, match="pair it again, with the simulator of this task"):
         make("humanoid-walker2d", "direct_transfer", paired, None, tmp_path / "out")
-    predicted = TRAIN.model_copy(update={"reward": "predicted"})
-    with pytest.raises(BadInputError, match="'direct_transfer' learns no reward: expected reward abstract"):
-        make(task, "direct_transfer", paired, None, tmp_path / "out", predicted)
     with pytest.raises(BadInputError, match=r"grounding.safetensors does not exist") as caught:
         make(task, "astra", paired, tmp_path, tmp_path / "out")
     assert "\n" not in str(caught.value)
@@ -354,10 +289,10 @@ def test_what_a_function_of_the_user_s_learns_is_a_policy_file_and_a_curve(
 
 
 def test_a_policy_of_short_commands_is_no_start_of_fine_tuning(
-    task: str, paired: Path, tmp_path: Path
+    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    limited = TRAIN.model_copy(update={"command_limit": 0.5})
-    make(task, "direct_transfer", paired, None, tmp_path / "limited", limited)
+    monkeypatch.setattr("astra_data.training.train.command_limit", lambda task, episodes: 0.5)
+    make(task, "direct_transfer_plus", paired, None, tmp_path / "limited")
     with pytest.raises(BadInputError, match="command_limit, which has no effect on 'direct_transfer_iql'"):
         train(
             task,

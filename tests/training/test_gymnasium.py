@@ -13,6 +13,7 @@ import astra_data.envs
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
+from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.simulator_env import SimulatorEnv
 from astra_data.worlds.registry import TASKS
@@ -54,7 +55,7 @@ def test_without_gymnasium_one_line_says_how_to_install_it() -> None:
     ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
     assert ran.returncode == 1
     last = ran.stderr.splitlines()[-1]
-    assert "BadInputError: gymnasium is needed but not installed: " in last and "astra-data[sim]" in last
+    assert last.endswith("BadInputError: gymnasium is needed but not installed: uv sync --extra sim")
 
 
 def test_failures_are_told_apart_from_successes() -> None:
@@ -125,7 +126,11 @@ def test_a_seed_of_a_list_is_the_first_and_nothing_else_is_drawn_from() -> None:
 
 def test_noise_comes_from_the_seed_and_differs_from_step_to_step() -> None:
     task = TASKS["antmaze-umaze"]
-    simulator = NO_GROUNDING.simulator(task, 1, scatter=0.1 * torch.eye(4))
+    model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
+    inputs = 16 + 2 + model.state_features(torch.zeros(1, 4)).shape[1]
+    scatters = ScatterModel(ScatterShape(inputs, 4, 50))
+    scatters.forms.copy_(torch.randn(50, 4))
+    simulator = HistoryGrounding(model, scatter_model=scatters).simulator(task, 1)
     env = SeededSimulatorEnv(SimulatorEnv(task.objective, simulator))
 
     def velocities(seed: int) -> list[list[float]]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +19,7 @@ from astra_data.training.own_policy import KINDS, Array
 from astra_data.training.policy_file import PolicyFile, add_policy_kind, running
 from astra_data.training.train import PpoTrainConfig, Training
 from astra_data.training.watched_env import WatchedEnv
+from astra_data.worlds.task import Task
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +31,7 @@ def training(folder: Path, progress: Callable[[float, str], None] = lambda share
     one = torch.zeros(1, 3, 1)
     return Training(
         task=TASK,
-        config=PpoTrainConfig(num_envs=4, total_steps=400),
+        config=PpoTrainConfig(num_envs=4, total_steps=400, data_start_share=0.0),
         settings=None,
         episodes=toy_episodes(one, one, next_state=one),
         grounding=NO_GROUNDING,
@@ -64,6 +64,7 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
     points = curve["points"]
     assert [point["steps"] for point in points[:3]] == [8, 16, 24]
     assert points[-1]["steps"] == 400 and len(points) == 50
+    assert [point["share"] for point in points] == pytest.approx([step / 50 for step in range(1, 51)])
     ended = [point["success"] for point in points if point["success"] is not None]
     assert set(ended) == {success} and told[-1][0] == 1.0
     # Backward all four end at steps 160 and 320, by the horizon of 40.
@@ -73,23 +74,24 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
 
 
 @pytest.mark.parametrize(
-    ("settings", "command", "expected"),
+    ("is_plus", "task", "command", "expected"),
     [
-        ({"ramp": 0.5}, 1.0, [step / 50 for step in range(50)] + [1.0] * 50),
-        ({"ramp": 0.5, "ramp_while": 0.5}, -1.0, [0.0] * 100),
-        ({}, 1.0, [1.0] * 100),
+        (True, TASK, 1.0, [0.0] * 10 + [0.25]),
+        (True, TASK, -1.0, [0.0] * 11),
+        (False, TASK, 1.0, [1.0] * 11),
+        (True, replace(TASK, objective=Last(horizon=40)), 1.0, [1.0] * 11),
     ],
 )
-def test_penalties_ramp_up_as_in_other_trainings(
-    tmp_path: Path, settings: dict[str, Any], command: float, expected: list[float]
+def test_prices_grow_as_in_other_trainings(
+    tmp_path: Path, is_plus: bool, task: Task, command: float, expected: list[float]
 ) -> None:
-    """Over the first half; while nobody arrives they do not grow."""
-    given, scales = training(tmp_path), list[float]()
-    object.__setattr__(given, "config", PpoTrainConfig(num_envs=4, total_steps=400, **settings))
+    given, scales = replace(training(tmp_path), is_plus=is_plus, task=task), list[float]()
 
     def learn(env: WatchedEnv, training: Training) -> Constant:
         env.reset()
-        for _ in range(100):
+        for _ in range(11):
+            # After a tenth of the training, of which prices grow over four.
+            env.points[:] = [] if len(scales) < 10 else [{"share": 0.1, "success": max(0.0, command)}]
             env.step(np.full((4, 1), command))
             scales.append(env.env.env.penalty_scale)  # type: ignore[attr-defined]
         return Constant(command)
@@ -150,7 +152,7 @@ def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
 
 def test_a_hand_written_policy_takes_no_step(tmp_path: Path) -> None:
     _, curve = driving(1.0, 0)(training(tmp_path))
-    assert curve == {"points": [{"steps": 0, "success": None, "episode_steps": None}]}
+    assert curve == {"points": [{"steps": 0, "share": 0.0, "success": None, "episode_steps": None}]}
 
 
 def test_what_is_not_learned_is_told(tmp_path: Path) -> None:

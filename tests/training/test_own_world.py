@@ -3,18 +3,17 @@
 from dataclasses import replace
 
 import pytest
-import torch
 from constant_policy import Constant
 from small_cart import TASK
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.build_env import EnvConfig, Simulation
+from astra_data.training.build_env import Simulation, WorldConfig
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import own_world, reached_in_own_world
 from astra_data.training.policy_file import PolicyFile
 
-SIMULATION = Simulation(None, torch.zeros(1, 1), EnvConfig())
+SIMULATION = Simulation(WorldConfig())
 
 
 def constant(command: float, simulation: Simulation = SIMULATION) -> PolicyFile:
@@ -40,21 +39,8 @@ def test_a_policy_that_knows_no_simulator_cannot_be_tried() -> None:
         reached_in_own_world(TASK, trained, NO_GROUNDING, seed=0)
 
 
-def test_it_has_the_noise_that_it_was_trained_with() -> None:
-    quiet, noisy = (
-        own_world(
-            TASK, Simulation(None, factor * torch.eye(1), EnvConfig(residual_noise=1.0)), NO_GROUNDING, 50
-        )
-        for factor in (0.0, 0.5)
-    )
-    for world, scatter in ((quiet, 0.0), (noisy, 0.5)):
-        world.reset()
-        world.step(torch.zeros(50, 1))
-        assert float(world.simulator.state.std()) == pytest.approx(scatter, abs=0.15)
-
-
 def test_it_starts_where_the_task_does() -> None:
-    simulation = Simulation(None, torch.zeros(1, 1), EnvConfig(data_start_share=1.0))
+    simulation = Simulation(WorldConfig(data_start_share=1.0))
     world = own_world(TASK, simulation, NO_GROUNDING, 5)
     world.reset()
     assert world.starts is None and not world.simulator.state.any()

@@ -14,7 +14,7 @@ from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticSh
 from astra_data.learning.networks.adaptation import AdaptiveShape, Student
 from astra_data.learning.networks.alignment import TargetEncoder
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.build_env import EnvConfig, Simulation
+from astra_data.training.build_env import Simulation, WorldConfig
 from astra_data.training.own_policy import KINDS, OwnPolicy
 from astra_data.training.policy_file import PolicyFile, running
 from astra_data.worlds.registry import TASKS
@@ -23,19 +23,14 @@ from astra_data.worlds.variation import PlanarVariation
 
 def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
-    thinness, scatter = torch.rand(6, 5), torch.randn(4, 4)
-    world = EnvConfig(reward="blend", topple=True, residual_noise=0.5)
+    world = WorldConfig(reward="priced", change_penalty=0.02, command_limit=0.7, data_start_share=0.5)
     variation = PlanarVariation(friction=(0.8, 1.2))
-    simulation = Simulation(thinness, scatter, world, variation)
+    simulation = Simulation(world, variation)
     saved = PolicyFile(policy, simulation, "toy@data-1.0.0", "abc")
     saved.save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors")
     assert (loaded.dataset, loaded.content_hash) == ("toy@data-1.0.0", "abc")
-    assert loaded.simulation is not None
-    assert (loaded.simulation.world, loaded.simulation.variation) == (world, variation)
-    assert loaded.simulation.thinness is not None
-    assert torch.equal(loaded.simulation.thinness, thinness)
-    assert torch.equal(loaded.simulation.scatter, scatter)
+    assert loaded.simulation == simulation
     assert loaded.policy.shape == policy.shape
     assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
     step = torch.randn(4, 3), torch.randn(4, 2), torch.randn(4, 8)
@@ -48,11 +43,10 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
 
 
 def test_it_runs_as_it_was_trained(tmp_path: Path) -> None:
-    simulation = Simulation(None, torch.zeros(4, 4), EnvConfig(command_limit=0.7))
+    simulation = Simulation(WorldConfig(command_limit=0.7))
     policy = ActorCritic(ActorCriticShape(41, 2))
     PolicyFile(policy, simulation, None, None, "full").save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors")
-    assert loaded.simulation is not None and loaded.simulation.thinness is None
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
     aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
     acting = running(TASKS["antmaze-umaze"], loaded, HistoryGrounding(model), aligned)

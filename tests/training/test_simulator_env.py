@@ -1,9 +1,12 @@
+from typing import Any
+
 import pytest
 import torch
 
 from astra_data.grounding.grounded_simulator import GroundedSimulator
 from astra_data.grounding.raw import NO_GROUNDING
 from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.learning.networks.failure import FailureModel, FailureShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.simulator_env import DataStarts, SimulatorEnv, policy_observation
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -16,9 +19,34 @@ from astra_data.worlds.variation import PlanarVariation
 TASK = Navigation(U_MAZE, horizon=700)
 
 
-def world(num_envs: int = 4, **options: float | torch.Tensor | DataStarts) -> SimulatorEnv:
+def world(num_envs: int = 4, **options: Any) -> SimulatorEnv:  # noqa: ANN401
     simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
-    return SimulatorEnv(TASK, simulator, **options)  # type: ignore[arg-type]
+    return SimulatorEnv(TASK, simulator, **options)
+
+
+class Risky(GroundedSimulator):
+    """A grounded simulator in which failures come with a probability that is known."""
+
+    risk = 0.05
+
+    def failure_risk(self) -> torch.Tensor:
+        return torch.full((len(self.state),), self.risk)
+
+
+def risky(count: int, risk: float, **options: Any) -> SimulatorEnv:  # noqa: ANN401
+    """Return episodes of which every second one reaches the goal in the first step."""
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    simulator = Risky(PointMass(U_MAZE, count, timestep_s=0.05), model)
+    simulator.risk = risk
+    one = SimulatorEnv(TASK, simulator, **options)
+    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
+    goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
+    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(count, 8)})
+    return one
+
+
+BACK = torch.tensor([[-1.0, 0.0]])
 
 
 def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
@@ -38,17 +66,20 @@ def test_the_same_torch_seed_gives_the_same_starts() -> None:
     assert not torch.equal(observations[0], observations[2])
 
 
-def test_resumes_where_it_was() -> None:
-    first, second = world(), world()
+def test_it_resumes_where_it_was_from_a_state_that_stays_as_it_was() -> None:
+    first, second = (world(change_penalty=1.0) for _ in range(2))
     first.reset()
     first.step(torch.ones(4, 2))
-    observation = second.load_state_dict(first.state_dict())
+    saved = {name: values.clone() for name, values in first.state_dict().items()}
+    kept = {name: values.clone() for name, values in saved.items()}
+    assert second.load_state_dict(saved).shape == (4, 8)
     for _ in range(3):
         action = 2 * torch.rand(4, 2) - 1
         a, b = first.step(action), second.step(action)
         assert torch.equal(a.observation, b.observation)
         assert torch.equal(a.reward, b.reward)
-    assert observation.shape == (4, 8)
+    second.reset(torch.tensor([True, False, False, True]))
+    assert all(torch.equal(saved[name], values) for name, values in kept.items())
 
 
 @pytest.mark.parametrize("is_varied", [False, True])
@@ -70,51 +101,6 @@ def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
             torch.manual_seed(0)
             after.append(one.step(torch.zeros(3, 4)).observation)
         assert torch.equal(*after)
-
-
-def test_thin_data_costs_its_penalty() -> None:
-    thinness = torch.zeros(U_MAZE.fine_walls.shape)
-    thinness[:, : thinness.shape[1] // 2] = 0.25  # x < 0
-    plain, costly = world(2), world(2, thinness=thinness)
-    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [4.0, 4.0, 0.0, 0.0]])
-    goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
-    steps = []
-    for one in (plain, costly):
-        one.load_state_dict({"state": state, "goal": goal})
-        steps.append(one.step(torch.tensor([[0.0, 1.0]]).expand(2, 2)))
-    assert (steps[1].reward - steps[0].reward).tolist() == pytest.approx([-0.25, 0.0])
-
-
-def test_disagreement_costs_its_penalty() -> None:
-    torch.manual_seed(0)
-    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=3))
-    with torch.no_grad():
-        for offset, head in zip((0.0, 0.0, 0.9), model.corrections, strict=True):
-            list(head.parameters())[-1][2:].fill_(offset)
-    # The heads differ in two of four entries, by sqrt(0.27 / 2) over all.
-    spread = (0.9**2 / 3 / 2) ** 0.5
-    rewards = []
-    for penalty in (0.0, 0.5):
-        model.usual_disagreement.fill_(spread / 3)
-        grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), model)
-        one = SimulatorEnv(TASK, grounded, disagreement_penalty=penalty)
-        torch.manual_seed(1)
-        one.reset()
-        rewards.append(one.step(torch.zeros(2, 2)).reward)
-        assert grounded.disagreement.tolist() == pytest.approx([2.0, 2.0])
-        model.usual_disagreement.fill_(2 * spread)
-        one.step(torch.zeros(2, 2))
-        assert not grounded.disagreement.any()  # less than usual
-    assert (rewards[1] - rewards[0]).tolist() == pytest.approx([-1.0, -1.0])
-
-
-@pytest.mark.parametrize(("heads", "steps"), [(1, 0), (1, 1), (3, 0)])
-def test_without_other_heads_or_a_step_there_is_no_disagreement(heads: int, steps: int) -> None:
-    shape = GroundingShape(4, 2, 2, latent_size=8, position_octaves=0, correction_heads=heads)
-    grounded = GroundedSimulator(PointMass(U_MAZE, 2, timestep_s=0.05), GroundingModel(shape))
-    for _ in range(steps):
-        grounded.step(torch.zeros(2, 2))
-    assert grounded.disagreement.tolist() == [0.0, 0.0]
 
 
 def test_episodes_may_start_from_recorded_moments() -> None:
@@ -143,29 +129,62 @@ def test_reaching_the_goal_is_success() -> None:
     assert float(step.reward) == pytest.approx(10.05, abs=0.01)
 
 
-def test_blend_pays_for_the_predicted_risk_of_toppling() -> None:
-    torch.manual_seed(0)
-    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
-    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4).clone()
-    goal = torch.tensor([[-4.0, -4.0]]).expand(3, 2)
-    action = torch.tensor([[1.0, 0.0]]).expand(3, 2)
-    rewards = []
-    for options in ({"reward": "abstract"}, {"reward": "blend"}, {"reward": "blend", "risk_weight": 3.0}):
-        grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model)
-        one = SimulatorEnv(TASK, grounded, **options)
-        one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
-        latent = grounded.latent
-        rewards.append(one.step(action).reward)
-    risk = model.topple_risk(latent, action, one.simulator.state).detach()
-    assert (risk > 0).all()
-    torch.testing.assert_close(rewards[1] - rewards[0], -10.0 * risk)
-    torch.testing.assert_close(rewards[2] - rewards[0], -30.0 * risk)
+def test_the_price_of_failures_is_four_times_what_they_cost_as_far_as_it_has_grown() -> None:
+    plain = risky(2, 0.01).step(BACK.expand(2, 2)).reward
+    for scale, price in ((0.0, 0.0), (0.5, 0.2), (1.0, 0.4)):  # a failure costs 10
+        priced = risky(2, 0.01, reward="priced")
+        priced.penalty_scale = scale
+        step = priced.step(BACK.expand(2, 2))
+        assert (plain - step.reward).tolist() == pytest.approx([price] * 2, abs=1e-5)
+        assert step.success.tolist() == [False, True] and not priced.failed.any()
+
+
+def test_without_a_failure_model_nothing_is_priced() -> None:
+    rewards = [world(2, reward=reward) for reward in ("abstract", "priced")]
+    rewards[1].load_state_dict(rewards[0].state_dict())
+    assert torch.equal(*(one.step(BACK.expand(2, 2)).reward for one in rewards))
+
+
+@pytest.mark.parametrize(("risk", "share"), [(0.05, 0.05), (0.0, 0.0), (1.0, 1.0)])
+def test_failures_are_drawn_at_their_probability_and_end_episodes_that_did_not_succeed(
+    risk: float, share: float
+) -> None:
+    count = 4000
+    one = risky(count, risk, draws_failures=True)
+    before, goal = one.simulator.state, one.goal
+    step = one.step(BACK.expand(count, 2))
+    assert step.success[1::2].all() and not step.success[::2].any()
+    assert not one.failed[1::2].any()
+    assert float(one.failed[::2].float().mean()) == pytest.approx(share, abs=0.015)
+    assert torch.equal(step.terminated, step.success | one.failed)
+    own = TASK.reward(before, one.simulator.state, goal, one.failed)
+    torch.testing.assert_close(step.reward, own)
+
+
+def test_a_predicted_reward_is_the_tasks_own_corrected_and_what_the_risk_costs() -> None:
+    """By hand: the residual by R_pred, shrunk, the task's own, and hazard times the cost of a failure."""
+    torch.manual_seed(1)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    for name, value in {"mean": 0.3, "std": 2.0, "shrinkage": 0.25}.items():
+        getattr(model, f"reward_{name}").fill_(value)
+    model.failure_cost.fill_(-8.0)
+    failures = FailureModel(FailureShape(4, 2, 0.05, members=1, risk_steps=2)).eval()
+    grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model, failures)
+    one = SimulatorEnv(TASK, grounded, reward="predicted")
+    one.reset()
+    before, latent, action = one.simulator.state, grounded.latent, torch.full((3, 2), 0.2)
+    step = one.step(action)
+    hazard = grounded.failure_risk()
+    assert hazard is not None and (hazard > 0).all()
+    normal = model.reward_head(torch.cat([latent, action], dim=-1))[:, -1]
+    own = TASK.reward(before, one.simulator.state, one.goal, torch.zeros(3, dtype=torch.bool))
+    torch.testing.assert_close(step.reward, own + 0.25 * (0.3 + 2.0 * normal) - 8.0 * hazard)
 
 
 def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() -> None:
     torch.manual_seed(0)
     task = TASKS["nao-kick"]
-    model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, position_octaves=0, ball_index=4))
+    model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, ball_index=4, corrects_reward=False))
     one = SimulatorEnv(task.objective, GroundedSimulator(task.simulator(3), model), reward="predicted")
     # Balls that roll on in the field, into the goal, and over the side line.
     balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
@@ -185,60 +204,12 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     assert float(predicted[0]) != pytest.approx(float(own[0]))
 
 
-def test_predicted_corrections_are_added_to_the_tasks_own_reward() -> None:
-    rewards = []
-    for corrects in (False, True):
-        torch.manual_seed(1)
-        model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, corrects_reward=corrects))
-        for reward in ("abstract", "predicted"):
-            one = SimulatorEnv(
-                TASK, GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model), reward=reward
-            )
-            state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4)
-            one.load_state_dict({"state": state, "goal": -state[:, :2], "hidden": torch.zeros(3, 8)})
-            rewards.append(one.step(torch.tensor([[1.0, 0.0]]).expand(3, 2)).reward)
-    own, whole, _, corrected = rewards
-    assert (own - whole).abs().min() > 1e-3
-    torch.testing.assert_close(corrected, own + whole)
-
-
-def test_predicted_rewards_leave_to_the_task_walls_that_end_it() -> None:
-    torch.manual_seed(0)
-    task = TASKS["nao-navigation"]
-    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, position_octaves=0))
-    one = SimulatorEnv(task.objective, GroundedSimulator(task.simulator(2), model), reward="predicted")
-    # The one in the middle of a corridor, the other just before the wall at x = -2.
-    state = torch.tensor([[0.0, 2.0, 0.0, 0.0], [-1.999, 2.0, 0.0, 0.0]])
-    goal = torch.tensor([task.maze.cell_center(*task.maze.goal)]).float().expand(2, 2)
-    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(2, 8)})
-    latent = one.simulator.latent
-    assert latent is not None
-    action = torch.tensor([[0.0, 0.0], [-1.0, 0.0]])
-    step = one.step(action)
-    assert step.terminated.tolist() == one.failed.tolist() == [False, True]
-    predicted = model.predict_reward(latent, action).detach()
-    torch.testing.assert_close(step.reward[:1], predicted[:1])
-    assert float(step.reward[1]) == pytest.approx(task.objective.failure_reward, abs=0.01)
-
-
 def test_commands_are_clipped_and_shortened() -> None:
     commands = torch.tensor([[3.0, 0.0], [0.6, 0.8], [1.0, 1.0], [0.1, -0.2], [0.0, 0.0]])
     limited = TASK.limit_command(commands, 0.5)
     expected = torch.tensor([[0.5, 0.0], [0.3, 0.4], [0.5 / 2**0.5] * 2, [0.1, -0.2], [0.0, 0.0]])
     torch.testing.assert_close(limited, expected)
     torch.testing.assert_close(TASK.limit_command(commands, 2.0), commands.clamp(-1.0, 1.0))
-
-
-def test_the_penalty_scale_scales_the_penalties() -> None:
-    one = world(1, thinness=torch.ones(U_MAZE.fine_walls.shape), command_limit=0.5)
-    state = {"state": torch.tensor([[-4.0, 4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
-    rewards = []
-    for scale in (0.0, 0.25, 1.0):
-        one.load_state_dict(state)
-        one.penalty_scale = scale
-        rewards.append(float(one.step(torch.tensor([[1.0, 0.0]])).reward))
-    assert one.simulator.state[0].tolist() == pytest.approx([-3.975, 4.0, 0.5, 0.0], abs=1e-5)
-    assert [rewards[0] - reward for reward in rewards] == pytest.approx([0.0, 0.25, 1.0], abs=1e-5)
 
 
 def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -> None:
@@ -288,63 +259,6 @@ def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     assert torch.equal(showing.load_state_dict(showing.state_dict()), after)
 
 
-def test_topples_are_drawn_at_the_predicted_risk_and_end_the_episode() -> None:
-    torch.manual_seed(0)
-    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
-    last = list(model.topple_head.parameters())
-    last[-2].zero_()
-    count = 4000
-    for logit, share in ((50.0, 1 / 20), (-50.0, 0.0)):
-        last[-1].fill_(logit)
-        inner = PointMass(U_MAZE, count, timestep_s=0.05)
-        one = SimulatorEnv(TASK, GroundedSimulator(inner, model), topple=True, reward="blend")
-        # Half of them reach the goal in this step: whoever does has not toppled.
-        state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
-        goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
-        one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(count, 8)})
-        step = one.step(torch.tensor([[-1.0, 0.0]]).expand(count, 2))
-        assert step.success[1::2].all() and not step.success[::2].any()
-        assert not one.failed[1::2].any()
-        assert float(one.failed[::2].float().mean()) == pytest.approx(share, abs=0.015)
-        assert torch.equal(step.terminated, step.success | one.failed)
-        # The draw replaces the expected cost: a topple costs, its risk does not.
-        own = TASK.reward(state, one.simulator.state, goal, one.failed)
-        torch.testing.assert_close(step.reward, own)
-
-
-def test_topples_that_are_drawn_are_no_part_of_the_predicted_reward() -> None:
-    torch.manual_seed(0)
-    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
-    model.failure_cost.fill_(-10.0)
-    list(model.topple_head.parameters())[-1].fill_(-50.0)
-    goal = torch.tensor([[-4.0, -4.0]]).expand(3, 2)
-    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0]]).expand(3, 4)
-    rewards = []
-    for topple in (False, True):
-        inner = PointMass(U_MAZE, 3, timestep_s=0.05)
-        one = SimulatorEnv(TASK, GroundedSimulator(inner, model), topple=topple, reward="predicted")
-        one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
-        latent, action = one.simulator.latent, torch.full((3, 2), 0.2)
-        rewards.append(one.step(action).reward)
-    assert latent is not None
-    going_on, failing = model.predict_reward_parts(latent, action).unbind(-1)
-    torch.testing.assert_close(rewards, [going_on + failing, going_on])
-    assert (failing < -1).all()
-
-
-def test_a_topple_that_is_drawn_costs_what_a_failure_costs() -> None:
-    torch.manual_seed(0)
-    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
-    list(model.topple_head.parameters())[-1].fill_(50.0)
-    inner = PointMass(U_MAZE, 400, timestep_s=0.05)
-    one = SimulatorEnv(TASK, GroundedSimulator(inner, model), topple=True, reward="predicted")
-    one.reset()
-    step = one.step(torch.zeros(400, 2))
-    assert 5 < one.failed.sum() < 50 and torch.equal(step.terminated, one.failed)
-    assert TASK.failure_reward == -10.0
-    assert (step.reward[one.failed] < -9.0).all() and (step.reward[~one.failed] > -1.0).all()
-
-
 def test_recorded_starts_hand_over_their_history() -> None:
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
@@ -369,35 +283,3 @@ def test_whoever_reaches_the_goal_at_a_wall_has_not_failed() -> None:
     step = one.step(torch.tensor([[-1.0, 0.0]]).expand(2, 2))
     assert one.simulator.blocked.all() and step.terminated.all()
     assert step.success.tolist() == [True, False] and one.failed.tolist() == [False, True]
-
-
-def test_thin_data_costs_where_a_step_ends() -> None:
-    thinness = torch.zeros(U_MAZE.fine_walls.shape)
-    thinness[:, thinness.shape[1] // 2 :] = 0.25  # x > 0
-    rewards = []
-    for one in (world(2), world(2, thinness=thinness)):
-        state = torch.tensor([[-0.02, 4.0, 0.0, 0.0], [0.02, 4.0, 0.0, 0.0]])
-        one.load_state_dict({"state": state, "goal": torch.tensor([[-4.0, -4.0]]).expand(2, 2)})
-        rewards.append(one.step(torch.tensor([[1.0, 0.0], [-1.0, 0.0]])).reward)
-    assert (rewards[1] - rewards[0]).tolist() == pytest.approx([-0.25, 0.0])
-
-
-def test_going_on_the_last_command_is_known() -> None:
-    first, second = (world(2, change_penalty=1.0) for _ in range(2))
-    same = torch.full((2, 2), 0.5)
-    first.reset()
-    first.step(same)
-    second.load_state_dict(first.state_dict())
-    assert torch.equal(first.step(same).reward, second.step(same).reward)
-
-
-def test_a_saved_state_stays_as_it_was() -> None:
-    one = world(2, change_penalty=1.0)
-    one.reset()
-    one.step(torch.full((2, 2), 0.5))
-    saved = {name: values.clone() for name, values in one.state_dict().items()}
-    kept = {name: values.clone() for name, values in saved.items()}
-    one.load_state_dict(saved)
-    one.reset(torch.tensor([True, False]))
-    one.step(torch.full((2, 2), -0.5))
-    assert all(torch.equal(saved[name], values) for name, values in kept.items())

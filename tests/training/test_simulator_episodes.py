@@ -9,14 +9,14 @@ from constant_policy import Constant
 from small_cart import TASK, Last
 
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.build_env import EnvConfig, Simulation
+from astra_data.training.build_env import Simulation, WorldConfig
 from astra_data.training.own_policy import OwnPolicy
 from astra_data.training.own_world import own_world
 from astra_data.training.policy_file import PolicyFile, running
 from astra_data.training.recorded_range import RecordedRange
 from astra_data.training.simulator_episodes import in_simulator, started
 
-SIMULATION = Simulation(None, torch.zeros(1, 1), EnvConfig())
+SIMULATION = Simulation(WorldConfig())
 SPEED = 4.0
 FORWARD = PolicyFile(OwnPolicy(Constant(1.0), 2, 1), SIMULATION, None, None)
 
@@ -29,7 +29,7 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
         in_simulator(
             own_world(TASK, simulation, NO_GROUNDING, 9), begin, 40, seed, asked if not seed else None
         )
-        for simulation in (SIMULATION, Simulation(None, 0.1 * torch.eye(1), EnvConfig(residual_noise=1.0)))
+        for simulation in (SIMULATION, Simulation(WorldConfig(), TASK.varied.randomized))
         for seed in (0, 1)
     ]
     goals = [start_goal["goal"] for _, start_goal in runs]

@@ -129,7 +129,7 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
     assert type(policy.policy) is SoftActor and policy.observed == "full"
     config = Counting.made[0].config
     assert isinstance(config, SacConfig)
-    assert (config.total_steps, config.discount, config.reward_scale) == (steps, 0.99, 0.1)
+    assert (config.total_steps, config.discount) == (steps, 0.99)
 
 
 def test_where_good_episodes_are_short_sac_is_refused(tmp_path: Path) -> None:

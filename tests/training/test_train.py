@@ -2,7 +2,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
@@ -15,22 +15,21 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.learning.learner import Learner
+from astra_data.learning.acting import Acting
 from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.learning.networks.policy import PolicyShape
 from astra_data.learning.networks.soft_actor import SoftActor
 from astra_data.learning.ppo import Ppo
-from astra_data.learning.recorded import Recorded
 from astra_data.learning.sac import Sac
-from astra_data.training.ramp import Ramp
+from astra_data.training.build_env import WorldConfig
+from astra_data.training.simulator_env import RewardSource
 from astra_data.training.train import (
     AnyTrainConfig,
     InSimulator,
     PpoTrainConfig,
     SacTrainConfig,
     Training,
-    imitates,
     lately,
     learner_of,
     optimize,
@@ -90,20 +89,17 @@ def grounding() -> HistoryGrounding:
 def test_the_learner_that_is_named_has_the_settings_ppo_by_default() -> None:
     read: TypeAdapter[PpoTrainConfig | SacTrainConfig] = TypeAdapter(AnyTrainConfig)
     assert type(read.validate_python({})) is PpoTrainConfig
-    assert type(read.validate_python({"learner": "ppo", "clip": 0.1})) is PpoTrainConfig
+    assert type(read.validate_python({"learner": "ppo", "rollout_steps": 9})) is PpoTrainConfig
     sac = read.validate_python({"learner": "sac", "burn_in": 3})
     assert (type(sac), sac.num_envs) == (SacTrainConfig, 32)
     assert read.validate_python(sac) is sac
     with pytest.raises(ValidationError, match="burn_in"):
         read.validate_python({"burn_in": 3})
-    with pytest.raises(ValidationError, match="ramp: expected 0 with SAC"):
-        read.validate_python({"learner": "sac", "ramp": 0.5})
 
 
 def test_each_learner_gets_its_policy_in_the_asked_sizes() -> None:
     shape = PolicyShape(1, 1, 5, hidden_sizes=(8, 6))
-    recorded = Recorded(torch.zeros(1, 9, 1), torch.zeros(1, 9, 1), torch.zeros(1, 9, 1), torch.tensor([9]))
-    given: dict[str, Any] = {"horizon": 7, "seed": 3, "recorded": recorded}
+    given: dict[str, Any] = {"horizon": 7, "seed": 3}
     ppo = learner_of(PPO, ToyWorld(4), shape, "cpu", **given)
     assert type(ppo) is Ppo and type(ppo.policy) is ActorCritic
     assert ppo.policy.shape == ActorCriticShape(1, 1, 5, hidden_sizes=(8, 6))
@@ -112,8 +108,6 @@ def test_each_learner_gets_its_policy_in_the_asked_sizes() -> None:
     assert type(sac) is Sac and type(sac.policy) is SoftActor
     assert sac.policy.shape == shape
     assert sac.acting.horizon == 7
-    imitating = SAC.model_copy(update={"imitation_weight": 0.4})
-    assert [imitates(config) for config in (PPO, SAC, imitating)] == [False, False, True]
 
 
 @pytest.mark.parametrize("config", [PPO, SAC])
@@ -130,150 +124,170 @@ def test_the_seed_decides_the_policy(config: PpoTrainConfig | SacTrainConfig, tm
     assert not torch.equal(weights[0], weights[2])
 
 
-class Counting:
-    """Stands for a learner that does nothing but count, and notes the scale of the penalties as it goes."""
+class Counting(Ppo):
+    """PPO that does nothing but count to ten, and notes the scale of penalties and its pace as it goes."""
 
     def __init__(self, env: ToyWorld, figures: Callable[[int], dict[str, float]]) -> None:
         self.env, self.figures, self.steps, self.total_steps = env, figures, 0, 10
-        self.scales: list[float] = []
-        self.acting = self
+        self.share, self.pace = 0.0, 1.0
+        self.scales, self.paces = list[float](), list[float]()
+        self.acting: Any = self
         self.world_seconds = 0.5
 
-    @property
-    def done(self) -> bool:
-        return self.steps >= self.total_steps
-
     def iterate(self) -> dict[str, float]:
-        self.scales.append(self.env.penalty_scale)
+        self.scales.append(self.env.penalty_scale)  # type: ignore[attr-defined]
+        self.paces.append(self.pace)
         self.steps += 1
+        self.share = min(1.0, self.share + self.pace / self.total_steps)
         return self.figures(self.steps)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"steps": torch.tensor(self.steps)}
+    def state_dict(self) -> dict[str, Any]:
+        return {"steps": torch.tensor(self.steps), "share": torch.tensor(self.share, dtype=torch.double)}
 
-    def load_state_dict(self, state: dict[str, Tensor], observation: Tensor, *, goes_on: bool) -> None:
-        self.steps, self.observation, self.goes_on = int(state["steps"]), observation, goes_on
-
-
-WHOLE = Ramp()
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor, *, goes_on: bool = True) -> None:
+        self.steps, self.share = int(state["steps"]), float(state["share"])
+        self.observation, self.goes_on = observation, goes_on
 
 
 def counted(
-    given: Training, ramp: Ramp, figures: Callable[[int], dict[str, float]]
+    given: Training, figures: Callable[[int], dict[str, float]] = lambda step: {"success": 0.5}
 ) -> tuple[Counting, dict[str, Any]]:
-    env = ToyWorld(2)
-    learner = Counting(env, figures)
-    return learner, optimize(cast(Learner, learner), env, ramp, given)
+    learner = Counting(ToyWorld(2), figures)
+    return learner, optimize(learner, learner.env, given)  # type: ignore[arg-type]
 
 
-def test_penalties_ramp_up_over_a_share_of_the_training(tmp_path: Path) -> None:
-    for name, ramp, expected in (
-        ("ramp", 0.4, [0.0, 0.25, 0.5, 0.75, *[1.0] * 6]),
-        ("none", 0.0, [1.0] * 10),
-    ):
-        (tmp_path / name).mkdir()
-        learner, _ = counted(training(tmp_path / name), Ramp(ramp), lambda step: {"success": 0.0})
-        assert learner.scales == pytest.approx(expected)
+WALKER = TASKS["humanoid-kinematics"]
 
 
-def test_penalties_shrink_while_the_training_fails(tmp_path: Path) -> None:
-    succeeding = {1, 2, 3, *range(9, 11)}
-    learner, _ = counted(
-        training(tmp_path), Ramp(0.5, 0.5), lambda step: {"success": float(step in succeeding) * 0.7}
-    )
-    # Means of five points: 0.7 until step 3, then 0.52, 0.42, 0.28, 0.14, 0 and 0.14; a step is a fifth.
-    assert learner.scales == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 0.6, 0.4, 0.2, 0.0, 0.0], abs=1e-9)
+@pytest.mark.parametrize(
+    ("task", "is_plus", "success", "scales"),
+    [
+        # Mastered from the first point on: penalties grow over four tenths, and then it is thrice as fast.
+        (TASK, True, 1.0, [0.0, 0.25, 0.5, 0.75, 1.0, 1.0]),
+        (TASK, False, 1.0, [1.0] * 4),
+        (TASK, True, 0.9, [0.0] * 10),
+        (TASK, False, 0.9, [1.0] * 10),
+        # Success that is to last is unknown here: nothing grows, and nothing ends early.
+        (WALKER, True, 1.0, [1.0] * 10),
+    ],
+)
+def test_a_mastered_training_ends_early_and_only_its_penalties_grow(
+    task: Task, is_plus: bool, success: float, scales: list[float], tmp_path: Path
+) -> None:
+    notes: list[tuple[float, str]] = []
+    given = training(tmp_path, task=task, progress=lambda *note: notes.append(note))
+    figures = {"success": success, "episode_steps": 1000.0}
+    learner, curve = counted(replace(given, is_plus=is_plus), lambda step: figures)
+    assert learner.scales == pytest.approx(scales)
+    slow = {4: 1, 6: 4}.get(len(scales), 10)
+    assert learner.paces == [1.0] * slow + [3.0] * (len(scales) - slow)
+    shares = [point["share"] for point in curve["points"]]
+    tenths = [*range(1, slow + 1), *range(slow + 3, 11, 3)]
+    assert shares == pytest.approx([tenth / 10 for tenth in tenths])
+    assert [share for share, _ in notes] == shares
+    assert [point["steps"] for point in curve["points"]] == [*range(1, len(scales) + 1)]
+    told = f"success of training episodes {success:.2f}"
+    if task is WALKER:
+        told = "steps of training episodes 1,000"
+        assert {point["success"] for point in curve["points"]} == {None}
+    assert notes[-1][1].endswith(told)
+
+
+def test_with_sac_penalties_are_whole_and_it_ends_early_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A learner that is no PPO: its replay holds rewards of long ago."""
+    monkeypatch.setattr("astra_data.training.train.Ppo", int)
+    learner, _ = counted(replace(training(tmp_path), is_plus=True), lambda step: {"success": 1.0})
+    assert learner.scales == [1.0] * 4
+
+
+@pytest.mark.parametrize(("success", "iterations"), [(1.0, 3), (0.0, 6)])
+def test_ppo_itself_takes_fewer_steps_once_episodes_succeed_and_completes_its_schedules(
+    success: float, iterations: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, rates = PPO.model_copy(update={"total_steps": 16 * 6}), list[float]()
+    figures = Acting.figures
+    monkeypatch.setattr(Acting, "figures", lambda acting: figures(acting) | {"success": success})
+    learn = Ppo._learn
+
+    def noted(ppo: Ppo, rollout: dict[str, Tensor]) -> None:
+        rates.append(ppo._optimizer.param_groups[0]["lr"] / config.learning_rate)
+        learn(ppo, rollout)
+
+    monkeypatch.setattr(Ppo, "_learn", noted)
+    _, curve = train_in(ToyWorld(4), config, 5, training(tmp_path, config), 20)
+    assert len(curve["points"]) == iterations and curve["points"][-1]["steps"] == 16 * iterations
+    done = [0, 1, 4] if success else range(6)
+    assert rates == pytest.approx([1 - sixths / 6 for sixths in done])
+    assert curve["points"][-1]["share"] == pytest.approx(1.0)
 
 
 def test_the_curve_has_every_iteration_and_null_for_what_is_undefined(tmp_path: Path) -> None:
     notes: list[tuple[float, str]] = []
     given = training(tmp_path, progress=lambda share, note: notes.append((share, note)))
-    _, curve = counted(given, WHOLE, lambda step: {"success": math.nan if step < 3 else step / 10})
+    _, curve = counted(given, lambda step: {"success": math.nan if step < 3 else step / 20})
     assert [point["success"] for point in curve["points"]] == [
         None,
         None,
-        *[step / 10 for step in range(3, 11)],
+        *[step / 20 for step in range(3, 11)],
     ]
     assert [point["steps"] for point in curve["points"]] == list(range(1, 11))
     assert curve["simulator_steps_per_second"] == pytest.approx(10 / 0.5)
     assert [share for share, _ in notes] == pytest.approx([step / 10 for step in range(1, 11)])
     assert notes[0][1].endswith("success of training episodes unknown yet")
-    assert notes[-1][1].endswith("success of training episodes 0.65")  # the mean of 0.3 to 1.0
-
-
-def test_where_success_is_to_last_the_length_of_episodes_is_told_instead(tmp_path: Path) -> None:
-    notes: list[str] = []
-    walker = TASKS["humanoid-kinematics"]
-    given = training(tmp_path, task=walker, progress=lambda share, note: notes.append(note))
-    _, curve = counted(given, WHOLE, lambda step: {"success": 0.0, "episode_steps": 1000.0 * step})
-    assert {point["success"] for point in curve["points"]} == {None}
-    assert notes[-1].endswith("steps of training episodes 5,500")
+    assert notes[-1][1].endswith("success of training episodes 0.33")  # the mean of 0.15 to 0.5
 
 
 def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     given = training(tmp_path)
-    first, _ = counted(given, WHOLE, lambda step: {"success": 0.5})
-    assert (tmp_path / "checkpoint.safetensors").is_file()
-    env = ToyWorld(2)
-    again = Counting(env, lambda step: {"success": 0.5})
-    again.total_steps = 12
-    curve = optimize(cast(Learner, again), env, WHOLE, given)
-    assert again.scales == [1.0, 1.0] and again.goes_on
-    assert torch.equal(again.observation, first.env.observe())
-    assert [point["steps"] for point in curve["points"]] == list(range(1, 13))
-    assert curve["simulator_steps_per_second"] == pytest.approx(2 / 0.5)
-    ended = Counting(env, lambda step: {"success": 0.5})
-    ended.total_steps = 12
-    curve = optimize(cast(Learner, ended), env, WHOLE, given)
-    assert len(curve["points"]) == 12 and curve["simulator_steps_per_second"] is None
+    notes: list[float] = []
+
+    def interrupt(share: float, note: str) -> None:
+        notes.append(share)
+        if len(notes) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+        counted(replace(given, progress=interrupt))
+    again, curve = counted(given)
+    # The third was not written any more.
+    assert len(again.scales) == 8 and again.goes_on
+    assert [point["steps"] for point in curve["points"]] == [*range(1, 11)]
+    assert curve["simulator_steps_per_second"] == pytest.approx(8 / 0.5)
+    ended, curve = counted(given)
+    assert not ended.scales and len(curve["points"]) == 10 and curve["simulator_steps_per_second"] is None
 
 
 def test_the_episodes_of_robots_do_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ToyWorld, "state_dict", lambda world: {})
     monkeypatch.setattr(ToyWorld, "load_state_dict", lambda world, state: world.observe())
     given = training(tmp_path)
-    counted(given, WHOLE, lambda step: {"success": 0.5})
-    again = Counting(ToyWorld(2), lambda step: {"success": 0.5})
-    optimize(cast(Learner, again), again.env, WHOLE, given)
+    counted(given)
+    again, _ = counted(given)
     assert again.steps == 10 and not again.goes_on
 
 
-def test_a_recipe_decides_the_reward_before_the_method(tmp_path: Path) -> None:
-    for asked, methods, expected in (
-        (None, "abstract", "abstract"),
-        (None, "predicted", "predicted"),
-        ("blend", "predicted", "blend"),
-    ):
-        config = PPO.model_copy(update={"reward": asked})
-        env, simulation = InSimulator(reward=methods).world(training(tmp_path, config, grounding=grounding()))  # type: ignore[arg-type]
-        assert (env.reward, simulation.world.reward) == (expected, expected)
-
-
-def test_switches_reach_the_environment_and_the_policy_file(tmp_path: Path) -> None:
-    switches = {
-        "num_envs": 3,
-        "topple": True,
-        "risk_weight": 2.0,
-        "residual_noise": 0.5,
-        "support_penalty": 0.2,
-        "disagreement_penalty": 0.3,
-        "change_penalty": 0.1,
-        "command_limit": 0.7,
-        "data_start_share": 0.6,
-    }
-    given = training(tmp_path, PPO.model_copy(update=switches))
-    env, simulation = InSimulator().world(given)
-    assert (env.num_envs, env.topple, env.risk_weight, env.disagreement_penalty) == (3, True, 2.0, 0.3)
-    assert (env.command_limit, env.data_start_share, env.change_penalty) == (0.7, 0.6, 0.1)
-    assert simulation.thinness is not None and env.thinness is not None
-    torch.testing.assert_close(env.thinness, 0.2 * simulation.thinness)
-    expected = 0.5 * NO_GROUNDING.scatter(given.episodes)
-    torch.testing.assert_close(simulation.scatter, expected)
-    assert env.simulator.scatter is simulation.scatter
-    assert (
-        simulation.world.model_dump().items()
-        >= {"topple": True, "disagreement_penalty": 0.3, "data_start_share": 0.6}.items()
+@pytest.mark.parametrize("reward", ["abstract", "predicted"])
+def test_rows_and_their_plus_rows_differ_by_the_plus_settings_alone(
+    reward: RewardSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.training.train.command_limit", lambda task, episodes: 0.85)
+    given = training(tmp_path, PPO.model_copy(update={"data_start_share": 0.6}), grounding=grounding())
+    (plain, known), (plus, priced) = (
+        InSimulator(reward=reward).world(replace(given, is_plus=is_plus)) for is_plus in (False, True)
     )
+    assert known.world == WorldConfig(reward=reward, data_start_share=0.6)
+    changes = {"reward": "priced", "change_penalty": 0.02, "command_limit": 0.85}
+    assert priced.world == known.world.model_copy(update=changes)
+    plainly = (str, float, int, bool)
+    switches, others = (
+        {name: value for name, value in vars(env).items() if isinstance(value, plainly)}
+        for env in (plain, plus)
+    )
+    assert switches["data_start_share"] == 0.6 and plain.num_envs == PPO.num_envs
+    assert others == switches | changes
 
 
 def test_parameters_vary_as_the_method_says_unless_its_settings_do(tmp_path: Path) -> None:
@@ -312,30 +326,6 @@ def test_simulated_episodes_last_as_long_as_the_tasks_unless_told_otherwise(tmp_
     given = training(tmp_path)
     assert given.simulated_steps == TASK.objective.horizon
     assert replace(given, config=PPO.model_copy(update={"episode_steps": 9})).simulated_steps == 9
-
-
-def test_what_was_recorded_is_imitated_where_the_learner_imitates(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[Recorded | None] = []
-
-    def note(*_: object, recorded: Recorded | None = None) -> None:
-        seen.append(recorded)
-        raise InterruptedError
-
-    monkeypatch.setattr("astra_data.training.train.train_in", lambda *given: note(recorded=given[-1]))
-    for config in (PPO, SAC, SAC.model_copy(update={"imitation_weight": 0.4})):
-        with pytest.raises(InterruptedError):
-            InSimulator()(training(tmp_path, config, grounding=grounding()))
-    assert seen[:2] == [None, None]
-    recorded = seen[2]
-    assert recorded is not None and recorded.observation.shape == (2, 6, 8 + 8)
-    episodes = training(tmp_path).episodes
-    latent, _ = grounding().model.encode(episodes.windows)
-    torch.testing.assert_close(recorded.observation[..., :8], latent / 8**0.5)
-    assert torch.equal(recorded.action, episodes.windows.action)
-    assert torch.equal(recorded.previous_action, episodes.windows.previous_action)
-    assert recorded.lengths.tolist() == [6, 6]
 
 
 def test_what_is_told_on_the_way_is_of_the_last_ten_points() -> None:

@@ -3,9 +3,8 @@ import torch
 from pydantic import ValidationError, create_model
 
 from astra_data.core.config import Config, validated
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.errors import RecipeError
 from astra_data.worlds.variation import (
-    AnyVariation,
     BallVariation,
     CommandVariation,
     JointVariation,
@@ -61,18 +60,6 @@ def test_redrawing_leaves_the_other_rows_alone() -> None:
     before = variation.draw(4)
     after = variation.redraw(before, torch.tensor([1, 3]))
     assert (after != before).any(-1).tolist() == [False, True, False, True]
-
-
-def test_of_any_ranges_a_simulator_takes_its_own() -> None:
-    ranges = AnyVariation(friction=(0.8, 1.2), observation_scale=(0.9, 1.1))
-    assert ranges.of_kind(JointVariation) == JointVariation(
-        **ranges.model_dump(include={*JointVariation().names})
-    )
-    assert AnyVariation(**BallVariation().model_dump()).of_kind(PlanarVariation) == PlanarVariation()
-    with pytest.raises(
-        BadInputError, match=r"^expected ranges of friction, .*, got one of observation_scale$"
-    ):
-        ranges.of_kind(BallVariation)
 
 
 def test_noise_carries_no_command_beyond_one() -> None:

@@ -14,7 +14,6 @@ from pydantic.fields import FieldInfo
 from astra_data.experiments.recipe import Recipe
 from astra_data.methods import METHODS, tables
 from astra_data.stages.registry import STAGES
-from astra_data.worlds.variation import AnyVariation
 
 _INTRODUCTION = """# Keys of recipes
 
@@ -57,7 +56,7 @@ def _section(name: str, models: list[type[BaseModel]]) -> str:
         )
     if len(models) > 1:
         return _choice(name, models)
-    return _titled(name, models[0], _key_table(models[0].model_fields, *_usual(name)))
+    return _titled(name, models[0], _key_table(models[0].model_fields, _usual(name)))
 
 
 def _titled(name: str, model: type[BaseModel], keys: str) -> str:
@@ -95,22 +94,15 @@ def _choice(name: str, models: list[type[BaseModel]]) -> str:
     return "\n".join(parts)
 
 
-def _usual(name: str) -> tuple[Mapping[str, object], Iterable[str]]:
-    """Return the defaults of a table that are not its model's, and the keys whose defaults are the task's."""
-    if name not in tables():
-        return {}, ()
-    found = tables()[name]
-    return found.usual.model_dump(mode="json"), AnyVariation.model_fields if found.ranges else ()
+def _usual(name: str) -> Mapping[str, object]:
+    """Return the defaults of a table that are not its model's."""
+    return tables()[name].usual.model_dump(mode="json") if name in tables() else {}
 
 
-def _key_table(
-    fields: Mapping[str, FieldInfo], usual: Mapping[str, object] | None = None, of_task: Iterable[str] = ()
-) -> str:
+def _key_table(fields: Mapping[str, FieldInfo], usual: Mapping[str, object] | None = None) -> str:
     rows = []
     for key, field in fields.items():
         default = _default(field, (usual or {}).get(key))
-        if key in of_task:
-            default = f"the task's, else {default}"
         kind = _kind(field.annotation, field.metadata)
         rows.append((f"`{key}`", kind, default, unit(key), plain(field.description or "")))
     return f'<div class="keys" markdown>\n\n{table(_HEAD, rows)}\n</div>\n'

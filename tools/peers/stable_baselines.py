@@ -22,6 +22,7 @@ from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.learning import ppo
 from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
 from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.training.simulator_env import SimulatorEnv
@@ -82,14 +83,13 @@ def main(algorithm: Algorithm, face: Face) -> None:
         env,
         learning_rate=config.learning_rate,
         n_steps=config.rollout_steps,
-        batch_size=steps // config.minibatches,
-        n_epochs=config.epochs,
+        batch_size=steps // ppo.MINIBATCHES,
+        n_epochs=ppo.EPOCHS,
         gamma=config.discount,
-        gae_lambda=config.gae_lambda,
-        clip_range=config.clip,
-        ent_coef=config.entropy_weight,
-        vf_coef=config.value_weight,
-        max_grad_norm=config.gradient_norm,
+        gae_lambda=ppo.GAE_LAMBDA,
+        clip_range=ppo.CLIP,
+        vf_coef=ppo.VALUE_WEIGHT,
+        max_grad_norm=ppo.GRADIENT_NORM,
         policy_kwargs=sizes,
         device="cpu",
     )

@@ -78,7 +78,7 @@ class EpisodeEnds:
                 "note",
                 f"{count}, which is little for a failure model to learn from",
                 f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
-                "ground without failure_members",
+                "no failure can be predicted from it",
                 tuple(failures),
             ),
         ]

@@ -102,8 +102,8 @@ def _claimed(run: Run) -> tuple[int, int, int]:
     """Return the episode, the first row in the dataset and the first frame that most rows of `run` tell."""
     steps = np.arange(len(run))
     columns = run.columns
-    told = columns[names.EPISODE_INDEX], columns[names.INDEX] - steps, columns[names.FRAME_INDEX] - steps
-    number, first, frame = (int(np.sort(values)[len(run) // 2]) for values in told)
+    recorded = columns[names.EPISODE_INDEX], columns[names.INDEX] - steps, columns[names.FRAME_INDEX] - steps
+    number, first, frame = (int(np.sort(values)[len(run) // 2]) for values in recorded)
     return number, first, frame
 
 

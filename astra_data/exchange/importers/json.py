@@ -118,7 +118,7 @@ def _row(line: bytes, origin: str, fields: Sequence[str]) -> dict[str, Any]:
     row = _flat(row)
     if not all(name in row for name in fields):
         row_count(origin, fields, dict.fromkeys(row, (1,)))
-    return row
+    return dict(row)
 
 
 def _block(fields: dict[str, list[Any]], mapping: ImportMapping, origin: str) -> Block:

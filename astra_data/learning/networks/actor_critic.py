@@ -15,20 +15,17 @@ class ActorCriticShape(PolicyShape):
 
     Attributes:
         initial_log_std: logarithm of the initial standard deviation.
-        clips_mean: whether the mean is clipped, in place of a tanh; see `bounded`.
     """
 
     initial_log_std: float = -0.5
-    clips_mean: bool = False
 
 
-def bounded(output: Tensor, clips: bool) -> Tensor:
-    """Return the mean actions (..., A), within ±1, of an actor's `output`: its tanh, or with `clips` clipped.
+def bounded(output: Tensor) -> Tensor:
+    """Return the mean actions (..., A) of an actor's `output`, clipped to ±1 with the gradient of the output.
 
-    What is clipped keeps the gradient of what is not. A tanh is flat far out: once a policy pushes against a
-    wall at full speed, it hardly learns to turn.
+    A tanh is flat far out: once a policy pushes against a wall at full speed, it hardly learns to turn.
     """
-    return output + (output.clamp(-1.0, 1.0) - output).detach() if clips else torch.tanh(output)
+    return output + (output.clamp(-1.0, 1.0) - output).detach()
 
 
 class ActorCritic(Policy):
@@ -61,7 +58,7 @@ class ActorCritic(Policy):
 
     def gaussian(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation (..., A) of the action for the actor's `output` (..., A)."""
-        mean = bounded(output, self.shape.clips_mean)
+        mean = bounded(output)
         return mean, self.log_std.exp().expand_as(mean)
 
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -9,6 +9,9 @@ from astra_data.core.numbers import normalized
 from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures
 from astra_data.learning.networks.scales import add_scales, take_scales
 
+LEAST_LATENT_R2 = 0.9
+"""Of a target encoder on held-out episodes, to be deployed in place of the source encoder."""
+
 
 class TargetEncoder(nn.Module):
     """ψ^t: encode histories of full target states into the source encoder's latent space.
@@ -19,6 +22,7 @@ class TargetEncoder(nn.Module):
 
     Attributes:
         sizes: the arguments that it was made with.
+        latent_r2: share of the variance of ψ^s's latents that it explains on held-out episodes.
     """
 
     def __init__(
@@ -47,10 +51,17 @@ class TargetEncoder(nn.Module):
             latent_size=latent_size,
         )
         add_scales(self, {"state": state_size, "goal": goal_size})
+        self.register_buffer("latent_r2", torch.zeros(()))
+        self.latent_r2: Tensor
         self.state_mean: Tensor
         self.state_std: Tensor
         self.goal_mean: Tensor
         self.goal_std: Tensor
+
+    @property
+    def is_deployed(self) -> bool:
+        """Whether robots run with ψ^t by default; where it is coarse, they run with ψ^s on φ(s)."""
+        return bool(self.latent_r2 >= LEAST_LATENT_R2)
 
     def set_scales(self, state: Tensor, goal: Tensor, unseen: Sequence[int] = ()) -> None:
         """Take means and standard deviations from training steps: `state` (N, S), `goal` (N, G).

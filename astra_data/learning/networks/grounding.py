@@ -6,33 +6,28 @@ Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: 
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from astra_data.core.numbers import normalized
 from astra_data.learning.networks.history import HistoryEncoder, PositionFeatures, mlp
-from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
+from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.learning.networks.scales import add_scales, take_scales
-
-TargetKind = Literal["ema", "detach", "online"]
 
 _BALL_M = 0.1
 """Unit of the ball's position relative to the robot: less than this decides whether they touch."""
-_LEAST_DISAGREEMENT = 1e-9
-"""On the data, in standard deviations of the correction; 0 where there was nothing to correct."""
+_EMA_RATE = 0.01
+"""By how much the target encoder follows the encoder in each update."""
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """λ1, λ2, λ3 of the paper's total loss, and of what R_pred and the topple head learn of failures."""
+    """λ1, λ2, λ3 of the paper's total loss."""
 
-    latent: float = 1.0
+    latent: float = 0.1
     reward: float = 1.0
     state: float = 1.0
-    failures: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -43,9 +38,8 @@ class GroundingShape:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
         position_octaves: of `PositionFeatures`; 0 for none, as in states without a position.
         ball_index: index in the state where the position of a ball begins; None where there is no ball.
-        correction_heads: K, heads of f_abs, whose mean corrects.
-        corrects_reward: R_pred is fitted to the residual reward: the target's less the task's own.
-        reward_dropout: dropout rate of the latent that R_pred is given in training.
+        corrects_reward: R_pred predicts the residual reward, the target's less the task's own, beside the
+            target's.
     """
 
     state_size: int
@@ -56,23 +50,20 @@ class GroundingShape:
     head_sizes: tuple[int, ...] = (128, 128)
     position_octaves: int = 4
     ball_index: int | None = None
-    correction_heads: int = 1
-    corrects_reward: bool = False
-    reward_dropout: float = 0.0
+    corrects_reward: bool = True
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
 
 
 class GroundingModel(nn.Module):
-    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone, plus a topple head without gradient to the latent.
+    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone.
 
     Scales are buffers, so checkpoints hold them; `set_scales` and `set_reward_scales` take them from the
     training episodes.
     """
 
-    def __init__(self, shape: GroundingShape, target: TargetKind = "ema") -> None:
+    def __init__(self, shape: GroundingShape) -> None:
         super().__init__()
         self.shape = shape
-        self.target = target
         states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
         self.position_features = PositionFeatures(shape.position_octaves)
         features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
@@ -81,22 +72,17 @@ class GroundingModel(nn.Module):
         )
         heads = shape.head_sizes
         self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
-        self.reward_head = mlp((latent + actions, *heads, 2))
-        sizes = (latent + actions + features, *heads, states)
-        self.corrections = nn.ModuleList(mlp(sizes) for _ in range(shape.correction_heads))
-        self.topple_head = mlp((latent + actions + features, *heads, 1))
+        self.reward_head = mlp((latent + actions, *heads, 2 if shape.corrects_reward else 1))
+        self.correction = mlp((latent + actions + features, *heads, states))
         # An untrained correction is the identity: the raw simulator.
-        for head in self.corrections:
-            for parameter in list(head.parameters())[-2:]:
-                nn.init.zeros_(parameter)
+        for parameter in list(self.correction.parameters())[-2:]:
+            nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
         add_scales(self, {"state": states, "goal": shape.goal_size, "correction": states})
-        self.register_buffer("reward_mean", torch.zeros(()))
-        self.register_buffer("reward_std", torch.ones(()))
+        self.register_buffer("reward_mean", torch.zeros(2 if shape.corrects_reward else 1))
+        self.register_buffer("reward_std", torch.ones(2 if shape.corrects_reward else 1))
+        self.register_buffer("reward_shrinkage", torch.ones(()))
         self.register_buffer("failure_cost", torch.zeros(()))
-        self.register_buffer("failure_weight", torch.zeros(()))
-        self.register_buffer("residual_factor", torch.zeros(states, states))
-        self.register_buffer("usual_disagreement", torch.ones(()))
         self.state_mean: Tensor
         self.state_std: Tensor
         self.goal_mean: Tensor
@@ -104,34 +90,43 @@ class GroundingModel(nn.Module):
         self.correction_std: Tensor
         self.reward_mean: Tensor
         self.reward_std: Tensor
+        self.reward_shrinkage: Tensor
         self.failure_cost: Tensor
-        self.failure_weight: Tensor
-        self.residual_factor: Tensor
-        self.usual_disagreement: Tensor
 
     def set_scales(self, columns: Mapping[str, Tensor]) -> None:
         """Take means and deviations from training steps: state, goal, correction (N, ...)."""
         take_scales(self, columns)
 
     @torch.no_grad()
-    def set_reward_scales(
-        self, reward: Tensor, goes_on: Tensor, failed: Tensor, failure_weight: float = 1.0
-    ) -> None:
-        """Take the scales of `reward` (N, 2), in its two parts (see `PairedWindows`), from training steps.
+    def set_reward_scales(self, reward: Tensor, known: Tensor, failed: Tensor) -> None:
+        """Take the scales of rewards (N, R) from training steps; `known` and `failed` are (N,), 0 or 1.
 
-        Steps that `failed` (N,) end in failure. Mean and deviation are those of steps where `goes_on` (N,) is
-        1. The reward head starts at the rate of failures, whose loss counts by rarity times `failure_weight`.
+        R is 2, the reward and the residual reward, or 1 without the latter. Means and deviations are those of
+        steps whose reward R_pred learns (`known`). A failure costs the mean of the last reward of steps that
+        `failed`, less its mean.
         """
-        failed = failed.bool()
-        if goes_on.any():
-            paid = reward[goes_on.bool(), 0]
-            self.reward_mean.copy_(paid.mean())
-            self.reward_std.copy_(paid.std(correction=0).clamp_min(1e-3))
+        known, failed = known.bool(), failed.bool()
+        if known.any():
+            self.reward_mean.copy_(reward[known].mean(0))
+            self.reward_std.copy_(reward[known].std(0, correction=0).clamp_min(1e-3))
         if failed.any():
-            rate = failed.float().mean().clamp(max=0.5)
-            self.failure_cost.copy_((reward[failed, 1].mean() - self.reward_mean).clamp_max(0.0))
-            self.failure_weight.copy_(failure_weight / functional.binary_cross_entropy(rate, rate))
-            list(self.reward_head.parameters())[-1][1] = rate.logit()
+            cost = reward[failed, -1].mean() - self.reward_mean[-1]
+            self.failure_cost.copy_(cost.clamp_max(0.0))
+
+    @torch.no_grad()
+    def shrink_reward(self, windows: PairedWindows) -> None:
+        """Shrink predicted residual rewards as far as they explain those of held-out `windows`.
+
+        The factor is the slope of the recorded on the predicted residuals, within 0 and 1: a prediction that
+        explains nothing pays nothing, and a policy cannot live on its errors.
+        """
+        latent, _ = self.encode(windows)
+        known = windows.goes_on.bool()
+        predicted = self.rewards(latent, windows.action)[known][:, -1]
+        recorded = recorded_rewards(windows)[known][:, -1]
+        power = predicted.square().sum()
+        slope = (predicted * recorded).sum() / power if power > 0 else torch.zeros_like(power)
+        self.reward_shrinkage.copy_(slope.clamp(0.0, 1.0))
 
     def state_features(self, state: Tensor) -> Tensor:
         """Normalize abstract states (..., X) and append features of the robot's and the ball's position."""
@@ -169,67 +164,38 @@ class GroundingModel(nn.Module):
     ) -> Tensor:
         """Return the target's reward (...) of a step, given the task's `own` (...) on abstract states.
 
-        A `hazard` (...), the probability that the step fails by a failure model, replaces R_pred's own.
+        A `hazard` (...), the probability that the step fails by a failure model, adds what failures cost.
         """
-        if hazard is None:
-            predicted = self.predict_reward(latent, action)
-        else:
-            going_on, _ = self.predict_reward_parts(latent, action).unbind(-1)
-            predicted = going_on + hazard * self.failure_cost
-        return predicted + own if self.shape.corrects_reward else predicted
+        predicted = self.predict_reward(latent, action)
+        if self.shape.corrects_reward:
+            predicted = predicted + own
+        return predicted if hazard is None else predicted + hazard * self.failure_cost
 
     def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
-        """R_pred: return the target's reward (...), or the residual reward if it was fitted to that."""
-        return self.predict_reward_parts(latent, action).sum(-1)
+        """R_pred: return the target's reward (...), or the residual reward if it predicts that."""
+        return self.rewards(latent, action)[..., -1] * self.reward_shrinkage
 
-    def predict_reward_parts(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Return the two parts of the predicted reward (..., 2): of going on, and of failing.
+    def rewards(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Return the predicted rewards (..., R), see `set_reward_scales`."""
+        return self._normal_rewards(latent, action) * self.reward_std + self.reward_mean
 
-        The latter is the probability of failing times its cost. Failures are rare and large: regressed as a
-        number, their reward would be as often positive as negative away from the data, and policies would
-        exploit that.
-        """
-        going_on, log_odds = self._reward_outputs(latent, action)
-        parts = [going_on * self.reward_std + self.reward_mean, log_odds.sigmoid() * self.failure_cost]
-        return torch.stack(parts, dim=-1)
-
-    def _reward_outputs(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the normalized reward of a step that goes on, and the log-odds that it fails, (...) each."""
-        going_on, log_odds = self.reward_head(torch.cat([latent, action], dim=-1)).unbind(-1)
-        return going_on, log_odds
+    def _normal_rewards(self, latent: Tensor, action: Tensor) -> Tensor:
+        return torch.as_tensor(self.reward_head(torch.cat([latent, action], dim=-1)))
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
-        return self.ensemble_predictions(latent, action, simulated_next).mean(0)
-
-    def ensemble_predictions(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
-        """Return the next abstract state as each of the K heads corrects it, (K, ..., X)."""
-        inputs = self.correction_inputs(latent, action, simulated_next)
-        return torch.stack([simulated_next + head(inputs) * self.correction_std for head in self.corrections])
+        correction: Tensor = self.correction(self.correction_inputs(latent, action, simulated_next))
+        return simulated_next + correction * self.correction_std
 
     def correction_inputs(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """Return what the correction sees of a step, (..., I)."""
         return torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
 
-    def disagreement(self, predictions: Tensor) -> Tensor:
-        """Return the spread (...) of ensemble predictions (K, ..., X), relative to that on the data."""
-        spread = (predictions / self.correction_std).std(0).square().mean(-1).sqrt()
-        return spread / self.usual_disagreement.clamp_min(_LEAST_DISAGREEMENT)
-
-    def topple_logit(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """Return the log-odds (...) of a topple within `RISK_STEPS`, on the way to `next_state`."""
-        logit: Tensor = self.topple_head(self.correction_inputs(latent, action, next_state))
-        return logit.squeeze(-1)
-
-    def topple_risk(self, latent: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """Return the probability (...) that the target topples in this step."""
-        return self.topple_logit(latent, action, next_state).sigmoid() / RISK_STEPS
-
-    def update_target(self, rate: float) -> None:
-        """Move the EMA target encoder by `rate` toward the encoder."""
+    def update_target(self) -> None:
+        """Move the target encoder toward the encoder."""
         with torch.no_grad():
             for slow, fast in zip(self.target_encoder.parameters(), self.encoder.parameters(), strict=True):
-                slow.lerp_(fast, rate)
+                slow.lerp_(fast, _EMA_RATE)
 
     def losses(self, windows: PairedWindows, weights: LossWeights) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the joint loss (paper, Section IV-A) and its parts, each a mean over real steps and dims."""
@@ -239,7 +205,7 @@ class GroundingModel(nn.Module):
         parts: dict[str, Tensor] = {}
         total = torch.zeros((), device=mask.device)
         if weights.latent > 0:
-            following = self._following_latent(inputs, latent)
+            following = self._following_latent(inputs)
             mean, log_variance = self.predict_latent(latent[:, :-1], action[:, :-1])
             nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
             both = mask[:, :-1] * mask[:, 1:]
@@ -250,45 +216,37 @@ class GroundingModel(nn.Module):
             total = total + weights.reward * parts["reward"]
         parts["state"] = self._correction_loss(latent, windows)
         total = total + weights.state * parts["state"]
-        if weights.failures > 0:
-            logit = self.topple_logit(latent.detach(), action, windows.next_state)
-            surprise = functional.binary_cross_entropy_with_logits(
-                logit, windows.fails_soon, reduction="none"
-            )
-            parts["topple"] = _masked_mean(surprise, mask)
-            total = total + weights.failures * parts["topple"]
         return total, parts
 
     def _reward_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
-        """Return the mean of the losses of both parts of the reward.
+        """Return half the squared error of the reward, and of the residual reward, where R_pred learns them.
 
-        Predicting the averages gives a loss of about one for the steps that go on, and of its weight for the
-        failures; the latter is zero where the data has none. What a success pays is not R_pred's to learn.
+        The reward itself shapes the latent (paper, L_rew); the residual is what policies are paid.
         """
-        if self.shape.reward_dropout:
-            latent = functional.dropout(latent, self.shape.reward_dropout, self.training)
-        going_on, log_odds = self._reward_outputs(latent, windows.action)
-        error = windows.goes_on * (going_on - (windows.reward[..., 0] - self.reward_mean) / self.reward_std)
-        surprise = functional.binary_cross_entropy_with_logits(log_odds, windows.failed, reduction="none")
-        return 0.5 * _masked_mean(error.square() + self.failure_weight * surprise, windows.mask)
+        true = (recorded_rewards(windows) - self.reward_mean) / self.reward_std
+        error = (self._normal_rewards(latent, windows.action) - true).square().sum(-1)
+        return 0.5 * _masked_mean(error, windows.goes_on * windows.mask)
 
     def _correction_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
-        predictions = self.ensemble_predictions(latent, windows.action, windows.simulated_next)
-        error = ((predictions - windows.next_state) / self.correction_std).square().mean(-1)
-        mask = windows.mask.expand_as(error)
-        if len(predictions) > 1:
-            # Each head learns from its own half of every batch, so that heads differ away from the data.
-            mask = mask * (torch.rand(*error.shape[:2], 1, device=error.device) < 0.5)
-        return _masked_mean(error, mask)
+        corrected = self.correct(latent, windows.action, windows.simulated_next)
+        error = ((corrected - windows.next_state) / self.correction_std).square().mean(-1)
+        return _masked_mean(error, windows.mask)
 
-    def _following_latent(self, inputs: Tensor, latent: Tensor) -> Tensor:
-        if self.target == "online":
-            return latent[:, 1:]
-        if self.target == "detach":
-            return latent[:, 1:].detach()
+    def _following_latent(self, inputs: Tensor) -> Tensor:
+        """Return the latents (B, T - 1, Z) of the next steps, by a slow copy of the encoder.
+
+        With the encoder itself the loss is unbounded below: it can predict a constant latent exactly.
+        """
         with torch.no_grad():
             slow, _ = self.target_encoder(inputs)
         return torch.as_tensor(slow[:, 1:])
+
+
+def recorded_rewards(windows: PairedWindows) -> Tensor:
+    """Return the recorded rewards (B, T, R), see `GroundingModel.set_reward_scales`."""
+    if windows.own_reward is None:
+        return windows.reward.unsqueeze(-1)
+    return torch.stack([windows.reward, windows.reward - windows.own_reward], dim=-1)
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 RISK_STEPS = 20
-"""Steps before each topple that the topple head is fitted to. The last step alone is too rare, and by then
-the robot moves as it never does in a simulator without topples."""
+"""Steps before each failure that `PairedWindows.fails_soon` marks."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +17,13 @@ class PairedWindows:
         goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
         next_state: φ(s_{i+1}), (B, T, X).
         fails_soon: (B, T), 1 where the episode fails within `RISK_STEPS`; see also `failing`.
-        reward: r_i, or the residual reward, in two parts, (B, T, 2): of steps that go on, and of steps that
-            end in failure; 0 in the other. Reaching the goal is detected and rewarded by the simulator.
-        goes_on: (B, T), 1 where the step ends nothing: only there the first part of the reward is known.
-        failed: (B, T), 1 where the step ends in a failure that R_pred is to foresee, whatever it pays.
+        reward: r_i, (B, T).
+        goes_on: (B, T), 1 where R_pred learns the reward: where the step ends nothing, as simulators detect
+            and pay what ends an episode; without a failure model, also where it fails.
+        failed: (B, T), 1 where the step ends in a failure that no abstract state shows, whatever it pays.
         mask: (B, T), 1 on real steps.
+        own_reward: the task's own reward of the step on abstract states, (B, T); None where R_pred predicts
+            no residual reward, `reward` less this.
     """
 
     state: Tensor
@@ -36,6 +37,7 @@ class PairedWindows:
     failed: Tensor
     fails_soon: Tensor
     mask: Tensor
+    own_reward: Tensor | None = None
 
 
 def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:

@@ -55,7 +55,7 @@ class ScatterModel(nn.Module):
         """Return the logarithm of the scale (..., X), in units of the usual, given `inputs` (..., I)."""
         return _MOST * torch.tanh(self.network(inputs) / _MOST)
 
-    def surprise(self, inputs: Tensor, residual: Tensor) -> Tensor:
+    def nll(self, inputs: Tensor, residual: Tensor) -> Tensor:
         """Return the negative log-likelihood (..., X), but for a constant, of residuals (..., X)."""
         log_scale = self.log_scale(inputs)
         return log_scale + 0.5 * (residual / self.usual / log_scale.exp()).square()

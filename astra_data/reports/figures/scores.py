@@ -86,7 +86,7 @@ def _bar(axes: Axes, place: int, row: str, results: Results, measure: str) -> No
 def learning_curves(results: Results, _: Scene) -> Figure | None:
     """Draw the headline score of training episodes over steps: mean over seeds, band from worst to best.
 
-    Each method has a panel; its variant with the [plus] settings is dashed. Methods with a seed without
+    Each method has a panel; its variant with the plus settings is dashed. Methods with a seed without
     scores are left out.
     """
     curves: dict[str, list[tuple[Floats, Floats]]] = {}
@@ -127,7 +127,7 @@ def learning_curves(results: Results, _: Scene) -> Figure | None:
         # In two lines, since a single row of panels is low.
         figure.supylabel(f"{results.headline.title} of training\nepisodes, from all starts")
         if any(map(is_plus, curves)):
-            looks = {"without the [plus] settings": "-", "with the [plus] settings": "--"}
+            looks = {"without the plus settings": "-", "with the plus settings": "--"}
             handles = [Line2D([], [], color=INK, ls=dashes, label=label) for label, dashes in looks.items()]
             figure.legend(handles=handles, loc="outside upper center", ncols=2, handlelength=2.4)
         return figure

@@ -38,8 +38,8 @@ class Delta(torch.nn.Module):
 class DeltaSimulator(EpisodeSimulator):
     """Step the simulator by action + f(history)."""
 
-    def __init__(self, simulator, delta, *, scatter):
-        super().__init__(simulator, scatter=scatter)
+    def __init__(self, simulator, delta):
+        super().__init__(simulator)
         self.delta, count = delta, len(simulator.state)
         self.hidden = torch.zeros(1, count, delta.sizes[2], device=simulator.state.device)
 
@@ -66,12 +66,8 @@ class DeltaAction(FittedGrounding):
 
     delta: Delta
 
-    def corrected(self, simulator, scatter):
-        return DeltaSimulator(simulator, self.delta, scatter=scatter)
-
-    def scatter(self, episodes):
-        size = episodes.windows.state.shape[-1]
-        return torch.zeros(size, size, device=episodes.windows.state.device)
+    def corrected(self, simulator):
+        return DeltaSimulator(simulator, self.delta)
 
     def to_file(self):
         return self.delta.state_dict(), {"sizes": self.delta.sizes}
@@ -108,7 +104,7 @@ def fit(fitting):
     delta.to(fitting.device)
     spread = steps(windows.next_state - windows.state).std(0) + 1e-6
     optimizer = torch.optim.Adam(delta.parameters(), lr=fitting.settings.learning_rate)
-    for update in range(config.updates):
+    for update in range(fitting.descent.updates):
         drawn, _ = fitting.training.draw_windows(config.batch_windows, config.window)
         is_real = drawn.mask.bool()
         action = drawn.action + delta(drawn.state, drawn.action)[0]
@@ -117,7 +113,7 @@ def fit(fitting):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        fitting.progress(update / config.updates, f"loss {loss.item():.3f}")
+        fitting.progress(update / fitting.descent.updates, f"loss {loss.item():.3f}")
     return DeltaAction(delta.requires_grad_(False)), {"loss": loss.item()}
 
 

@@ -82,7 +82,7 @@ class ResidualGrounding(FittedGrounding):
 
     model: Residual
 
-    def corrected(self, simulator, scatter=None):
+    def corrected(self, simulator):
         return ResidualSimulator(simulator, self.model)
 
     @torch.no_grad()
@@ -94,9 +94,6 @@ class ResidualGrounding(FittedGrounding):
             given = (one[:, steps] for one in (windows.state, windows.action, windows.simulated_next))
             _, memory = self.model(*given, memory)
         return torch.stack(before, dim=1)
-
-    def scatter(self, episodes):
-        return episodes.windows.state.new_zeros(2 * episodes.windows.state.shape[-1:])
 
     def to_file(self):
         return self.model.state_dict(), {"sizes": self.model.sizes}

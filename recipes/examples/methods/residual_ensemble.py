@@ -1,7 +1,6 @@
 """An ensemble of networks without memory, each of which predicts by how much the simulator's step is wrong.
 
-They are fitted to bootstraps of the steps; the mean is the correction. What it leaves is the scatter that
-judges add, and trainings with `residual_noise`.
+They are fitted to bootstraps of the steps; the mean is the correction.
 """
 
 from dataclasses import dataclass
@@ -9,7 +8,6 @@ from dataclasses import dataclass
 import torch
 
 from astra_data.grounding.protocols import FittedGrounding
-from astra_data.grounding.raw import scatter_factor
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.methods.method import Method
 
@@ -27,7 +25,6 @@ class Ensemble(torch.nn.Module):
         )
         for name, size in (("mean", states), ("std", states), ("error", states)):
             self.register_buffer(name, torch.ones(size))
-        self.register_buffer("factor", torch.zeros(states, states))
 
     def inputs(self, state, action):
         return torch.cat([(state - self.mean) / self.std, action], dim=-1)
@@ -38,8 +35,8 @@ class Ensemble(torch.nn.Module):
 
 
 class EnsembleSimulator(EpisodeSimulator):
-    def __init__(self, simulator, ensemble, *, scatter):
-        super().__init__(simulator, scatter=scatter)
+    def __init__(self, simulator, ensemble):
+        super().__init__(simulator)
         self.ensemble = ensemble
 
     def step(self, action):
@@ -55,11 +52,8 @@ class ResidualEnsemble(FittedGrounding):
 
     ensemble: Ensemble
 
-    def corrected(self, simulator, scatter):
-        return EnsembleSimulator(simulator, self.ensemble, scatter=scatter)
-
-    def scatter(self, episodes):
-        return self.ensemble.factor
+    def corrected(self, simulator):
+        return EnsembleSimulator(simulator, self.ensemble)
 
     def to_file(self):
         return self.ensemble.state_dict(), {"sizes": self.ensemble.sizes}
@@ -80,7 +74,7 @@ def fit(fitting):
     ensemble.mean, ensemble.std, ensemble.error = state.mean(0), state.std(0) + 1e-6, error.std(0) + 1e-6
     bootstraps = torch.randint(len(state), (MEMBERS, len(state)), device=fitting.device)
     optimizer = torch.optim.Adam(ensemble.parameters(), lr=3e-3)
-    for update in range(fitting.config.updates):
+    for update in range(fitting.descent.updates):
         drawn = torch.randint(len(state), (256,), device=fitting.device)
         loss = sum(
             (member(ensemble.inputs(state[rows], action[rows])) - error[rows] / ensemble.error)
@@ -91,11 +85,8 @@ def fit(fitting):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        fitting.progress(update / fitting.config.updates, f"loss {loss.item():.3f}")
+        fitting.progress(update / fitting.descent.updates, f"loss {loss.item():.3f}")
     ensemble.requires_grad_(False)
-    held_out = fitting.held_out.windows
-    left = held_out.next_state - held_out.simulated_next - ensemble(held_out.state, held_out.action)
-    ensemble.factor = scatter_factor(fitting.held_out.steps(left))
     return ResidualEnsemble(ensemble), {"loss": loss.item()}
 
 

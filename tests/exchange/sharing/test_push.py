@@ -95,16 +95,14 @@ def test_an_altered_remote_is_told(fake: Dataset, tmp_path: Path) -> None:
     (shared / "SHA256SUMS").write_text(sums.replace(sums[:64], "0" * 64))
     with pytest.raises(BadInputError, match=r"SHA256SUMS there lists other files as data/"):
         push(fake.root, f"file://{tmp_path}/shared")
-    (shared / "SHA256SUMS").write_text(f"{sums}{'0' * 64}  meta/astra/policy.safetensors\n")
+    policy = "meta/astra/policy.safetensors"
+    (shared / "SHA256SUMS").write_text(f"{sums}{'0' * 64}  {policy}\n# 1 bytes  {policy}\n")
     with pytest.raises(BadInputError, match=r"lists other files as meta/astra/policy\.safetensors: it was"):
         push(fake.root, f"file://{tmp_path}/shared")
     lines = sums.splitlines(keepends=True)
     (shared / "SHA256SUMS").write_text("".join(line for line in lines if "meta/stats" not in line))
     with pytest.raises(BadInputError, match=r"lists other files as meta/stats\.json: it was"):
         push(fake.root, f"file://{tmp_path}/shared")
-    # As 0.1 wrote them, without sizes.
-    (shared / "SHA256SUMS").write_text("".join(f"{line}\n" for line in sums.splitlines() if line[0] != "#"))
-    push(fake.root, f"file://{tmp_path}/shared")
 
 
 def test_a_full_disk_is_told_with_the_folder_there(

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from astra_data.learning.networks.alignment import TargetEncoder, gaussian_mmd
 from astra_data.learning.networks.history import PositionFeatures
-from astra_data.stages.align import AlignConfig
+from astra_data.stages.align import _BANDWIDTHS
 
 
 def mean_kernel(x: Tensor, y: Tensor, bandwidths: Tensor) -> tuple[float, float]:
@@ -52,7 +52,7 @@ def gradient(bandwidths: Tensor) -> float:
 
 
 def test_the_gradient_is_alive_at_latent_size_64() -> None:
-    assert gradient(torch.tensor(AlignConfig().bandwidths) * 64**0.5) > 1e-2
+    assert gradient(torch.tensor(_BANDWIDTHS) * 64**0.5) > 1e-2
     assert gradient(torch.tensor([1.0])) < 1e-12  # without the factor sqrt(Z) it is dead
 
 
@@ -75,3 +75,13 @@ def test_target_encoder_does_not_see_what_it_shall_not() -> None:
     encoder.set_scales(state, nothing, unseen=[0, 2])
     inputs = encoder.encoder_input(1e6 * state, nothing, torch.zeros(50, 1))
     assert not inputs[:, [0, 2]].any() and inputs[:, 1].all()
+
+
+@pytest.mark.parametrize(("r2", "deployed"), [(0.0, False), (0.89, False), (0.91, True)])
+def test_only_a_close_target_encoder_is_deployed(r2: float, deployed: bool) -> None:
+    encoder = TargetEncoder(3, 2, 1, embedding_size=4, latent_size=4)
+    assert not encoder.is_deployed
+    encoder.latent_r2.fill_(r2)
+    again = TargetEncoder(**encoder.sizes)
+    again.load_state_dict(encoder.state_dict())
+    assert encoder.is_deployed is again.is_deployed is deployed

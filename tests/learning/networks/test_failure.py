@@ -5,20 +5,26 @@ import torch
 from torch import Tensor
 from toy_episodes import toy_episodes
 
-from astra_data.learning.networks.failure import AHEAD_S, AVERAGED_S, FailureModel, FailureShape
-from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows
+from astra_data.learning.networks.failure import (
+    AHEAD_S,
+    AVERAGED_S,
+    FAILURE_STEPS,
+    FailureModel,
+    FailureShape,
+)
+from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.worlds.plane.mazes import U_MAZE
 
 TIMESTEP_S = 0.05
 
 
-def model(*, has_maze: bool = False) -> FailureModel:
+def model(*, has_maze: bool = False, latent_size: int = 0) -> FailureModel:
     torch.manual_seed(0)
     cells = U_MAZE.fine_walls.shape
-    shape = FailureShape(
-        4, 2, TIMESTEP_S, (cells[0], cells[1]) if has_maze else (0, 0), U_MAZE.fine_m, members=3
+    sizes = (cells[0], cells[1]) if has_maze else (0, 0)
+    made = FailureModel(
+        FailureShape(4, 2, TIMESTEP_S, sizes, U_MAZE.fine_m, members=3, latent_size=latent_size)
     )
-    made = FailureModel(shape)
     if has_maze:
         made.clearance.copy_(torch.from_numpy(U_MAZE.clearance_field))
         made.half_extent.copy_(torch.from_numpy(U_MAZE.half_extent))
@@ -36,8 +42,10 @@ def windows(episodes: int = 3, steps: int = 12) -> PairedWindows:
 def seen(made: FailureModel, of: PairedWindows) -> Tensor:
     """Return the inputs (E, T, I) of all steps, one by one."""
     memory, inputs = made.initial_memory(of.state[:, 0], of.previous_action[:, 0]), []
+    nothing = torch.zeros(len(of.state), 0)
     for step in range(of.state.shape[1]):
-        one, memory = made.inputs(of.state[:, step], of.action[:, step], of.simulated_next[:, step], memory)
+        now = of.state[:, step], of.action[:, step], of.simulated_next[:, step], nothing
+        one, memory = made.inputs(*now, memory)
         inputs.append(one)
     return torch.stack(inputs, dim=1)
 
@@ -78,14 +86,19 @@ def test_averages_forget_with_their_time_constants() -> None:
         assert of_the_action.tolist() == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.parametrize("latent_size", [0, 8])
 @pytest.mark.parametrize("has_maze", [False, True])
-def test_a_step_says_what_its_inputs_are_worth(has_maze: bool) -> None:
-    made, of = model(has_maze=has_maze), windows()
+def test_a_step_says_what_its_inputs_are_worth(has_maze: bool, latent_size: int) -> None:
+    made, of = model(has_maze=has_maze, latent_size=latent_size), windows()
     memory = made.initial_memory(of.state[:, 0], of.previous_action[:, 0])
     for step in range(12):
-        now = of.state[:, step], of.action[:, step], of.simulated_next[:, step]
+        latent = torch.randn(3, 8)
+        now = of.state[:, step], of.action[:, step], of.simulated_next[:, step], latent
         inputs, after = made.inputs(*now, memory)
         assert inputs.shape == (3, made.shape.input_size) and after.shape == (3, made.memory_size)
+        # The latent comes last: without it, a model sees the same but for that.
+        assert made.shape.motion_size == made.shape.input_size - latent_size == (31 if has_maze else 20)
+        assert torch.equal(inputs[:, made.shape.motion_size :], latent[:, :latent_size])
         said, memory = made.step(*now, memory)
         torch.testing.assert_close(memory, after)
         torch.testing.assert_close(said, made.probability(inputs))
@@ -96,8 +109,9 @@ def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
     # The upper corridor of the U-Maze: walls 2 m to the north and to the south.
     state = torch.tensor([[0.0, 4.0, 0.0, 0.0]])
     landed = state + torch.tensor([[0.0, 0.05, 0.0, 0.0]])  # 1 m/s to the north
-    before = state - torch.tensor([[0.0, 0.0, 0.0, 0.0]])
-    inputs, _ = made.inputs(state, torch.zeros(1, 2), landed, made.initial_memory(before, torch.zeros(1, 2)))
+    inputs, _ = made.inputs(
+        *(state, torch.zeros(1, 2), landed, torch.zeros(1, 0)), made.initial_memory(state, torch.zeros(1, 2))
+    )
     walls = inputs[0, 20:]
     to_wall = [float(U_MAZE.clearance(state[0, :2].double().numpy()))]
     for second in AHEAD_S:
@@ -117,7 +131,7 @@ def test_the_members_probabilities_are_averaged_after_the_shift() -> None:
     assert float((odds[0] - odds[1]).abs().max()) > 0.01
     made.calibrate(torch.tensor(0.5), torch.tensor(-3.0))
     torch.testing.assert_close(made.probability(inputs), (0.5 * odds - 3.0).sigmoid().mean(0))
-    assert float(made.hazard(torch.tensor(0.5))) == pytest.approx(0.5 / RISK_STEPS)
+    assert FAILURE_STEPS == 2 and float(made.hazard(torch.tensor(0.5))) == pytest.approx(0.25)
 
 
 def test_scales_are_those_of_moves_and_inputs() -> None:

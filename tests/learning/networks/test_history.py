@@ -22,15 +22,6 @@ def test_step_by_step_is_the_whole_sequence(encoder: HistoryEncoder) -> None:
         torch.testing.assert_close(encoder.latent(hidden), latents[:, step])
 
 
-def test_a_hidden_state_handed_in_continues_the_sequence(encoder: HistoryEncoder) -> None:
-    inputs = torch.randn(3, 20, 5)
-    whole, states = encoder(inputs)
-    rest, _ = encoder(inputs[:, 8:], states[:, 7])
-    torch.testing.assert_close(rest, whole[:, 8:])
-    forgotten, _ = encoder(inputs[:, 8:])
-    assert (forgotten - rest).abs().max() > 0.01
-
-
 def test_latents_have_zero_mean_and_unit_variance(encoder: HistoryEncoder) -> None:
     latents, states = encoder(3.0 * torch.randn(4, 10, 5))
     torch.testing.assert_close(latents.mean(-1), torch.zeros(4, 10), atol=1e-5, rtol=0)

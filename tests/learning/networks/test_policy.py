@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape, bounded
 from astra_data.learning.networks.policy import Policy, PolicyShape, features_of
 from astra_data.learning.networks.soft_actor import SoftActor
 
@@ -57,6 +57,19 @@ def test_a_start_empties_the_memory_of_its_row() -> None:
     assert not torch.allclose(ours[1, :2], theirs[1, :2])
     assert not torch.allclose(ours[0], theirs[0])
     assert torch.equal(features_of(None, OBSERVATION, ACTION, known, start), OBSERVATION)
+
+
+def test_means_are_clipped_and_keep_the_gradient_of_what_is_not() -> None:
+    output = torch.tensor([-7.0, -0.4, 0.9, 3.0], requires_grad=True)
+    mean = bounded(output)
+    torch.testing.assert_close(mean, torch.tensor([-1.0, -0.4, 0.9, 1.0]))
+    mean.sum().backward()
+    assert output.grad is not None and torch.equal(output.grad, torch.ones(4))
+    policy, seen = ActorCritic(ActorCriticShape(3, 2, initial_log_std=-1.0)), 1e3 * torch.randn(50, 3)
+    clipped, std = policy.policy(seen)
+    torch.testing.assert_close(clipped, policy.actor(seen).clamp(-1.0, 1.0))
+    torch.testing.assert_close(std, torch.full((50, 2), -1.0).exp())
+    assert policy.value(seen).shape == (50,)
 
 
 @pytest.mark.parametrize("index", [0, 1])

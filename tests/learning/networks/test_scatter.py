@@ -26,11 +26,11 @@ def test_an_untrained_one_says_that_every_moment_is_usual() -> None:
     assert torch.equal(scatter_model().log_scale(INPUTS), torch.zeros(3, 3))
 
 
-def test_the_surprise_is_that_of_a_gaussian_but_for_a_constant() -> None:
+def test_the_likelihood_is_that_of_a_gaussian_but_for_a_constant() -> None:
     made = told(scatter_model())
     residual = torch.randn(3, 3) * made.usual
     gaussian = Normal(0.0, made.log_scale(INPUTS).exp()).log_prob(residual / made.usual)
-    apart = made.surprise(INPUTS, residual) + gaussian
+    apart = made.nll(INPUTS, residual) + gaussian
     torch.testing.assert_close(apart, torch.full((3, 3), -0.5 * math.log(2 * math.pi)))
 
 

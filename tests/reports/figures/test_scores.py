@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from matplotlib.figure import Figure
 
 from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import data_efficiency, learning_curves, on_one_grid, score_bars
-from astra_data.reports.results import SIMULATED, TESTED, Line, Results, Training
+from astra_data.reports.results import SIMULATED, TESTED, Line, Results, TrainingFacts
 from astra_data.worlds.registry import TASKS
 from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS
 
@@ -58,15 +59,16 @@ def test_bars_show_mean_interval_seeds_and_the_own_simulator(scene: Scene) -> No
 
 
 def test_seeds_without_interval_and_scores_without_limit(scene: Scene) -> None:
-    found = results(line("nas", 0, steps=300.0, **{"return": 1.0}), scores=(SURVIVED_STEPS, RETURN))
+    values: dict[str, Any] = {"steps": 300.0, "return": 1.0}
+    found = results(line("nas", 0, **values), scores=(SURVIVED_STEPS, RETURN))
     figure = drawn(score_bars("steps")(found, scene))
     assert not [of for of in figure.axes[0].lines if len(np.asarray(of.get_xdata())) == 2]
     assert figure.axes[0].get_xlim()[1] > 300 and "in its own simulator" not in legend(figure)
     assert drawn(score_bars("return")(found, scene)).axes[0].get_yticklabels()[0].get_text() == "NAS   1.0"
 
 
-def training(row: str, seed: int, *scores: float) -> Training:
-    return Training(row=row, seed=seed, steps=[1000.0 * k for k in range(len(scores))], score=[*scores])
+def training(row: str, seed: int, *scores: float) -> TrainingFacts:
+    return TrainingFacts(row=row, seed=seed, steps=[1000.0 * k for k in range(len(scores))], score=[*scores])
 
 
 def test_curves_have_a_panel_per_method_and_a_band_from_worst_to_best(scene: Scene) -> None:
@@ -85,7 +87,7 @@ def test_curves_have_a_panel_per_method_and_a_band_from_worst_to_best(scene: Sce
     band = np.asarray(axes.collections[0].get_paths()[0].vertices)[:, 1]
     assert (band.min(), band.max()) == pytest.approx((0.0, 1.0))
     assert figure.get_supylabel() == f"{SUCCESS.title} of training\nepisodes, from all starts"
-    assert "with the [plus] settings" in legend(figure)
+    assert "with the plus settings" in legend(figure)
     assert learning_curves(results(line("astra", 0, success=1.0)), scene) is None
 
 

@@ -81,9 +81,7 @@ def test_training_goes_on_after_an_interruption(
     collected = collect(TASK, config, seed=0, out=tmp_path / "raw", progress=silent, num_threads=1)
     paired = pair(TASK, PairConfig(), dataset=collected, out=tmp_path / "paired", progress=silent)
     settings = RmaConfig(history_length=40, adaptation_steps=64) if method == "rma" else None
-    training = PpoTrainConfig(
-        num_envs=4, rollout_steps=8, total_steps=96, hidden_sizes=(8,), memory_size=8, residual_noise=0.1
-    )
+    training = PpoTrainConfig(num_envs=4, rollout_steps=8, total_steps=96, hidden_sizes=(8,), memory_size=8)
 
     def trained(out: Path, progress: Progress = silent) -> bytes:
         given = {"dataset": paired, "grounding": None, "settings": settings, "seed": 0, "device": "cpu"}

@@ -1,0 +1,26 @@
+"""The rows whose simulators vary."""
+
+import pytest
+
+from astra_data.methods.compass import COMPASS
+from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
+from astra_data.methods.rma import RMA
+from astra_data.training.train import InSimulator
+from astra_data.worlds.registry import TASKS
+
+
+def test_the_ranges_are_those_printed_in_the_paper() -> None:
+    printed = {
+        "friction": (0.8, 1.2),
+        "action_scale": (-0.1, 0.1),
+        "action_noise": (0.05, 0.05),
+        "position_noise_m": (0.03, 0.03),
+        "velocity_noise_m_s": (0.0, 0.02),
+        "heading_bias_deg": (-5.0, 5.0),
+        "timestep_scale": (0.015 / 0.02, 0.025 / 0.02),
+    }
+    for name, ends in printed.items():
+        assert getattr(TASKS["antmaze-umaze"].varied.wide, name) == pytest.approx(ends)
+    for method, ranges in ((COMPASS, "wide"), (RMA, "wide"), (DOMAIN_RANDOMIZATION, "randomized")):
+        assert not method.grounds and method.in_simulator
+        assert isinstance(method.learn, InSimulator) and method.learn.ranges == ranges
