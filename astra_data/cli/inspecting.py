@@ -42,7 +42,7 @@ def inspect(
         typer.echo(f"written: {json}")
     if plot is None:
         return
-    from astra_data.reports.figures import coverage, png
+    from astra_data.reports.figures.catalog import coverage, png
 
     maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
     drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]

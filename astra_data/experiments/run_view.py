@@ -25,7 +25,7 @@ from astra_data.grounding.open_loop_replay import replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.reports.figures import method_color
+from astra_data.reports.figures.catalog import method_color
 from astra_data.stages.registry import STAGES
 from astra_data.worlds.registry import task_named
 

@@ -84,7 +84,7 @@ def write_held_out(
     ]
     figures = {}
     if rates := failure_rates(results):
-        from astra_data.reports.figures import pictures, png, reliability
+        from astra_data.reports.figures.catalog import pictures, png, reliability
 
         write_file(root / RELIABILITY, png(reliability(rates)))
         blocks += pictures(results, "failures")

@@ -31,7 +31,7 @@ from astra_data.core.digest import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.naming import seed_folder
-from astra_data.reports import figures
+from astra_data.reports.figures import catalog as figures
 from astra_data.reports.results import read_results
 from astra_data.stages import report as stage
 from astra_data.stages.report import is_current, report
@@ -44,7 +44,7 @@ DRAWN = figures.drawn
 def known_task(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give the report a task of its own, and no figures, which take seconds."""
     monkeypatch.setattr(stage, "task_named", {"antmaze-u": task()}.__getitem__)
-    monkeypatch.setattr("astra_data.reports.figures.drawn", lambda *_: {})
+    monkeypatch.setattr("astra_data.reports.figures.catalog.drawn", lambda *_: {})
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def rough(monkeypatch: pytest.MonkeyPatch) -> None:
         figure.savefig(content := BytesIO(), format="png", dpi=20)
         return content.getvalue()
 
-    monkeypatch.setattr("astra_data.reports.figures.drawn", DRAWN)
+    monkeypatch.setattr("astra_data.reports.figures.catalog.drawn", DRAWN)
     monkeypatch.setattr("astra_data.reports.figures.motion.replay_commands", lambda _: REPLAY)
     monkeypatch.setattr("astra_data.reports.figures.png", png)
 

@@ -1,0 +1,150 @@
+"""Figures: what they show, and how they are drawn, in one style.
+
+A figure of the report is a line of `FIGURES` and a function from the results and their scene to a matplotlib
+Figure, or to None where there is nothing to draw.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from matplotlib.figure import Figure
+
+from astra_data.reports.blocks import Picture
+from astra_data.reports.figures.coverage import coverage
+from astra_data.reports.figures.motion import mismatch, strips, trajectories
+from astra_data.reports.figures.open_loop import open_loop_error
+from astra_data.reports.figures.reliability import reliability, reliability_of
+from astra_data.reports.figures.scene import Scene
+from astra_data.reports.figures.scores import data_efficiency, learning_curves, score_bars
+from astra_data.reports.figures.style import method_color, method_title, png
+from astra_data.reports.figures.validity import predictive_validity
+from astra_data.reports.figures.walks import walk_prediction
+from astra_data.reports.results import Results
+
+__all__ = [
+    "FIGURES",
+    "Drawing",
+    "Scene",
+    "coverage",
+    "drawn",
+    "method_color",
+    "method_title",
+    "pictures",
+    "png",
+    "reliability",
+    "walk_prediction",
+]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure of the report.
+
+    Attributes:
+        draw: it, or returns None. title: above it. caption: below it; "{where}" stands for where methods were
+        tested. section: of the page. photo: it keeps its colors on a dark page.
+    """
+
+    draw: Callable[[Results, Scene], Figure | None]
+    title: str
+    caption: str
+    section: Literal["methods", "gap", "failures", "validity", "sizes", "training"]
+    photo: bool = False
+
+
+_BARS = "Bars: means over seeds, also as numbers beside the names. Dots: single seeds. Lines: 95 % intervals."
+_DIAMONDS = (
+    " Diamonds: the same policies in the simulator of their training; the drop from diamond to bar is the "
+    "cost of the transfer."
+)
+
+FIGURES = {
+    "success": Drawing(score_bars("success"), "Success {where}", _BARS + _DIAMONDS, "methods"),
+    "steps": Drawing(score_bars("steps"), "Survived steps {where}", _BARS + _DIAMONDS, "methods"),
+    "return": Drawing(score_bars("return"), "Return {where}", _BARS, "methods"),
+    "trajectories": Drawing(
+        trajectories,
+        "Trajectories",
+        "Orange, dashed: the policy in the simulator of its training. Blue: the same policy {where}. A "
+        "failed episode ends with a cross, a successful one at its goal, a star. Starts and goals are drawn "
+        "separately in the two worlds, so the lines are not pairs: compare their routes and where they end. "
+        "The number is the success rate {where} over all episodes and seeds.",
+        "methods",
+    ),
+    "strips": Drawing(
+        strips,
+        "The first episode of each method",
+        "The target at the times above the pictures, in the first evaluation episode of the first seed; all "
+        "methods have the same start. A strip ends with its episode.",
+        "methods",
+        photo=True,
+    ),
+    "gap": Drawing(
+        open_loop_error,
+        "Open-loop error by horizon",
+        "The simulator starts in a state of the target and receives the target's actions; the error is its "
+        "distance from the target. Lower is better. Dotted: no grounding. Bands: 95 % intervals over the "
+        "episodes of each seed, averaged over seeds.",
+        "gap",
+    ),
+    "mismatch": Drawing(
+        mismatch,
+        "The same commands in simulator and target",
+        "The simulator without grounding (orange) and, repeatedly, the target (blue: mean; bands: 25 to 75 "
+        "% and 5 to 95 %). Where they diverge, the simulator is missing something.",
+        "gap",
+    ),
+    "reliability": Drawing(
+        reliability_of,
+        "Reliability of predicted failures",
+        "On the dashed line, as many failures happen as are predicted; above it, more. Bottom: the number "
+        "of steps with each prediction.",
+        "failures",
+    ),
+    "validity": Drawing(
+        predictive_validity,
+        "Return in the simulators and in the target",
+        "Each dot is one policy (a seed of a method), with its mean return over the episodes. On the dashed "
+        "line, the simulator predicts the target's return exactly. For choosing between policies, it is "
+        "enough that what is better in the simulator is better in the target.",
+        "validity",
+    ),
+    "data_efficiency": Drawing(
+        data_efficiency,
+        "Data efficiency",
+        "Top, if shown: positions and velocities in the datasets of one seed; brighter means more often. "
+        "Bottom: means over seeds by size of the dataset; bands: their 95 % intervals; dots: single seeds.",
+        "sizes",
+    ),
+    "learning": Drawing(
+        learning_curves,
+        "Learning curves",
+        "Headline score of training episodes, in the simulator the policy is trained in. Lines: means over "
+        "seeds, dashed with the plus settings. Bands: from the worst seed to the best. Many episodes "
+        "may start in the middle of a recording or be cut off early, so these are not results on the task; "
+        "those are in the table. High here and low there means that the policy learned what does not work "
+        "in the target.",
+        "training",
+    ),
+}
+
+
+def drawn(results: Results, scene: Scene) -> dict[str, bytes]:
+    """Return the figures of results as PNG, by name."""
+    found = {name: figure.draw(results, scene) for name, figure in FIGURES.items()}
+    return {name: png(figure) for name, figure in found.items() if figure is not None}
+
+
+def pictures(results: Results, section: str) -> list[Picture]:
+    """Return the figures of a section as blocks of a page."""
+    found = {name: figure for name, figure in FIGURES.items() if figure.section == section}
+    return [
+        Picture(
+            name,
+            figure.title.replace("{where}", results.where),
+            figure.caption.replace("{where}", results.where),
+            photo=figure.photo,
+        )
+        for name, figure in found.items()
+    ]
