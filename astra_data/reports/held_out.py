@@ -1,6 +1,7 @@
 """How good corrections are, and how much data is enough: errors on held-out episodes, without a target."""
 
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,10 +85,10 @@ def write_held_out(
     ]
     figures = {}
     if rates := failure_rates(results):
-        from astra_data.reports.figures.catalog import pictures, png, reliability
-
-        write_file(root / RELIABILITY, png(reliability(rates)))
-        blocks += pictures(results, "failures")
+        # Figures read this module, so it finds them by name.
+        figure = import_module("astra_data.reports.figures.catalog")
+        write_file(root / RELIABILITY, figure.png(figure.reliability(rates)))
+        blocks += figure.pictures(results, "failures")
         figures["reliability"] = RELIABILITY
     write_file(root / PAGE, markdown(f"{recipe}: held-out errors", [Section("", blocks)], figures))
     return root / PAGE

@@ -58,7 +58,7 @@ def rough(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("astra_data.reports.figures.catalog.drawn", DRAWN)
     monkeypatch.setattr("astra_data.reports.figures.motion.replay_commands", lambda _: REPLAY)
-    monkeypatch.setattr("astra_data.reports.figures.png", png)
+    monkeypatch.setattr("astra_data.reports.figures.catalog.png", png)
 
 
 @pytest.fixture
