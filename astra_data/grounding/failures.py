@@ -134,18 +134,18 @@ class _Candidate:
                 continue
             fitted = _descended(self.untrained, *_steps(others, self.inputs[~fold]))
             mask = windows.mask[fold].bool()
-            predicted.append((fitted.log_odds(self.inputs[fold][mask]).detach(), fold, fitted.log_odds_shift))
+            predicted.append((fitted.log_odds(self.inputs[fold][mask]).detach(), fold, mask))
         if not predicted:
             return None
         self.odds = torch.cat([odds for odds, *_ in predicted], dim=1)
-        masks = [(windows.mask[fold].bool(), fold) for _, fold, _ in predicted]
-        self.happened = torch.cat([windows.fails_soon[fold][mask] for mask, fold in masks])
+        self.happened = torch.cat([windows.fails_soon[fold][mask] for _, fold, mask in predicted])
         if not _has_both(self.happened):
             return None
         scale, shift = calibration(self.odds, self.happened, self.untrained.shape.risk_steps)
         soon = (scale * self.odds + shift).sigmoid().mean(0)
         hazard = self.untrained.hazard(soon).clamp(1e-9, 1 - 1e-9)
-        now = torch.cat([_at_last(windows.fails_soon, windows.mask)[fold][mask] for mask, fold in masks])
+        failing_step = before_failures(windows.fails_soon.bool().any(1), windows.mask, 1)
+        now = torch.cat([failing_step[fold][mask] for _, fold, mask in predicted])
         rate = now.mean()
         constant = now.sum() * rate.log() + (len(now) - now.sum()) * (1 - rate).log()
         likelihood = (now * hazard.log() + (1 - now) * (1 - hazard).log()).sum()
@@ -161,11 +161,6 @@ class _Candidate:
 
 def _steps(episodes: PairedEpisodes, inputs: Tensor) -> tuple[Tensor, Tensor]:
     return episodes.steps(inputs), episodes.steps(episodes.windows.fails_soon)
-
-
-def _at_last(fails_soon: Tensor, mask: Tensor) -> Tensor:
-    """Return 1 at the last real step of each episode that fails, else 0, (E, T)."""
-    return before_failures(fails_soon.bool().any(1), mask, 1)
 
 
 def _has_both(fails: Tensor) -> bool:

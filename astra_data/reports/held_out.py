@@ -1,19 +1,17 @@
 """How good corrections are, and how much data is enough: errors on held-out episodes, without a target."""
 
 from collections.abc import Iterator, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from astra_data.core.arrays import Floats
 from astra_data.core.durable import write_file
-from astra_data.grounding.failures import BINS
 from astra_data.methods import method_title
 from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown
 from astra_data.reports.formatting import measured
-from astra_data.reports.results import WHOLE, Results, judged_horizon
+from astra_data.reports.predicted_failures import all_bins, failure_rates, predicted_failures
+from astra_data.reports.results import Results, judged_horizon
 from astra_data.reports.runs import read_errors, read_grounding
 
 if TYPE_CHECKING:
@@ -85,10 +83,10 @@ def write_held_out(
     ]
     figures = {}
     if rates := failure_rates(results):
-        # Figures read this module, so it finds them by name.
-        figure = import_module("astra_data.reports.figures.catalog")
-        write_file(root / RELIABILITY, figure.png(figure.reliability(rates)))
-        blocks += figure.pictures(results, "failures")
+        from astra_data.reports.figures.catalog import pictures, png, reliability
+
+        write_file(root / RELIABILITY, png(reliability(rates)))
+        blocks += pictures(results, "failures")
         figures["reliability"] = RELIABILITY
     write_file(root / PAGE, markdown(f"{recipe}: held-out errors", [Section("", blocks)], figures))
     return root / PAGE
@@ -241,29 +239,14 @@ def _fit_blocks(results: Results) -> Iterator[Block]:
         )
 
 
-def _predicted_failures(results: Results) -> "dict[tuple[int, str, str], pd.DataFrame]":
-    """Return the figures of predicted failures by size, grounding and part of it: name → seed → value."""
-    table = results.table
-    of = table[(table["where"] == "ground") & table["measure"].str.startswith("failures.")]
-    if of.empty:
-        return {}
-    names = of["measure"].str.split(".", n=2, expand=True)
-    of = of.assign(part=names[1], measure=names[2])
-    return {
-        key: group.pivot_table(index="measure", columns="seed", values="value", sort=False)
-        for key, group in of.groupby(["percent", "row", "part"], sort=False)
-        if group["measure"].str.startswith("auc").any()
-    }
-
-
 def _failure_blocks(results: Results) -> Iterator[Block]:
     lines, swept = [], len(results.percents) > 1
-    for (percent, row, part), of in _predicted_failures(results).items():
+    for (percent, row, part), of in predicted_failures(results).items():
         means = of.mean(axis=1)
         known = (means.get(f"auc.{ahead}") for ahead in ("1-20", "11-30", "21-40"))
         aucs = ["-" if value is None else f"{value:.2f}" for value in known]
         skill = f"{means['brier_skill']:.2f}" if "brier_skill" in means else "-"
-        bins = _bins(of)
+        bins = all_bins(of)
         sure = bins[bins[:, 0] > _SURE]
         happens = "-"
         if len(sure):
@@ -287,33 +270,3 @@ def _failure_blocks(results: Results) -> Iterator[Block]:
         "0.1, the share before a failure, and the mean predicted probability. With few failures, these "
         "numbers mean little."
     )
-
-
-def _bins(of: "pd.DataFrame") -> Floats:
-    """Return predicted and observed rates and number of steps of all bins and seeds, (N, 3)."""
-    rows = of[of.index.str.startswith("reliability.")]
-    bins = rows.groupby([name.split(".")[1] for name in rows.index], sort=False)
-    found = [values.to_numpy().T for _, values in bins]
-    stacked = np.concatenate(found) if found else np.empty((0, 3))
-    return np.asarray(stacked[~np.isnan(stacked).any(axis=1)], dtype=np.float64)
-
-
-def failure_rates(results: Results) -> dict[str, dict[str, Floats]]:
-    """Return rates over all seeds at the largest size: what predicts failures → grounding → (3, bins).
-
-    The three are predicted rate, observed rate and number of steps.
-    """
-    parts: dict[str, dict[str, Floats]] = {}
-    for (percent, row, part), of in _predicted_failures(results).items():
-        rows = _bins(of)
-        if percent == (results.percents or [WHOLE])[-1] and len(rows):
-            parts.setdefault(part.replace("_", " "), {})[row] = _pooled(rows)
-    return parts
-
-
-def _pooled(rows: Floats) -> Floats:
-    """Pool rows (N, 3) of predicted and observed rates and numbers of steps by bin: (3, bins)."""
-    bins = np.digitize(rows[:, 0], BINS[1:-1])
-    steps = np.array([rows[bins == one, 2].sum() for one in np.unique(bins)])
-    rates = [rows[bins == one, :2].T @ rows[bins == one, 2] for one in np.unique(bins)]
-    return np.vstack([np.reshape(rates, (-1, 2)).T / steps, steps])

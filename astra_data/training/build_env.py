@@ -82,12 +82,9 @@ def data_starts(
 
 def _used(grounding: Grounding, world: WorldConfig) -> Grounding:
     """Return what `world` makes use of in a grounding."""
-    return grounding if world.prices_failures else without_failures(grounding)
-
-
-def without_failures(grounding: Grounding) -> Grounding:
-    """Return a grounding without its failure model, if it has one."""
-    return replace(grounding, failures=None) if isinstance(grounding, HistoryGrounding) else grounding
+    if world.prices_failures or not isinstance(grounding, HistoryGrounding):
+        return grounding
+    return replace(grounding, failures=None)
 
 
 def _remembered(task: Task, grounding: Grounding, episodes: PairedEpisodes, every: int) -> Tensor | None:

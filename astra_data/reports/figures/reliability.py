@@ -10,7 +10,7 @@ from astra_data.core.arrays import Floats
 from astra_data.core.naming import is_plus
 from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import FAINT, method_color, method_title, style
-from astra_data.reports.held_out import failure_rates
+from astra_data.reports.predicted_failures import failure_rates
 from astra_data.reports.results import Results
 
 _TICKS = (0.01, 0.1, 0.3, 0.6, 1.0)
