@@ -24,22 +24,22 @@ if TYPE_CHECKING:
     from astra_data.dataset.reader import Dataset as Dataset
     from astra_data.dataset.staging import StagedWriter as StagedWriter
     from astra_data.dataset.writer import DatasetWriter as DatasetWriter
-    from astra_data.exchange.sharing.pull import pull as pull
-    from astra_data.exchange.sharing.push import push as push
-    from astra_data.experiments.run import run as run
-    from astra_data.experiments.trained_policy import load_policy as load_policy
+    from astra_data.io.hub.pull import pull as pull
+    from astra_data.io.hub.push import push as push
     from astra_data.methods import METHODS as METHODS
-    from astra_data.stages.align import align as align
-    from astra_data.stages.augment import augment as augment
-    from astra_data.stages.collect import collect as collect
-    from astra_data.stages.evaluate import evaluate as evaluate
-    from astra_data.stages.ground import ground as ground
-    from astra_data.stages.label import label as label
-    from astra_data.stages.pair import pair as pair
-    from astra_data.stages.train import train as train
+    from astra_data.pipeline.run import run as run
+    from astra_data.pipeline.stages.align import align as align
+    from astra_data.pipeline.stages.augment import augment as augment
+    from astra_data.pipeline.stages.collect import collect as collect
+    from astra_data.pipeline.stages.evaluate import evaluate as evaluate
+    from astra_data.pipeline.stages.ground import ground as ground
+    from astra_data.pipeline.stages.label import label as label
+    from astra_data.pipeline.stages.pair import pair as pair
+    from astra_data.pipeline.stages.train import train as train
+    from astra_data.pipeline.trained_policy import load_policy as load_policy
+    from astra_data.robots.registry import TASKS as TASKS
     from astra_data.worlds.objective import Objective as Objective
     from astra_data.worlds.protocols import Simulator as Simulator
-    from astra_data.worlds.registry import TASKS as TASKS
     from astra_data.worlds.task import Task as Task
 
 _MODULES = {
@@ -52,22 +52,22 @@ _MODULES = {
     "Objective": "worlds.objective",
     "Simulator": "worlds.protocols",
     "StagedWriter": "dataset.staging",
-    "TASKS": "worlds.registry",
+    "TASKS": "robots.registry",
     "Task": "worlds.task",
-    "align": "stages.align",
-    "augment": "stages.augment",
-    "collect": "stages.collect",
-    "evaluate": "stages.evaluate",
-    "ground": "stages.ground",
-    "label": "stages.label",
-    "load_policy": "experiments.trained_policy",
+    "align": "pipeline.stages.align",
+    "augment": "pipeline.stages.augment",
+    "collect": "pipeline.stages.collect",
+    "evaluate": "pipeline.stages.evaluate",
+    "ground": "pipeline.stages.ground",
+    "label": "pipeline.stages.label",
+    "load_policy": "pipeline.trained_policy",
     "merge": "dataset.edit",
-    "pair": "stages.pair",
-    "pull": "exchange.sharing.pull",
-    "push": "exchange.sharing.push",
-    "run": "experiments.run",
+    "pair": "pipeline.stages.pair",
+    "pull": "io.hub.pull",
+    "push": "io.hub.push",
+    "run": "pipeline.run",
     "subset": "dataset.edit",
-    "train": "stages.train",
+    "train": "pipeline.stages.train",
 }
 __all__ = sorted(_MODULES)
 

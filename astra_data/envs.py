@@ -1,3 +1,3 @@
-"""`import astra_data.envs` registers the Gymnasium ids; see `astra_data.experiments.gymnasium_ids`."""
+"""`import astra_data.envs` registers the Gymnasium ids; see `astra_data.pipeline.gymnasium_ids`."""
 
-from astra_data.experiments import gymnasium_ids as gymnasium_ids
+from astra_data.pipeline import gymnasium_ids as gymnasium_ids

@@ -10,8 +10,8 @@ import fake_stages
 import pytest
 
 if TYPE_CHECKING:
-    from astra_data.experiments.recipe import Recipe
-    from astra_data.stages.registry import Stage
+    from astra_data.pipeline.recipe import Recipe
+    from astra_data.pipeline.stages.registry import Stage
 
 # Before torch and numpy are loaded: tests run side by side, a core each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -60,7 +60,7 @@ def quick_failures(monkeypatch: pytest.MonkeyPatch) -> None:
 def forgotten_methods() -> Iterator[None]:
     """Forget afterwards the methods of one's own that a test adds to this process."""
     methods, policies = (
-        importlib.import_module(f"astra_data.{name}") for name in ("methods", "training.own_policy")
+        importlib.import_module(f"astra_data.{name}") for name in ("methods", "policies.own_policy")
     )
     registered = (methods.METHODS, methods.KINDS, methods._PLACES, policies.KINDS)
     known = [dict(found) for found in registered]
@@ -73,7 +73,7 @@ def forgotten_methods() -> Iterator[None]:
 @functools.cache
 def _fake_stages() -> "tuple[dict[str, Stage], type[Recipe]]":
     """Return fake stages and the model of their recipes, which takes long to make."""
-    plan, recipe = (importlib.import_module(f"astra_data.experiments.{name}") for name in ("plan", "recipe"))
+    plan, recipe = (importlib.import_module(f"astra_data.pipeline.{name}") for name in ("plan", "recipe"))
     stages: dict[str, Stage] = {
         name: dataclasses.replace(stage, run=getattr(fake_stages, name), config=fake_stages.CONFIGS.get(name))
         for name, stage in plan.STAGES.items()
@@ -86,10 +86,10 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
     """Replace the stages, methods and tasks by fake ones, and return the model of their recipes."""
     # Imported here, so that tests of other parts need not wait for every stage.
     plan, recipe, experiment, staleness = (
-        importlib.import_module(f"astra_data.experiments.{name}")
+        importlib.import_module(f"astra_data.pipeline.{name}")
         for name in ("plan", "recipe", "experiment", "staleness")
     )
-    registry = importlib.import_module("astra_data.worlds.registry")
+    registry = importlib.import_module("astra_data.robots.registry")
     stages, model = _fake_stages()
     monkeypatch.setattr(plan, "STAGES", stages)
     methods = importlib.import_module("astra_data.methods")
@@ -97,10 +97,10 @@ def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
         monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
     monkeypatch.setitem(registry.TASKS, "maze", registry.TASKS["antmaze-umaze"])
     monkeypatch.setattr(experiment, "Recipe", model)
-    condition = importlib.import_module("astra_data.experiments.condition")
+    condition = importlib.import_module("astra_data.pipeline.condition")
     monkeypatch.setattr(condition, "Dataset", fake_stages.FakeDataset)
     monkeypatch.setattr(condition, "read_description", fake_stages.read_description)
     # Without torch and the real stages, the spawned processes start at once.
     monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
-    monkeypatch.setattr("astra_data.experiments.run._prepare", fake_stages.prepare)
+    monkeypatch.setattr("astra_data.pipeline.run._prepare", fake_stages.prepare)
     return model

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 from fake_runs import FakeRecipe
 
+from astra_data.pipeline.stages.report import ReportConfig, report
 from astra_data.reports.command_replay import CommandReplay
 from astra_data.reports.results import Results, read_results
-from astra_data.stages.report import ReportConfig, report
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.score import SUCCESS
 

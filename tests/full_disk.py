@@ -9,7 +9,7 @@ import h5py  # noqa: F401 - imported once, for all children
 import minari.dataset.minari_dataset  # noqa: F401
 
 from astra_data.cli.app import main
-from astra_data.exchange import exporters  # noqa: F401
+from astra_data.io import exporters  # noqa: F401 - while there is space
 
 if __name__ == "__main__":
     dataset, folder, cases = sys.argv[1:]

@@ -2,9 +2,9 @@
 
 import torch
 
-from astra_data.learning.networks.failure import FailureModel, FailureShape
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.worlds.registry import TASKS
+from astra_data.grounding.networks.failure import FailureModel, FailureShape
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 GOAL = torch.tensor([[-4.0, -4.0], [4.0, 4.0], [0.0, 4.0]])

@@ -15,8 +15,8 @@ from forks import forked
 from shared_files import contents
 
 from astra_data.dataset import Dataset
-from astra_data.exchange.sharing import store
-from astra_data.exchange.sharing.pull import pull
+from astra_data.io.hub import store
+from astra_data.io.hub.pull import pull
 
 store.BLOCK_BYTES = 1024
 

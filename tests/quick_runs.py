@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.progress import silent
-from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.plan import plan, stage_of, stages_until
-from astra_data.learning.descent import DescentConfig
+from astra_data.grounding.descent import DescentConfig
+from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.plan import plan, stage_of, stages_until
 
 
 def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:

@@ -5,10 +5,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from astra_data.grounding.fit import GroundConfig
-from astra_data.stages.align import AlignConfig
-from astra_data.stages.collect import CollectConfig
-from astra_data.training.train import PpoTrainConfig
-from astra_data.worlds.registry import TASKS
+from astra_data.pipeline.stages.align import AlignConfig
+from astra_data.pipeline.stages.collect import CollectConfig
+from astra_data.policies.train import PpoTrainConfig
+from astra_data.robots.registry import TASKS
 
 TASK = "antmaze-short"
 _LONG = TASKS["antmaze-umaze"]

@@ -3,7 +3,7 @@ import pytest
 import torch
 from ant_velocity import AntVelocityConfig, AntVelocityEnv
 
-from astra_data.worlds.ant.body import VelocityController, canonical_view, torques_to_body
+from astra_data.robots.ant.body import VelocityController, canonical_view, torques_to_body
 
 
 def make(num_envs: int = 4, seed: int = 0) -> AntVelocityEnv:

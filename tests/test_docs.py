@@ -22,13 +22,13 @@ from typer.main import get_command
 from astra_data.cli.app import app
 from astra_data.core.config import Config
 from astra_data.core.progress import silent
-from astra_data.exchange import mapping  # noqa: F401 - has the keys of mappings
-from astra_data.experiments import recipe  # noqa: F401 - has all tables of settings
-from astra_data.stages.align import align
-from astra_data.stages.collect import CollectConfig, collect
-from astra_data.stages.ground import ground
-from astra_data.stages.pair import PairConfig, pair
-from astra_data.stages.train import train
+from astra_data.io import mapping  # noqa: F401 - has the keys of mappings
+from astra_data.pipeline import recipe  # noqa: F401 - has all tables of settings
+from astra_data.pipeline.stages.align import align
+from astra_data.pipeline.stages.collect import CollectConfig, collect
+from astra_data.pipeline.stages.ground import ground
+from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.pipeline.stages.train import train
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

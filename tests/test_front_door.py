@@ -14,7 +14,7 @@ import astra_data
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import EXTRAS
 from astra_data.core.progress import silent
-from astra_data.stages.collect import CollectConfig, collect
+from astra_data.pipeline.stages.collect import CollectConfig, collect
 
 PUBLIC = [
     *("Column", "Dataset", "DatasetWriter", "Episode", "Frames", "METHODS", "Objective", "Simulator"),
@@ -114,9 +114,9 @@ def test_a_card_with_its_figure_needs_no_more_than_its_own_extra(tmp_path: Path)
     write_fake(tmp_path / "whole")
     code = WITHOUT.format(names=("torch", "safetensors", "mujoco", "gymnasium")) + (
         "from pathlib import Path\nfrom astra_data import Dataset\n"
-        "from astra_data.exchange.sharing.card import write_card\n"
-        "from astra_data.exchange.sharing.notes import Notes\n"
-        "import astra_data.exchange.sharing.push\n"
+        "from astra_data.io.hub.card import write_card\n"
+        "from astra_data.io.hub.notes import Notes\n"
+        "import astra_data.io.hub.push\n"
         "write_card(Dataset.open(Path(sys.argv[1])), Path(sys.argv[2]), Notes())\n"
     )
     python(code, str(tmp_path / "whole"), str(tmp_path / "card.md"))

@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 
 import astra_data
 from astra_data.cli.app import app
-from astra_data.experiments.recipe import Recipe
+from astra_data.pipeline.recipe import Recipe
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))

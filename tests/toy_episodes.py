@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+from astra_data.grounding.networks.paired_windows import PairedWindows
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.paired_windows import PairedWindows
 
 
 def toy_episodes(

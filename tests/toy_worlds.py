@@ -7,7 +7,7 @@ import torch
 from kept_states import came_back
 from torch import Tensor
 
-from astra_data.learning.learner import Learner
+from astra_data.policies.learner import Learner
 from astra_data.worlds.batched import Step
 
 

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
-from astra_data.worlds.ant.body import (
+from astra_data.robots.ant.body import (
     CONTROL_SUBSTEPS,
     TIMESTEP_S,
     TOPPLE_COSINE,

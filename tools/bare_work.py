@@ -8,10 +8,10 @@ import torch
 from timing import Stretch
 from torch import Tensor
 
-from astra_data.learning.networks.actor_critic import ActorCritic
-from astra_data.learning.networks.history import mlp
-from astra_data.learning.ppo import EPOCHS, MINIBATCHES, PpoConfig
-from astra_data.training.simulator_env import SimulatorEnv
+from astra_data.grounding.networks.history import mlp
+from astra_data.policies.networks.actor_critic import ActorCritic
+from astra_data.policies.ppo import EPOCHS, MINIBATCHES, PpoConfig
+from astra_data.policies.simulator_env import SimulatorEnv
 
 
 def bare_ppo(env: SimulatorEnv, policy: ActorCritic, config: PpoConfig) -> Stretch:

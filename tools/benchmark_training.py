@@ -33,23 +33,23 @@ from astra_data.core.config import load_recipe
 from astra_data.core.cores import cores
 from astra_data.core.errors import AstraDataError
 from astra_data.core.progress import silent
-from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.fit import Fitting, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.learning.iql import Experience, Iql, IqlConfig
-from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.learning.networks.policy import PolicyShape
-from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.learning.ppo import Ppo
-from astra_data.learning.sac import Sac, SacConfig
-from astra_data.training.simulator_env import SimulatorEnv
-from astra_data.training.train import PpoTrainConfig
-from astra_data.worlds.ant.body import POSITIONS, VelocityController
-from astra_data.worlds.registry import TASKS
+from astra_data.pipeline.recipe import Recipe
+from astra_data.policies.iql import Experience, Iql, IqlConfig
+from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.networks.policy import PolicyShape
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.ppo import Ppo
+from astra_data.policies.sac import Sac, SacConfig
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.train import PpoTrainConfig
+from astra_data.robots.ant.body import POSITIONS, VelocityController
+from astra_data.robots.registry import TASKS
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
 TASK = TASKS[SETTINGS.task]

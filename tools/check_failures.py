@@ -21,7 +21,7 @@ from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as
-from astra_data.worlds.registry import task_named
+from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
 
 

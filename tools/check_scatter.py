@@ -22,7 +22,7 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.moments import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as
-from astra_data.worlds.registry import task_named
+from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
 
 LAGS_S = (0.1, 0.25, 0.5, 1.0, 2.0)

@@ -22,9 +22,9 @@ from door import run_tool
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
-from astra_data.experiments.grounded_env import training_of
 from astra_data.methods import method_named
-from astra_data.training.own_world import reached_in_own_world
+from astra_data.pipeline.grounded_env import training_of
+from astra_data.policies.own_world import reached_in_own_world
 
 
 class Trained(NamedTuple):

@@ -33,9 +33,9 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.doctor.check import check
-from astra_data.stages.augment import AugmentConfig, augment
-from astra_data.stages.pair import PairConfig, pair
-from astra_data.worlds.registry import TASKS
+from astra_data.pipeline.stages.augment import AugmentConfig, augment
+from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 AMBLE_M = 0.4
@@ -123,7 +123,7 @@ def ambles(episodes: int, steps: int) -> Iterator[Episode]:
 def apart(work: Work, root: Path, episodes: int, steps: int) -> tuple[int, float, float]:
     """Run `work` in its own process; return its steps, its peak in MiB above the imports, its seconds."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["astra_data.stages.augment", "astra_data.dataset.doctor.check"])
+    context.set_forkserver_preload(["astra_data.pipeline.stages.augment", "astra_data.dataset.doctor.check"])
     with context.Pool(1) as pool:
         return pool.apply(_measured, (work, root, episodes, steps))
 

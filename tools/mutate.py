@@ -1,6 +1,6 @@
 """How many small changes of the code do the tests notice? Mutants are drawn with Cosmic Ray.
 
-    uv run --with cosmic-ray python tools/mutate.py learning grounding --count 40 --seed 0
+    uv run --with cosmic-ray python tools/mutate.py grounding policies --count 40 --seed 0
 
 First the tests have to pass without a change. Then each mutant is run, in a copy of the checkout, against the
 test files that import its module, the one of the same name first. Left out are mutants that change nothing a

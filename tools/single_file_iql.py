@@ -4,7 +4,7 @@ import copy
 
 import torch
 
-from astra_data.learning.iql import Experience
+from astra_data.policies.iql import Experience
 
 
 class SingleFileIql:

@@ -6,8 +6,8 @@ import torch
 from timing import Stretch
 
 from astra_data.grounding.fit import GroundConfig
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape, LossWeights
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape, LossWeights
 
 
 def step_by_step(

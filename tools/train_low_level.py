@@ -18,10 +18,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors.numpy import save_file
 from torch import nn
 
-from astra_data.learning.networks.policy import PolicyShape
-from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.learning.sac import Sac, SacConfig
-from astra_data.worlds.ant.body import VelocityController
+from astra_data.policies.networks.policy import PolicyShape
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.sac import Sac, SacConfig
+from astra_data.robots.ant.body import VelocityController
 
 SETTLED_STEPS = 20
 """One second after a command change, tracking counts as settled."""

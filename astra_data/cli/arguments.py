@@ -17,7 +17,7 @@ def recipe_at(path: Path) -> Path:
         RecipeError: there is no such file, or it is not TOML.
     """
     from astra_data.core.config import load_tables
-    from astra_data.experiments.shipped import whereabouts
+    from astra_data.pipeline.shipped import whereabouts
 
     if path.is_dir():  # a run or a dataset, perhaps: what is read then says so
         return path
@@ -164,7 +164,7 @@ def check_asked(
         RecipeError: its file, or that of its base, cannot be read.
     """
     from astra_data.core.config import load_tables
-    from astra_data.experiments.points import refuse_unknown
+    from astra_data.pipeline.points import refuse_unknown
 
     if recipe.is_dir() or not (methods or seeds or percents):
         return

@@ -8,7 +8,7 @@ from astra_data.cli.arguments import DatasetName, NewName, Out
 from astra_data.cli.settings import with_settings
 
 
-@with_settings("astra_data.stages.augment:AugmentConfig")
+@with_settings("astra_data.pipeline.stages.augment:AugmentConfig")
 def augment(
     dataset: DatasetName,
     settings: dict[str, Any],
@@ -28,9 +28,9 @@ def augment(
 
     root = locate(dataset)
     from astra_data.core.config import validated
-    from astra_data.experiments.display import shown
-    from astra_data.stages.augment import AugmentConfig
-    from astra_data.stages.augment import augment as augment_dataset
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.stages.augment import AugmentConfig
+    from astra_data.pipeline.stages.augment import augment as augment_dataset
 
     config = validated(settings, AugmentConfig, "augment")
     with shown("augment") as progress:

@@ -34,7 +34,7 @@ Name = Annotated[
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the same command after an interruption.")]
 
 
-@with_settings("astra_data.stages.collect:CollectConfig")
+@with_settings("astra_data.pipeline.stages.collect:CollectConfig")
 def collect(
     task: Task,
     settings: dict[str, Any],
@@ -58,9 +58,9 @@ def collect(
     import torch
 
     from astra_data.core.config import validated
-    from astra_data.experiments.display import shown
-    from astra_data.stages.collect import CollectConfig
-    from astra_data.stages.collect import collect as collect_dataset
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.stages.collect import CollectConfig
+    from astra_data.pipeline.stages.collect import collect as collect_dataset
 
     planned = {"behavior": "planned"} if "plan" in settings and "behavior" not in settings else {}
     config = validated(settings | planned, CollectConfig, "collect")
@@ -75,7 +75,7 @@ def collect(
     typer.echo(f"finished: {folder}")
 
 
-@with_settings("astra_data.stages.pair:PairConfig")
+@with_settings("astra_data.pipeline.stages.pair:PairConfig")
 def pair(
     dataset: Source,
     settings: dict[str, Any],
@@ -107,9 +107,9 @@ def pair(
 
     source = locate(dataset)
     from astra_data.core.config import validated
-    from astra_data.experiments.display import shown
-    from astra_data.stages.pair import PairConfig
-    from astra_data.stages.pair import pair as pair_dataset
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.stages.pair import PairConfig
+    from astra_data.pipeline.stages.pair import pair as pair_dataset
 
     config = validated(settings, PairConfig, "pair")
     with shown("pair") as progress:

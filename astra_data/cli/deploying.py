@@ -30,7 +30,7 @@ def deploy(
 ) -> None:
     """Export a trained policy as a folder that runs without this package."""
     from astra_data.dataset.atomic import refuse_existing
-    from astra_data.experiments.points import refuse_unmade
+    from astra_data.pipeline.points import refuse_unmade
 
     run_at(run)
     out = out or run / artifact_key("deploy", row, seed, percent)

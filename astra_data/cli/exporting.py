@@ -18,7 +18,7 @@ def export(
 ) -> None:
     """Convert a dataset to the format of another library."""
     from astra_data.dataset.versions import open_dataset
-    from astra_data.exchange.exporters import export as write
+    from astra_data.io.exporters import export as write
 
     write(open_dataset(dataset), out, format=format)
     typer.echo(f"finished: {out}")

@@ -63,7 +63,7 @@ def import_(
 ) -> None:
     """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON, PyTorch) to a dataset."""
     from astra_data.core.wording import printable
-    from astra_data.exchange.importing import import_dataset
+    from astra_data.io.importing import import_dataset
 
     report = import_dataset(
         recordings,

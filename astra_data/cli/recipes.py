@@ -38,7 +38,7 @@ def run(
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
     check_asked(recipe_at(recipe), seeds=seeds)
-    from astra_data.experiments.run import run as run_recipe
+    from astra_data.pipeline.run import run as run_recipe
 
     with resumable():
         folder = run_recipe(recipe, seeds=seeds or (), root=root, jobs=jobs, device=device, until=until)
@@ -58,8 +58,8 @@ def check(
     """Check recipes without running them, and list which artifacts are finished, damaged or stale."""
     for recipe in recipes:
         recipe_at(recipe)
-    from astra_data.experiments.recipe_file import is_gap_recipe
-    from astra_data.experiments.run import check as check_recipe
+    from astra_data.pipeline.recipe_file import is_gap_recipe
+    from astra_data.pipeline.run import check as check_recipe
 
     faults: list[str] = []
     for recipe in recipes:
@@ -148,8 +148,8 @@ def evaluate(
         raise BadInputError(
             "evaluate: with --policy, give one --method, one --seed and --out, and leave out --jobs"
         )
-    from astra_data.experiments.display import shown
-    from astra_data.experiments.grounded_env import evaluate_policy
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.grounded_env import evaluate_policy
     from astra_data.worlds.own_code import own_object
 
     with shown("evaluate") as progress:
@@ -177,7 +177,7 @@ def run_stage(
 ) -> None:
     """Run one stage of a recipe, and print the folder of its artifacts."""
     check_asked(recipe_at(recipe), [*methods], [*seeds])
-    from astra_data.experiments.run import run_stage as run
+    from astra_data.pipeline.run import run_stage as run
 
     with resumable():
         folder = run(
@@ -202,11 +202,11 @@ def show_made(folder: Path, until: str | None, *others: Path) -> None:
     After the report: the verdict, best method, floor and the interval between them, and the command that
     deploys it. Where it ends with its groundings: the page of their held-out errors.
     """
-    from astra_data.experiments.plan import stages_until
+    from astra_data.pipeline.plan import stages_until
+    from astra_data.pipeline.stages.report import HTML, JSON
     from astra_data.reports.held_out import PAGE
     from astra_data.reports.results import read_results
     from astra_data.reports.verdict import verdict_of
-    from astra_data.stages.report import HTML, JSON
 
     made = stages_until(until)
     if until == "ground" and (folder / PAGE).is_file():

@@ -31,8 +31,8 @@ def card(
     """Write a dataset card: contents, origin, and how to load it."""
     from astra_data.core.config import load_recipe
     from astra_data.dataset.versions import open_dataset
-    from astra_data.exchange.sharing.card import write_card
-    from astra_data.exchange.sharing.notes import Notes
+    from astra_data.io.hub.card import write_card
+    from astra_data.io.hub.notes import Notes
 
     opened = open_dataset(dataset)
     written = load_recipe(notes, Notes) if notes else Notes()
@@ -58,8 +58,8 @@ def push(
 ) -> None:
     """Share a version of a dataset, with its card; a shared version never changes."""
     from astra_data.dataset.versions import open_dataset
-    from astra_data.exchange.sharing.push import push as send
-    from astra_data.experiments.display import shown
+    from astra_data.io.hub.push import push as send
+    from astra_data.pipeline.display import shown
 
     with shown("push") as progress:
         source = send(dataset, url, notes=notes, private=private, progress=progress)
@@ -87,9 +87,9 @@ def pull(
     ] = None,
 ) -> None:
     """Download and verify a shared dataset; run again to continue, or to verify the copy."""
-    from astra_data.exchange.sharing.pull import MOST_BYTES
-    from astra_data.exchange.sharing.pull import pull as fetch
-    from astra_data.experiments.display import shown
+    from astra_data.io.hub.pull import MOST_BYTES
+    from astra_data.io.hub.pull import pull as fetch
+    from astra_data.pipeline.display import shown
 
     with shown("pull") as progress:
         dataset = fetch(

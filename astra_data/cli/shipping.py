@@ -16,7 +16,7 @@ def list_() -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from astra_data.experiments.shipped import START_HERE, listed
+    from astra_data.pipeline.shipped import START_HERE, listed
 
     for title, recipes in listed().items():
         table = Table("name", "takes", "what it is", title=title, title_justify="left", box=None)
@@ -38,7 +38,7 @@ def copy(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to copy to.")] = Path("recipes"),
 ) -> None:
     """Copy a recipe or mapping, with the recipe it is based on and the code it needs."""
-    from astra_data.experiments.shipped import IMPORTS, copy_recipe, shipped
+    from astra_data.pipeline.shipped import IMPORTS, copy_recipe, shipped
 
     new = copy_recipe(name, folder)
     path = shipped(name).path

@@ -36,8 +36,8 @@ def new(
 
     from astra_data.core.errors import BadInputError
     from astra_data.core.wording import first_few
-    from astra_data.experiments.first_simulator import CLEARLY, JUDGED_STEPS
-    from astra_data.experiments.new_robot import write_robot
+    from astra_data.pipeline.first_simulator import CLEARLY, JUDGED_STEPS
+    from astra_data.pipeline.new_robot import write_robot
 
     places = [*(logs or ()), *(more or ())]
     if not places:

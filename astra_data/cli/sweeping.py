@@ -61,7 +61,7 @@ def sweep(
     if address is not None and engine is not Engine.ray:
         raise BadInputError("sweep: --address is for --engine ray")
     check_asked(recipe_at(recipe), methods, seeds, percents)
-    from astra_data.experiments.sweep import sweep as sweep_recipe
+    from astra_data.pipeline.sweep import sweep as sweep_recipe
 
     with resumable():
         folder = sweep_recipe(

@@ -32,7 +32,7 @@ def tasks(
     from rich.table import Table
 
     from astra_data.core.errors import BadInputError
-    from astra_data.worlds.registry import TASKS, known_tasks, task_named
+    from astra_data.robots.registry import TASKS, known_tasks, task_named
 
     if task is not None:
         from astra_data.worlds.walk_through import check_task
@@ -84,8 +84,8 @@ def label(
     from astra_data.dataset.versions import locate
 
     data = locate(dataset)
-    from astra_data.experiments.display import shown
-    from astra_data.stages.label import label as label_dataset
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.stages.label import label as label_dataset
 
     with shown("label") as progress:
         folder = label_dataset(task, data=data, seed=seed, name=name, out=out, progress=progress)

@@ -16,6 +16,6 @@ def view(
 ) -> None:
     """Show a run's held-out episodes in Rerun, and replays of them in its simulators."""
     run_at(run)
-    from astra_data.experiments.run_view import view_run
+    from astra_data.pipeline.run_view import view_run
 
     view_run(run, uids or (), seed=seed, save=save)

@@ -15,8 +15,8 @@ from astra_data.dataset.columns import Column
 from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, write_graph
 from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.deployment.page import page
-from astra_data.experiments.trained_policy import trained_policy
-from astra_data.training.running_policy import RunningPolicy
+from astra_data.pipeline.trained_policy import trained_policy
+from astra_data.policies.running_policy import RunningPolicy
 from astra_data.worlds.own_code import file_of
 
 DESCRIPTION, LOOP, PAGE = "policy.json", "run_policy.py", "README.md"

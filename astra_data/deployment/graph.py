@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.training.own_policy import OwnPolicy
-from astra_data.training.running_policy import Memory, RunningPolicy
+from astra_data.policies.own_policy import OwnPolicy
+from astra_data.policies.running_policy import Memory, RunningPolicy
 
 ONNX = "policy.onnx"
 INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")

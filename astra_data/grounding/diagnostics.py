@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
+from astra_data.grounding.networks.grounding import GroundingModel, LossWeights, recorded_rewards
+from astra_data.grounding.networks.paired_windows import PairedWindows
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.grounding import GroundingModel, LossWeights, recorded_rewards
-from astra_data.learning.networks.paired_windows import PairedWindows
 
 
 @torch.no_grad()

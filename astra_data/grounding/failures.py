@@ -14,13 +14,13 @@ from torch.nn import functional
 
 from astra_data.core.seeding import derive
 from astra_data.grounding.calibration import calibration, folds
+from astra_data.grounding.descent import Descent, DescentConfig
+from astra_data.grounding.generators import seeded
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.moments import Moments
+from astra_data.grounding.networks.failure import FAILURE_STEPS, FailureModel, FailureShape
+from astra_data.grounding.networks.paired_windows import RISK_STEPS, before_failures
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.descent import Descent, DescentConfig
-from astra_data.learning.generators import seeded
-from astra_data.learning.networks.failure import FAILURE_STEPS, FailureModel, FailureShape
-from astra_data.learning.networks.paired_windows import RISK_STEPS, before_failures
 from astra_data.worlds.task import Task
 
 AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))

@@ -6,11 +6,11 @@ from typing import cast
 from astra_data.core.checkpoint import loaded, save_tensors, understood
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.alignment import TargetEncoder
+from astra_data.grounding.networks.grounding import GroundingModel
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.protocols import FittedGrounding, Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.learning.networks.alignment import TargetEncoder
-from astra_data.learning.networks.grounding import GroundingModel
 from astra_data.worlds.own_saving import parts_of, restored
 
 KINDS: dict[str, type[FittedGrounding]] = {HistoryGrounding.kind: HistoryGrounding}

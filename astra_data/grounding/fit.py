@@ -15,19 +15,19 @@ from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.clearance import recorded_clearance_m
+from astra_data.grounding.descent import Descent, DescentConfig, WindowedConfig
 from astra_data.grounding.diagnostics import telemetry
 from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import FittedGrounding
-from astra_data.grounding.scatter import fit_scatter
-from astra_data.learning.descent import Descent, DescentConfig, WindowedConfig
-from astra_data.learning.networks.grounding import (
+from astra_data.grounding.networks.grounding import (
     GroundingModel,
     GroundingShape,
     LossWeights,
     recorded_rewards,
 )
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.scatter import fit_scatter
 from astra_data.worlds.task import Task
 
 _MEASURED_EVERY = 100

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
+from astra_data.grounding.networks.failure import FailureModel
+from astra_data.grounding.networks.grounding import GroundingModel
+from astra_data.grounding.networks.scatter import ScatterModel
 from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.learning.networks.failure import FailureModel
-from astra_data.learning.networks.grounding import GroundingModel
-from astra_data.learning.networks.scatter import ScatterModel
 from astra_data.worlds.protocols import PlacedSimulator, keep_clear
 
 

@@ -10,11 +10,11 @@ from torch.nn import functional
 
 from astra_data.core.checkpoint import as_part, loaded, part_of
 from astra_data.grounding.grounded_simulator import GroundedSimulator
+from astra_data.grounding.networks.failure import FailureModel, FailureShape
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.networks.paired_windows import PairedWindows
+from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
 from astra_data.grounding.protocols import FittedGrounding
-from astra_data.learning.networks.failure import FailureModel, FailureShape
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.learning.networks.paired_windows import PairedWindows
-from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
 from astra_data.worlds.protocols import PlacedSimulator
 
 _FAILURES, _SCATTER = "failures", "scatter"

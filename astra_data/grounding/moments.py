@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from astra_data.grounding.networks.paired_windows import PairedWindows
 from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.learning.networks.paired_windows import PairedWindows
 
 
 @dataclass(frozen=True)

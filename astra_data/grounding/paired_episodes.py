@@ -29,8 +29,8 @@ from astra_data.dataset.endings import stands_still
 from astra_data.dataset.lineage import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
-from astra_data.learning.networks.paired_windows import RISK_STEPS, PairedWindows, before_failures
-from astra_data.learning.recorded import draw_steps
+from astra_data.grounding.networks.paired_windows import RISK_STEPS, PairedWindows, before_failures
+from astra_data.grounding.recorded import draw_steps
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.task import Task
 

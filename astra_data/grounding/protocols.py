@@ -5,9 +5,9 @@ from typing import Any, ClassVar, Protocol, Self
 
 from torch import Tensor
 
+from astra_data.grounding.networks.history import LatentEncoder
+from astra_data.grounding.networks.paired_windows import PairedWindows
 from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
-from astra_data.learning.networks.history import LatentEncoder
-from astra_data.learning.networks.paired_windows import PairedWindows
 from astra_data.worlds.protocols import PlacedSimulator
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation

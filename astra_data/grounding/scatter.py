@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from astra_data.core.seeding import derive
+from astra_data.grounding.descent import Descent, DescentConfig
+from astra_data.grounding.networks.grounding import GroundingModel
+from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.descent import Descent, DescentConfig
-from astra_data.learning.networks.grounding import GroundingModel
-from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
 
 _DESCENT = DescentConfig(updates=1000, learning_rate=1e-3)
 _BATCH = 2048

@@ -28,9 +28,9 @@ from astra_data.methods.method import Method, Table
 from astra_data.methods.nas import NAS
 from astra_data.methods.rma import RMA
 from astra_data.methods.target import FULL_OBS, TARGET
-from astra_data.training.own_learner import OwnLearner
-from astra_data.training.policy_file import add_policy_kind
-from astra_data.training.train import InSimulator
+from astra_data.policies.own_learner import OwnLearner
+from astra_data.policies.policy_file import add_policy_kind
+from astra_data.policies.train import InSimulator
 from astra_data.worlds.own_code import offered, own_object
 from astra_data.worlds.variation import Variation
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from astra_data.grounding.fit import HistoryFit
 from astra_data.methods.method import Method
-from astra_data.training.train import InSimulator
+from astra_data.policies.train import InSimulator
 
 ASTRA = Method(
     name="astra",

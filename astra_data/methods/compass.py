@@ -5,6 +5,6 @@ uniform ranges (Section V-A).
 """
 
 from astra_data.methods.method import Method
-from astra_data.training.train import InSimulator
+from astra_data.policies.train import InSimulator
 
 COMPASS = Method(name="compass", title="COMPASS", color="#B8A000", learn=InSimulator(ranges="wide"))

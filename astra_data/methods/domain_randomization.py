@@ -5,7 +5,7 @@ episode. The task has the ranges.
 """
 
 from astra_data.methods.method import Method
-from astra_data.training.train import InSimulator
+from astra_data.policies.train import InSimulator
 
 DOMAIN_RANDOMIZATION = Method(
     name="domain_randomization",

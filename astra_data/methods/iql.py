@@ -18,15 +18,15 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
+from astra_data.grounding.networks.history import PositionFeatures
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.iql import Experience, Iql, IqlConfig
-from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.learning.networks.history import PositionFeatures
-from astra_data.learning.networks.policy import Policy
 from astra_data.methods.method import Method, Table
-from astra_data.training.policy_file import PolicyFile
-from astra_data.training.simulator_env import policy_observation
-from astra_data.training.train import Training
+from astra_data.policies.iql import Experience, Iql, IqlConfig
+from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.networks.policy import Policy
+from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.simulator_env import policy_observation
+from astra_data.policies.train import Training
 from astra_data.worlds.task import Task
 
 _CHECKPOINT_EVERY = 500

@@ -14,12 +14,12 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import part
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import CLOCKS
-from astra_data.learning.networks.adaptation import AdaptiveShape, Teacher
-from astra_data.learning.ppo import Ppo
-from astra_data.learning.rma import Adaptation, RmaConfig
 from astra_data.methods.method import Method, Table
-from astra_data.training.policy_file import PolicyFile
-from astra_data.training.train import InSimulator, PpoTrainConfig, Training, optimize
+from astra_data.policies.networks.adaptation import AdaptiveShape, Teacher
+from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.ppo import Ppo
+from astra_data.policies.rma import Adaptation, RmaConfig
+from astra_data.policies.train import InSimulator, PpoTrainConfig, Training, optimize
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from astra_data.methods.method import Method, Table
-from astra_data.training.train_in_target import InTarget, TargetConfig
+from astra_data.policies.train_in_target import InTarget, TargetConfig
 
 TARGET = Method(
     name="target",

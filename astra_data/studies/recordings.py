@@ -19,9 +19,9 @@ from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED
 from astra_data.dataset.endings import is_terminated, stands_still
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.versions import Version, locate
-from astra_data.exchange.importing import import_dataset, log_suffixes
-from astra_data.exchange.mapping import read_mapping
-from astra_data.exchange.recording import find_sources, is_archive
+from astra_data.io.importing import import_dataset, log_suffixes
+from astra_data.io.mapping import read_mapping
+from astra_data.io.recording import find_sources, is_archive
 from astra_data.studies.body import Body, Reading
 
 

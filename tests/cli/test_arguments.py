@@ -9,10 +9,10 @@ from astra_data.cli.app import app
 from astra_data.cli.settings import settings_of
 from astra_data.core.config import Config
 from astra_data.core.naming import STAGE_NAMES
-from astra_data.stages.augment import AugmentConfig
-from astra_data.stages.collect import CollectConfig
-from astra_data.stages.pair import PairConfig
-from astra_data.stages.registry import STAGES
+from astra_data.pipeline.stages.augment import AugmentConfig
+from astra_data.pipeline.stages.collect import CollectConfig
+from astra_data.pipeline.stages.pair import PairConfig
+from astra_data.pipeline.stages.registry import STAGES
 
 
 @pytest.mark.parametrize(
@@ -36,6 +36,6 @@ def test_the_stages_that_help_lists_are_those_of_the_pipeline() -> None:
 
 
 def test_settings_are_read_without_their_stages() -> None:
-    code = "import sys, astra_data.cli.app; print('astra_data.stages.collect' in sys.modules)"
+    code = "import sys, astra_data.cli.app; print('astra_data.pipeline.stages.collect' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"

@@ -6,7 +6,7 @@ from fake_dataset import write_fake
 
 from astra_data.core.errors import AstraDataError
 from astra_data.dataset.versions import open_dataset
-from astra_data.stages.augment import AugmentConfig
+from astra_data.pipeline.stages.augment import AugmentConfig
 
 pytestmark = pytest.mark.usefixtures("home")
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from astra_data.cli import app as cli
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
-from astra_data.exchange.importing import FORMATS
+from astra_data.io.importing import FORMATS
 
 
 def test_options_override_the_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,7 @@ def test_a_command_passes_its_options_to_its_stage(
         asked.append((*arguments, options))
         return tmp_path / "made"
 
-    monkeypatch.setattr("astra_data.experiments.run.run_stage", run_stage)
+    monkeypatch.setattr("astra_data.pipeline.run.run_stage", run_stage)
     words = {
         "methods": (["--method", "nas", "--method", "astra"], ["nas", "astra"]),
         "seeds": (["--seed", "4", "--seed", "7"], [4, 7]),
@@ -108,7 +108,7 @@ def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch)
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("astra_data.experiments.run.execute", interrupted)
+    monkeypatch.setattr("astra_data.pipeline.run.execute", interrupted)
     result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
     assert result.exit_code == 130
     assert "run the same command again" in result.output

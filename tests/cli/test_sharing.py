@@ -13,7 +13,7 @@ from astra_data.dataset.edit import subset
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dataset:
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("astra_data.exchange.sharing.card.png", lambda figure: b"\x89PNG")
+    monkeypatch.setattr("astra_data.io.hub.card.png", lambda figure: b"\x89PNG")
     monkeypatch.chdir(tmp_path)
     return write_fake(tmp_path / "fake")
 

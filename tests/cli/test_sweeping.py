@@ -27,7 +27,7 @@ def asked_of(recipe: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> di
         (folder / "sweep.csv").touch()
         return folder
 
-    monkeypatch.setattr("astra_data.experiments.sweep.sweep", sweep)
+    monkeypatch.setattr("astra_data.pipeline.sweep.sweep", sweep)
     result = CliRunner().invoke(cli.app, ["sweep", str(recipe), *options])
     folder = recipe.parent / "r"
     assert result.output == f"finished: {folder}\n{folder / 'sweep.csv'}\n"

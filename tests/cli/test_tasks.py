@@ -11,7 +11,8 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.worlds import own_code, registry
+from astra_data.robots import registry
+from astra_data.worlds import own_code
 
 CART = Path(__file__).parents[1] / "small_cart.py"
 

@@ -15,8 +15,8 @@ from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode, Scalar
 from astra_data.dataset.edit import filter_episodes
 from astra_data.dataset.inspection import BINS, CELLS, Inspection, Map, inspect_dataset, visited
-from astra_data.exchange.sharing.card import render_card
-from astra_data.exchange.sharing.notes import Notes
+from astra_data.io.hub.card import render_card
+from astra_data.io.hub.notes import Notes
 
 
 @pytest.fixture(scope="module")

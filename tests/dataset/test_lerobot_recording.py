@@ -38,9 +38,9 @@ from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.edit import filter_episodes, merge, subset
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.lerobot_rows import RECORDED_TASK
-from astra_data.exchange.exporters import EXPORTERS, export
-from astra_data.exchange.importing import import_dataset
-from astra_data.exchange.sharing.push import push
+from astra_data.io.exporters import EXPORTERS, export
+from astra_data.io.hub.push import push
+from astra_data.io.importing import import_dataset
 
 KEPT = (0, 2, 3)
 """Episodes of `arm` with a next state."""
@@ -260,8 +260,8 @@ def test_what_is_whole_of_it_is_paired_and_merged(recorded: Path, tmp_path: Path
 def test_it_is_grounded(recorded: Path, tmp_path: Path) -> None:
     from small_run import GROUND  # noqa: PLC0415 - torch
 
-    from astra_data.stages.ground import ground  # noqa: PLC0415
-    from astra_data.stages.pair import pair  # noqa: PLC0415
+    from astra_data.pipeline.stages.ground import ground  # noqa: PLC0415
+    from astra_data.pipeline.stages.pair import pair  # noqa: PLC0415
 
     pairs = pair("antmaze-umaze", dataset=recorded / "ant", out=tmp_path / "pairs")
     few = GROUND.model_copy(update={"updates": 2})
@@ -272,7 +272,7 @@ def test_it_is_grounded(recorded: Path, tmp_path: Path) -> None:
 
 
 def test_augmenting_needs_roles_and_says_so(recorded: Path, tmp_path: Path) -> None:
-    from astra_data.stages.augment import augment  # noqa: PLC0415 - torch
+    from astra_data.pipeline.stages.augment import augment  # noqa: PLC0415 - torch
 
     with pytest.raises(BadInputError, match=r"no column next\.reward.*it has no roles"):
         augment("antmaze-umaze", dataset=recorded / "ant", out=tmp_path / "more")

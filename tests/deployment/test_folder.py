@@ -20,21 +20,21 @@ from astra_data.dataset import Dataset
 from astra_data.deployment.folder import deploy, describe
 from astra_data.deployment.graph import load_onnx
 from astra_data.deployment.page import page
-from astra_data.experiments.recipe_file import recorded_settings
-from astra_data.experiments.selecting import select
-from astra_data.experiments.trained_policy import load_policy
-from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.learning.networks.alignment import TargetEncoder
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.learning.networks.policy import PolicyShape
-from astra_data.learning.networks.soft_actor import SoftActor
-from astra_data.stages.collect import CollectConfig, collect
-from astra_data.stages.ground import ground
-from astra_data.stages.pair import PairConfig, pair
-from astra_data.stages.train import train
-from astra_data.training.policy_file import PolicyFile
-from astra_data.training.running_policy import RunningPolicy
-from astra_data.worlds.registry import TASKS
+from astra_data.grounding.networks.alignment import TargetEncoder
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.pipeline.recipe_file import recorded_settings
+from astra_data.pipeline.selecting import select
+from astra_data.pipeline.stages.collect import CollectConfig, collect
+from astra_data.pipeline.stages.ground import ground
+from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.pipeline.stages.train import train
+from astra_data.pipeline.trained_policy import load_policy
+from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.networks.policy import PolicyShape
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.running_policy import RunningPolicy
+from astra_data.robots.registry import TASKS
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_what_is_no_policy_and_a_folder_that_exists_are_refused(run: Path, tmp_p
 
 def test_the_record_of_a_run_is_read_once(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read = Mock(wraps=recorded_settings)
-    monkeypatch.setattr("astra_data.experiments.trained_policy.recorded_settings", read)
+    monkeypatch.setattr("astra_data.pipeline.trained_policy.recorded_settings", read)
     deploy(run, "nas", tmp_path / "policy")
     read.assert_called_once_with(run)
 

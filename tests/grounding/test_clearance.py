@@ -12,10 +12,10 @@ from astra_data.grounding.clearance import recorded_clearance_m
 from astra_data.grounding.files import load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.learning.networks.scatter import ScatterModel, ScatterShape
-from astra_data.worlds.registry import TASKS
+from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 
 TASK = TASKS["antmaze-umaze"]

@@ -12,6 +12,7 @@ from toy_episodes import toy_episodes
 
 from astra_data.grounding import failures as module
 from astra_data.grounding.calibration import folds
+from astra_data.grounding.descent import DescentConfig
 from astra_data.grounding.failures import (
     averages_before,
     failing,
@@ -22,11 +23,10 @@ from astra_data.grounding.failures import (
     replayed_inputs,
 )
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.failure import FailureModel, FailureShape
+from astra_data.grounding.networks.paired_windows import RISK_STEPS
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.learning.descent import DescentConfig
-from astra_data.learning.networks.failure import FailureModel, FailureShape
-from astra_data.learning.networks.paired_windows import RISK_STEPS
-from astra_data.worlds.registry import TASKS
+from astra_data.robots.registry import TASKS
 
 HERE = torch.tensor([0.0, 4.0, 0.0, 0.0])
 GROUNDING = HistoryGrounding(model())

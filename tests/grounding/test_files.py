@@ -16,10 +16,10 @@ from astra_data.grounding.files import (
     save_target_encoder,
 )
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.learning.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.learning.networks.alignment import TargetEncoder
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.policy_file import PolicyFile
+from astra_data.grounding.networks.alignment import TargetEncoder
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.policy_file import PolicyFile
 
 
 def small() -> HistoryGrounding:

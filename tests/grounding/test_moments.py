@@ -5,7 +5,7 @@ from toy_episodes import toy_episodes
 
 from astra_data.grounding.moments import Moments
 from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.worlds.registry import TASKS
+from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 

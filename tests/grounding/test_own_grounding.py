@@ -14,7 +14,7 @@ from astra_data.grounding.files import KINDS
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.own_grounding import check_step, fitted, missing_parts
 from astra_data.grounding.protocols import FittedGrounding
-from astra_data.worlds.registry import task_named
+from astra_data.robots.registry import task_named
 
 SHIFTED = Shifted(torch.tensor([0.01]))
 

@@ -29,8 +29,8 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.edit import delete
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import Commands
-from astra_data.worlds.registry import TASKS
 
 LENGTHS = (7, 1, 12, 30, 5)
 ABSTRACT = (ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE)

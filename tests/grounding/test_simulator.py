@@ -1,9 +1,9 @@
 import torch
 
 from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
+from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 HERE = torch.tensor([[-4.0, 4.0, 0.0, 0.0]])

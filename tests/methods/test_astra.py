@@ -1,7 +1,7 @@
 from astra_data.grounding.fit import GroundConfig, HistoryFit
-from astra_data.learning.networks.grounding import LossWeights
+from astra_data.grounding.networks.grounding import LossWeights
 from astra_data.methods import METHODS
-from astra_data.training.train import InSimulator
+from astra_data.policies.train import InSimulator
 
 ROWS = {
     # λ1, λ2; whether it aligns; what pays; what its fit leaves out or adds

@@ -5,8 +5,8 @@ import pytest
 from astra_data.methods.compass import COMPASS
 from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
 from astra_data.methods.rma import RMA
-from astra_data.training.train import InSimulator
-from astra_data.worlds.registry import TASKS
+from astra_data.policies.train import InSimulator
+from astra_data.robots.registry import TASKS
 
 
 def test_the_ranges_are_those_printed_in_the_paper() -> None:

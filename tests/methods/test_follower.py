@@ -4,8 +4,8 @@ import torch
 
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.methods.follower import CarefulFollower, CarefulKicker, careful
-from astra_data.training.simulator_env import SimulatorEnv
-from astra_data.worlds.registry import TASKS
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.robots.registry import TASKS
 
 
 def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:

@@ -1,7 +1,7 @@
 from astra_data.core.config import Config
 from astra_data.methods.method import Method, Table
-from astra_data.training.train import InSimulator
-from astra_data.training.train_in_target import InTarget
+from astra_data.policies.train import InSimulator
+from astra_data.policies.train_in_target import InTarget
 
 PLAIN = Method(name="mine", title="Mine")
 

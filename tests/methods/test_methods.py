@@ -4,12 +4,12 @@ import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.fit import GroundConfig, HistoryFit
-from astra_data.learning.networks.grounding import LossWeights
+from astra_data.grounding.networks.grounding import LossWeights
 from astra_data.methods import METHODS, method_named, method_role, method_title, tables
+from astra_data.policies.train import InSimulator
+from astra_data.policies.train_in_target import InTarget
 from astra_data.reports.figures.catalog import method_color
 from astra_data.reports.figures.style import SPARE_COLORS
-from astra_data.training.train import InSimulator
-from astra_data.training.train_in_target import InTarget
 
 
 def test_methods_are_known_by_their_names() -> None:

@@ -14,15 +14,15 @@ import astra_data.methods as registry
 from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.progress import silent
-from astra_data.experiments.experiment import load_experiment
-from astra_data.experiments.own_methods import OwnMethod
-from astra_data.experiments.plan import plan
-from astra_data.experiments.trained_policy import load_policy
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.methods import METHODS, add_method, method_named
+from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.own_methods import OwnMethod
+from astra_data.pipeline.plan import plan
+from astra_data.pipeline.trained_policy import load_policy
+from astra_data.robots.registry import TASKS
 from astra_data.worlds.own_code import own_object
-from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ from toy_joints import FPS, NAMES, piece, write_log
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
-from astra_data.exchange.importing import import_dataset
+from astra_data.io.importing import import_dataset
 from astra_data.studies.errors import Starts
 from astra_data.studies.joints import ALL, Joints, JointsConfig
 from astra_data.studies.predictors import Response

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from astra_data.core.arrays import Floats
-from astra_data.worlds.ant.body import ant_model
+from astra_data.robots.ant.body import ant_model
 from astra_data.worlds.batched_mujoco import BatchedPhysics, wall_geoms
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE
 

@@ -157,4 +157,4 @@ def test_a_package_in_a_folder_of_packages_is_known_by_its_own_files(library: Pa
 
 
 def test_this_package_is_known_by_its_commit_alone() -> None:
-    assert code_digest("astra_data.worlds.registry:TASKS") is code_digest("not.here:TASK") is None
+    assert code_digest("astra_data.robots.registry:TASKS") is code_digest("not.here:TASK") is None

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.worlds.humanoid.objectives import JointWalking
+from astra_data.robots.humanoid.objectives import JointWalking
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.kicking import Kicking
 from astra_data.worlds.plane.mazes import FIELD, U_MAZE

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
+from astra_data.robots.registry import task_named
 from astra_data.worlds.own_code import explained, file_of, found_near, is_own_code, own_object
-from astra_data.worlds.registry import task_named
 from astra_data.worlds.task import Task
 
 CART = Path(__file__).parents[1] / "small_cart.py"

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from astra_data.robots.humanoid.walker2d import HumanoidWalker2d
+from astra_data.robots.registry import TASKS
 from astra_data.worlds import protocols
-from astra_data.worlds.humanoid.walker2d import HumanoidWalker2d
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.protocols import RememberingSimulator, Simulator, TaskSimulator
-from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 
 

@@ -12,11 +12,11 @@ from small_cart import GIVEN, LOGS_ALONE, TASK, Rail, Reach
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
 from astra_data.methods.follower import careful
-from astra_data.training.behaviors import WallWatch
+from astra_data.policies.behaviors import WallWatch
+from astra_data.robots.registry import TASKS
 from astra_data.worlds.driven import DrivenSimulator
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.states import VariedPlanar
-from astra_data.worlds.registry import TASKS
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import BallVariation, PlanarVariation
 

@@ -14,7 +14,7 @@ from on_meta import places
 from small_cart import TASK, Cart, Rail, Reach
 from torch import Tensor
 
-from astra_data.worlds.registry import TASKS, task_named
+from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.task import Task
 from astra_data.worlds.walk_through import check_task
 

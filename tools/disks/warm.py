@@ -25,14 +25,14 @@ import astra_data
 from astra_data.cli.app import main
 from astra_data.core.provenance import git_commit, package_versions
 
-LIGHT = ("cli", "dataset", "exchange")
+LIGHT = ("cli", "dataset", "io")
 """Rooms that commands on datasets need."""
 WITH_TORCH = (
     "dataset.frames",
     "dataset.samples",
     "dataset.step_windows",
-    "exchange.sharing.card",
-    "exchange.sharing.push",
+    "io.hub.card",
+    "io.hub.push",
 )
 """Modules of theirs that load torch: a process with torch takes several times as long to fork."""
 LIBRARIES = ("pandas", "fsspec.implementations.local")

@@ -11,9 +11,9 @@ from pages.markdown import plain, table
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from astra_data.experiments.recipe import Recipe
 from astra_data.methods import METHODS, tables
-from astra_data.stages.registry import STAGES
+from astra_data.pipeline.recipe import Recipe
+from astra_data.pipeline.stages.registry import STAGES
 
 _INTRODUCTION = """# Keys of recipes
 

@@ -18,17 +18,17 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from astra_data.core.config import load_recipe
-from astra_data.experiments.recipe import Recipe
 from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
 from astra_data.grounding.protocols import Grounding
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.learning import ppo
-from astra_data.learning.networks.grounding import GroundingModel, GroundingShape
-from astra_data.training.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
-from astra_data.training.simulator_env import SimulatorEnv
-from astra_data.training.stable_baselines import StableBaselinesEnv
-from astra_data.training.train import PpoTrainConfig
-from astra_data.worlds.registry import TASKS
+from astra_data.pipeline.recipe import Recipe
+from astra_data.policies import ppo
+from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.stable_baselines import StableBaselinesEnv
+from astra_data.policies.train import PpoTrainConfig
+from astra_data.robots.registry import TASKS
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "antmaze_long.toml"
 SINGLE_WORLDS = 16

@@ -13,10 +13,10 @@ import typer
 from stable_baselines3 import SAC
 
 from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.training.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
-from astra_data.training.simulator_env import SimulatorEnv
-from astra_data.training.stable_baselines import StableBaselinesEnv
-from astra_data.worlds.registry import TASKS
+from astra_data.policies.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.stable_baselines import StableBaselinesEnv
+from astra_data.robots.registry import TASKS
 
 
 def main(count: int, updates: int, steps: int) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from astra_data.methods.method import Method
-from astra_data.training.own_learner import OwnLearner
+from astra_data.policies.own_learner import OwnLearner
 
 REACH_M = 0.045  # from the gripper's axis to the puck's
 

@@ -7,8 +7,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from astra_data.methods.method import Method
 from astra_data.methods.nas import NAS
-from astra_data.training.own_learner import OwnLearner
-from astra_data.training.stable_baselines import StableBaselinesEnv
+from astra_data.policies.own_learner import OwnLearner
+from astra_data.policies.stable_baselines import StableBaselinesEnv
 
 
 class Sb3Policy:

@@ -12,7 +12,7 @@ import pytest
 
 from astra_data import Dataset
 from astra_data.core.errors import BadInputError
-from astra_data.experiments.trained_policy import load_policy, task_of
+from astra_data.pipeline.trained_policy import load_policy, task_of
 
 FIRST_SEED = 7
 
@@ -119,7 +119,7 @@ def test_a_push_to_the_goal_is_a_success_and_one_that_tips_is_none(environment: 
 
 
 def test_pictures_are_those_of_the_task(environment: Any) -> None:  # noqa: ANN401
-    from astra_data.worlds.registry import task_named  # noqa: PLC0415
+    from astra_data.robots.registry import task_named  # noqa: PLC0415
 
     robot = environment.TargetRobot(task_named("humanoid-walker2d"))
     robot.reset(seed=0)

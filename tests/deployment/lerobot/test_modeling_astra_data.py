@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.experiments.trained_policy import load_policy
+from astra_data.pipeline.trained_policy import load_policy
 
 
 @pytest.fixture(scope="module")

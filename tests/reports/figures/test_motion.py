@@ -16,8 +16,8 @@ from astra_data.reports.figures.motion import dynamics_mismatch, strips, traject
 from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import DEPLOYED, SIMULATED
 from astra_data.reports.results import TESTED, Line, Results
+from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.registry import TASKS
 
 
 def results(*rows: str, **changes: object) -> Results:

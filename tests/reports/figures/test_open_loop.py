@@ -6,7 +6,7 @@ from figures_shown import legend
 from astra_data.reports.figures.open_loop import open_loop_error
 from astra_data.reports.figures.scene import Scene
 from astra_data.reports.results import Errors, Results
-from astra_data.worlds.registry import TASKS
+from astra_data.robots.registry import TASKS
 
 SCENE = Scene(Path(), TASKS["antmaze-umaze"])
 

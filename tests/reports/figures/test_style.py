@@ -13,7 +13,7 @@ from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import score_bars
 from astra_data.reports.figures.style import method_color, method_title, png, style
 from astra_data.reports.results import TESTED, Line, Results
-from astra_data.worlds.registry import TASKS
+from astra_data.robots.registry import TASKS
 
 ROWS = ("direct_transfer", "nas", "astra", "direct_transfer_plus", "nas_plus", "astra_plus", "follower")
 

@@ -7,7 +7,7 @@ from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import method_color, png
 from astra_data.reports.figures.validity import predictive_validity
 from astra_data.reports.results import TESTED, Line, Results
-from astra_data.worlds.registry import TASKS
+from astra_data.robots.registry import TASKS
 
 SCENE = Scene(Path(), TASKS["antmaze-umaze"])
 

@@ -16,8 +16,8 @@ from astra_data.dataset.columns import (
     Array,
     Episode,
 )
+from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.relocation import Relocation, outcomes, positions
-from astra_data.worlds.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
 KICKING = TASKS["nao-kick"]

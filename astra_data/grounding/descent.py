@@ -1,0 +1,153 @@
+"""Fit a model by gradient descent, with a decaying learning rate; an interrupted fit is resumed."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.config import AtOnce, Config, Count, Positive
+from astra_data.core.logbook import Logbook
+from astra_data.grounding.divergence import refuse_divergence
+
+
+class DescentConfig(Config):
+    """How a model is fitted by gradient descent."""
+
+    updates: Count
+    """Maximum number of gradient updates; fewer where the held-out error no longer falls."""
+    learning_rate: Positive
+    """Learning rate at the start; decays to zero along a half cosine."""
+
+
+class WindowedConfig(Config):
+    """How a model is fitted to windows of recorded steps. The paper gives none of these settings."""
+
+    updates: Count | None = None
+    """Maximum number of gradient updates; fewer where the held-out error no longer falls. By default as many
+    as see each recorded step 32 times, but 600 to 1200."""
+    learning_rate: Positive = 3e-3
+    """Learning rate at the start; decays to zero along a half cosine."""
+    batch_windows: AtOnce = 48
+    """Windows per update."""
+    window: AtOnce = 50
+    """Steps per window, in backpropagation through time; at most the longest episode."""
+
+    def descent(self, steps: int) -> DescentConfig:
+        """Return the settings of a fit to so many recorded `steps`."""
+        passes = round(_PASSES * steps / (self.batch_windows * self.window))
+        updates = self.updates or min(max(passes, _UPDATES[0]), _UPDATES[1])
+        return DescentConfig(updates=updates, learning_rate=self.learning_rate)
+
+
+_PASSES, _UPDATES = 32, (600, 1200)
+_GRADIENT_NORM = 1.0
+"""Gradients are clipped to this norm."""
+_PATIENCE_SHARE = 0.3
+"""A fit ends once its held-out error has not fallen for this share of the updates."""
+
+
+class Descent:
+    """A fit in progress, with AdamW.
+
+    Attributes:
+        parameters: the fitted ones.
+        done: updates so far. best: the update with the least held-out error; None without one.
+        points: measurements during the fit.
+        stopwatch: measures from the start, including the time before an interruption.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        config: DescentConfig,
+        *,
+        checkpoint: Path | None = None,
+        weight_decay: float = 0.0,
+    ) -> None:
+        """Start, or resume from `checkpoint` if it exists.
+
+        Args:
+            model: its parameters that require gradients are fitted.
+            config: settings.
+            checkpoint: the file that `keep` writes; None for none.
+            weight_decay: of AdamW.
+
+        Raises:
+            BadInputError: the checkpoint is of another model, or from an older version.
+        """
+        self.done = 0
+        self.best: int | None = None
+        self._least, self._weights = float("inf"), dict[str, Tensor]()
+        self._model, self._config = model, config
+        self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+        self._optimizer = torch.optim.AdamW(self.parameters, config.learning_rate, weight_decay=weight_decay)
+        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimizer, config.updates)
+        self._logbook = Logbook(checkpoint, self._go_on)
+        self.points, self.stopwatch = self._logbook.points, self._logbook.stopwatch
+
+    def _go_on(self, state: dict[str, Any]) -> None:
+        self._model.load_state_dict(state["model"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._schedule.load_state_dict(state["schedule"])
+        self.done, self.best, self._least = state["done"], state["best"], state["least"]
+        self._weights = state["weights"]
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all updates are done, or the held-out error no longer falls."""
+        # Of a short fit, patience ends before the next measurement.
+        is_later = self.best is not None and self.points[-1]["step"] > self.best
+        waited = self.done - (self.best or 0) if is_later else 0
+        return self.done >= self._config.updates or waited > _PATIENCE_SHARE * self._config.updates
+
+    @property
+    def share(self) -> float:
+        """Share of the updates that are done."""
+        return self.done / self._config.updates
+
+    def update(self, loss: Tensor) -> None:
+        """Take one step down the gradient of `loss`.
+
+        Raises:
+            BadInputError: the fit diverged.
+        """
+        self._optimizer.zero_grad()
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, _GRADIENT_NORM)
+        refuse_divergence(f"in update {self.done + 1}", {"gradient": float(norm)})
+        self._optimizer.step()
+        self._schedule.step()
+        self.done += 1
+
+    def keep(self, held_out_error: float | None = None, **measured: float | None) -> None:
+        """Add the figures `measured` now to the points, and write the checkpoint.
+
+        The weights are remembered if their `held_out_error` is the least so far; `finish` returns to them.
+
+        Raises:
+            BadInputError: the fit diverged.
+        """
+        error = {} if held_out_error is None else {"held_out_error": held_out_error}
+        refuse_divergence(f"by update {self.done}", error | measured)
+        self.points.append({"step": self.done, **error, **measured})
+        if held_out_error is not None and held_out_error < self._least:
+            self._least, self.best = held_out_error, self.done
+            self._weights = copy.deepcopy(self._model.state_dict())
+        self._logbook.keep(
+            {
+                "model": self._model.state_dict(),
+                "optimizer": self._optimizer.state_dict(),
+                "schedule": self._schedule.state_dict(),
+                "done": self.done,
+                "best": self.best,
+                "least": self._least,
+                "weights": self._weights,
+            }
+        )
+
+    def finish(self) -> None:
+        """Return to the weights with the least held-out error, if it was measured."""
+        if self._weights:
+            self._model.load_state_dict(self._weights)

@@ -1,0 +1,111 @@
+"""The target encoder ψ^t and the discrepancy that aligns it with the source encoder (paper, Section IV-B)."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.numbers import normalized
+from astra_data.grounding.networks.history import HistoryEncoder, PositionFeatures
+from astra_data.grounding.networks.scales import add_scales, take_scales
+
+LEAST_LATENT_R2 = 0.9
+"""Of a target encoder on held-out episodes, to be deployed in place of the source encoder."""
+
+
+class TargetEncoder(nn.Module):
+    """ψ^t: encode histories of full target states into the source encoder's latent space.
+
+    The first two entries of a target state are its planar position in m, which gets the `PositionFeatures`
+    of the source encoder: without them, ψ^t cannot match how ψ^s represents walls. With 0 octaves there are
+    none.
+
+    Attributes:
+        sizes: the arguments that it was made with.
+        latent_r2: share of the variance of ψ^s's latents that it explains on held-out episodes.
+    """
+
+    def __init__(
+        self,
+        state_size: int,
+        goal_size: int,
+        action_size: int,
+        *,
+        embedding_size: int,
+        latent_size: int,
+        position_octaves: int = 4,
+    ) -> None:
+        super().__init__()
+        self.sizes = {
+            "state_size": state_size,
+            "goal_size": goal_size,
+            "action_size": action_size,
+            "embedding_size": embedding_size,
+            "latent_size": latent_size,
+            "position_octaves": position_octaves,
+        }
+        self.position_features = PositionFeatures(position_octaves)
+        self.encoder = HistoryEncoder(
+            state_size + self.position_features.size + goal_size + action_size,
+            embedding_size=embedding_size,
+            latent_size=latent_size,
+        )
+        add_scales(self, {"state": state_size, "goal": goal_size})
+        self.register_buffer("latent_r2", torch.zeros(()))
+        self.latent_r2: Tensor
+        self.state_mean: Tensor
+        self.state_std: Tensor
+        self.goal_mean: Tensor
+        self.goal_std: Tensor
+
+    @property
+    def is_deployed(self) -> bool:
+        """Whether robots run with ψ^t by default; where it is coarse, they run with ψ^s on φ(s)."""
+        return bool(self.latent_r2 >= LEAST_LATENT_R2)
+
+    def set_scales(self, state: Tensor, goal: Tensor, unseen: Sequence[int] = ()) -> None:
+        """Take means and standard deviations from training steps: `state` (N, S), `goal` (N, G).
+
+        The entries `unseen` of states are given an infinite deviation, so that they are always 0 as inputs.
+        """
+        take_scales(self, {"state": state, "goal": goal})
+        self.state_std[list(unseen)] = torch.inf
+
+    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
+        """Assemble [s_i, features of its position, goal, a_{i-1}] (..., I)."""
+        normal_state = normalized(state, self.state_mean, self.state_std)
+        waves = self.position_features(state[..., :2])
+        normal_goal = normalized(goal, self.goal_mean, self.goal_std)
+        return torch.cat([normal_state, waves, normal_goal, previous_action], dim=-1)
+
+
+def gaussian_mmd(
+    mean_1: Tensor, variance_1: Tensor, mean_2: Tensor, variance_2: Tensor, bandwidths: Tensor
+) -> Tensor:
+    """Return the squared MMD between two diagonal Gaussians in closed form.
+
+    With the kernel k(x, y) = exp(-|x - y|² / 2h²), the mean of k over N(m1, v1) and N(m2, v2) is
+    Π_d sqrt(h² / (h² + v1 + v2)) exp(-(m1 - m2)² / 2(h² + v1 + v2)).
+
+    Args:
+        mean_1: m1, (..., Z).
+        variance_1: v1, (..., Z).
+        mean_2: m2, (..., Z).
+        variance_2: v2, (..., Z).
+        bandwidths: h, (K,); the kernels are averaged. h near sqrt(Z) keeps the gradient alive.
+
+    Returns:
+        MMD² of each pair, (...).
+    """
+
+    def mean_kernel(m1: Tensor, v1: Tensor, m2: Tensor, v2: Tensor) -> Tensor:
+        squared = bandwidths.square().unsqueeze(-1)
+        spread = squared + (v1 + v2).unsqueeze(-2)
+        exponent = 0.5 * ((squared / spread).log() - (m1 - m2).unsqueeze(-2).square() / spread)
+        return exponent.sum(-1).exp().mean(-1)
+
+    return (
+        mean_kernel(mean_1, variance_1, mean_1, variance_1)
+        + mean_kernel(mean_2, variance_2, mean_2, variance_2)
+        - 2.0 * mean_kernel(mean_1, variance_1, mean_2, variance_2)
+    )

@@ -1,0 +1,254 @@
+"""ASTRA's grounding model: history encoder, latent dynamics, reward, correction; and their joint loss.
+
+Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: only the correction is fitted.
+"""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.numbers import normalized
+from astra_data.grounding.networks.history import HistoryEncoder, PositionFeatures, mlp
+from astra_data.grounding.networks.paired_windows import PairedWindows
+from astra_data.grounding.networks.scales import add_scales, take_scales
+
+_BALL_M = 0.1
+"""Unit of the ball's position relative to the robot: less than this decides whether they touch."""
+_EMA_RATE = 0.01
+"""By how much the target encoder follows the encoder in each update."""
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """λ1, λ2, λ3 of the paper's total loss."""
+
+    latent: float = 0.1
+    reward: float = 1.0
+    state: float = 1.0
+
+
+@dataclass(frozen=True)
+class GroundingShape:
+    """Sizes of the networks; the paper prints none.
+
+    Attributes:
+        state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
+        position_octaves: of `PositionFeatures`; 0 for none, as in states without a position.
+        ball_index: index in the state where the position of a ball begins; None where there is no ball.
+        corrects_reward: R_pred predicts the residual reward, the target's less the task's own, beside the
+            target's.
+    """
+
+    state_size: int
+    action_size: int
+    goal_size: int
+    latent_size: int = 64
+    embedding_size: int = 64
+    head_sizes: tuple[int, ...] = (128, 128)
+    position_octaves: int = 4
+    ball_index: int | None = None
+    corrects_reward: bool = True
+    log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
+
+
+class GroundingModel(nn.Module):
+    """ψ^s, P_lat, R_pred and f_abs on one GRU backbone.
+
+    Scales are buffers, so checkpoints hold them; `set_scales` and `set_reward_scales` take them from the
+    training episodes.
+    """
+
+    def __init__(self, shape: GroundingShape) -> None:
+        super().__init__()
+        self.shape = shape
+        states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
+        self.position_features = PositionFeatures(shape.position_octaves)
+        features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
+        self.encoder = HistoryEncoder(
+            features + shape.goal_size + actions, embedding_size=shape.embedding_size, latent_size=latent
+        )
+        heads = shape.head_sizes
+        self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
+        self.reward_head = mlp((latent + actions, *heads, 2 if shape.corrects_reward else 1))
+        self.correction = mlp((latent + actions + features, *heads, states))
+        # An untrained correction is the identity: the raw simulator.
+        for parameter in list(self.correction.parameters())[-2:]:
+            nn.init.zeros_(parameter)
+        self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
+        add_scales(self, {"state": states, "goal": shape.goal_size, "correction": states})
+        self.register_buffer("reward_mean", torch.zeros(2 if shape.corrects_reward else 1))
+        self.register_buffer("reward_std", torch.ones(2 if shape.corrects_reward else 1))
+        self.register_buffer("reward_shrinkage", torch.ones(()))
+        self.register_buffer("failure_cost", torch.zeros(()))
+        self.state_mean: Tensor
+        self.state_std: Tensor
+        self.goal_mean: Tensor
+        self.goal_std: Tensor
+        self.correction_std: Tensor
+        self.reward_mean: Tensor
+        self.reward_std: Tensor
+        self.reward_shrinkage: Tensor
+        self.failure_cost: Tensor
+
+    def set_scales(self, columns: Mapping[str, Tensor]) -> None:
+        """Take means and deviations from training steps: state, goal, correction (N, ...)."""
+        take_scales(self, columns)
+
+    @torch.no_grad()
+    def set_reward_scales(self, reward: Tensor, known: Tensor, failed: Tensor) -> None:
+        """Take the scales of rewards (N, R) from training steps; `known` and `failed` are (N,), 0 or 1.
+
+        R is 2, the reward and the residual reward, or 1 without the latter. Means and deviations are those of
+        steps whose reward R_pred learns (`known`). A failure costs the mean of the last reward of steps that
+        `failed`, less its mean.
+        """
+        known, failed = known.bool(), failed.bool()
+        if known.any():
+            self.reward_mean.copy_(reward[known].mean(0))
+            self.reward_std.copy_(reward[known].std(0, correction=0).clamp_min(1e-3))
+        if failed.any():
+            cost = reward[failed, -1].mean() - self.reward_mean[-1]
+            self.failure_cost.copy_(cost.clamp_max(0.0))
+
+    @torch.no_grad()
+    def shrink_reward(self, windows: PairedWindows) -> None:
+        """Shrink predicted residual rewards as far as they explain those of held-out `windows`.
+
+        The factor is the slope of the recorded on the predicted residuals, within 0 and 1: a prediction that
+        explains nothing pays nothing, and a policy cannot live on its errors.
+        """
+        latent, _ = self.encode(windows)
+        known = windows.goes_on.bool()
+        predicted = self.rewards(latent, windows.action)[known][:, -1]
+        recorded = recorded_rewards(windows)[known][:, -1]
+        power = predicted.square().sum()
+        slope = (predicted * recorded).sum() / power if power > 0 else torch.zeros_like(power)
+        self.reward_shrinkage.copy_(slope.clamp(0.0, 1.0))
+
+    def state_features(self, state: Tensor) -> Tensor:
+        """Normalize abstract states (..., X) and append features of the robot's and the ball's position."""
+        position, index = state[..., :2], self.shape.ball_index
+        features = [normalized(state, self.state_mean, self.state_std), self.position_features(position)]
+        if index is not None:
+            apart = state[..., index : index + 2] - position
+            near = torch.cat([apart, apart.norm(dim=-1, keepdim=True)], dim=-1)
+            features.append(normalized(near, 0.0, _BALL_M))
+        return torch.cat(features, dim=-1)
+
+    def normal_goal(self, goal: Tensor) -> Tensor:
+        """Normalize goals (..., G)."""
+        return normalized(goal, self.goal_mean, self.goal_std)
+
+    def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
+        """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
+        return torch.cat([self.state_features(state), self.normal_goal(goal), previous_action], dim=-1)
+
+    def encode(self, windows: PairedWindows) -> tuple[Tensor, Tensor]:
+        """Return the latents (B, T, Z) and hidden states (B, T, H) of histories that begin with `windows`."""
+        latent, hidden = self.encoder(
+            self.encoder_input(windows.state, windows.goal, windows.previous_action)
+        )
+        return latent, hidden
+
+    def predict_latent(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """P_lat: return mean and log-variance (..., Z) of the next latent."""
+        mean, raw = self.latent_dynamics(torch.cat([latent, action], dim=-1)).chunk(2, dim=-1)
+        low, high = self.shape.log_variance_bounds
+        return mean, low + (high - low) * torch.sigmoid(raw)
+
+    def target_reward(
+        self, latent: Tensor, action: Tensor, own: Tensor, hazard: Tensor | None = None
+    ) -> Tensor:
+        """Return the target's reward (...) of a step, given the task's `own` (...) on abstract states.
+
+        A `hazard` (...), the probability that the step fails by a failure model, adds what failures cost.
+        """
+        predicted = self.predict_reward(latent, action)
+        if self.shape.corrects_reward:
+            predicted = predicted + own
+        return predicted if hazard is None else predicted + hazard * self.failure_cost
+
+    def predict_reward(self, latent: Tensor, action: Tensor) -> Tensor:
+        """R_pred: return the target's reward (...), or the residual reward if it predicts that."""
+        return self.rewards(latent, action)[..., -1] * self.reward_shrinkage
+
+    def rewards(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Return the predicted rewards (..., R), see `set_reward_scales`."""
+        return self._normal_rewards(latent, action) * self.reward_std + self.reward_mean
+
+    def _normal_rewards(self, latent: Tensor, action: Tensor) -> Tensor:
+        return torch.as_tensor(self.reward_head(torch.cat([latent, action], dim=-1)))
+
+    def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """f_abs: return the corrected next abstract state (..., X)."""
+        correction: Tensor = self.correction(self.correction_inputs(latent, action, simulated_next))
+        return simulated_next + correction * self.correction_std
+
+    def correction_inputs(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
+        """Return what the correction sees of a step, (..., I)."""
+        return torch.cat([latent, action, self.state_features(simulated_next)], dim=-1)
+
+    def update_target(self) -> None:
+        """Move the target encoder toward the encoder."""
+        with torch.no_grad():
+            for slow, fast in zip(self.target_encoder.parameters(), self.encoder.parameters(), strict=True):
+                slow.lerp_(fast, _EMA_RATE)
+
+    def losses(self, windows: PairedWindows, weights: LossWeights) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the joint loss (paper, Section IV-A) and its parts, each a mean over real steps and dims."""
+        inputs = self.encoder_input(windows.state, windows.goal, windows.previous_action)
+        latent, _ = self.encoder(inputs)
+        action, mask = windows.action, windows.mask
+        parts: dict[str, Tensor] = {}
+        total = torch.zeros((), device=mask.device)
+        if weights.latent > 0:
+            following = self._following_latent(inputs)
+            mean, log_variance = self.predict_latent(latent[:, :-1], action[:, :-1])
+            nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
+            both = mask[:, :-1] * mask[:, 1:]
+            parts["latent"] = (nll * both).sum() / both.sum().clamp_min(1.0)
+            total = total + weights.latent * parts["latent"]
+        if weights.reward > 0:
+            parts["reward"] = self._reward_loss(latent, windows)
+            total = total + weights.reward * parts["reward"]
+        parts["state"] = self._correction_loss(latent, windows)
+        total = total + weights.state * parts["state"]
+        return total, parts
+
+    def _reward_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
+        """Return half the squared error of the reward, and of the residual reward, where R_pred learns them.
+
+        The reward itself shapes the latent (paper, L_rew); the residual is what policies are paid.
+        """
+        true = (recorded_rewards(windows) - self.reward_mean) / self.reward_std
+        error = (self._normal_rewards(latent, windows.action) - true).square().sum(-1)
+        return 0.5 * _masked_mean(error, windows.goes_on * windows.mask)
+
+    def _correction_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
+        corrected = self.correct(latent, windows.action, windows.simulated_next)
+        error = ((corrected - windows.next_state) / self.correction_std).square().mean(-1)
+        return _masked_mean(error, windows.mask)
+
+    def _following_latent(self, inputs: Tensor) -> Tensor:
+        """Return the latents (B, T - 1, Z) of the next steps, by a slow copy of the encoder.
+
+        With the encoder itself the loss is unbounded below: it can predict a constant latent exactly.
+        """
+        with torch.no_grad():
+            slow, _ = self.target_encoder(inputs)
+        return torch.as_tensor(slow[:, 1:])
+
+
+def recorded_rewards(windows: PairedWindows) -> Tensor:
+    """Return the recorded rewards (B, T, R), see `GroundingModel.set_reward_scales`."""
+    if windows.own_reward is None:
+        return windows.reward.unsqueeze(-1)
+    return torch.stack([windows.reward, windows.reward - windows.own_reward], dim=-1)
+
+
+def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean of the values where the mask is 1; 0 where it is nowhere, as in a small batch."""
+    return (values * mask).sum() / mask.sum().clamp_min(1.0)

@@ -1,0 +1,214 @@
+"""A dataset's card, in the format of the Hugging Face Hub."""
+
+import json
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
+from astra_data.core.wording import in_code, in_markdown
+from astra_data.dataset import Dataset
+from astra_data.dataset import format as layout
+from astra_data.dataset.columns import RESERVED, Column
+from astra_data.dataset.description import full_name
+from astra_data.dataset.inspection import visited
+from astra_data.io.hub.loading import loading
+from astra_data.io.hub.notes import Notes
+from astra_data.reports.figures.coverage import coverage
+from astra_data.reports.figures.style import png
+from astra_data.reports.formatting import table
+
+TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
+
+SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
+"""Upper bounds of the Hub's size categories in steps, from 1000 in factors of ten."""
+
+WIDE = 4
+"""Columns with more values than this have their names listed below the table."""
+
+CITATION = """\
+```bibtex
+@article{deng2026abstract,
+  title   = {Abstract Sim2Real through Approximate Information States},
+  author  = {Deng and Li and Hanna},
+  journal = {IEEE Robotics and Automation Letters},
+  year    = {2026},
+  doi     = {10.1109/LRA.2026.3688068}
+}
+```"""
+
+
+def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None = None) -> list[Path]:
+    """Write the card of `dataset` to `out` and, if the dataset has planar positions, their figure beside it.
+
+    Args:
+        dataset: any of which every value was verified, for the card states the hash of all of them.
+        out: the Markdown file, which is not replaced by another; the figure, `<stem>-coverage.png`, is.
+        notes: the part of the card that a person writes.
+        source: where it is shared, as `pull` takes it; if None, the card shows how to open a folder.
+
+    Returns:
+        the files written.
+
+    Raises:
+        BadInputError: `out` is there already, with other contents.
+        DiskError: `out` cannot be written.
+    """
+    positions = visited(dataset)
+    figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")
+    text = render_card(dataset, notes, source=source, figure=figure.name if figure else None)
+    if out.exists() and out.read_bytes() != text.encode():
+        raise BadInputError(f"{out} exists already and is not this card; delete it or choose another file.")
+    write_file(out, text)
+    if positions is None or figure is None:
+        return [out]
+    write_file(figure, png(coverage(positions.counts, positions.extent, "position", "m")))
+    return [out, figure]
+
+
+def render_card(
+    dataset: Dataset, notes: Notes, *, source: str | None = None, figure: str | None = None
+) -> str:
+    """Return the card of `dataset` as Markdown with the Hub's front matter; `figure` is a path beside it."""
+    from huggingface_hub import DatasetCardData  # noqa: PLC0415 - slow to import
+
+    description = dataset.description
+    data = DatasetCardData(
+        license=notes.license,
+        pretty_name=description["name"],
+        task_categories=["robotics"],
+        tags=list(TAGS),
+        size_categories=[_size_category(int(dataset.lengths.sum()))],
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
+    picture = f"![Steps per cell of the plane]({figure})" if figure else ""
+    sections = {
+        "Loading": loading(dataset, source),
+        "Behavior": notes.behavior,
+        "Intended use": notes.intended_use,
+        "Limits": notes.limits,
+        "Contents": _counts(dataset),
+        "Columns": _columns(dataset),
+        "Provenance": _folded(_provenance(description)),
+        "Citation": f"The method that these datasets are made for:\n\n{CITATION}",
+    }
+    front = [f"---\n{data.to_yaml()}\n---", f"# {description['name']}", notes.summary, _opening(dataset)]
+    parts = [*front, picture, *(f"## {title}\n\n{text.strip()}" for title, text in sections.items() if text)]
+    return "\n\n".join(part.strip() for part in parts if part) + "\n"
+
+
+def _folded(text: str) -> str:
+    summary = "How it was made, and the sum of its values"
+    return f"<details>\n<summary>{summary}</summary>\n\n{text}\n\n</details>"
+
+
+def _opening(dataset: Dataset) -> str:
+    stand_in = dataset.description["environment"].get("stand_in")
+    note = (
+        f" The robot is a simulated stand-in ({in_code(str(stand_in))}) for a physical one."
+        if stand_in
+        else ""
+    )
+    return (
+        f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
+        f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. "
+        f"Task: “{in_markdown(dataset.task)}”. The format is LeRobot {layout.CODEBASE_VERSION}.{note}"
+    )
+
+
+def _counts(dataset: Dataset) -> str:
+    lengths = dataset.lengths
+    quartiles = ", ".join(f"{length:g}" for length in np.percentile(lengths, [25, 50, 75]))
+    rows = [
+        ("episodes", f"{len(dataset):,}"),
+        ("steps", f"{int(lengths.sum()):,}"),
+        ("duration", f"{lengths.sum() / dataset.info['fps'] / 60:,.1f} min"),
+        ("episode length", f"{lengths.min()} to {lengths.max()} steps; quartiles {quartiles}"),
+    ]
+    metadata = dataset.metadata | {"success": dataset.successes() or []}
+    facts = {key: [value for value in values if value is not None] for key, values in metadata.items()}
+    for key, values in sorted(facts.items()):
+        if values and all(isinstance(value, bool) for value in values):
+            share = sum(map(bool, values)) / len(values)
+            rows.append(
+                (in_markdown(key), f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.1%})")
+            )
+        elif key == "return" and values:
+            returns = np.array(values, dtype=np.float64)
+            rows.append((key, f"mean {returns.mean():.2f}; {returns.min():.2f} to {returns.max():.2f}"))
+    return _table(("what", "value"), rows)
+
+
+def _columns(dataset: Dataset) -> str:
+    columns = [Column.from_feature(name, feature) for name, feature in dataset.features.items()]
+    rows = []
+    wide: dict[tuple[str, ...], list[str]] = {}
+    for column in columns:
+        if column.name not in RESERVED or column.meaning:
+            meaning, labels = in_markdown(column.meaning), tuple(map(in_markdown, column.names or ()))
+            if labels and column.size > WIDE:
+                wide.setdefault(labels, []).append(column.name)
+            elif labels:
+                meaning = f"{meaning}: {', '.join(labels)}".removeprefix(": ")
+            shape = f"({column.size},)"
+            rows.append((in_code(column.name), column.dtype, shape, _units(column), meaning))
+    plain = [f"`{column.name}`" for column in columns if column.name in RESERVED and not column.meaning]
+    order = [f"In {_joined(same)}, in order: {', '.join(names)}." for names, same in wide.items()]
+    return "\n\n".join(
+        [
+            _table(("column", "type", "shape", "units", "meaning"), rows),
+            *order,
+            f"LeRobot's own columns are {', '.join(plain)}. Frames, and what turns or shifts with the world, "
+            f"stand in `{layout.INFO_PATH}` under `astra`.",
+        ]
+    )
+
+
+def _joined(names: list[str]) -> str:
+    return " and ".join(map(in_code, names))
+
+
+def _units(column: Column) -> str:
+    units = (column.astra or {}).get("unit", [])
+    runs = [(unit, len(list(run))) for unit, run in groupby(units)]
+    counted = ((in_markdown(unit), count) for unit, count in runs)
+    return ", ".join(unit if count == 1 else f"{unit} ({count})" for unit, count in counted)
+
+
+def _provenance(description: dict[str, Any]) -> str:
+    parents = [f"{full_name(parent)} ({in_code(parent['hash'])})" for parent in description["parents"]]
+    packages = [f"{name} {version}" for name, version in description["packages"].items()]
+    rows = [
+        ("version", description["version"]),
+        ("made by stage", in_markdown(description["stage"])),
+        ("from", "; ".join(parents) or "nothing earlier"),
+        ("config", _json(description["config"])),
+        ("seeds", _json(description["seeds"])),
+        ("environment", _json(description["environment"])),
+        ("simulator", _json(description["simulator"])),
+        ("packages", in_markdown(", ".join(packages))),
+        ("commit", in_code(description["git_commit"]) if description["git_commit"] else "not recorded"),
+        ("content hash (sha256)", f"`{description['content_hash']}`"),
+    ]
+    return _table(("what", "value"), rows)
+
+
+def _json(content: dict[str, Any]) -> str:
+    return in_code(json.dumps(content, ensure_ascii=False)) if content else "none"
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    cells = ([" ".join(cell.split()).replace("|", "\\|") for cell in row] for row in rows)
+    return table(head, cells, words=len(head))
+
+
+def _size_category(steps: int) -> str:
+    powers = [(1000 * 10**power, name) for power, name in enumerate(SIZES)]
+    above = next((number for number, (limit, _) in enumerate(powers) if steps < limit), len(powers))
+    if above == 0:
+        return f"n<{SIZES[0]}"
+    return f"n>{SIZES[-1]}" if above == len(SIZES) else f"{SIZES[above - 1]}<n<{SIZES[above]}"

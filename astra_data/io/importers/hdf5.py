@@ -1,0 +1,226 @@
+"""HDF5: one dataset per field; the layouts of D4RL, robomimic and d3rlpy are known. Read block by block."""
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED, Array
+from astra_data.io.hdf5_file import check_storage, stored_datasets, unpacked_bytes
+from astra_data.io.layouts import D3RLPY, D4RL, NUMBERED, RECORD, ROBOMIMIC
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.recording import BLOCK_ROWS, Block, Source, natural, row_count
+
+SUFFIXES = (".h5", ".hdf5", ".mat")
+_COMMANDS = re.compile(r"(?<![a-z])actions?(?![a-z])")
+"""Observations that are, or were, commands."""
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows of each episode's group, or of the file where `mapping.episodes` is left out.
+
+    Raises:
+        BadInputError: groups or fields are missing, or are stored in another file.
+    """
+    with _opened(source) as (h5py, file):
+        for origin, datasets, attributes in _episodes(h5py, file, mapping.episodes, str(source)):
+            with source.tolerant():
+                yield from _blocks(source, mapping, origin, datasets, attributes)
+
+
+def _blocks(
+    source: Source,
+    mapping: ImportMapping,
+    origin: str,
+    datasets: dict[str, Any],
+    attributes: dict[str, Any],
+) -> Iterator[Block]:
+    """Yield the rows of an episode, or of a file."""
+    if mapping.episodes is None:
+        _refuse_groups(datasets, mapping, origin)
+    order = slice(None, None, -1 if mapping.transposed else 1)
+    shapes = {name: (dataset.shape or ())[order] for name, dataset in datasets.items()}
+    single = {name: datasets[name] for name, shape in shapes.items() if not shape} | attributes
+    of_episodes = single if mapping.episodes else {}
+    rowed = [field for field in mapping.all_fields if field not in of_episodes]
+    n = row_count(origin, rowed, shapes)
+    used = {field: datasets[field] for field in rowed}
+    ends = {field: np.asarray(of_episodes[field][()]) for field in mapping.all_fields if field not in used}
+    known = [name for name, shape in shapes.items() if shape]
+    check_storage(used, origin)
+    source.refuse_beyond(unpacked_bytes(used))
+    for first in range(0, n, BLOCK_ROWS):
+        rows = slice(first, min(first + BLOCK_ROWS, n))
+        values = {
+            field: dataset[..., rows].T if mapping.transposed else dataset[rows]
+            for field, dataset in used.items()
+        }
+        values |= {field: _at_the_end(value, rows, n) for field, value in ends.items()}
+        yield Block(values, origin, starts=mapping.episodes is not None and first == 0, known=known)
+
+
+@contextmanager
+def _opened(source: Source) -> Iterator[tuple[Any, Any]]:
+    """Open a file; yield h5py and it.
+
+    Raises:
+        BadInputError: it is of MATLAB's older format; says what to do.
+    """
+    with source.open() as stream:
+        if stream.read(10) == b"MATLAB 5.0":
+            raise BadInputError(
+                f"{source} is of MATLAB's format 5, expected 7.3, which is HDF5: in MATLAB, load it and "
+                "save('NEW.mat', '-v7.3'); in Python, save the arrays of scipy.io.loadmat by numpy.savez"
+            )
+    h5py = optional("h5py")
+    with h5py.File(source.path, "r") as file:
+        yield h5py, file
+
+
+def record(source: Source) -> str | None:
+    """Return the record of an export of ours, None if it has none."""
+    with _opened(source) as (h5py, file):
+        found = file
+        for part in RECORD.split("/"):
+            is_here = isinstance(found, h5py.Group) and part in found
+            if not is_here or not isinstance(found.get(part, getlink=True), h5py.HardLink):
+                return None
+            found = found[part]
+        is_text = isinstance(found, h5py.Dataset) and h5py.check_string_dtype(found.dtype) is not None
+        return str(found.asstr()[()]) if is_text and found.shape == () else None
+
+
+def layout(source: Source) -> dict[str, Any]:
+    """Return the keys of a mapping for a file in the layout of D4RL, d3rlpy or robomimic.
+
+    Of robomimic, the state is all of `obs` with one or two dimensions (images are left out) but actions, in
+    the order of their names; `dones` is taken as terminated, as robomimic's own learners do. It may stay set
+    while success lasts: rows after its first are episodes of one step, left out unless truncation is recorded
+    too. The demonstrations' attribute `success` is that of their last steps.
+
+    Raises:
+        BadInputError: it is none of them, or has no observations.
+    """
+    with _opened(source) as (h5py, file):
+        fields = stored_datasets(h5py, file)
+        if {"observations", "actions"} <= fields.keys():
+            columns = {name: {"fields": [field]} for name, field in D4RL.items() if field in fields}
+            stacked = {fields[field].shape[:2] for field in ("observations", "actions")}
+            is_stacked = len(stacked) == 1 and fields["actions"].ndim == 3
+            return {"columns": columns, "stacked": is_stacked}
+        if {"num_episodes", "observations_0", "actions_0"} <= fields.keys():
+            columns = {name: {"fields": [field]} for name, field in D3RLPY.items() if f"{field}_0" in fields}
+            return {"columns": columns, "episodes": NUMBERED}
+        demos = sorted({name.split("/")[1] for name in fields if name.startswith("data/demo_")}, key=natural)
+        if not demos:
+            raise BadInputError(
+                f"{source}: neither D4RL's layout (observations, actions) nor d3rlpy's (observations_0) nor "
+                "robomimic's (data/demo_0); pass --mapping"
+            )
+        demo = stored_datasets(h5py, file[f"data/{demos[0]}"])
+        columns = {name: {"fields": [field]} for name, field in ROBOMIMIC.items() if field in demo}
+        commands = [field for field in demo if field.startswith("obs/") and _COMMANDS.search(field)]
+        for name, folder in ((STATE, "obs/"), (NEXT_STATE, "next_obs/")):
+            rows = [field for field, d in demo.items() if field.startswith(folder) and d.ndim in (1, 2)]
+            if found := sorted(field for field in rows if not _COMMANDS.search(field)):
+                columns[name] = {"fields": found, "names": _labels(demo, found)}
+        if STATE not in columns:
+            raise BadInputError(
+                f"{source}: data/{demos[0]} has no obs of numbers, which are the state (its fields: "
+                f"{', '.join(demo)}): run robomimic's dataset_states_to_obs.py, or map states by --mapping"
+            )
+        keys: dict[str, Any] = {"columns": columns, "episodes": "data/demo_*"}
+        if commands:
+            keys["remark"] = f"without {', '.join(commands)}, which would show a policy the command to find"
+        with_success = [name for name in demos if "success" in file[f"data/{name}"].attrs]
+        if len(with_success) == len(demos):
+            columns[SUCCESS] = {"fields": ["@success"]}
+        elif with_success:
+            keys["remark"] = f"without the attribute success, which {len(with_success)} of {len(demos)} have"
+        if TRUNCATED not in columns:
+            keys["min_steps"] = 2
+        env_args = json.loads(file["data"].attrs.get("env_args", "{}"))
+        fps = env_args.get("env_kwargs", {}).get("control_freq")
+        return keys | ({"fps": int(fps)} if fps and fps == int(fps) else {})
+
+
+def _labels(demo: dict[str, Any], fields: list[str]) -> list[str]:
+    """Return a name for each value of the fields of `obs`, such as tilt, pos_0 and pos_1."""
+    widths = {field: math.prod(demo[field].shape[1:]) for field in fields}
+    return [
+        field.split("/", 1)[1] + (f"_{number}" if width > 1 else "")
+        for field, width in widths.items()
+        for number in range(width)
+    ]
+
+
+def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, origin: str) -> None:
+    """Raise BadInputError where the fields are not in the file itself, but all in each of some groups."""
+    groups = {name.removesuffix(f"/{field}") for field in mapping.all_fields for name in stored} - {*stored}
+    whole = [group for group in groups if all(f"{group}/{field}" in stored for field in mapping.all_fields)]
+    if whole and not stored.keys() & set(mapping.all_fields):
+        first = min(whole, key=natural)
+        pattern = re.sub("[0-9]+", "*", first)
+        raise BadInputError(
+            f"{origin}: the fields are in {len(whole)} groups, such as {first}: give the mapping episodes = "
+            f'"{pattern}", and each is an episode'
+        )
+
+
+def _episodes(
+    h5py: Any,  # noqa: ANN401 - a module
+    file: Any,  # noqa: ANN401 - of h5py
+    pattern: str | None,
+    origin: str,
+) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Yield the name of each episode's part of the file, its fields, and its attributes as "@name"."""
+    if pattern != NUMBERED:
+        for group in _groups(h5py, file, pattern, origin):
+            attributes = {f"@{name}": np.asarray(value) for name, value in group.attrs.items()}
+            yield f"{origin}{group.name}".rstrip("/"), stored_datasets(h5py, group), attributes
+        return
+    numbered: dict[int, dict[str, Any]] = {}
+    for name, dataset in stored_datasets(h5py, file).items():
+        if found := re.fullmatch(r"(.+)_([0-9]+)", name):
+            numbered.setdefault(int(found[2]), {})[found[1]] = dataset
+    for number in sorted(numbered):
+        yield f"{origin}/{number}", numbered[number], {}
+
+
+def _at_the_end(value: Array, rows: slice, n: int) -> Array:
+    """Return the values of `rows` of n: `value` in the last, and 0 before it."""
+    values = np.zeros((n, *value.shape), value.dtype)
+    values[-1] = value
+    return values[rows]
+
+
+def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py
+    groups = [file]
+    if pattern is None:
+        return groups
+    for part in pattern.strip("/").split("/"):
+        groups = [
+            _linked(h5py, group, name, origin)
+            for group in groups
+            for name in sorted(group, key=natural)
+            if fnmatchcase(name, part)
+        ]
+    if not groups:
+        raise BadInputError(f"{origin}: no groups '{pattern}'; it has {', '.join(list(file)[:10])}")
+    return groups
+
+
+def _linked(h5py: Any, group: Any, name: str, origin: str) -> Any:  # noqa: ANN401 - of h5py
+    """Return the group `name` of `group`; links are refused, since they may lead to another file."""
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise BadInputError(
+            f"{origin}{group.name.rstrip('/')}/{name} is a link; replace it by a copy of its target"
+        )
+    return group[name]

@@ -1,0 +1,136 @@
+"""Minari: a dataset's folder, read by Minari itself, one episode at a time.
+
+Fields are `observations`, `next_observations`, `actions`, `rewards`, `terminations`, `truncations` and
+`infos`; where a space is a dictionary or a tuple, its parts: `observations/desired_goal`, `actions/0`. Where
+the info of the reset was recorded, `infos` are those before a step in columns of observations and those after
+it in all others, and `next_infos` those after it in any.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
+from astra_data.io.hdf5_file import (
+    check_storage,
+    refuse_links,
+    stored_datasets,
+    unpacked_bytes,
+)
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.recording import Block, Source, row_count
+
+GOAL_FIELD = "observations/desired_goal"
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield each episode as one block.
+
+    Raises:
+        BadInputError: fields are missing or differ in length, or the files lead elsewhere or unpack to too
+            much.
+    """
+    for episode in _open(source).iterate_episodes():
+        origin = f"{source}/episode_{episode.id}"
+        with source.tolerant():
+            fields = _fields(episode)
+            notes = _after_steps(fields, mapping, origin)
+            shapes = {name: values.shape for name, values in fields.items()}
+            if row_count(origin, mapping.all_fields, shapes):
+                used = {field: fields[field] for field in mapping.all_fields}
+                known = [name for name in fields if not {name, f"next_{name}"} & used.keys()]
+                known = [name for name in known if not name.startswith("next_")]
+                yield Block(used, origin, starts=True, notes=notes, known=known)
+
+
+def layout(source: Source) -> dict[str, Any]:
+    """Return the keys of a mapping: the state is every part of the observation but the desired goal."""
+    fields = _fields(next(iter(_open(source).iterate_episodes([0]))))
+    state = [f for f in fields if f.split("/")[0] == "observations" and f != GOAL_FIELD]
+    columns = {
+        STATE: {"fields": state},
+        NEXT_STATE: {"fields": [f"next_{field}" for field in state]},
+        ACTION: {"fields": [field for field in fields if field.split("/")[0] == "actions"]},
+        REWARD: {"fields": ["rewards"]},
+        TERMINATED: {"fields": ["terminations"]},
+        TRUNCATED: {"fields": ["truncations"]},
+    }
+    return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
+
+
+def record(source: Source) -> str | None:
+    """Return the record of an export of ours, None if it has none."""
+    metadata = json.loads((source.path / "data" / "metadata.json").read_text(encoding="utf-8"))
+    return json.dumps(metadata["astra_data"]) if "astra_data" in metadata else None
+
+
+def is_dataset(path: Path) -> bool:
+    """Return whether `path` is the folder of a Minari dataset."""
+    return (path / "data" / "metadata.json").is_file() or (path / "data" / "main_data.hdf5").is_file()
+
+
+def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
+    """Open the dataset; Minari itself reads whole episodes, and follows links into other files."""
+    minari, h5py = optional("minari"), optional("h5py")
+    for path in (source.path / "data").rglob("*.hdf5"):
+        if not path.is_file():
+            raise BadInputError(f"{path} is a device or a pipe, expected a file")
+        with h5py.File(path, "r") as file:
+            refuse_links(h5py, file, str(source))
+            datasets = stored_datasets(h5py, file)
+            check_storage(datasets, str(source))
+            source.refuse_beyond(unpacked_bytes(datasets))
+    return minari.MinariDataset(source.path / "data")
+
+
+def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
+    observations = dict(_parts("observations", episode.observations))
+    infos = dict(_parts("infos", episode.infos or {}))  # None where none were recorded
+    with_reset = {name: values for name, values in infos.items() if len(values) == len(episode.rewards) + 1}
+    between = observations | with_reset
+    steps = {
+        **infos,
+        **{name: values[:-1] for name, values in between.items()},
+        **{f"next_{name}": values[1:] for name, values in between.items()},
+        **dict(_parts("actions", episode.actions)),
+    }
+    for name in ("rewards", "terminations", "truncations"):
+        steps[name] = np.asarray(getattr(episode, name))
+    return steps
+
+
+def _after_steps(fields: dict[str, Array], mapping: ImportMapping, origin: str) -> tuple[str, ...]:
+    """Let infos with an entry of the reset be those after each step, but for observations; return a note.
+
+    Raises:
+        BadInputError: an observation and another column take the same one.
+    """
+    observed, others = set[str](), set(mapping.split.ends)
+    for name, column in mapping.columns.items():
+        (observed if name.startswith("observation") else others).update(column.fields)
+    with_reset = sorted(name for name in fields if name.startswith("infos/") and f"next_{name}" in fields)
+    if both := [name for name in with_reset if name in observed & others]:
+        raise BadInputError(
+            f"{origin}: {', '.join(both)} has an entry for the reset, too, and is taken as an observation, "
+            f"before a step, and of its outcome: write next_{both[0]} for what is after the step"
+        )
+    after = [name for name in with_reset if name in others]
+    for name in after:
+        fields[name] = fields[f"next_{name}"]
+    if not after:
+        return ()
+    return (f"{', '.join(after)}: of one entry more than steps, each step has the one after it",)
+
+
+def _parts(name: str, value: Any) -> Iterator[tuple[str, Array]]:  # noqa: ANN401 - nested dicts and tuples
+    if isinstance(value, dict | tuple):
+        pairs = sorted(value.items()) if isinstance(value, dict) else enumerate(value)
+        for key, part in pairs:
+            yield from _parts(f"{name}/{key}", part)
+    else:
+        yield name, np.asarray(value)

@@ -1,0 +1,86 @@
+"""Parquet: a column per field, of numbers or of lists that are equally long. Read block by block."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import Array
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.recording import BLOCK_ROWS, VALUE_BYTES, Block, Source, row_count
+
+SUFFIXES = (".parquet",)
+
+_ONE_LENGTH = "expected lists of one length, without missing ones"
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows of the fields.
+
+    Missing numbers become NaN, and times whole numbers of their own unit.
+
+    Raises:
+        BadInputError: fields are missing, have lists of several lengths, or lack what has no NaN.
+    """
+    fields = list(mapping.all_fields)
+    with source.open() as stream, pq.ParquetFile(stream) as file:
+        shapes = dict.fromkeys(file.schema_arrow.names, (file.metadata.num_rows,))
+        row_count(str(source), fields, shapes)
+        source.refuse_beyond(VALUE_BYTES * _values_of(file.metadata, set(fields)))
+        first: dict[str, Array] = {}
+        for batch in file.iter_batches(BLOCK_ROWS, columns=fields):
+            if not batch.num_rows:
+                continue
+            values = {field: _array(batch.column(field), f"{source}: field '{field}'") for field in fields}
+            first = first or values
+            for field, rows in values.items():
+                if rows.shape[1:] != first[field].shape[1:]:
+                    raise BadInputError(f"{source}: field '{field}': {_ONE_LENGTH}")
+            yield Block(values, str(source), known=file.schema_arrow.names)
+
+
+def _values_of(metadata: pq.FileMetaData, fields: set[str]) -> int:
+    """Return how many values the columns hold; compressed zeros take hardly any bytes."""
+    chunks = (
+        metadata.row_group(group).column(column)
+        for group in range(metadata.num_row_groups)
+        for column in range(metadata.num_columns)
+    )
+    return sum(
+        chunk.num_values
+        for chunk in chunks
+        if any(
+            chunk.path_in_schema == field or chunk.path_in_schema.startswith(f"{field}.") for field in fields
+        )
+    )
+
+
+def _array(column: pa.Array, origin: str) -> Array:
+    """Return the rows as (n,), or (n, ...) where each is a list; text stays text."""
+    kind = column.type
+    if pa.types.is_dictionary(kind):
+        return _array(column.dictionary_decode(), origin)
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        flat = column.flatten()
+        is_fixed = pa.types.is_fixed_size_list(kind)
+        sizes = {kind.list_size} if is_fixed else set(column.value_lengths().to_pylist())
+        if column.null_count or len(sizes) > 1:
+            raise BadInputError(f"{origin}: {_ONE_LENGTH}")
+        size = sizes.pop()
+        values = _array(flat, origin) if len(flat) else np.empty(0)
+        return values.reshape(len(column), size, *values.shape[1:])
+    if pa.types.is_temporal(kind):
+        return _array(column.cast(pa.int32() if kind.bit_width == 32 else pa.int64()), origin)
+    if pa.types.is_decimal(kind):
+        return _array(column.cast(pa.float64()), origin)
+    if column.null_count and pa.types.is_floating(kind):
+        column = column.fill_null(float("nan"))
+    if column.null_count:
+        raise BadInputError(f"{origin}: {column.null_count} values are missing, and {kind} has no NaN")
+    if pa.types.is_boolean(kind):
+        return _array(column.cast(pa.uint8()), origin).astype(bool)
+    if pa.types.is_integer(kind) or pa.types.is_floating(kind):
+        return np.from_dlpack(column)
+    return np.array(column.to_pylist(), dtype=str)

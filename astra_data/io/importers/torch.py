@@ -1,0 +1,83 @@
+"""PyTorch: a dictionary of tensors, rows along the first dimension, as `torch.save` writes it.
+
+Only tensors are taken, through PyTorch's own restricted reader: nothing of the file is run.
+"""
+
+from collections.abc import Iterator
+from pickle import UnpicklingError
+from typing import Any
+from zipfile import ZipFile, is_zipfile
+
+import numpy as np
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.dataset.columns import ACTION, STATE
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.recording import BLOCK_ROWS, VALUE_BYTES, Block, Source, row_count
+
+SUFFIXES = (".pt", ".pth")
+PACE = {STATE: "dof_pos", ACTION: "des_dof_pos"}
+"""Fields of the joint logs of PACE (leggedrobotics/pace-sim2real, scripts/pace/data_collection.py): positions
+before each row and the targets sent in it, both (T, joints) in rad; "time" (T,) in s."""
+TIME = "time"
+
+
+def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the rows.
+
+    Raises:
+        BadInputError: it is no dictionary of tensors, or fields are missing or differ in length.
+    """
+    tensors = _tensors(source)
+    n = row_count(str(source), mapping.all_fields, {name: value.shape for name, value in tensors.items()})
+    used = {field: tensors[field] for field in mapping.all_fields}
+    source.refuse_beyond(sum(VALUE_BYTES * value.numel() for value in used.values()))
+    for first in range(0, n, BLOCK_ROWS):
+        rows = slice(first, first + BLOCK_ROWS)
+        values = {name: value[rows].numpy() for name, value in used.items()}
+        yield Block(values, str(source), known=tensors)
+
+
+def layout(source: Source) -> dict[str, Any]:
+    """Return the keys of a mapping for a joint log of PACE; fps is measured from its times.
+
+    Raises:
+        BadInputError: it is none.
+    """
+    tensors = _tensors(source)
+    missing = [field for field in (TIME, *PACE.values()) if field not in tensors]
+    if missing:
+        raise BadInputError(
+            f"{source}: not a joint log of PACE (time, dof_pos, des_dof_pos): no {', '.join(missing)}; pass "
+            "--mapping"
+        )
+    times = tensors[TIME].double().numpy().ravel()
+    if len(times) < 2 or not times[-1] > times[0]:
+        raise BadInputError(f"{source}: expected times that rise; pass --mapping without `time`")
+    columns = {name: {"fields": [field], "unit": ["rad"]} for name, field in PACE.items()}
+    fps = max(1, round(1 / float(np.median(np.diff(times)))))
+    return {"columns": columns, "time": TIME, "fps": fps}
+
+
+def _tensors(source: Source) -> dict[str, Any]:
+    """Return the tensors of the dictionary in the file, by name; what else it holds is left out."""
+    torch = optional("torch")
+    if not is_zipfile(source.path):
+        raise BadInputError(f"{source}: expected a file that torch.save wrote")
+    with ZipFile(source.path) as archive:
+        source.refuse_beyond(sum(entry.file_size for entry in archive.infolist()))
+    try:
+        found = torch.load(source.path, map_location="cpu", weights_only=True)
+    except UnpicklingError as error:
+        raise BadInputError(
+            f"{source}: holds Python objects, which are never unpickled, or is damaged; save a dictionary of "
+            "tensors alone"
+        ) from error
+    if not isinstance(found, dict):
+        raise BadInputError(f"{source}: expected a dictionary of tensors, got {type(found).__name__}")
+    return {
+        name: value.detach()
+        for name, value in found.items()
+        if isinstance(name, str) and isinstance(value, torch.Tensor) and value.layout == torch.strided
+    }

@@ -1,0 +1,380 @@
+"""MCAP files: the messages of some topics as they stand in the file, as far as it goes.
+
+A file without an end, as of a recorder that was killed, is read up to its last whole record.
+
+A file is in the order in which its messages were recorded, but for a little: chunks and several publishers.
+Where a topic goes back by more than `split.gap_s`, the clock was set back, and a new stretch begins for all
+topics. Where this is so for over one in `FEWEST` messages, it is no clock: the file is out of order, and
+sorted.
+"""
+
+import json
+import struct
+from array import array
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator
+from heapq import heappop, heappush
+from io import SEEK_END, BufferedReader, BytesIO
+from itertools import pairwise
+from typing import IO, Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.io.recording import MOST_UNPACKED, SMALL_BYTES, Part, Source
+
+MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")
+"""Of a record: its kind and its length."""
+_BLOCK_BYTES = 2**16
+FEWEST = 10
+"""Messages to a step back of the clock."""
+
+
+class McapFile:
+    """The messages of some topics of an MCAP file, in its order.
+
+    Attributes:
+        is_cut: whether messages may be missing at its end; known once it was read.
+        streams: topic to what gives the names under which one of its messages is yielded, by default its own.
+    """
+
+    def __init__(self, source: Source, topics: Collection[str]) -> None:
+        """Look at both ends of the file, and read its index if it has one.
+
+        Raises:
+            BadInputError: the file is empty, or lacks topics by its index.
+        """
+        self.is_cut = False
+        self.streams: dict[str, Callable[[Any], list[str]]] = {}
+        self._decoders: dict[int, Callable[[bytes], Any]] = {}
+        self._source = source
+        self._wanted = topics
+        self._channels: dict[int, Any] = {}
+        self._schemas: dict[int, Any] = {}
+        self._chunks: list[Any] | None = None
+        self._whole_bytes: int | None = None
+        self._left = 0
+        self._open()
+
+    def messages(self, *, checked: bool) -> Iterator[tuple[str, Any]]:
+        """Yield each message with its topic, in the order of the file; `checked` by its sums, or not."""
+        records = optional("mcap.records")
+        wanted = {number: channel.topic for number, channel in self._channels.items()}
+        for record in self._records(checked=checked):
+            if isinstance(record, records.Message):
+                if record.channel_id not in wanted:
+                    raise BadInputError(f"{self._source}: no channel {record.channel_id}, which has messages")
+                topic = wanted[record.channel_id]
+                if topic in self._wanted:
+                    for stream in self.streams[topic](record) if topic in self.streams else [topic]:
+                        yield stream, record
+            elif isinstance(record, records.Channel):
+                self._channels[record.id] = record
+                wanted[record.id] = record.topic
+            elif isinstance(record, records.Schema):
+                self._schemas[record.id] = record
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics that the file's index or its messages have named so far."""
+        return {channel.topic for channel in self._channels.values()}
+
+    def check_topics(self) -> None:
+        """Refuse a file that lacks wanted topics, once its index or its messages were read.
+
+        Raises:
+            BadInputError: it does; lists all of them.
+        """
+        known = sorted(self.topics)
+        if self.is_cut and not known:
+            raise BadInputError(f"{self._source} is cut off before its first message ends: leave it out")
+        missing = [
+            f"no topic '{topic}'{did_you_mean(topic, known)}" for topic in self._wanted if topic not in known
+        ]
+        if missing:
+            raise BadInputError(f"{self._source}: {'; '.join(missing)}")
+
+    def decoder(self, number: int) -> Callable[[bytes], Any]:
+        """Return the decoder of the messages of channel `number`.
+
+        Raises:
+            BadInputError: they have an encoding that cannot be read, or a package is missing.
+        """
+        if number not in self._decoders:
+            self._decoders[number] = self._decoder(number)
+        return self._decoders[number]
+
+    def _decoder(self, number: int) -> Callable[[bytes], Any]:
+        packages = "mcap_protobuf", "mcap_ros2"
+        factories = [optional(f"{package}.decoder").DecoderFactory() for package in packages]
+        channel = self._channels[number]
+        if channel.message_encoding == "json":
+            return json.loads
+        schema = self._schemas.get(channel.schema_id)
+        for factory in factories:
+            decoder: Callable[[bytes], Any] | None = factory.decoder_for(channel.message_encoding, schema)
+            if decoder is not None:
+                return decoder
+        encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} schema"
+        raise BadInputError(
+            f"{self._source}: messages of {channel.topic} are {encoding}, expected json, protobuf, or cdr "
+            "with ros2msg schema"
+        )
+
+    def _open(self) -> None:
+        with self._source.open() as stream:
+            size, content = stream.seek(0, SEEK_END), _content_bytes(stream)
+            if not content:
+                raise BadInputError(f"{self._source} is empty: nothing was recorded, leave it out")
+            stream.seek(max(size - len(MAGIC), 0))
+            if size < 2 * len(MAGIC) or stream.read() != MAGIC:
+                self._whole_bytes, self.is_cut = _whole_bytes(stream, content), True
+                return
+            stream.seek(0)
+            summary = optional("mcap.reader").make_reader(stream).get_summary()
+        if summary is None:
+            return
+        self._channels, self._schemas = dict(summary.channels), dict(summary.schemas)
+        used = set().union(*(index.message_index_offsets for index in summary.chunk_indexes))
+        described = {channel.schema_id for channel in summary.channels.values()} - {0}
+        # A summary may leave out what the data say.
+        if summary.chunk_indexes and used <= summary.channels.keys() and described <= summary.schemas.keys():
+            indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+            self._chunks = [index for index in indexes if self._may_hold(index.message_index_offsets)]
+            self.check_topics()
+
+    def _may_hold(self, channels: Collection[int]) -> bool:
+        """Return whether a chunk with messages of `channels` may have wanted ones; some list no channels."""
+        return not channels or any(self._channels[number].topic in self._wanted for number in channels)
+
+    def _records(self, *, checked: bool) -> Iterator[Any]:
+        """Yield the records of the data, those of chunks unpacked, and `checked` by their sums."""
+        reading, records = optional("mcap.stream_reader"), optional("mcap.records")
+        with self._source.open() as stream:
+            size = stream.seek(0, SEEK_END)
+            self._left = max(self._source.most_bytes or 0, SMALL_BYTES, MOST_UNPACKED * size)
+            stream.seek(0)
+            if self._chunks is not None:
+                for index in self._chunks:
+                    stream.seek(index.chunk_start_offset + _HEAD.size)
+                    yield from self._unpacked(records.Chunk.read(reading.ReadDataStream(stream)), checked)
+                return
+            whole: IO[bytes] = stream
+            if self._whole_bytes is not None:
+                whole = BufferedReader(Part(stream, self._whole_bytes))
+            try:
+                for record in reading.StreamReader(whole, emit_chunks=True, validate_crcs=checked).records:
+                    if isinstance(record, records.Chunk):
+                        yield from self._unpacked(record, checked)
+                    elif isinstance(record, records.DataEnd):
+                        self.is_cut = False
+                        return
+                    else:
+                        yield record
+            except optional("mcap.exceptions").EndOfFile:
+                if self._whole_bytes is None:
+                    raise
+
+    def _unpacked(self, chunk: Any, checked: bool) -> Iterator[Any]:  # noqa: ANN401 - mcap's
+        """Yield the records of a chunk, unpacked only as far as its header says and the limit allows."""
+        reading, records = optional("mcap.stream_reader"), optional("mcap.records")
+        if chunk.uncompressed_size > self._left:
+            raise BadInputError(
+                f"{self._source}: its chunks are more than {MOST_UNPACKED} times as large as the file once "
+                "unpacked: if you trust it, pass a larger --max-bytes"
+            )
+        self._left -= chunk.uncompressed_size
+        most = chunk.uncompressed_size + 1
+        data: bytes = chunk.data
+        if chunk.compression == "zstd":
+            packed = optional("zstandard").ZstdDecompressor().stream_reader(data, read_across_frames=True)
+            data = packed.read(most)
+        elif chunk.compression == "lz4":
+            data = optional("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=most)
+        elif chunk.compression:
+            raise BadInputError(f"{self._source}: chunks packed as {chunk.compression}, expected zstd or lz4")
+        if len(data) != chunk.uncompressed_size:
+            raise BadInputError(
+                f"{self._source}: a chunk has another size than its header says: it is damaged"
+            )
+        if checked and chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
+            raise BadInputError(
+                f"{self._source}: a chunk has another checksum than was written: it is damaged"
+            )
+        stream, kinds = reading.ReadDataStream(BytesIO(data)), optional("mcap.opcode").Opcode
+        while stream.count < len(data):
+            kind, length = stream.read1(), stream.read8()
+            if kind == kinds.MESSAGE:
+                yield records.Message.read(stream, length)
+            elif kind in (kinds.CHANNEL, kinds.SCHEMA):
+                yield (records.Channel if kind == kinds.CHANNEL else records.Schema).read(stream)
+            else:
+                stream.read(length)
+
+
+def _content_bytes(stream: IO[bytes]) -> int:
+    """Return the size of a file without the zeros at its end, which a full or failing disk leaves."""
+    end = stream.seek(0, SEEK_END)
+    while end:
+        begin = max(0, end - _BLOCK_BYTES)
+        stream.seek(begin)
+        if content := stream.read(end - begin).rstrip(b"\0"):
+            return begin + len(content)
+        end = begin
+    return 0
+
+
+def _whole_bytes(stream: IO[bytes], content: int) -> int:
+    """Return up to where the records of a file with `content` bytes before zeros are whole."""
+    size = stream.seek(0, SEEK_END)
+    end = len(MAGIC) if size >= len(MAGIC) else 0
+    while True:
+        stream.seek(end)
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            return end
+        after = end + _HEAD.size + _HEAD.unpack(head)[1]
+        # Without zeros at the end, a record may well end in some of its own.
+        if after > content and after != size:
+            return end
+        end = after
+
+
+class McapMessage(NamedTuple):
+    """A message.
+
+    Attributes:
+        topic: where it was sent.
+        time: when, in ns, on a clock that only goes forward.
+        log_time: when by the recorder's clock.
+        content: the decoded message.
+        is_back: whether it is the first after the clock was set back.
+    """
+
+    topic: str
+    time: int
+    log_time: int
+    content: Any
+    is_back: bool
+
+
+class _Stretch:
+    """What comes in a file before its clock goes back, or until its end.
+
+    Attributes:
+        times: topic to the log times of its messages, in ns, in the file's order.
+        latest: the largest of them.
+        late_ns: how far they are out of order.
+    """
+
+    def __init__(self) -> None:
+        """Begin it."""
+        self.times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
+        self.latest = 0
+        self.late_ns = 0
+
+    def add(self, topic: str, time: int) -> None:
+        """Add a message."""
+        self.times[topic].append(time)
+        if time >= self.latest:
+            self.latest = time
+        elif self.latest - time > self.late_ns:
+            self.late_ns = self.latest - time
+
+    @property
+    def earliest(self) -> int:
+        """The smallest of the times."""
+        return min(map(min, self.times.values()))
+
+    def __len__(self) -> int:
+        """Return how many messages it has."""
+        return sum(map(len, self.times.values()))
+
+
+class Timeline:
+    """The messages of an MCAP file by their times.
+
+    Attributes:
+        moments: topic to the times of its messages in ns, as `McapMessage.time`, in their order.
+    """
+
+    def __init__(self, file: McapFile, gap_s: float, pause_s: float) -> None:
+        """Find out when messages come, by reading the file once.
+
+        Args:
+            file: has all topics that are wanted.
+            gap_s: by how much a topic may go back while the clock does not.
+            pause_s: what is longer between messages ends an episode in any case.
+
+        Raises:
+            BadInputError: the file lacks topics; lists all of them.
+        """
+        self._file = file
+        self._gap_ns = round(gap_s * 1e9)
+        self._pause_ns = 2 * round(pause_s * 1e9) + 1
+        self._stretches = self._survey()
+        file.check_topics()
+        self._shifts = self._shifted()
+        self.moments = self._moments()
+
+    def messages(self) -> Iterator[McapMessage]:
+        """Yield the messages, by their times, and in the file's order where these are equal.
+
+        Only those that may be out of order are held in memory.
+
+        Raises:
+            BadInputError: messages have an encoding that cannot be read.
+        """
+        held: list[tuple[int, int, str, Any]] = []
+        messages = enumerate(self._file.messages(checked=True))
+        for at, stretch in enumerate(self._stretches):
+            is_back, latest = at > 0, 0
+            for left in range(len(stretch) - 1, -1, -1):
+                number, (topic, message) = next(messages)
+                heappush(held, (message.log_time, number, topic, message))
+                latest = max(latest, message.log_time)
+                while held and (held[0][0] <= latest - stretch.late_ns or not left):
+                    time, _, topic, message = heappop(held)
+                    content = self._file.decoder(message.channel_id)(message.data)
+                    yield McapMessage(topic, time + self._shifts[at], time, content, is_back)
+                    is_back = False
+        next(messages, None)  # the sums at the end of the file
+
+    def _survey(self) -> list[_Stretch]:
+        stretches = [_Stretch()]
+        highest: dict[str, int] = {}
+        for topic, message in self._file.messages(checked=False):
+            time = message.log_time
+            if time < highest.get(topic, 0) - self._gap_ns:
+                stretches.append(_Stretch())
+                highest = {}
+            highest[topic] = max(time, highest.get(topic, 0))
+            stretches[-1].add(topic, time)
+        if sum(map(len, stretches)) >= FEWEST * (len(stretches) - 1):
+            return stretches
+        whole = _Stretch()
+        for stretch in stretches:
+            for topic, times in stretch.times.items():
+                whole.times[topic] += times
+        whole.latest = max(stretch.latest for stretch in stretches)
+        whole.late_ns = whole.latest - whole.earliest
+        return [whole]
+
+    def _shifted(self) -> list[int]:
+        """Return what to add to the times of each stretch, so that it begins a pause after the one before."""
+        shifts = [0]
+        for before, stretch in pairwise(self._stretches):
+            shifts.append(before.latest + shifts[-1] + self._pause_ns - stretch.earliest)
+        return shifts
+
+    def _moments(self) -> dict[str, NDArray[np.int64]]:
+        parts: defaultdict[str, list[NDArray[np.int64]]] = defaultdict(list)
+        for stretch, shift in zip(self._stretches, self._shifts, strict=True):
+            for topic, times in stretch.times.items():
+                parts[topic].append(np.sort(np.asarray(times, np.int64)) + shift)
+        return {topic: np.concatenate(each) for topic, each in parts.items()}

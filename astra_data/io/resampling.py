@@ -1,0 +1,385 @@
+"""Rows at fps of the messages of asynchronous topics.
+
+From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
+topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s`, or the
+`gap_s` of its column, ends the episode, and the next begins when all have sent a message again; where all are
+silent for as long, it ends with the last message.
+
+Where a state comes as often as rows, or a whole number of times as often, rows are taken midway between its
+messages and those of the commands: jitter changes no row, and a state meets the command that is in force for
+most of its step.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.checkup.clock import GAP
+from astra_data.dataset.columns import ACTION, STATE, Array
+from astra_data.io.cutting import RATE_TOLERANCE
+from astra_data.io.mapping import ImportMapping
+
+MOST_HELD_ROWS = 10**6
+"""Most rows in which the same values may be held: five hours at 50 Hz."""
+MOST_UNEVEN = 0.05
+"""Largest share of a topic's rows, steps or messages that are odd and not told."""
+MISSED = 2.5
+"""Silent for more of its periods, a topic has dropped out: two of its messages or more are missing."""
+DUE = 0.75
+"""Periods after a message from which on a row should hold the next one."""
+_WHOLE = 0.005
+"""Relative error of a measured rate that is taken for a whole number."""
+_SMOOTH = 10
+"""With so many messages a row, or more, one more or less changes a step too little to be told."""
+_NEAR = 4
+"""Rates of rows that are proposed are up to so many times as high or low as `fps`."""
+_AVERAGED = 20
+"""Messages of a topic over which jitter is averaged; over many more, a rate that is a little off counts."""
+
+
+class Resampler:
+    """Holds the last values of all topics and samples rows from them.
+
+    Attributes:
+        topics: topic to its fields.
+        times: topic to the time of its last message, in ns.
+        silences: topic to how often it ended an episode: it was silent for too long, and others were not.
+        repeated: topic to how many rows of an episode hold the same message as the row before.
+        skipped: topic to how many messages within episodes are in no row.
+    """
+
+    def __init__(self, mapping: ImportMapping, origin: str, moments: Mapping[str, ArrayLike]) -> None:
+        """Sample the fields of `mapping` from the file `origin`.
+
+        Args:
+            mapping: says which fields of which topics become which columns.
+            origin: the file's name, for messages.
+            moments: topic to the times of all its messages, in their order, in ns.
+
+        Raises:
+            BadInputError: a topic begins when another has ended, as where their clocks differ.
+        """
+        self._origin = origin
+        self.topics: dict[str, list[str]] = {}
+        self.times: dict[str, int] = {}
+        self.silences: Counter[str] = Counter()
+        self.repeated: Counter[str] = Counter()
+        self.skipped: Counter[str] = Counter()
+        self._messages: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()
+        self._rows = 0
+        self._fresh: set[str] = set()
+        for field in mapping.all_fields:
+            self.topics.setdefault(topic_of(field), []).append(field)
+        self._gap_ns: dict[str, int] = {}
+        self._own_gap: dict[str, str] = {}
+        self._has_own_gap: set[str] = set()
+        for name, column in mapping.columns.items():
+            gap_ns = round((column.gap_s or mapping.split.gap_s or 0) * 1e9)
+            for topic in () if column.latched else topics_of(column.fields):
+                if gap_ns < self._gap_ns.get(topic, gap_ns + 1):
+                    self._gap_ns[topic] = gap_ns
+                    self._own_gap[topic] = name if column.gap_s else ""
+                if column.gap_s:
+                    self._has_own_gap.add(topic)
+        self._expiring = set(self._gap_ns)
+        self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
+        self._refuse_apart()
+        self._periods = usual_periods(self._moments, round((mapping.split.gap_s or 0) * 1e9))
+        self._fps = mapping.fps
+        self._values: dict[str, Array] = {}
+        self._start: int | None = None
+        self._row = 0
+        often = {
+            topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()
+        }
+        states = self._expiring & topics_of(mapping.columns[STATE].fields if STATE in mapping.columns else ())
+        self._states = [topic for topic in states if often.get(topic)]
+        most = max((often[topic] for topic in self._states), default=0)
+        self._in_step = [topic for topic in self._expiring if 0 < often.get(topic, 0) <= most]
+        self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
+        self._delay_ns = 0
+        self._observed: dict[str, str] = {}
+        for name, column in mapping.columns.items():
+            if name.startswith("observation"):
+                self._observed |= dict.fromkeys(column.fields, name)
+        observed = topics_of(self._observed) & self._expiring & self._periods.keys()
+        self._silent_ns: dict[str, dict[int, int]] = {topic: {} for topic in observed}
+        commands = [name for name in mapping.columns if name.startswith(ACTION)]
+        self._commands = {topic: n for n in commands for topic in topics_of(mapping.columns[n].fields)}
+        self._lossy = self._commands.keys() | topics_of(mapping.flag_fields)
+
+    def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
+        """Update the values of `topic` with a message at `time` ns."""
+        if self._start is not None:
+            self._messages[topic] += 1
+            self.skipped[topic] += topic in self._fresh
+        self._fresh.add(topic)
+        self._values |= values
+        self.times[topic] = time
+        if self._start is None and self._is_complete(time):
+            self._delay_ns = self._midway(time)
+            self._start, self._row = time + self._delay_ns, 0
+
+    def rows_before(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
+        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode.
+
+        Raises:
+            BadInputError: these are more than `MOST_HELD_ROWS`.
+        """
+        if self._start is not None and self._is_pause(time):
+            yield from self._sampled(self._end(max(self.times[topic] for topic in self._expiring)))
+            self._start = None
+        yield from self._sampled(time)
+
+    def last_rows(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
+        """Yield the rows that are left after the last message, at `time` ns.
+
+        Raises:
+            BadInputError: as `rows_before`.
+        """
+        if self._start is not None:
+            yield from self._sampled(self._end(time))
+
+    def endings(self) -> tuple[str, ...]:
+        """Tell each topic that ended episodes, and what to do where it should not."""
+        return tuple(
+            f"{self._origin}: "
+            + ended(topic, times, self._gap_ns[topic] / 1e9, self._own_gap[topic], self._commands.get(topic))
+            for topic, times in self.silences.items()
+        )
+
+    def unevenness(self) -> tuple[str, ...]:
+        """Tell each topic that many rows repeat, or of which many messages are in no row.
+
+        Of a topic without commands, flags and outcomes, messages may be in no row, as where fps is lower than
+        its rate; where it is observed, uneven steps are told, and dropouts, unless a column has its own gap.
+        """
+        notes = []
+        for topic in sorted(self._expiring & self._periods.keys()):
+            rate = 1e9 / self._periods[topic]
+            if topic in self._silent_ns and (odd := uneven_steps(topic, rate, self._fps)):
+                notes.append(odd)
+            elif self.repeated[topic] > MOST_UNEVEN * self._rows or (
+                topic in self._lossy and self.skipped[topic] > MOST_UNEVEN * self._messages[topic]
+            ):
+                notes.append(
+                    f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {self.repeated[topic]} of "
+                    f"{self._rows} rows repeat its message before, {self.skipped[topic]} of "
+                    f"{self._messages[topic]} messages are in no row"
+                )
+            if topic not in self._has_own_gap and (silences := self._silent_ns.get(topic)):
+                column = next(self._observed[f] for f in self.topics[topic] if f in self._observed)
+                ns = list(silences.values())
+                notes.append(dropouts(topic, column, rate, self._fps, ns, self._dropped[topic]))
+        return tuple(f"{self._origin}: {note}" for note in notes)
+
+    def _sampled(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
+        self._refuse_gap(time)
+        while self._start is not None:
+            moment = self._start + self._row * 10**9 // self._fps
+            if moment >= time:
+                return
+            if silent := self._silent(moment - self._delay_ns):
+                self._start = None
+                self.silences.update(silent)
+                return
+            if self._row:
+                self._rows += 1
+                repeated = self.topics.keys() - self._fresh
+                self.repeated.update(repeated)
+                for topic in repeated & self._silent_ns.keys():
+                    self._note_silence(topic, moment - self._delay_ns)
+            self._fresh.clear()
+            yield self._row == 0, dict(self._values)
+            self._row += 1
+
+    def _note_silence(self, topic: str, time: int) -> None:
+        """Count a row at `time` that repeats a message of `topic`, if the next ones are missing."""
+        since, period = self.times[topic], self._periods[topic]
+        moments = self._moments[topic]
+        later = moments[np.searchsorted(moments, since, side="right") :]
+        until = later[0] if len(later) else max(each[-1] for each in self._moments.values())
+        silence = min(int(until) - since, self._gap_ns[topic])
+        if silence > MISSED * period and time - since > DUE * period:
+            self._silent_ns[topic][since] = silence
+            self._dropped[topic] += 1
+
+    def _midway(self, time: int) -> int:
+        """Return how long after `time` the widest gap between the messages that are in step is half over."""
+        if not self._states:
+            return 0
+        phases = sorted(self._phase(topic, time) for topic in self._in_step)
+        gaps = pairwise([*phases, phases[0] + self._spacing_ns])
+        before, after = max(gaps, key=lambda gap: gap[1] - gap[0])
+        return round((before + after) / 2 % self._spacing_ns)
+
+    def _phase(self, topic: str, time: int) -> float:
+        """Return how long after `time`, in ns below the spacing, messages of `topic` come but for jitter."""
+        first = np.searchsorted(self._moments[topic], self.times[topic])
+        moments = self._moments[topic][first : first + _AVERAGED]
+        step = self._spacing_ns * max(1, round(self._periods[topic] / self._spacing_ns))
+        return float(np.median(moments - time - step * np.arange(len(moments))) % self._spacing_ns)
+
+    def _end(self, time: int) -> int:
+        """Return before when the last row is, of an episode whose last message is at `time`."""
+        if not self._states:
+            return time + 1
+        next_state = max(self.times[topic] + round(self._periods[topic]) for topic in self._states)
+        return min(next_state, time + round(self._spacing_ns))
+
+    def _refuse_apart(self) -> None:
+        if not self.topics.keys() <= self._moments.keys():
+            return
+        last = max(self.topics, key=lambda topic: self._moments[topic][0])
+        first = min(self._expiring, key=lambda topic: int(self._moments[topic][-1]) + self._gap_ns[topic])
+        apart_ns = self._moments[last][0] - self._moments[first][-1]
+        if apart_ns > self._gap_ns[first]:
+            raise BadInputError(
+                f"{self._origin}: {last} begins {apart_ns / 1e9:.4g} s after the last message of {first}, "
+                "and no row can have both: their clocks differ, or one of them was not recorded until the end"
+            )
+
+    def _refuse_gap(self, time: int) -> None:
+        if self._start is None:
+            return
+        moment = self._start + self._row * 10**9 // self._fps
+        end = min(time, *(self.times[topic] + self._gap_ns[topic] for topic in self._expiring))
+        if (rows := (end - moment) * self._fps // 10**9) > MOST_HELD_ROWS:
+            raise BadInputError(
+                f"{self._origin}: nothing new comes between {moment} and {time} ns, which would be {rows} "
+                f"equal rows, expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
+            )
+
+    def _is_pause(self, time: int) -> bool:
+        """Return whether all topics that are not latched are silent too long at `time`; all were heard."""
+        return len(self._silent(time)) == len(self._expiring)
+
+    def _is_complete(self, time: int) -> bool:
+        return self.times.keys() == self.topics.keys() and not self._silent(time)
+
+    def _silent(self, time: int) -> list[str]:
+        """Return the topics that may not be silent for so long as they were before `time`; all were heard."""
+        return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns[topic]]
+
+
+def usual_periods(moments: Mapping[str, NDArray[np.int64]], gap_ns: int) -> dict[str, float]:
+    """Return the mean step between the messages of each topic that has two steps or more up to `gap_ns`.
+
+    Steps that are far longer than the median are left out, as of lost messages, unless they are most of the
+    time, as of messages that come in bursts.
+    """
+    periods = {}
+    for topic, times in moments.items():
+        steps = np.diff(np.unique(times))
+        steps = steps[steps <= gap_ns]
+        if len(steps) > 1:
+            usual = steps[steps <= GAP * np.median(steps)]
+            periods[topic] = float((usual if 2 * usual.sum() >= steps.sum() else steps).mean())
+    return periods
+
+
+def topic_of(field: str) -> str:
+    """Return the topic of a field."""
+    return field.partition(":")[0]
+
+
+def topics_of(fields: Iterable[str]) -> set[str]:
+    """Return the topics of fields."""
+    return set(map(topic_of, fields))
+
+
+def _messages_per_row(ratio: float) -> int:
+    """Return the whole number that `ratio` is about, 1 where its inverse is, else 0."""
+    most = max(ratio, 1 / ratio)
+    if abs(most / round(most) - 1) > RATE_TOLERANCE:
+        return 0
+    return max(round(ratio), 1)
+
+
+def uneven_steps(topic: str, rate: float, fps: int) -> str:
+    """Tell that `topic` comes `rate` times a second, of which `fps` is no whole fraction, and what to do.
+
+    Nothing is told where so few steps are odd, or odd by so little, that it does not matter, nor where fewer
+    messages come than rows.
+    """
+    whole = round(rate)
+    if whole and abs(rate / whole - 1) < _WHOLE:
+        rate = whole
+    fewest, share_long = divmod(rate / fps, 1)
+    if not 1 <= fewest < _SMOOTH or min(share_long, 1 - share_long) <= MOST_UNEVEN:
+        return ""
+    short, long = (f"{1000 * messages / rate:.0f}" for messages in (fewest, fewest + 1))
+    near = range(math.ceil(fps / _NEAR), min(_NEAR * fps, whole) + 1)
+    even = sorted((each for each in near if rate % each == 0), key=lambda each: abs(math.log(each / fps)))
+    comes = f"{topic} comes {rate:.4g} times a second, of which"
+    if even:
+        *others, last = map(str, sorted(even[:3]))
+        take = f"{', '.join(others)} or {last}" if others else last
+        return (
+            f"{comes} {fps} fps is no whole fraction: steps of {short} and {long} ms alternate; take {take}"
+        )
+    best = min(near, key=lambda each: (_share_odd(rate / each), abs(math.log(each / fps))))
+    return (
+        f"{comes} no fps nearby is a whole fraction: at {fps}, {share_long:.0%} of the steps are of "
+        f"{long} ms, the others of {short}; at {best} only {_share_odd(rate / best):.0%} are odd, "
+        "or publish it a whole number of times a second"
+    )
+
+
+def dropouts(topic: str, column: str, rate: float, fps: int, silences_ns: list[int], rows: int) -> str:
+    """Tell that `topic` was silent, and the `gap_s` of its `column` that ends episodes there.
+
+    Args:
+        topic: the topic.
+        column: a column of the mapping that it gives values to.
+        rate: how often it usually comes in a second.
+        fps: rows in a second.
+        silences_ns: how long it was silent, each time.
+        rows: how many rows repeat its message meanwhile.
+    """
+    places = f"in {len(silences_ns)} places" if len(silences_ns) > 1 else "once"
+    # A message that a row repeats is at least 1 / fps - 1 / rate old, of topics that come more often.
+    gap_ms = math.floor(1000 * max(2 / rate, 1 / fps - 1 / rate))
+    repeat = f"{rows} rows repeat" if rows > 1 else "a row repeats"
+    return (
+        f"{topic} is silent for up to {max(silences_ns) / 1e9:.2g} s {places}, where {repeat} its message "
+        f'before: gap_s = {gap_ms / 1000:g} in [columns."{column}"] ends episodes there'
+    )
+
+
+def ended(topic: str, times: int, gap_s: float, column: str, commanded: str | None) -> str:
+    """Tell that `topic` ended episodes, and what to do where that is not right.
+
+    Args:
+        topic: the topic.
+        times: how often it was silent for too long, and others were not.
+        gap_s: the longest silence that is no end.
+        column: the column whose own `gap_s` that is; "" if it is that of `split`.
+        commanded: the column of commands that the topic gives values to, if any.
+    """
+    key = f'gap_s in [columns."{column}"]' if column else "split.gap_s"
+    often = "once" if times == 1 else f"{times} times"
+    silence = (
+        f"{topic} is silent for over {gap_s:g} s ({key}) {often} while others are not; episodes end there"
+    )
+    # A column with a gap of its own cannot be latched.
+    if commanded:
+        latched = "" if column else f'latched = true in [columns."{commanded}"], or '
+        return (
+            f"{silence}. That is right if the robot stops by itself without commands; if it continues with "
+            f"the last one, set {latched}a longer gap_s"
+        )
+    if column:
+        return f"{silence}; if values may be held for longer, set a longer one"
+    return f"{silence}: set latched = true if it is sent on change, or a longer gap_s"
+
+
+def _share_odd(messages_per_row: float) -> float:
+    """Return the share of the rows that have one message more, or less, than most."""
+    return abs(messages_per_row - round(messages_per_row))

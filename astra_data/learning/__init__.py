@@ -1,1 +1,0 @@
-"""Policy optimization, on any batched environment or from recorded episodes."""

@@ -1,0 +1,196 @@
+"""Progress of a run: a live line per running item in a terminal, plain lines elsewhere."""
+
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from functools import partial
+from statistics import fmean
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TaskProgressColumn, TextColumn
+from rich.table import Column
+from rich.text import Text
+
+from astra_data.core.naming import stage_of_key
+from astra_data.core.progress import Progress as Notes
+from astra_data.pipeline.execution import Watcher
+
+SLOW_STAGES = ("ground", "train", "align")
+"""Stages that take most of a run: until it is known how long their items take, no time left is shown."""
+_BAR_WIDTH = 20
+
+
+@contextmanager
+def display(keys: Collection[str], console: Console) -> Iterator[Watcher]:
+    """Show the progress of the items of these `keys` on `console`.
+
+    Where lines are too long for the terminal, names and notes are cut off, never bar, share and time left.
+    """
+    if not console.is_terminal:
+        yield PlainDisplay(len(keys), console)
+        return
+    columns = (
+        _Cropped("{task.description}", markup=False, table_column=Column()),
+        BarColumn(_BAR_WIDTH, table_column=Column(width=_BAR_WIDTH)),
+        TaskProgressColumn(),
+        _TimeLeft(table_column=Column(width=7, no_wrap=True)),
+        _Cropped("{task.fields[note]}", markup=False, table_column=Column()),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield LiveDisplay(keys, progress)
+
+
+class _Cropped(TextColumn):
+    """A text of one line, of which the end gives way."""
+
+    def render(self, task: Task) -> Text:
+        """Return the text."""
+        text = super().render(task)
+        text.no_wrap, text.overflow = True, "ellipsis"
+        return text
+
+
+class _TimeLeft(ProgressColumn):
+    """The time left as the task's field `left` estimates it, a function that returns seconds or None."""
+
+    max_refresh = 0.5
+
+    def render(self, task: Task) -> Text:
+        """Return hours, minutes and seconds."""
+        seconds = task.fields["left"]()
+        return Text("-:--:--" if seconds is None else str(timedelta(seconds=round(seconds))))
+
+
+class TimeEstimate:
+    """The time that a run of items has left, by their work: how long an item of a stage takes.
+
+    An item that runs takes what its share done says; one that waits, what others of its stage take.
+    """
+
+    def __init__(self, keys: Collection[str], clock: Callable[[], float] = time.monotonic) -> None:
+        """Take the `keys` of all items; `clock` returns seconds."""
+        self._waiting, self._clock = list(keys), clock
+        self._running: dict[str, tuple[float, float]] = {}  # when each began, and its share done
+        self._took: dict[str, list[float]] = {}
+
+    def started(self, key: str) -> None:
+        """Begin an item."""
+        self._waiting.remove(key)
+        self._running[key] = (self._clock(), 0.0)
+
+    def progressed(self, key: str, share: float) -> None:
+        """Go on with an item, of which a share is done."""
+        self._running[key] = (self._running[key][0], share)
+
+    def finished(self, key: str, seconds: float) -> None:
+        """End an item that took so long."""
+        del self._running[key]
+        self._took.setdefault(stage_of_key(key), []).append(seconds)
+
+    def left_of(self, key: str) -> float | None:
+        """Return the seconds that a running item has left; None while nothing is known of it."""
+        began, _ = self._running[key]
+        whole = self._wholes().get(key, self._means().get(stage_of_key(key)))
+        return None if whole is None else max(0.0, whole - (self._clock() - began))
+
+    def left(self) -> float | None:
+        """Return the seconds left of all items, as many at a time as run now; None if not known."""
+        means = self._means()
+        open_stages = {stage_of_key(key) for key in [*self._waiting, *self._running]}
+        if not means or open_stages.intersection(SLOW_STAGES) - means.keys():
+            return None
+        of_running = [self.left_of(key) or 0.0 for key in self._running]
+        waiting = sum(means.get(stage_of_key(key), 0.0) for key in self._waiting)
+        return max([(sum(of_running) + waiting) / max(1, len(self._running)), *of_running])
+
+    def _wholes(self) -> dict[str, float]:
+        """Return how long each running item takes in all, as its share done says."""
+        now = self._clock()
+        return {key: (now - began) / share for key, (began, share) in self._running.items() if share > 0}
+
+    def _means(self) -> dict[str, float]:
+        """Return how long an item takes, by its stage."""
+        found = {stage: list(seconds) for stage, seconds in self._took.items()}
+        for key, whole in self._wholes().items():
+            found.setdefault(stage_of_key(key), []).append(whole)
+        return {stage: fmean(seconds) for stage, seconds in found.items()}
+
+
+@contextmanager
+def shown(key: str) -> Iterator[Notes]:
+    """Show the progress of one job of this process on standard error; yield its progress callback."""
+    began = time.perf_counter()
+    with display([key], Console(stderr=True)) as watch:
+        watch.started(key)
+        yield partial(watch.progressed, key)
+        watch.finished(key, time.perf_counter() - began)
+
+
+class PlainDisplay:
+    """One line per start, tenth and finish of an item."""
+
+    def __init__(self, total: int, console: Console) -> None:
+        self._total, self._console = total, console
+        self._finished = 0
+        self._tenths: dict[str, int] = {}
+
+    def started(self, key: str) -> None:
+        """Print that an item has started."""
+        self._tenths[key] = 0
+        self._print(f"{key}  started")
+
+    def progressed(self, key: str, fraction: float, note: str) -> None:
+        """Print the note when another tenth is done."""
+        tenths = int(10 * fraction)
+        if tenths > self._tenths[key]:
+            self._tenths[key] = tenths
+            self._print(f"{key}  {10 * tenths} %  {note}")
+
+    def finished(self, key: str, seconds: float) -> None:
+        """Print how long the item took."""
+        self._finished += 1
+        self._print(f"{key}  finished in {seconds:.1f} s  ({self._finished} of {self._total})")
+
+    def failed(self, key: str) -> None:
+        """Print that the item has failed."""
+        self._print(f"{key}  failed")
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+class LiveDisplay:
+    """One moving line per running item; finished ones become lines above."""
+
+    def __init__(self, keys: Collection[str], progress: Progress) -> None:
+        self._total, self._progress = len(keys), progress
+        self._finished, self._estimate = 0, TimeEstimate(keys)
+        text = f"0 of {self._total} finished"
+        self._whole = progress.add_task(text, total=self._total, note="", left=self._estimate.left)
+        self._tasks: dict[str, TaskID] = {}
+
+    def started(self, key: str) -> None:
+        """Add the item's line."""
+        self._estimate.started(key)
+        left = partial(self._estimate.left_of, key)
+        self._tasks[key] = self._progress.add_task(key, total=1.0, note="starting", left=left)
+
+    def progressed(self, key: str, fraction: float, note: str) -> None:
+        """Move the item's line on."""
+        self._estimate.progressed(key, fraction)
+        self._progress.update(self._tasks[key], completed=fraction, note=note)
+
+    def finished(self, key: str, seconds: float) -> None:
+        """Replace the item's line by a finished one."""
+        self._progress.remove_task(self._tasks.pop(key))
+        self._estimate.finished(key, seconds)
+        self._finished += 1
+        text = f"{self._finished} of {self._total} finished"
+        self._progress.update(self._whole, completed=self._finished, description=text)
+        self._progress.console.print(f"{key}  finished in {seconds:.1f} s", markup=False, highlight=False)
+
+    def failed(self, key: str) -> None:
+        """Leave the item's line where it stopped, if it had started."""
+        if key in self._tasks:
+            self._progress.update(self._tasks[key], note="failed")

@@ -1,0 +1,209 @@
+"""The environment in which a row of a run is trained, for learners of other libraries; their policies tested.
+
+Gymnasium's "astra_data/Grounded-v0" is made here.
+"""
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.config import did_you_mean, validated
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import artifact_key, is_plus
+from astra_data.core.progress import Progress, silent
+from astra_data.grounding.files import GROUNDING, grounding_at
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.methods import method_named
+from astra_data.methods.method import Method
+from astra_data.pipeline.own_methods import add_all
+from astra_data.pipeline.plan import plan
+from astra_data.pipeline.points import Selection
+from astra_data.pipeline.recipe import Recipe
+from astra_data.pipeline.trained_policy import settings_of
+from astra_data.policies.build_env import Simulation
+from astra_data.policies.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
+from astra_data.policies.own_policy import ActingPolicy, OwnPolicy
+from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.train import InSimulator, Training
+from astra_data.robots.registry import task_named
+
+OPTIONS = ("data_start_share", "episode_steps")
+"""The keywords of an environment, keys of `[train]`."""
+
+
+def grounded(
+    run: str | Path,
+    row: str,
+    seed: int = 0,
+    percent: int | None = None,
+    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+) -> SingleEnv:
+    """Build the environment of one robot in which a row of a run is trained.
+
+    Args:
+        run: the folder of a run, such as "runs/cart", made at least until `ground`.
+        row: a row that is trained in a simulator; "direct_transfer" for the raw one.
+        seed: one of the recipe's seeds: that of the data and the grounding.
+        percent: the size of the dataset, where the recipe sweeps over sizes.
+        options: those of `OPTIONS` that are not to be as in the recipe, see `TrainConfig`.
+
+    Raises:
+        BadInputError: the row is not trained in a simulator, an artifact is not there, or an option does not
+            fit the row or the task.
+    """
+    env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=1, **options)
+    return SingleEnv(SeededSimulatorEnv(env), training.simulated_steps)
+
+
+def grounded_vector(
+    num_envs: int,
+    run: str | Path,
+    row: str,
+    seed: int = 0,
+    percent: int | None = None,
+    max_episode_steps: int | None = None,
+    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+) -> BatchedVectorEnv:
+    """Build `num_envs` of the environments that `grounded` builds, stepped at once.
+
+    Raises:
+        BadInputError: as `grounded`.
+    """
+    env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=num_envs, **options)
+    steps = training.simulated_steps
+    return BatchedVectorEnv(SeededSimulatorEnv(env), min(steps, max_episode_steps or steps))
+
+
+def evaluate_policy(
+    run: str | Path,
+    row: str,
+    policy: ActingPolicy,
+    *,
+    out: str | Path,
+    seed: int = 0,
+    percent: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Test a policy of another learner as `evaluate` tests that of a row, and write the figures to `out`.
+
+    It is shown what the row's environment shows; the latent, if the row has one, comes from the row's
+    encoder, in the target from the aligned one. Starts and goals are those of the rows of this seed.
+
+    Args:
+        run: the folder of a run, such as "runs/cart".
+        row: the row in whose environment it was trained.
+        policy: has `act(observation) -> action`, see `ActingPolicy`.
+        out: the folder to write.
+        seed: one of the recipe's seeds.
+        percent: the size of the dataset, where the recipe sweeps over sizes.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: as `grounded`, or the policy returns something else than actions.
+    """
+    settings = settings_of(run)
+    env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)
+    own = OwnPolicy(policy, env.observation_size, env.action_size)
+    episodes = training.episodes
+    rows = list(dict.fromkeys([*settings.get("methods", []), row]))
+    tested = {"seeds": [seed]} | settings | {"methods": rows}
+    evaluate = _planned(run, tested, "evaluate", row, seed, percent)
+    _check_made(evaluate.keywords, ("target_encoder", "reference"))
+    evaluate(
+        policy=PolicyFile(own, simulation, episodes.reference, episodes.content_hash),
+        out=Path(out),
+        progress=progress,
+    )
+
+
+def _world(
+    run: str | Path,
+    settings: dict[str, Any],
+    row: str,
+    seed: int,
+    percent: int | None,
+    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+) -> tuple[SimulatorEnv, Simulation, Training]:
+    """Return the environment that `train` builds for a row, and what it builds it from."""
+    learn = _method_of(settings, row).learn
+    if not isinstance(learn, InSimulator):
+        raise BadInputError(
+            f"{row} is not trained in a simulator: expected a row that is, such as nas, or "
+            "direct_transfer for the raw simulator"
+        )
+    if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
+        raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
+    training = _training(run, settings, row, seed, percent, options)
+    return *learn.world(training), training
+
+
+def training_of(
+    run: str | Path,
+    row: str,
+    seed: int,
+    percent: int | None = None,
+    changes: Mapping[str, Any] = {},
+) -> Training:
+    """Return what `train` gives the method of a row of a run, with `changes` of its `[train]`.
+
+    The policy that another one starts from is not read.
+
+    Raises:
+        BadInputError: the row trains nothing, an artifact is not there, or a change does not fit.
+    """
+    return _training(run, settings_of(run), row, seed, percent, changes)
+
+
+def _training(
+    run: str | Path,
+    settings: dict[str, Any],
+    row: str,
+    seed: int,
+    percent: int | None,
+    changes: Mapping[str, Any],
+) -> Training:
+    if _method_of(settings, row).learn is None:
+        raise BadInputError(f"{row} has no training: expected a row that is trained")
+    changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | dict(changes)}
+    of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
+    _check_made(of_train, ("dataset", "grounding"))
+    return Training(
+        task=task_named(of_train["task"]),
+        config=of_train["config"],
+        settings=of_train["settings"],
+        episodes=PairedEpisodes.load(of_train["dataset"]),
+        grounding=grounding_at(of_train["grounding"] and of_train["grounding"] / GROUNDING),
+        initial=None,
+        seed=seed,
+        device="cpu",
+        folder=Path(run),
+        progress=silent,
+        is_plus=is_plus(row),
+    )
+
+
+def _method_of(settings: Mapping[str, Any], row: str) -> Method:
+    """Return the method of a row of a run with these settings, whose own methods are added first."""
+    add_all(settings.get("own_methods", {}))
+    return method_named(row)
+
+
+def _planned(
+    run: str | Path, settings: dict[str, Any], stage: str, row: str, seed: int, percent: int | None
+) -> partial[object]:
+    """Return the call by which a run with these `settings` makes the artifact of a row."""
+    recipe = validated(settings | {"select": None}, Recipe, f"{run}")
+    only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
+    items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
+    call = items.get(artifact_key(stage, row, seed, percent))
+    if not isinstance(call, partial):
+        raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
+    return call
+
+
+def _check_made(given: dict[str, Any], artifacts: Iterable[str]) -> None:
+    """Refuse a call to which one of the `artifacts` is given that is not there."""
+    if missing := [str(given[name]) for name in artifacts if given[name] and not given[name].is_dir()]:
+        raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")

@@ -1,0 +1,292 @@
+"""A folder for a new robot: a task, a recipe, a mapping of its logs, a test and a page."""
+
+import importlib.util
+import json
+import keyword
+import math
+import re
+import shlex
+import sys
+import sysconfig
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+import numpy as np
+
+from astra_data.core.arrays import Floats
+from astra_data.core.config import did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.atomic import atomic_folder
+from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TERMINATED
+from astra_data.dataset.format import INFO_PATH
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import locate, names_at_home
+from astra_data.io.guessing import guess
+from astra_data.io.logs import Logs, Role, csv_files, logs_of
+from astra_data.pipeline.first_simulator import DIRECT, SimulatorKind, first_simulator, unpacked
+
+_COLUMNS: dict[Role, str] = {
+    "state": STATE,
+    "command": ACTION,
+    "goal": GOAL,
+    "failure": TERMINATED,
+    "success": SUCCESS,
+    "reward": REWARD,
+}
+_TAKEN = sys.stdlib_module_names | {"astra_data", "conftest", "logs", "numpy", "pytest", "torch"}
+"""Names whose file would be found in place of a module, or is that of the mapping."""
+_FILES = {"task.py": "{}.py", "recipe.toml": "{}.toml", "test.py": "test_{}.py", "README.md": "README.md"}
+
+
+def write_robot(name: str, out: Path, logs: Sequence[Path]) -> SimulatorKind:
+    """Write the new folder `out` of the robot `name`; return the simulator that it begins with, and its logs.
+
+    Args:
+        name: of the task: a-z, digits and _, and no module's.
+        out: the folder to write.
+        logs: CSV files, or folders of them; or one dataset.
+
+    Raises:
+        BadInputError: `name` is no name, `out` exists, or logs are missing or useless, see `guess`.
+    """
+    if not re.fullmatch("[a-z][a-z0-9_]*", name):
+        raise BadInputError(
+            f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart, that begins with a letter"
+        )
+    if name in _TAKEN or keyword.iskeyword(name) or _is_installed(name):
+        raise BadInputError(f"'{name}': expected a name that Python does not use, such as my_{name}")
+    with atomic_folder(out) as folder:
+        data = _dataset(logs)
+        found = logs_of(data) if data else guess(logs)
+        simulator = first_simulator(found)
+        values = _values(name, simulator)
+        if data:
+            values |= dict.fromkeys(("and_mapping", "versions", "import_line", "mapping_row"), "")
+            values |= {
+                "data": _code(str(data.root.resolve())),
+                "dataset": shlex.quote(str(data.root.resolve())),
+            }
+        else:
+            values |= _of_mapping(name, [path.resolve() for path in logs])
+        for template, written in (_FILES if data else _FILES | {"logs.toml": "logs.toml"}).items():
+            (folder / written.format(name)).write_text(_template(template, values), encoding="utf-8")
+    return simulator
+
+
+def _is_installed(name: str) -> bool:
+    spec = importlib.util.find_spec(name)
+    places = [Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib")]
+    return bool(spec and spec.origin and any(Path(spec.origin).is_relative_to(place) for place in places))
+
+
+def _dataset(logs: Sequence[Path]) -> Dataset | None:
+    """Return the dataset that `logs` name; None where they are files, or folders of them.
+
+    Raises:
+        BadInputError: one of several is a dataset, or nothing is there.
+        CorruptDatasetError: the dataset is incomplete or was altered.
+    """
+    folders = []
+    for place in logs:
+        try:
+            folder = locate(place)
+        except BadInputError:
+            if not place.exists() and "@" not in place.name:
+                close = did_you_mean(str(place), names_at_home())
+                raise BadInputError(f"{place}: no such file, folder or dataset{close}") from None
+            if not place.exists():
+                raise
+            continue
+        folders += [folder] if folder != place or (folder / INFO_PATH).is_file() else []
+    if folders and len(logs) > 1:
+        raise BadInputError(
+            f"{' and '.join(map(str, logs))}: expected logs, or one dataset: `astra-data merge` them first"
+        )
+    return Dataset.open(folders[0]) if folders else None
+
+
+def _of_mapping(name: str, logs: Sequence[Path]) -> dict[str, str]:
+    """Return what recipe and page say where the data are imported from `logs`, by a mapping."""
+    folder = logs[0].parent
+    is_whole = len(logs) > 1 and all(path.is_file() for path in logs) and csv_files(folder) == sorted(logs)
+    places = shlex.join(map(str, [folder] if is_whole else logs))
+    return {
+        "logs": places,
+        "data": _code(f"{name}-logs@data-1.0.0"),
+        "dataset": f"{name}-logs",
+        "and_mapping": " and `logs.toml`",
+        "versions": " After a change of `logs.toml` give it a `version`, and the recipe's `data` the same.",
+        "import_line": f"astra-data import {places} --mapping logs.toml  # a dataset, {name}-logs\n",
+        "mapping_row": "| `logs.toml` | which fields of the logs become which columns, in which units |\n",
+    }
+
+
+def _values(name: str, simulator: SimulatorKind) -> dict[str, str]:
+    """Return what the templates name."""
+    logs = simulator.logs
+    states, commands = logs.of("state"), logs.of("command")
+    lines = ["| field | used as | unit | factor | why |", "|---|---|---|---|---|"]
+    for one in logs.fields:
+        called = one.name.replace("|", r"\|")
+        lines.append(f"| `{called}` | {one.taken_for} | {one.unit} | {one.scale:.4g} | {one.why} |")
+    time = [f"time = {_code(field.name)}\ntime_scale = {field.scale!r}\n" for field in logs.of("time")]
+    split = [f"field = {_code(field.name)}\n" for field in logs.of("episode")[:1]]
+    if time:
+        split.append(f"gap_s = {5 / logs.rate!r}  # a longer step begins a new episode\n")
+    check = logs.uneven if time else "the logs have no time field"
+    row, command = logs.values(states)[0][:1], logs.values(commands)[0][:1]
+    first = simulator.episodes()[0][0][:1]
+    given = np.concatenate(logs.values(commands))
+    lows, highs = given.min(axis=0), given.max(axis=0)
+    unit = 10.0 ** np.floor(np.log10(np.where(highs > lows, highs - lows, 1.0))) / 1e3
+    lows, highs = np.floor(lows / unit) * unit, np.ceil(highs / unit) * unit  # outwards
+    highs = np.where(highs > lows, highs, lows + unit)  # of a command that never changes
+    ranges = zip(commands, lows, highs, strict=True)
+    bounds = ", ".join(f"{_code(command.short)}: {_code((low, high))}" for command, low, high in ranges)
+    return {
+        "name": name,
+        "called": simulator.called,
+        "simulator": simulator.code(),
+        "simulator_line": simulator.described,
+        "timestep_s": repr(1 / logs.rate),
+        "rate_hz": f"{logs.rate}" + (f"  # CHECK: {check}" if check else ""),
+        "time": "".join(time),
+        "not_finite": 'not_finite = "split"  # CHECK: rows with a missing number end the episode\n'
+        * bool(logs.left_out),
+        "split": "".join(["\n[split]\n", *split]) if split else "",
+        "columns": "\n".join(_column(role, logs) for role in _COLUMNS if logs.of(role)),
+        "size": str(len(states)),
+        "state": _code(tuple(field.short for field in states)),
+        "state_units": _code([field.unit for field in states]),
+        "command_size": str(len(commands)),
+        "command_names": _code(tuple(field.short for field in commands)),
+        "command_units": _code([field.unit for field in commands]),
+        "bounds": f"{{{bounds}}}",
+        "still": f"; {logs.still}" if logs.still else "",
+        "horizon": str(max(map(len, logs.values(states)))),
+        "guesses": "\n".join(lines),
+        "row": _code(row[0]),
+        "phi": _code(first[0]),
+        "command": _code(command[0]),
+        "landed": _code(simulator.after(first, [command])[0]),
+        **_objective(simulator),
+    }
+
+
+def _objective(simulator: SimulatorKind) -> dict[str, str]:
+    """Return what the template names of the objective, to come to where logs go, and its code."""
+    logs, is_planar = simulator.logs, simulator.called != DIRECT
+    recorded = [states for states, _ in simulator.episodes()]
+    width = 2 if is_planar else len(simulator.names)
+    spans = np.ptp(np.concatenate(recorded), axis=0)
+    spans = np.where(spans > 0, spans, 1.0)  # of what never moves
+    shares = 1.0 if is_planar else spans
+    goal, way = _typical([states[:, :width] / shares for states in recorded], logs)
+    taken = _goals_of(simulator, is_planar=is_planar)
+    drawn, pairs, text = [], [], ""
+    for entry in simulator.entries:
+        at = [simulator.names.index(one) for one in entry.names]
+        begins = np.array([states[0, at] for states in recorded])
+        is_angle = len(at) > 1
+        pairs.append(_arc(np.arctan2(*begins.T[::-1])) if is_angle else (begins.min(), begins.max()))
+        drawn += entry.shown("np.cos({})", "np.sin({})")
+    if goals := logs.of("goal"):
+        every = np.concatenate(logs.values(goals))
+        use = "" if taken else "; nothing below uses them"
+        bounds = f"{_code(every.min(axis=0))}, {_code(every.max(axis=0))}, (count, {len(goals)})"
+        text = (
+            f"\n    goal_size = {len(goals)}\n\n"
+            f"    def draw_goals(self, rng, count):  # CHECK: where goals are{use}\n"
+            f"        return rng.uniform({bounds})"
+        )
+    values = {
+        "command_size": str(len(logs.of("command"))),
+        "goals": text,
+        "starts": unpacked([entry.name for entry in simulator.entries]),
+        "lows": _code([low for low, _ in pairs]),
+        "highs": _code([high for _, high in pairs]),
+        "start_size": str(len(pairs)),
+        "drawn": ", ".join(drawn),
+        "target": f"goal[..., {taken}]" if taken else "state.new_tensor(GOAL)",
+        "seen": "cos * east + sin * north, cos * north - sin * east",
+    }
+    if "east" in simulator.driven.values():
+        values["seen"] = "east, north"  # of a robot that is commanded along the axes of the world
+    sizes = [
+        f"\n{name} = {value!r}  # CHECK: fitted to the logs" for name, value in simulator.constants.items()
+    ]
+    return {
+        "names": _code(tuple(simulator.names)),
+        "constants": "".join(sizes),
+        "goal_line": "" if taken else f"GOAL = {_code(tuple(goal * shares))}  # CHECK: where to go\n",
+        "close": f"{way / 10:.2g}",
+        "range": f"{way:.3g}" if is_planar else _code(tuple(spans)),
+        "objective": _template("planar.py" if is_planar else "direct.py", values),
+    }
+
+
+def _template(name: str, values: Mapping[str, str]) -> str:
+    text = (files("astra_data.pipeline") / f"robot_files/{name}.template").read_text(encoding="utf-8")
+    return Template(text).substitute(values)
+
+
+def _goals_of(simulator: SimulatorKind, *, is_planar: bool) -> list[int]:
+    """Return which values of recorded goals are for the position, or for all states; none if none are."""
+    goals = simulator.logs.of("goal")
+    if not is_planar:
+        return list(range(len(goals))) if len(goals) == len(simulator.names) else []
+    axes = [entry.fields[0].plain.rpartition("_")[2][:3] for entry in simulator.entries[:2]]
+    found = [number for axis in axes for number, one in enumerate(goals) if f"_{axis}" in one.plain]
+    return found if len(found) == 2 else [0, 1] if len(goals) == 2 else []
+
+
+def _typical(episodes: Sequence[Floats], logs: Logs) -> tuple[Floats, float]:
+    """Return the end (D,) of the episode whose distance from its start is the median, and this distance.
+
+    Failed episodes do not count, unless all are. If it ends where it began, it is the farthest of all.
+    """
+    fields = logs.of("failure")
+    failed = [any(bool(one[field.name].any()) for field in fields) for one in logs.episodes]
+    kept = [values for values, fails in zip(episodes, failed, strict=True) if not fails] or episodes
+    ways = [float(np.linalg.norm(values[-1] - values[0])) for values in kept]
+    typical = int(np.argsort(ways)[len(ways) // 2])
+    farthest = max(float(np.linalg.norm(values - values[0], axis=1).max()) for values in episodes)
+    return kept[typical][-1], ways[typical] or farthest or 1.0
+
+
+def _arc(angles: Floats) -> tuple[float, float]:
+    """Return where the shortest arc that contains all angles begins and ends."""
+    order = np.sort(angles)
+    gaps = np.diff(order, append=order[0] + math.tau)
+    widest = int(np.argmax(gaps))
+    begin = float(order[(widest + 1) % len(order)])
+    return begin, begin + max(0.0, math.tau - float(gaps[widest]))
+
+
+def _column(role: Role, logs: Logs) -> str:
+    """Return the table of a column in a mapping."""
+    fields, lines = logs.of(role), [f'[columns."{_COLUMNS[role]}"]']
+    if fields[0].why.endswith("(CHECK)"):
+        called = f"{fields[0].name} is {fields[0].why.removesuffix(' (CHECK)')}"
+        lines.insert(
+            0, f"# CHECK: {called}: a failure? If a success, write next.success; if neither, delete this"
+        )
+    lines.append(f"fields = {_code([field.name for field in fields])}")
+    if role in ("state", "command", "goal"):
+        keys = {"names": "short", "unit": "unit", "scale": "scale", "offset": "offset"}
+        lines += [f"{key} = {_code([getattr(field, of) for field in fields])}" for key, of in keys.items()]
+    return "\n".join(line for line in lines if not re.fullmatch(r"offset = \[(0\.0(, )?)+\]", line)) + "\n"
+
+
+def _code(value: str | Iterable[str] | Iterable[float]) -> str:
+    """Return a text, a tuple or a list as Python and, but for tuples, TOML; numbers as exact as float32."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    inside = ", ".join(
+        _code(one) if isinstance(one, str) else repr(float(f"{one:.9g}") + 0.0) for one in value
+    )
+    if isinstance(value, tuple):
+        return f"({inside},)" if len(value) == 1 else f"({inside})"
+    return f"[{inside}]"

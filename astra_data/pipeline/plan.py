@@ -1,0 +1,247 @@
+"""The artifacts that a recipe's rows, seeds and sizes need, each once.
+
+    collect ──┬── (augment) ── pair ──┬── ground ──┬── train ──┬── evaluate ──┬── report
+    or label ─┘                       │            └── align ──┘              │
+                                      │   (all seeds of ground and train) ── (select)
+                                      └── (rows without grounding train on the pairs alone)
+
+A row named `<method>_plus` is `<method>` trained with the plus settings; it shares the
+grounding and the alignment of `<method>`. A recipe with `data` labels that, and collects nothing. Where a
+recipe sweeps over sizes, what comes before is made of the largest once, `subset` makes each size of it,
+and everything from ground on is made for each.
+"""
+
+import inspect
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+from astra_data.core.config import did_you_mean, in_full
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import artifact_key, base_method, reference_of, stage_of_key
+from astra_data.methods import grounded_as, method_named
+from astra_data.methods.method import Method
+from astra_data.pipeline.execution import Item
+from astra_data.pipeline.points import Selection
+from astra_data.pipeline.recipe import Recipe
+from astra_data.pipeline.stages.registry import STAGES, Stage
+from astra_data.pipeline.stages.select import benches, judge_of
+from astra_data.reports.runs import Reported
+
+ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
+"""Parameters of stages that are folders of artifacts."""
+
+
+def plan(
+    recipe: Recipe,
+    path: Path,
+    folder: Path,
+    selection: Selection | None = None,
+    *,
+    device: str = "cpu",
+    publish: Path | None = None,
+    published: Sequence[Path] = (),
+) -> tuple[Item, ...]:
+    """Return every artifact of `recipe`, each after those it reads, seed after seed.
+
+    Args:
+        recipe: what to make.
+        path: the recipe's file.
+        folder: where it is made, such as `runs/antmaze_long`; an item's artifact is at `folder / key`.
+        selection: the points to make and to report; by default all.
+        device: torch device of the networks.
+        publish: a folder that the report copies its results to, if any.
+        published: files of results that the report adds to.
+    """
+    selection = selection or Selection.of(recipe)
+    items = list(_Plan(recipe, folder, selection, device).items())
+    report, keys = STAGES["report"], tuple(point.key for point in selection.points())
+    reported = Reported(
+        name=path.stem,
+        task=recipe.task,
+        methods=selection.methods,
+        seeds=selection.seeds,
+        settings=in_full(recipe),
+        percents=selection.percents,
+    )
+    choice = _choice(recipe, reported, folder)
+    if choice is not None:
+        items.append(choice)
+        keys += ("select",)
+    call = partial(
+        report.run,
+        reported,
+        root=folder,
+        command=_command(recipe, path, selection),
+        publish=publish,
+        published=published,
+        config=recipe.report,
+    )
+    return (*items, Item("report", keys, call))
+
+
+def _choice(recipe: Recipe, reported: Reported, folder: Path) -> Item | None:
+    """Return the choice among the policies of the selection, if there are judges and policies to judge."""
+    if recipe.select is None or len(reported.seeds) < 2:
+        return None
+    of = benches(reported, judge_of(recipe.select.judge, recipe.methods))
+    if not any(bench.entries for bench in of):
+        return None
+    inputs = dict.fromkeys(key for bench in of for key in bench.keys)
+    return Item(
+        "select",
+        tuple(inputs),
+        partial(STAGES["select"].run, reported, recipe.select, root=folder),
+    )
+
+
+def stage_of(item: Item) -> str:
+    """Return the stage that makes `item`."""
+    return stage_of_key(item.key)
+
+
+def stages_until(last: str | None) -> set[str]:
+    """Return the stages up to `last`, by default all.
+
+    Raises:
+        BadInputError: there is no such stage.
+    """
+    check_stage(last or "report")
+    return set(list(STAGES)[: list(STAGES).index(last or "report") + 1])
+
+
+def check_stage(stage: str) -> None:
+    """Refuse an unknown stage.
+
+    Raises:
+        BadInputError: there is no such stage.
+    """
+    if stage not in STAGES:
+        raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """The artifacts of a recipe, except its report."""
+
+    recipe: Recipe
+    folder: Path
+    selection: Selection
+    device: str
+
+    @cached_property
+    def _names(self) -> dict[str, tuple[str, ...]]:
+        """The methods or rows for which stages make one artifact each, per dataset."""
+        rows = self.selection.methods
+        bases = tuple(dict.fromkeys(map(base_method, rows)))
+        reference = reference_of(self.recipe.methods)
+        judge = [judge_of(self.recipe.select.judge, self.recipe.methods)] if self.recipe.select else []
+        candidates = (*bases, *([reference] if reference else []), *judge)
+        groundings = dict.fromkeys(grounded_as(base) for base in candidates if method_named(base).grounds)
+        initial = [first for base in bases if (first := method_named(base).initial)]
+        trained = [row for row in rows if method_named(row).trains]
+        return {
+            "grounding": tuple(groundings),
+            "policy": tuple(dict.fromkeys(initial + trained)),
+            "alignment": tuple(base for base in groundings if method_named(base).aligns),
+            "row": rows,
+        }
+
+    def items(self) -> Iterator[Item]:
+        """Yield the artifacts, each after those it reads."""
+        percents = self.selection.percents
+        for seed in self.selection.seeds:
+            for stage in STAGES.values():
+                if stage.makes_dataset:
+                    sizes = percents if stage.each == "size" else (None,)
+                    yield from (self._item(stage, seed, size) for size in sizes if self._has(stage))
+            for percent in percents or (None,):
+                for stage in STAGES.values():
+                    for name in self._names.get(stage.each, ()):
+                        yield self._item(stage, seed, percent, name)
+
+    def _has(self, stage: Stage) -> bool:
+        """Return whether the recipe has a stage that makes datasets."""
+        if stage.each == "size":
+            return bool(self.selection.percents)
+        return stage.asked_by is None or getattr(self.recipe, stage.asked_by) is not None
+
+    def _item(self, stage: Stage, seed: int, percent: int | None, name: str = "") -> Item:
+        """Return the artifact that a stage makes of a dataset, for a method or row if `name` is one."""
+        recipe, method = self.recipe, method_named(name) if name else None
+        key = artifact_key(stage.name, name, seed, percent)
+        parameters = inspect.signature(stage.run).parameters
+        artifacts = self._artifacts(stage, seed, percent, name)
+        keys = {parameter: artifacts[parameter] for parameter in parameters if parameter in ARTIFACTS}
+        known = {
+            "task": recipe.task,
+            "simulator": recipe.task,
+            "method": name,
+            "config": recipe.config_of(stage.name),
+            "settings": recipe.settings_of(name, stage.name) if name else None,
+            "seed": seed,
+            "percent": percent,
+            "of": recipe.collect and recipe.collect.episodes,
+            "data": recipe.data,
+            "recorded": self._recorded(method, seed, percent, name),
+            "out": self.folder / key,
+            "device": self.device,
+            **{parameter: made and self.folder / made for parameter, made in keys.items()},
+        }
+        return Item(
+            key,
+            tuple(dict.fromkeys(made for made in keys.values() if made)),
+            partial(
+                stage.run, **{parameter: known[parameter] for parameter in parameters if parameter in known}
+            ),
+            # Of the methods only some train in the target, whose physics uses several threads.
+            is_threaded="num_threads" in parameters
+            and (method is None or stage.each != "policy" or method.steps_target),
+            device=self.device if "device" in parameters else "cpu",
+        )
+
+    def _recorded(self, method: Method | None, seed: int, percent: int | None, name: str) -> Path | None:
+        """Return the dataset that the policy of a row was trained on; None if it is none."""
+        if method is None or not method.trains_without_target:
+            return None
+        made = self._artifacts(STAGES["train"], seed, percent, name)["dataset"]
+        return self.folder / made if made else None
+
+    def _artifacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
+        """Return the keys of the artifacts that a stage may read, by its parameters."""
+        datasets = [read for read in map(STAGES.get, stage.reads) if read and read.makes_dataset]
+        last = next((read for read in reversed(datasets) if self._has(read)), None)
+        size = percent if last and last.each == "size" else None
+        artifacts = {"dataset": artifact_key(last.name, "", seed, size) if last else None}
+        if not name:
+            return artifacts
+        base = base_method(name)
+        method, reference = method_named(base), reference_of(self.recipe.methods) or base
+
+        def made(by: str, of: str | None) -> str | None:
+            return artifact_key(by, of, seed, percent) if of else None
+
+        return artifacts | {
+            "policy": made("train", name if method.trains else None),
+            "grounding": made("ground", _grounding(base)),
+            "target_encoder": made("align", grounded_as(base) if method.aligns else None),
+            "reference": made("ground", _grounding(reference)),
+            "initial": made("train", method.initial),
+        }
+
+
+def _grounding(base: str) -> str | None:
+    return grounded_as(base) if method_named(base).grounds else None
+
+
+def _command(recipe: Recipe, path: Path, selection: Selection) -> str:
+    """Return the command that makes `selection`."""
+    whole = Selection.of(recipe)
+    options = [f" --method {row}" for row in selection.methods if selection.methods != whole.methods]
+    options += [f" --seed {seed}" for seed in selection.seeds if selection.seeds != whole.seeds]
+    options += [
+        f" --percent {percent}" for percent in selection.percents if selection.percents != whole.percents
+    ]
+    swept = recipe.sweep.percent or selection.methods != whole.methods
+    return f"astra-data {'sweep' if swept else 'run'} {path}{''.join(options)}"

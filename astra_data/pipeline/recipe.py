@@ -1,0 +1,252 @@
+"""The model of recipes: task, rows, seeds and sizes, and a table of settings per stage and method."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+from pydantic import Field, JsonValue, ValidationInfo, create_model, field_validator, model_validator
+
+from astra_data.core.config import Config, Seed, did_you_mean
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import PLUS, base_method, is_plus
+from astra_data.dataset.edit import share
+from astra_data.methods import METHODS, method_named, tables
+from astra_data.methods.method import Table
+from astra_data.pipeline.own_methods import OwnMethod, add_all, with_offered
+from astra_data.pipeline.recipe_tables import method_field, stage_field
+from astra_data.pipeline.stages.registry import STAGES, Stage
+from astra_data.pipeline.stages.select import judge_of
+from astra_data.robots.registry import task_named
+from astra_data.worlds.score import Score
+
+WHOLE = 100
+"""Per cent: the size of a dataset that is not swept over."""
+
+
+class SweepConfig(Config):
+    """The sizes of the dataset on which the rows are repeated."""
+
+    percent: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
+    """Percentages of `collect.episodes`, or of the episodes of `data`; smaller sets are contained in larger
+    ones. By default the whole dataset."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sweeps_sizes_alone(cls, table: Any) -> Any:  # noqa: ANN401 - checked next
+        if other := [key for key in table if key != "percent"] if isinstance(table, dict) else []:
+            fault = f"expected percent alone, got {', '.join(other)}"
+            raise ValueError(f"{fault}: for values of another setting write recipes with based_on")
+        return table
+
+
+class Recipe(Config):
+    """One experiment: which methods, on which task, with which seeds and settings.
+
+    Below `seeds` come a table for each stage, `based_on`, `sweep`, and the methods' tables; see
+    `with_tables`.
+    """
+
+    task: str
+    """A task of this package or of an installed one, or in a file next to the recipe: "cart.py:TASK"."""
+    data: str | None = Field(default=None, exclude_if=lambda data: data is None)
+    """A dataset instead of `[collect]`: a folder next to the recipe, what dataset commands take (a folder, a
+    name in the home folder, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
+    own_methods: dict[str, OwnMethod] = Field(default_factory=dict, exclude_if=lambda methods: not methods)
+    """Your own methods, by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
+    methods: tuple[str, ...] = Field(min_length=1)
+    """Rows of the results: a name in `astra_data.methods.METHODS`, alone or followed by `_plus`."""
+    seeds: tuple[Seed, ...] = Field(min_length=1)
+    """For each seed everything is repeated, starting with collecting the dataset."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, table: str) -> Any: ...  # noqa: ANN401 - each table has its own model
+
+    @property
+    def settings(self) -> dict[str, JsonValue]:
+        """All settings as JSON values, as a run records them; later settings only where they take effect."""
+        return self.model_dump(mode="json")
+
+    @property
+    def headline(self) -> Score:
+        """The score by which its rows are compared first."""
+        return task_named(self.task).objective.scores[0]
+
+    def settings_of(self, row: str, stage: str) -> Config | None:
+        """Return the settings of a row's method, if it has any and `stage` takes them."""
+        name = base_method(row)
+        method = METHODS[name]
+        if method.table is None or method.configures != stage:
+            return None
+        if name in self.own_methods:
+            return self.own_methods[name].settings(name)
+        table: Any = getattr(self, method.table.name)
+        settings: Config = table
+        return settings
+
+    def config_of(self, stage: str) -> Config | None:
+        """Return the settings of a stage; None where it has none."""
+        if stage == "collect" and self.largest != WHOLE:
+            episodes = share(self.largest, self.collect.episodes)
+            collect: Config = self.collect
+            return collect.model_copy(update={"episodes": episodes})
+        config: Config | None = getattr(self, stage, None)
+        return config
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_data_or_collects(cls, tables: Any) -> Any:  # noqa: ANN401 - checked next
+        if not isinstance(tables, dict):
+            return tables
+        tables = with_offered(tables, cls.model_fields)
+        if tables.get("data") is None:
+            return tables
+        if tables.get("collect") is not None:
+            raise ValueError("data replaces [collect]: leave out one of them")
+        return tables | {"collect": None}
+
+    @field_validator("task")
+    @classmethod
+    def _is_known_task(cls, task: str) -> str:
+        try:
+            task_named(task)
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return task
+
+    @field_validator("own_methods")
+    @classmethod
+    def _add_own_methods(cls, methods: dict[str, OwnMethod]) -> dict[str, OwnMethod]:
+        try:
+            add_all(methods)
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return methods
+
+    @field_validator("methods")
+    @classmethod
+    def _are_known_methods(cls, rows: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if "own_methods" not in info.data:
+            return rows  # told already
+        for row in rows:
+            try:
+                method_named(row)
+            except BadInputError:
+                unknown = f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}"
+                raise ValueError(unknown) from None
+            if is_plus(row) and not method_named(row).in_simulator:
+                raise ValueError(
+                    f"'{row}' trains nothing in a simulator, so plus settings have no effect: "
+                    f"leave out {PLUS}"
+                )
+        return rows
+
+    @model_validator(mode="after")
+    def _fits_the_learner(self) -> Self:
+        if self.train.learner != "ppo" and "rma" in map(base_method, self.methods):
+            raise ValueError(f"methods: rma: expected train.learner 'ppo', got '{self.train.learner}'")
+        collects_by = self.collect and self.collect.behavior
+        if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
+            raise ValueError(f"collect: good episodes of {self.task} are short: use 'suboptimal_ppo'")
+        return self
+
+    @model_validator(mode="after")
+    def _has_judges(self) -> Self:
+        if self.select is None:
+            return self
+        try:
+            judge_of(self.select.judge, self.methods)
+        except BadInputError as error:
+            raise ValueError(f"select.judge: {error}") from None
+        if len(self.seeds) < 2:
+            raise ValueError(
+                "select: expected two seeds or more, got 1 (judges are of other seeds): "
+                "remove [select], or add a seed"
+            )
+        if not any(method_named(row).trains_without_target for row in self.methods):
+            raise ValueError("select: expected a row with policies of abstract states, got none")
+        return self
+
+    @model_validator(mode="after")
+    def _has_the_target_that_it_needs(self) -> Self:
+        needing = [f"methods: {row}" for row in self.methods if method_named(row).steps_target]
+        task = task_named(self.task)
+        if needing and task.has_target and task.make_target is None and self.train.data_start_share:
+            fault = f"train.data_start_share: robots of {self.task} cannot be put into recorded states, where"
+            raise ValueError(f"{fault} these would start: {', '.join(needing)}: expected 0")
+        needing += ['[collect] (give `data = "…"` in its place)'] if self.data is None else []
+        if needing and not task.has_target:
+            raise ValueError(f"{self.task} has no target, which these need: {', '.join(needing)}")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_the_task(self) -> Self:
+        task = task_named(self.task)
+        if task.plane is not None:
+            if "leg_scale" not in task.facts and self.evaluate.leg_scale != 1.0:
+                raise ValueError(f"evaluate.leg_scale: {self.task} has legs of one length: expected 1")
+            return self
+        faults = [f"methods: {row}" for row in self.methods if method_named(row).planar]
+        asked = {
+            "augment": self.augment is not None,
+            'collect.start = "anywhere"': self.collect and self.collect.start == "anywhere",
+            "collect.clearance_m": self.collect and self.collect.clearance_m > 0,
+            "evaluate.leg_scale": self.evaluate.leg_scale != 1.0,
+            "report.paper_success": bool(self.report.paper_success),
+        }
+        if faults := faults + [setting for setting, is_asked in asked.items() if is_asked]:
+            needing = ", ".join(faults)
+            raise ValueError(f"{self.task} has no maze, which these need: {needing}; leave them out")
+        return self
+
+    @model_validator(mode="after")
+    def _counts_recorded_episodes(self) -> Self:
+        if self.augment and self.sweep.percent:
+            raise ValueError(
+                "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one "
+                "of the two"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _has_no_repeats(self) -> Self:
+        axes = {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}
+        for name, values in axes.items():
+            if len(set(values)) < len(values):
+                raise ValueError(f"expected each of {name} once, got {list(values)}")
+        return self
+
+    @model_validator(mode="after")
+    def _has_no_empty_size(self) -> Self:
+        if self.collect is None:
+            if self.largest > WHOLE:
+                raise ValueError(f"sweep.percent: expected at most {WHOLE} % of data, got {self.largest}")
+            return self
+        for percent in self.sweep.percent:
+            if not share(percent, self.collect.episodes):
+                raise ValueError(
+                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes are none: expected more"
+                )
+        return self
+
+    @property
+    def largest(self) -> int:
+        """The largest size, in per cent of the episodes: as much is collected."""
+        return max(self.sweep.percent, default=WHOLE)
+
+
+def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[Table]) -> type[Recipe]:
+    """Return the model of recipes with the tables of `stages` and those that `methods` read.
+
+    Further keys: `based_on`, the recipe that provides the settings not given here and the artifacts that do
+    not change; and `sweep`.
+    """
+    fields: dict[str, Any] = {stage.name: stage_field(stage) for stage in stages if stage.config}
+    about = "The recipe of the settings that are not given here, and of the artifacts that do not change."
+    fields["based_on"] = (str | None, Field(default=None, description=about))
+    fields["sweep"] = (SweepConfig, SweepConfig())
+    fields |= {table.name: method_field(table) for table in methods}
+    return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
+
+
+if not TYPE_CHECKING:
+    Recipe = with_tables(Recipe, STAGES.values(), tables().values())

@@ -1,0 +1,138 @@
+"""Align: fit the target encoder ψ^t to the frozen source encoder (paper, Section IV-B)."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from astra_data.core.artifact import CHECKPOINT, finished_folder
+from astra_data.core.config import NotNegative, as_json
+from astra_data.core.digest import file_digest
+from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
+from astra_data.core.seeding import derive
+from astra_data.grounding.descent import Descent, WindowedConfig
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_history_model, save_target_encoder
+from astra_data.grounding.networks.alignment import TargetEncoder, gaussian_mmd
+from astra_data.grounding.networks.grounding import GroundingModel
+from astra_data.grounding.networks.paired_windows import PairedWindows
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.reports.artifacts import METRICS
+
+_MEASURED_EVERY = 100
+_BANDWIDTHS = (0.25, 0.5, 1.0, 2.0)
+"""Bandwidths of the MMD's kernels, in units of the square root of the latent's size."""
+
+
+class AlignConfig(WindowedConfig):
+    """How the target encoder is fitted."""
+
+    paired_weight: NotNegative = 1.0
+    """Weight of the squared distance of paired latents, beside the MMD; 0 gives the paper's loss."""
+    held_out_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    """Fraction of the episodes to hold out for measuring the agreement, unless the dataset holds some out
+    itself. In a recipe this is that of `[ground]`, whose training leaves these episodes out."""
+
+
+def align(
+    config: AlignConfig = AlignConfig(),
+    *,
+    dataset: str | Path,
+    grounding: Path,
+    seed: int = 0,
+    out: Path,
+    device: str = "cpu",
+    progress: Progress = silent,
+) -> None:
+    """Fit ψ^t on index-matched target and abstract histories; write it and its agreement with ψ^s to `out`.
+
+    Raises:
+        BadInputError: an input is missing or malformed, or `out` was begun with other settings.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import align, ground
+        >>> from astra_data.grounding.fit import GroundConfig
+        >>> from astra_data.pipeline.stages.align import AlignConfig
+        >>> ground("antmaze-umaze", "astra", GroundConfig(updates=2), dataset="pairs", out=Path("astra"))
+        >>> align(AlignConfig(updates=2), dataset="pairs", grounding=Path("astra"), out=Path("encoder"))
+    """
+    made = origin(device)
+    grounding_file = grounding / GROUNDING
+    model = load_history_model(grounding_file, device)
+    episodes = PairedEpisodes.load(dataset, device)
+    training, held_out = episodes.split(config.held_out_share, seed)
+    torch.manual_seed(derive(seed, "alignment"))
+    encoder = TargetEncoder(
+        episodes.target_state.shape[-1],
+        model.shape.goal_size,
+        model.shape.action_size,
+        embedding_size=model.shape.embedding_size,
+        latent_size=model.shape.latent_size,
+        position_octaves=model.shape.position_octaves,
+    ).to(device)
+    # Where φ drops the robot's place, latents must not depend on where it came from.
+    encoder.set_scales(
+        training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
+    )
+    bandwidths = torch.tensor(_BANDWIDTHS, device=device) * model.shape.latent_size**0.5
+    grounding_digest = file_digest(grounding_file)
+    settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
+    made_from = {"dataset": episodes.content_hash, "grounding": grounding_digest}
+    with finished_folder(out, config=settings_text, made_from=made_from) as folder:
+        fitting = config.descent(int(training.lengths.sum()))
+        descent = Descent(encoder, fitting, checkpoint=folder / CHECKPOINT)
+        window = min(config.window, training.windows.mask.shape[1])
+        while not descent.is_over:
+            torch.manual_seed(derive(seed, f"alignment update {descent.done}"))
+            windows, state = training.draw_windows(config.batch_windows, window)
+            discrepancy, distance = _losses(model, encoder, windows, state, bandwidths)
+            descent.update(discrepancy + config.paired_weight * distance)
+            if descent.done % _MEASURED_EVERY == 0 or descent.done == fitting.updates:
+                agreement = _agreement(model, encoder, held_out, bandwidths)
+                error = agreement["mmd"] + config.paired_weight * agreement["latent_rmse"] ** 2
+                descent.keep(error, **agreement)
+                rate = descent.done * config.batch_windows / descent.stopwatch.seconds
+                note = f"{rate:,.0f} windows/s  paired latent RMSE {agreement['latent_rmse']:.3f}"
+                progress(descent.share, note)
+        descent.finish()
+        agreement = _agreement(model, encoder, held_out, bandwidths)
+        encoder.latent_r2.fill_(agreement["latent_r2"])
+        save_target_encoder(folder / TARGET_ENCODER, encoder)
+        metrics: dict[str, Any] = made | {
+            "windows_per_second": descent.done * config.batch_windows / descent.stopwatch.seconds,
+            **descent.stopwatch.spent(),
+            "points": descent.points,
+            **agreement,
+            "deployed": "target" if encoder.is_deployed else "source",
+        }
+        (folder / METRICS).write_text(json.dumps(metrics, indent=1))
+
+
+def _losses(
+    model: GroundingModel, encoder: TargetEncoder, windows: PairedWindows, state: Tensor, bandwidths: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the mean MMD² between p^s_i and p^t_i, and the mean squared distance of paired latents."""
+    with torch.no_grad():
+        source, _ = model.encode(windows)
+        source_mean, source_log_variance = model.predict_latent(source, windows.action)
+    target, _ = encoder.encoder(encoder.encoder_input(state, windows.goal, windows.previous_action))
+    mean, log_variance = model.predict_latent(target, windows.action)
+    discrepancy = gaussian_mmd(source_mean, source_log_variance.exp(), mean, log_variance.exp(), bandwidths)
+    distance = (target - source).square().mean(-1)
+    total = windows.mask.sum()
+    return (discrepancy * windows.mask).sum() / total, (distance * windows.mask).sum() / total
+
+
+@torch.no_grad()
+def _agreement(
+    model: GroundingModel, encoder: TargetEncoder, episodes: PairedEpisodes, bandwidths: Tensor
+) -> dict[str, float]:
+    discrepancy, distance = _losses(model, encoder, episodes.windows, episodes.target_state, bandwidths)
+    latent, _ = model.encode(episodes.windows)
+    variance = episodes.steps(latent).var(0, correction=0).mean()
+    explained = 1.0 - distance / variance if variance > 0 else torch.zeros_like(distance)
+    return {"mmd": float(discrepancy), "latent_rmse": float(distance.sqrt()), "latent_r2": float(explained)}

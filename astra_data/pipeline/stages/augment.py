@@ -1,0 +1,270 @@
+"""Augment: more episodes from few, by rotating and translating them on the floor.
+
+The robot's dynamics do not depend on where it is and which way it faces, so a moved episode is one that the
+robot could have recorded, with three exceptions:
+
+* Walls. A robot that was stopped by a wall would not be stopped elsewhere. So only stretches of an episode
+  that keep clear of the walls are copied, and the copies keep clear of them too.
+* The goal belongs to the maze and is not moved: every copy gets a goal of its own, drawn as the task draws
+  it. The task computes the copy's rewards and ends; a copy ends where it reaches its goal. A ball is moved
+  with its robot; the step that ended its episode is not copied, for where the ball was may have ended it.
+* Commands. Where commands are clipped to ±1 m/s along each axis, a command that is rotated out of that square
+  is no longer what the robot did; such rotations are drawn again.
+
+Held-out episodes are chosen first and never copied. Pairing comes later, so that pairs are exact.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationInfo, field_validator
+
+from astra_data.core.config import AtOnce, Config, Count, NotNegative
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, silent
+from astra_data.core.seeding import derive, generator, held_out_episodes
+from astra_data.dataset.columns import (
+    ABSTRACT_STATE,
+    GOAL,
+    NEXT_STATE,
+    OUTCOME_COLUMNS,
+    STATE,
+    Column,
+    Episode,
+)
+from astra_data.dataset.endings import outcome_of
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import next_version, open_dataset
+from astra_data.robots.registry import TASKS, task_named
+from astra_data.worlds.own_code import is_own_code
+from astra_data.worlds.plane.relocation import Copy, Relocation, Rotations
+from astra_data.worlds.task import Task
+
+DEFAULT_COPIES = 3
+_OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
+
+
+class AugmentConfig(Config):
+    """How many copies, and how they may differ; the paper makes 200 episodes of 50 by rotating and moving."""
+
+    copies: AtOnce | None = None
+    """Copies of each training episode; by default 3, or as many as `episodes` requires."""
+    episodes: Count | None = None
+    """Total number of episodes, including originals and held-out ones; instead of `copies`."""
+    rotations: Rotations = "any"
+    """"any": by any angle that keeps the commands within their limits, which is rarer for longer commands.
+    "quarter": by multiples of 90 degrees, each equally often, since these always keep commands within limits.
+    """
+    translations: bool = True
+    """Move copies anywhere in the maze; otherwise a copy starts where the original did."""
+    held_out_share: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    """Fraction of the episodes to hold out first, at least one episode unless it is 0."""
+    keep_originals: bool = True
+    """Whether the new dataset includes the training episodes themselves; it always includes held-out ones."""
+    margin_m: NotNegative | None = None
+    """Minimum distance to walls of copies and their originals; by default the robot's reach. With less,
+    copies are longer but some of their steps are wrong: the robot stops at walls that are not there, or walks
+    through walls that are (8 % of the steps on the U-Maze with 0.6 m, none with the ant's reach)."""
+    min_steps: Count = 20
+    """Length of the shortest stretch that is copied."""
+    tries: Count = 100
+    """Rotations to draw for a copy before giving up, with 64 places for each."""
+
+    @field_validator("episodes")
+    @classmethod
+    def _excludes_copies(cls, episodes: int | None, info: ValidationInfo) -> int | None:
+        if episodes is not None and info.data.get("copies") is not None:
+            raise ValueError("expected either copies or episodes, got both")
+        return episodes
+
+    @field_validator("translations")
+    @classmethod
+    def _changes_something(cls, translations: bool, info: ValidationInfo) -> bool:
+        if not translations and info.data.get("rotations") == "none":
+            raise ValueError("expected rotations or translations, got neither")
+        return translations
+
+
+def augment(
+    task: str | None = None,
+    config: AugmentConfig = AugmentConfig(),
+    *,
+    dataset: str | Path,
+    seed: int = 0,
+    name: str | None = None,
+    out: Path | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Write a version of `dataset` with copies of its training episodes; return its folder.
+
+    Every episode's metadata says whether it is `held_out`; a copy's also `source_episode` (uid),
+    `augmentation_first_step` (of the source) and the map from it, p ↦ R(`augmentation_rotation_rad`) p +
+    (`augmentation_x_m`, `augmentation_y_m`).
+
+    Args:
+        task: computes rewards and ends of copies; by default the one that the dataset was collected for.
+        config: settings.
+        dataset: folder of the dataset, not paired.
+        seed: of all randomness; the same seed gives the same bytes.
+        name: of the new dataset, by default that of `dataset`, whose next version it is.
+        out: its folder, by default its place at home.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: the task has no maze; the dataset does not fit it, was paired or augmented, has
+            columns without roles, or has no stretch to copy or no place for any copy.
+        CorruptDatasetError: `dataset` is incomplete.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import Dataset, augment
+        >>> from astra_data.pipeline.stages.augment import AugmentConfig
+        >>> turned = augment(config=AugmentConfig(episodes=16), dataset="walks", out=Path("turned"))
+        >>> len(Dataset.open(turned))
+        16
+    """
+    source = open_dataset(dataset)
+    world = _task_of(source, task)
+    plane = world.planar
+    _check(source, world)
+    relocation = Relocation(
+        world,
+        rotations=config.rotations,
+        translations=config.translations,
+        margin_m=plane.wall_reach_m if config.margin_m is None else config.margin_m,
+        min_steps=config.min_steps,
+        tries=config.tries,
+    )
+    held_out, copies = _shares(source, relocation, config, seed)
+    taken = set(source.uids.tolist())
+    placed, lost, moving = 0, 0, _moving(source)
+    with next_version(
+        source,
+        "episodes",
+        stage="augment",
+        config=config.model_dump(mode="json"),
+        name=name,
+        out=out,
+        seeds=source.description["seeds"] | {"augment": seed},
+    ) as writer:
+        for index, episode in enumerate(source.episodes()):
+            if held_out[index] or config.keep_originals:
+                metadata = {**episode.metadata, "held_out": bool(held_out[index])}
+                writer.add(Episode(episode.uid, episode.columns, metadata))
+            for copy in range(copies[index]):
+                rng = generator(seed, f"augment {episode.uid} {copy}")
+                copied = relocation.copied(episode, moving, rng)
+                if copied is None:
+                    lost += 1
+                    continue
+                purpose = f"{source.content_hash} {config.model_dump_json()} {episode.uid} {copy}"
+                uid = _free_uid(derive(seed, purpose), taken)
+                writer.add(_episode(uid, episode.uid, copied))
+                placed += 1
+            progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
+        if copies.any() and not placed:
+            raise BadInputError(
+                f"{source.reference}: found no place for any of {lost} copies: lower --margin-m "
+                f"({relocation.margin_m:g} m) or --min-steps, or raise --tries"
+            )
+        skipped = int((~held_out & (copies == 0)).sum())
+        writer.made = {"copies": placed, "copies_without_place": lost, "episodes_not_copied": skipped}
+    return writer.root
+
+
+def _task_of(source: Dataset, task: str | None) -> Task:
+    called, collected_for = source.reference, source.description["environment"].get("id")
+    if task is None and collected_for is None:
+        raise BadInputError(f"{called} does not name its task: give --task")
+    if task is None and is_own_code(str(collected_for)):
+        raise BadInputError(
+            f"{called} was collected for {collected_for}, whose code would be run: read it, then give "
+            f"--task {collected_for}"
+        )
+    if task is not None and collected_for in TASKS and task != collected_for:
+        raise BadInputError(f"{called} was collected for {collected_for}, not for {task}")
+    return task_named(task or str(collected_for))
+
+
+def _check(source: Dataset, world: Task) -> None:
+    columns = {column.name: column for column in source.schema}
+    faults = [f"no column {name}" for name in _OUTCOMES if name not in columns]
+    for expected in world.state_columns:
+        found = columns.get(expected.name)
+        if found is None or found.size != expected.size:
+            size = "none" if found is None else str(found.size)
+            faults.append(f"{expected.name}: expected {expected.size} values per step, got {size}")
+    if ABSTRACT_STATE in columns:
+        faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
+    if "held_out" in source.metadata:
+        faults.append("held_out: it has been augmented; augment its parent")
+    faults += [
+        f"{column.name}: it has no roles, which say how it is rotated"
+        for column in _moving(source)
+        if not column.roles
+    ]
+    if faults:
+        raise BadInputError(f"{source.root} cannot be augmented for {world.name}: {'; '.join(faults)}")
+
+
+def _moving(source: Dataset) -> list[Column]:
+    """Return the columns that are transformed: all of floats but the goal and the outcomes."""
+    still = (*_OUTCOMES, GOAL)
+    return [column for column in source.schema if column.dtype == "float32" and column.name not in still]
+
+
+def _shares(
+    source: Dataset, relocation: Relocation, config: AugmentConfig, seed: int
+) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Return which episodes are held out (E,), and how many copies each is to have (E,)."""
+    count = len(source)
+    training, held = held_out_episodes(count, config.held_out_share, seed)
+    held_out = np.isin(np.arange(count), held)
+    usable = ~held_out
+    for index, episode in enumerate(source.episodes([STATE, NEXT_STATE])):
+        usable[index] &= bool(relocation.stretches(episode))
+    if not usable.any():
+        raise BadInputError(
+            f"{source.reference}: none of {len(training)} training episodes keeps {relocation.margin_m:g} m "
+            f"from the walls for {config.min_steps} steps: lower --margin-m, --min-steps or --held-out-share "
+            f"({len(held)} episodes)"
+        )
+    copies = np.zeros(count, dtype=np.intp)
+    copies[usable] = config.copies or DEFAULT_COPIES
+    if config.episodes is not None:
+        kept = count if config.keep_originals else len(held)
+        if config.episodes < kept:
+            raise BadInputError(
+                f"--episodes {config.episodes}: expected at least {kept}, the number of episodes kept"
+            )
+        each, more = divmod(config.episodes - kept, int(usable.sum()))
+        copies[usable] = each
+        copies[training[usable[training]][:more]] += 1
+    return held_out, copies
+
+
+def _episode(uid: int, source: int, copied: Copy) -> Episode:
+    """Return a copy of the episode `source` with what is told of it."""
+    columns, change, steps = copied
+    return Episode(
+        uid,
+        columns,
+        outcome_of(columns)
+        | {
+            "held_out": False,
+            "source_episode": source,
+            "augmentation_first_step": int(steps.start),
+            "augmentation_rotation_rad": change.rotation_rad,
+            "augmentation_x_m": change.shift_m[0],
+            "augmentation_y_m": change.shift_m[1],
+        },
+    )
+
+
+def _free_uid(uid: int, taken: set[int]) -> int:
+    while uid in taken:
+        uid = (uid + 1) % 2**63
+    taken.add(uid)
+    return uid

@@ -1,0 +1,306 @@
+"""Evaluate: run a policy in the target environment and in simulators.
+
+The simulators are the one that it was trained in, and two that are the same for all policies, to measure how
+well each predicts the target: the raw simulator, and a grounded one as reference. These two give the task's
+own reward. Of a task without a target, there are the simulators alone.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from torch import Tensor
+
+from astra_data.core.artifact import finished_folder, refuse_finished
+from astra_data.core.checkpoint import save_tensors
+from astra_data.core.config import AtOnce, Config, Positive
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_made_from
+from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
+from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.files import (
+    GROUNDING,
+    TARGET_ENCODER,
+    grounding_at,
+    load_grounding,
+    load_target_encoder,
+)
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.methods import method_named
+from astra_data.methods.follower import careful
+from astra_data.policies.own_policy import OwnPolicy
+from astra_data.policies.own_world import own_world
+from astra_data.policies.policy_file import POLICY, PolicyFile, running
+from astra_data.policies.recorded_range import RecordedRange
+from astra_data.policies.running_policy import EncoderKind
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.simulator_episodes import Act, Begin, in_simulator, started
+from astra_data.policies.target_episodes import in_target
+from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES
+from astra_data.robots.registry import task_named
+from astra_data.worlds.task import Task
+
+
+class EvaluateConfig(Config):
+    """How policies are tested; the paper uses 100 episodes."""
+
+    episodes: AtOnce = 100
+    """Episodes in the target and in each simulator, run in one batch."""
+    encoder: EncoderKind | None = None
+    """Encoder that an aligned policy runs with; by default ψ^t, or ψ^s where ψ^t is coarse on held-out
+    episodes. Results with both are reported."""
+    leg_scale: Positive = 1.0
+    """Scale of the ant's legs in the target environment; 1.25 is the paper's morphology test."""
+
+
+def evaluate(
+    task: str,
+    method: str,
+    config: EvaluateConfig = EvaluateConfig(),
+    *,
+    policy: Path | PolicyFile | None = None,
+    grounding: Path | None = None,
+    target_encoder: Path | None = None,
+    reference: Path | None = None,
+    recorded: Path | None = None,
+    seed: int = 0,
+    out: Path,
+    progress: Progress = silent,
+    num_threads: int | None = None,
+) -> None:
+    """Test a row and write its figures and paths to `out`.
+
+    Starts, goals and headings depend on the seed alone, so they are the same for every method.
+
+    Args:
+        task: see `task_named`.
+        method: a row.
+        config: the recipe's `[evaluate]`.
+        policy: what `train` made, for a row that trains; or a policy in its place.
+        grounding: what `ground` made for it, for a row that grounds.
+        target_encoder: what `align` made for it, for a row that aligns.
+        reference: the grounding of the reference simulator, if there is one.
+        recorded: the dataset whose range of commands those of the policy are compared with.
+        seed: of all randomness.
+        out: the folder to write.
+        progress: called with the fraction done.
+        num_threads: of the physics, by default one per core; the outcome is the same with any number.
+
+    Raises:
+        BadInputError: an input is missing, malformed or of another grounding, or `out` exists.
+
+    Example:
+        >>> import json
+        >>> from pathlib import Path
+        >>> from astra_data import evaluate
+        >>> from astra_data.pipeline.stages.evaluate import EvaluateConfig
+        >>> evaluate("antmaze-umaze", "follower", EvaluateConfig(episodes=2), out=Path("evaluation"))
+        >>> json.loads(Path("evaluation/evaluation.json").read_text())["target"]["success"]
+        [1.0, 1.0]
+    """
+    refuse_finished(out)
+    world = task_named(task)
+    _check(world, method, policy, grounding)
+    stopwatch = Stopwatch()
+    files = {
+        "policy": policy / POLICY if isinstance(policy, Path) else None,
+        "grounding": grounding and grounding / GROUNDING,
+        "target_encoder": target_encoder and target_encoder / TARGET_ENCODER,
+        "reference": reference and reference / GROUNDING,
+    }
+    read = {name: file for name, file in files.items() if file}
+    if missing := [f"{file}" for file in read.values() if not file.is_file()]:
+        raise BadInputError(f"{missing[0]} does not exist: run the stage that makes it first")
+    made_from = {name: file_digest(file) for name, file in read.items()}
+    for name in made_from.keys() & {"policy", "target_encoder"}:
+        check_made_from(read[name], {"grounding": made_from.get("grounding")})
+    if policy is None:
+        row = _follower(world)
+    else:
+        row = _policy(world, policy if isinstance(policy, PolicyFile) else None, read, config)
+    shared = _shared_simulators(world, read.get("reference"), config) if row.shown_abstract else {}
+    simulators = row.simulators | shared
+    asked = None if recorded is None else RecordedRange.of(recorded, world.limits)
+    tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
+    results: dict[str, Any] = {
+        "task": world.name,
+        "method": method,
+        "seed": seed,
+        "episodes": config.episodes,
+        "leg_scale": config.leg_scale,
+        **origin(),
+        **row.facts,
+    }
+    tensors: dict[str, Tensor] = {}
+    if world.has_target:
+        figures, tensors = _tested_in_target(world, row, config, seed, asked, num_threads, progress)
+        results |= figures
+    else:
+        results |= {"tested_in": tested_in, "encoder": "source"}
+    figures, paths = _tested_in_simulators(world, row.begin, simulators, tested_in, seed, asked)
+    results, tensors = results | figures, tensors | paths
+    if asked is not None:
+        results["beyond_recorded"] = asked.share
+    with finished_folder(out, made_from=made_from) as folder:
+        save_tensors(folder / TRAJECTORIES, tensors, {})
+        results |= stopwatch.spent()
+        (folder / EVALUATION).write_text(json.dumps(results, indent=1))
+        (folder / "config.json").write_text(config.model_dump_json(indent=1))
+    first = world.objective.scores[0]
+    where = "target" if world.has_target else f"{tested_in} simulator"
+    progress(1.0, f"{first.title} in the {where} {first.text(fmean(results[tested_in][first.measure]))}")
+
+
+def _check(task: Task, method: str, policy: Path | PolicyFile | None, grounding: Path | None) -> None:
+    row = method_named(method)
+    if row.trains and policy is None:
+        raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
+    if not row.trains and policy is not None:
+        raise BadInputError(
+            f"method '{method}' has no policy: leave out the policy, or name the policy's row"
+        )
+    if not (row.trains or task.has_target):
+        raise BadInputError(f"method '{method}' acts in a target, and {task.name} has none")
+    if row.grounds and grounding is None:
+        raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What is tested.
+
+    Attributes:
+        begin: starts it in simulators. robots: start it in the target, by the encoder it is deployed with.
+        headline: the encoder whose figures are the row's. simulators: the one that it was trained in, if any.
+        shown_abstract: whether it sees abstract states, and so can act in simulators.
+        is_policy: whether it was trained. facts: to be reported.
+    """
+
+    begin: Begin
+    robots: dict[EncoderKind, Begin]
+    headline: EncoderKind
+    simulators: dict[str, SimulatorEnv] = field(default_factory=dict)
+    shown_abstract: bool = True
+    is_policy: bool = False
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def _follower(task: Task) -> _Row:
+    robot: Begin = partial(_careful_in_target, task)
+    return _Row(partial(careful, task), {"source": robot}, "source")
+
+
+def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
+    trained = loaded or PolicyFile.load(files["policy"])
+    grounding = grounding_at(files.get("grounding"))
+    source = running(task, trained, grounding)
+    robots: dict[EncoderKind, Begin] = {"source": partial(started, source, source.act)}
+    headline: EncoderKind = "source"
+    if "target_encoder" in files:
+        encoder = load_target_encoder(files["target_encoder"])
+        aligned = replace(source, target_encoder=encoder)
+        robots["target"] = partial(started, aligned, aligned.act)
+        headline = config.encoder or ("target" if encoder.is_deployed else "source")
+    facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, OwnPolicy) else {}
+    facts |= {
+        "encoder": headline,
+        "dataset_version": trained.dataset,
+        "dataset_hash": trained.content_hash,
+    }
+    simulators = {}
+    if trained.simulation is not None:
+        simulators["simulated"] = own_world(task, trained.simulation, grounding, config.episodes)
+    return _Row(
+        partial(started, source, source.act_in_simulator),
+        robots,
+        headline,
+        simulators,
+        shown_abstract=trained.observed == "abstract",
+        is_policy=True,
+        facts=facts,
+    )
+
+
+def _tested_in_target(
+    task: Task,
+    row: _Row,
+    config: EvaluateConfig,
+    seed: int,
+    asked: RecordedRange | None,
+    num_threads: int | None,
+    progress: Progress,
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Test a row with each of its encoders; return the figures, and the headline's paths and starts."""
+    tested = {
+        kind: in_target(
+            task,
+            robot,
+            config.episodes,
+            derive(seed, "evaluation"),
+            leg_scale=config.leg_scale,
+            num_threads=num_threads,
+            progress=progress,
+            asked=asked if kind == row.headline else None,
+        )
+        for kind, robot in row.robots.items()
+    }
+    headline = tested[row.headline]
+    figures: dict[str, Any] = {}
+    if row.is_policy:
+        figures["encoders"] = {
+            kind: {
+                score.measure: fmean(episodes.outcome.to_json()[score.measure])
+                for score in task.objective.scores
+            }
+            for kind, episodes in tested.items()
+        }
+    figures |= {"target": headline.outcome.to_json(), "target_steps_per_second": headline.rate}
+    tensors = {"target.position": headline.outcome.position} | headline.start_goal
+    if task.photograph is not None:
+        tensors["target.state"] = headline.filmed
+    return figures, tensors
+
+
+def _tested_in_simulators(
+    task: Task,
+    begin: Begin,
+    simulators: Mapping[str, SimulatorEnv],
+    tested_in: str,
+    seed: int,
+    asked: RecordedRange | None,
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Test a row in each simulator; return the figures, and paths and starts of those that are drawn."""
+    figures: dict[str, Any] = {}
+    tensors: dict[str, Tensor] = {}
+    for name, simulator in simulators.items():
+        counted = asked if name == tested_in else None
+        outcome, start_goal = in_simulator(
+            simulator, begin, task.objective.horizon, derive(seed, "simulated evaluation"), counted
+        )
+        figures[name] = outcome.to_json()
+        tensors |= start_goal if name == tested_in else {}
+        tensors |= {f"{name}.position": outcome.position} if name in ("simulated", tested_in) else {}
+    return figures, tensors
+
+
+def _careful_in_target(task: Task, goal: Tensor) -> Act:
+    act = careful(task, goal)
+    return lambda state, goal: act(task.abstraction(state), goal)
+
+
+def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
+    groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
+    if reference is not None:
+        groundings["grounded"] = load_grounding(reference)
+    return {
+        name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
+        for name, grounding in groundings.items()
+    }

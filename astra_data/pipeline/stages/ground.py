@@ -1,0 +1,106 @@
+"""Ground: fit a correction of the abstract simulator, and report its open-loop error."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from astra_data.core.artifact import finished_folder
+from astra_data.core.config import Config, as_json, faults_of
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import base_method
+from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.files import GROUNDING, load_grounding, save_grounding
+from astra_data.grounding.fit import Fitting, GroundConfig
+from astra_data.grounding.open_loop_error import gap_report
+from astra_data.grounding.own_grounding import check_step, fitted
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.methods import is_of_package, method_named
+from astra_data.reports.artifacts import GAP, METRICS, Metrics
+from astra_data.robots.registry import task_named
+
+
+def ground(
+    task: str,
+    method: str,
+    config: GroundConfig = GroundConfig(),
+    *,
+    settings: Config | None = None,
+    dataset: str | Path,
+    seed: int = 0,
+    out: Path,
+    device: str = "cpu",
+    progress: Progress = silent,
+) -> None:
+    """Fit a method's grounding to a paired dataset; write it with its diagnostics and gap report to `out`.
+
+    Args:
+        task: see `task_named`.
+        method: a row.
+        config: the recipe's `[ground]`.
+        settings: the method's own table of the recipe, if it has one.
+        dataset: paired.
+        seed: of all randomness.
+        out: the folder to write.
+        device: torch device.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: the method does not ground, the dataset is not paired, `out` was begun with other
+            settings, or a method of the user's makes no grounding that can be used.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import ground
+        >>> from astra_data.grounding.fit import GroundConfig
+        >>> ground("antmaze-umaze", "nas", GroundConfig(updates=2), dataset="pairs", out=Path("nas"))
+    """
+    fit = method_named(method).fit
+    if fit is None:
+        raise BadInputError(f"method '{method}' does not ground its simulator")
+    world, made = task_named(task), origin(device)
+    episodes = PairedEpisodes.load(dataset, device)
+    episodes.check(world)
+    training, held_out = episodes.split(config.held_out_share, seed)
+    named = {"task": world.name, "method": method, **episodes.named}
+    settings_text = as_json(**named, seed=seed, ground=config, settings=settings)
+    made_from = {"dataset": episodes.content_hash}
+    with finished_folder(out, config=settings_text, made_from=made_from) as folder:
+        fitting = Fitting(world, config, settings, training, held_out, seed, device, folder, progress)
+        stopwatch = Stopwatch()
+        grounding, metrics = fitted(fit(fitting))
+        figures = made | stopwatch.spent() | metrics
+        _check_figures(figures)
+        progress(1.0, "gap report")
+        save_grounding(folder / GROUNDING, grounding, episodes)
+        written = load_grounding(folder / GROUNDING, device)  # what policies are trained in
+        if not is_of_package(base_method(method)):
+            check_step(world, written, held_out)
+        gap = gap_report(world, written, held_out, seed=seed)
+        progress(1.0, _derived(figures))
+        (folder / METRICS).write_text(json.dumps(figures, indent=1))
+        (folder / GAP).write_text(json.dumps(gap, indent=1))
+
+
+def _derived(figures: Mapping[str, Any]) -> str:
+    """Return in one line what the data decided of a history model."""
+    parts = []
+    if "updates" in figures:
+        parts.append(f"{figures['updates']} updates of windows of {figures['window']}")
+    if (shrinkage := figures.get("reward_shrinkage")) is not None:
+        parts.append(f"residual reward times {shrinkage:.2f}")
+    if failures := figures.get("failure_model"):
+        parts.append(f"failure model {'with' if failures['latent'] else 'without'} latent")
+    return ", ".join(parts) or "fitted"
+
+
+def _check_figures(figures: Mapping[str, Any]) -> None:
+    """Check that reports can read them; a fit of the user's may return others under the same names."""
+    try:
+        Metrics.model_validate(figures)
+    except ValidationError as error:
+        raise BadInputError(f"the figures of fit: {faults_of(error)}: give them other names") from None

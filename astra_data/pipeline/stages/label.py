@@ -1,0 +1,242 @@
+"""Label: what a log lacks of goals, rewards, successes and failures, as the task computes them from φ(s)."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.core.durable import make_folder
+from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_column, as_rows
+from astra_data.core.progress import Progress, silent
+from astra_data.core.seeding import generator
+from astra_data.dataset.atomic import refuse_existing
+from astra_data.dataset.checkup.continuity import Continuity
+from astra_data.dataset.columns import (
+    DONE,
+    GOAL,
+    NEXT_STATE,
+    OUTCOME_COLUMNS,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+    Episode,
+)
+from astra_data.dataset.endings import is_terminated, outcome_of
+from astra_data.dataset.expected_columns import column_faults, names_apart
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import next_version
+from astra_data.io.hub.pull import opened
+from astra_data.robots.registry import task_named
+from astra_data.worlds.expecting import judged, paid
+from astra_data.worlds.own_code import explained
+from astra_data.worlds.task import Task
+
+_log = logging.getLogger(__name__)
+
+
+def label(
+    task: str,
+    *,
+    data: str | Path,
+    seed: int = 0,
+    name: str | None = None,
+    out: Path | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Add the columns of goals and outcomes that a dataset lacks; return the new folder.
+
+    Goals are drawn by the objective, one an episode. Episodes end where the goal is reached: later steps are
+    dropped. An episode that its log ends as terminated, without a success, is a failure.
+
+    Args:
+        task: see `task_named`.
+        data: with states, actions and next states; a folder, a name, or an address to pull it from.
+        seed: of the goals.
+        name: of the new dataset, by default that of `data`, whose next version it is.
+        out: its folder, by default its place at home. Where `data` lacks nothing, it becomes a link to that.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: the dataset lacks states or actions, or these are not those of the task; or there is
+            nothing to label and no `out`.
+        CorruptDatasetError: the dataset is incomplete.
+        SharingError: it cannot be pulled.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import label
+        >>> labeled = label("antmaze-umaze", data="walks", out=Path("labeled"))  # lacks nothing: a link
+    """
+    world, source = task_named(task), opened(data)
+    check_fits(source, world)
+    more = [
+        column
+        for column in ((world.goal,) if world.goal else ()) + OUTCOME_COLUMNS
+        if column.name not in source.features
+    ]
+    for warning in remarks(source, world):
+        _log.warning(warning)
+    if not more and out is not None:
+        refuse_existing(out)
+        make_folder(out.parent)
+        out.symlink_to(source.root.resolve())
+        return out
+    if not more:
+        raise BadInputError(f"{source.reference} already has goals and outcomes: there is nothing to label")
+    steps = successes = failures = at_goal = 0
+    with next_version(
+        source,
+        "columns",
+        stage="label",
+        config={"task": world.name, "seed": seed, "columns": [column.name for column in more]},
+        name=name,
+        out=out,
+        more=more,
+    ) as writer:
+        for number, episode in enumerate(source.episodes(), start=1):
+            labeled = with_outcomes(world, episode, seed)
+            writer.add(labeled)
+            steps += len(labeled)
+            successes += bool(labeled.metadata["success"])
+            failures += bool(labeled.metadata["failed"])
+            at_goal += SUCCESS not in episode.columns and _failed_at_its_goal(world, labeled, seed)
+            progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
+        writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
+    if at_goal:
+        _log.warning(
+            "%s",
+            f"{source.reference}: {at_goal} episodes terminate at their goal and are labeled as failures, "
+            f"because {TERMINATED} does not say why: also import {SUCCESS} if they ended on arrival",
+        )
+    return writer.root
+
+
+def remarks(source: Dataset, task: Task) -> list[str]:
+    """Say what is to be checked of a dataset that fits a task."""
+    named = names_apart(source, (task.state, task.action), task.name)
+    return [*_broken_steps(source), *filter(None, (named, _all_failures(source), _drawn_goals(source, task)))]
+
+
+def _broken_steps(source: Dataset) -> list[str]:
+    """Say that steps do not lead to the row after them, which a correction would be fitted to."""
+    continuity = Continuity()
+    for episode in source.episodes([STATE, NEXT_STATE]):
+        continuity.add(episode)
+    return [f"{finding.what}: {finding.advice}" for finding in continuity.findings()]
+
+
+def _all_failures(source: Dataset) -> str:
+    """Say that every episode counts as a failure, where each terminates and no success is recorded."""
+    if TERMINATED not in source.features or SUCCESS in source.features:
+        return ""
+    if not all(is_terminated(episode.columns) for episode in source.episodes([TERMINATED])):
+        return ""
+    return (
+        f"{source.reference}: each of the {len(source)} episodes ends as {TERMINATED} and counts as a "
+        f"failure, as there is no {SUCCESS}: import that too if they succeeded, or leave {TERMINATED} out of "
+        "the mapping if it only marks where each recording ends"
+    )
+
+
+def _drawn_goals(source: Dataset, task: Task) -> str:
+    """Say that goals are drawn, where a task has some and the data have none; empty otherwise."""
+    if task.goal is None or GOAL in source.features:
+        return ""
+    alike = [name for name in source.features if "goal" in name.lower()]
+    mistaken = f" ({', '.join(alike)} is not read as one)" if alike else ""
+    return (
+        f"{source.reference} has no {GOAL}{mistaken}: goals are drawn by the objective, one an episode "
+        f"(goal_size is {task.objective.goal_size}); import those that the robot had into that column"
+    )
+
+
+def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
+    """Return the episode with goals and outcomes, up to its first success.
+
+    What it has of them is kept.
+    """
+    given = episode.columns
+    before, after = (_abstracted(task, given[key]) for key in (STATE, NEXT_STATE))
+    goal = _goals(task, episode, seed)
+    over = torch.zeros(len(episode), dtype=torch.bool)
+    if TERMINATED in given:
+        over = torch.from_numpy(given[TERMINATED])
+    missed = judged(task.objective, "missed", after, goal)
+    reached = judged(task.objective, "reached", after, goal) & ~over
+    success = torch.from_numpy(given[SUCCESS]) if SUCCESS in given else reached.clone()
+    failed = (over | missed) & ~success
+    if SUCCESS in given:
+        # That what is to last did so ends no episode.
+        reached = reached if task.objective.is_lasting else success
+    else:
+        late = slice(task.objective.horizon - 1, None)
+        success[late] = task.objective.succeeded(reached[late], failed[late], task.objective.horizon)
+    reward = paid(task.objective, before, after, goal, failed).numpy()
+    terminated = (reached | failed).numpy()
+    length = int(terminated.argmax()) + 1 if terminated.any() else len(episode)
+    truncated = np.zeros(len(episode), bool)
+    truncated[length - 1] = not terminated[length - 1]
+    computed: dict[str, Array] = {
+        **({GOAL: as_column(goal.numpy())} if task.goal else {}),
+        REWARD: reward.astype(np.float32),
+        SUCCESS: success.numpy(),
+    }
+    columns = (
+        computed | dict(given) | {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
+    )
+    kept = {key: values[:length] for key, values in columns.items()}
+    return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
+
+
+def _failed_at_its_goal(task: Task, labeled: Episode, seed: int) -> bool:
+    """Whether an episode failed in a step that reached the goal."""
+    if not labeled.metadata["failed"]:
+        return False
+    after = _abstracted(task, labeled.columns[NEXT_STATE][-1:])
+    return bool(judged(task.objective, "reached", after, _goals(task, labeled, seed)[-1:]))
+
+
+def _abstracted(task: Task, states: Array) -> Tensor:
+    """Return φ (T, X) of recorded states."""
+    with explained("abstraction (φ) of the recorded states"):
+        return torch.from_numpy(np.ascontiguousarray(task.abstraction(as_rows(states)), dtype=np.float32))
+
+
+def _goals(task: Task, episode: Episode, seed: int) -> Tensor:
+    if GOAL in episode.columns:
+        return torch.from_numpy(as_rows(episode.columns[GOAL]))
+    with explained("objective.draw_goals(rng, 1)"):
+        drawn = task.objective.draw_goals(generator(seed, f"goal of episode {episode.uid}"), 1)
+    return torch.from_numpy(drawn).float().expand(len(episode), -1).contiguous()
+
+
+def check_fits(source: Dataset, task: Task) -> None:
+    """Check that a dataset has the states and actions of a task.
+
+    Raises:
+        BadInputError: it lacks some, or theirs are of another size, in another order, in other units or at
+            another rate.
+    """
+    faults = []
+    if (fps := source.info["fps"]) != task.fps:
+        faults.append(
+            f"has {fps} steps per second, expected the {task.fps} of {task.name}, whose timestep_s is "
+            f"{task.timestep_s:g}"
+        )
+    for expected in (task.state, task.action):
+        faults += column_faults(source, expected, task.name)
+    goal_size = task.goal.size if task.goal else 0
+    if GOAL in source.features and (found := source.features[GOAL]["shape"][0]) != goal_size:
+        faults.append(
+            f"{GOAL} has {found} values, goals of {task.name} have {goal_size}: import it without that column"
+        )
+    if NEXT_STATE not in source.features:
+        faults.append(f"has no column {NEXT_STATE}")
+    if faults:
+        raise BadInputError(f"{source.reference} {'; '.join(faults)}")

@@ -1,0 +1,257 @@
+"""Pair: reset the abstract simulator to φ(s), step it with the recorded action, and store its next state."""
+
+import logging
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from astra_data.core.config import Config, NotNegative
+from astra_data.core.errors import BadInputError
+from astra_data.core.numbers import as_column, as_rows
+from astra_data.core.progress import Progress, silent
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.dataset.blocks import in_blocks
+from astra_data.dataset.checkup.angles import LARGEST, TURNS, is_angle
+from astra_data.dataset.columns import (
+    ABSTRACT_NEXT_STATE,
+    ABSTRACT_SIMULATED_NEXT_STATE,
+    ABSTRACT_STATE,
+    ACTION,
+    NEXT_STATE,
+    STATE,
+    Array,
+    Episode,
+)
+from astra_data.dataset.expected_columns import column_faults, names_apart
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import next_version, open_dataset
+from astra_data.robots.registry import TASKS
+from astra_data.robots.simulator_loader import Pairing, built, checked_abstraction, pairing_named
+from astra_data.worlds.expecting import expect_tensor, stepped
+from astra_data.worlds.own_code import explained
+from astra_data.worlds.protocols import AbstractSimulator
+
+BATCH = 4096
+"""Simulators that are reset and stepped in one batch."""
+_BLOCK = 8 * BATCH
+"""Steps held in memory at once, rounded up to whole episodes."""
+_log = logging.getLogger(__name__)
+
+
+class PairConfig(Config):
+    """Tolerance of the check that the simulator was reset to φ(s)."""
+
+    reset_tolerance: NotNegative = 1e-6
+    """Maximum difference between φ(s) and the simulator's state after a reset to it."""
+
+
+def pair(
+    simulator: str,
+    config: PairConfig = PairConfig(),
+    *,
+    dataset: str | Path,
+    name: str | None = None,
+    out: Path | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Add the columns `abstract.*` to `dataset`, vectorized over its steps; return the new folder.
+
+    Args:
+        simulator: a task, for its abstract simulator, or `path.py:MySimulator`; see `pairing_named`.
+        config: settings.
+        dataset: folder of the dataset.
+        name: of the new dataset, by default that of `dataset`, whose next version it is.
+        out: its folder, by default its place at home.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: the simulator is not in the state that it was reset to, or does not fit the dataset.
+        CorruptDatasetError: `dataset` is incomplete.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import Dataset, pair
+        >>> pairs = pair("antmaze-umaze", dataset="walks", out=Path("pairs_again"))
+        >>> landed = "abstract.simulated_next_state"
+        >>> Dataset.open(pairs).columns([landed])[landed].shape  # (N, X)
+        (240, 4)
+    """
+    pairing = pairing_named(simulator)
+    source = open_dataset(dataset)
+    _check(source, pairing)
+    stopwatch = Stopwatch()
+    batch = built(pairing, BATCH)
+    bounds = (
+        {} if pairing.commands is None else {"commands": {k: list(v) for k, v in pairing.commands.items()}}
+    )
+    meanings = {
+        ABSTRACT_STATE: "abstract state of the target before the action",
+        ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
+        ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
+    }
+    added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
+    steps, simulating, reset_error = 0, 0.0, 0.0
+    jumps = {unit: np.zeros(added[0].size, np.int64) for unit in TURNS}
+    farthest = np.zeros(added[0].size)
+    with next_version(
+        source,
+        "columns",
+        stage="pair",
+        config=config.model_dump(mode="json"),
+        name=name,
+        out=out,
+        more=added,
+        simulator={"id": pairing.id, **pairing.origin, **batch.parameters, **bounds},
+    ) as writer:
+        for episodes in in_blocks(source.episodes(), _BLOCK):
+            before = time.perf_counter()
+            state, action, next_state = (
+                as_rows(np.concatenate([episode.columns[name] for episode in episodes]))
+                for name in (STATE, ACTION, NEXT_STATE)
+            )
+            paired, error = pair_steps(
+                pairing, batch, state, action, next_state, tolerance=config.reset_tolerance, first_step=steps
+            )
+            simulating += time.perf_counter() - before
+            reset_error = max(reset_error, error)
+            apart = paired[ABSTRACT_NEXT_STATE] - paired[ABSTRACT_SIMULATED_NEXT_STATE]
+            for unit, turn in TURNS.items():
+                jumps[unit] += (np.abs(apart) > turn / 2).sum(axis=0)
+            farthest = np.maximum(farthest, np.abs(paired[ABSTRACT_STATE]).max(axis=0))
+            first = 0
+            for episode in episodes:
+                values = {
+                    name: as_column(array[first : first + len(episode)]) for name, array in paired.items()
+                }
+                writer.add(Episode(episode.uid, {**episode.columns, **values}, episode.metadata))
+                first += len(episode)
+            steps += first
+            rate = steps / stopwatch.seconds
+            progress(steps / int(source.lengths.sum()), f"{rate:,.0f} pairs/s")
+        spent = stopwatch.spent()
+        writer.made = {
+            "reset_error": reset_error,
+            **spent,
+            "pairs_per_second": steps / spent["wall_seconds"],
+            "simulated_pairs_per_second": steps / simulating,
+        }
+    for unit, half in (("rad", "π"), ("deg", "180°")):
+        wrapped = [
+            f"{_name(pairing, entry)} in {rows} of {steps} rows"
+            for entry, rows in enumerate(jumps[unit])
+            if rows and _angle_unit(pairing, entry, farthest[entry]) == unit
+        ]
+        if wrapped:
+            _log.warning(
+                f"{pairing.id} lands more than {half} from where the robot was: {', '.join(wrapped)}; "
+                "a heading that wraps: make cos and sin of it in φ"
+            )
+    return writer.root
+
+
+def pair_steps(
+    pairing: Pairing,
+    batch: AbstractSimulator,
+    state: Array,
+    action: Array,
+    next_state: Array,
+    *,
+    tolerance: float,
+    first_step: int = 0,
+) -> tuple[dict[str, Array], float]:
+    """Reset `batch` to φ(s) of each of N target steps and step it with the recorded action.
+
+    Args:
+        pairing: the simulator and φ.
+        batch: B of these simulators; the N steps are taken B at a time.
+        state: target states, (N, S).
+        action: (N, A), or (N,).
+        next_state: (N, S).
+        tolerance: see `PairConfig`.
+        first_step: number of the first of these steps in the dataset, for messages.
+
+    Returns:
+        the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
+
+    Raises:
+        BadInputError: the difference is larger than `tolerance`, the simulator's states are not finite or no
+            tensors, or its step changes those handed out before.
+    """
+    abstract = checked_abstraction(pairing, state)
+    landed = np.empty_like(abstract)
+    size = len(batch.state)
+    largest = 0.0
+    for first in range(0, len(state), size):
+        rows = np.arange(first, first + size).clip(max=len(state) - 1)
+        wanted = torch.from_numpy(abstract[rows])
+        with explained(f"reset_to of {pairing.id}"):
+            batch.reset_to(wanted)
+            shown = batch.state
+        difference = (expect_tensor(f"after reset_to, {pairing.id}.state", shown) - wanted).abs()
+        if not float(difference.max()) <= tolerance:
+            row, entry = divmod(int(difference.argmax()), wanted.shape[1])
+            raise BadInputError(
+                f"the simulator, reset to φ(s) of step {first_step + rows[row]}, has "
+                f"{_name(pairing, entry)} = "
+                f"{float(shown[row, entry]):.6g}, expected {float(wanted[row, entry]):.6g} "
+                f"(tolerance {tolerance:g}): check its reset_to and the abstraction"
+            )
+        largest = max(largest, float(difference.max()))
+        reached = stepped(batch, torch.from_numpy(as_rows(action[rows])), f"step of {pairing.id}").numpy()
+        if reached.shape != wanted.shape:
+            raise BadInputError(
+                f"step of {pairing.id} returns shape {reached.shape}, expected {tuple(wanted.shape)}"
+            )
+        if not np.isfinite(reached).all():
+            row, entry = np.argwhere(~np.isfinite(reached))[0]
+            raise BadInputError(
+                f"the simulator, stepped from φ(s) of step {first_step + rows[row]}, gives "
+                f"{_name(pairing, entry)} = "
+                f"{reached[row, entry]}: expected finite states from its step"
+            )
+        landed[first : first + size] = reached[: len(state) - first]
+    columns = {
+        ABSTRACT_STATE: abstract,
+        ABSTRACT_NEXT_STATE: checked_abstraction(pairing, next_state),
+        ABSTRACT_SIMULATED_NEXT_STATE: landed,
+    }
+    return columns, largest
+
+
+def _name(pairing: Pairing, entry: int) -> str:
+    names = pairing.abstract_state.names
+    return names[entry] if names else f"value {entry}"
+
+
+def _angle_unit(pairing: Pairing, entry: int, farthest: float) -> str:
+    """Return the unit of an abstract state, where it has none that of an angle up to `farthest`."""
+    unit = pairing.abstract_state.units[entry]
+    if unit in ("", "1") and is_angle(_name(pairing, entry)):
+        return "rad" if farthest <= LARGEST else "deg"
+    return unit
+
+
+def _check(source: Dataset, pairing: Pairing) -> None:
+    task = source.description["environment"].get("id")
+    known = TASKS.get(task)
+    if pairing.maze is not None and known and known.plane is not None and known.maze != pairing.maze:
+        raise BadInputError(
+            f"{source.reference} was collected for {task}, which has another maze than "
+            f"{pairing.origin['task']}: give --simulator {task}"
+        )
+    faults = [f"no column {name}" for name in (STATE, ACTION, NEXT_STATE) if name not in source.features]
+    if ABSTRACT_STATE in source.features:
+        faults.append(f"{ABSTRACT_STATE} already: it is paired")
+    if pairing.fps not in (None, source.info["fps"]):
+        faults.append(f"{source.info['fps']} steps per second, where {pairing.id} makes {pairing.fps}")
+    if faults:
+        raise BadInputError(f"{source.root} has {' and '.join(faults)}; expected a dataset to be paired")
+    expected = pairing.origin.get("task", "")
+    faults = [fault for column in pairing.columns for fault in column_faults(source, column, expected)]
+    if faults:
+        raise BadInputError(f"{source.reference} {'; '.join(faults)}")
+    if warning := names_apart(source, pairing.columns, expected):
+        _log.warning(warning)

@@ -1,0 +1,78 @@
+"""All stages of the pipeline by name: what each reads, its settings, and what makes its artifacts."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER
+from astra_data.grounding.fit import GroundConfig
+from astra_data.pipeline.stages.align import AlignConfig, align
+from astra_data.pipeline.stages.augment import AugmentConfig, augment
+from astra_data.pipeline.stages.collect import CollectConfig, collect
+from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.pipeline.stages.ground import ground
+from astra_data.pipeline.stages.label import label
+from astra_data.pipeline.stages.pair import PairConfig, pair
+from astra_data.pipeline.stages.report import ReportConfig, report
+from astra_data.pipeline.stages.select import SelectConfig, select
+from astra_data.pipeline.stages.subset import subset
+from astra_data.pipeline.stages.train import train
+from astra_data.policies.policy_file import POLICY
+from astra_data.policies.train import AnyTrainConfig
+from astra_data.reports.artifacts import EVALUATION
+from astra_data.reports.choice import SELECTED
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the pipeline.
+
+    Attributes:
+        name: in recipes, folders and on the command line.
+        run: makes one artifact. `pipeline.plan` gives it what its parameters name.
+        each: the unit that it makes one artifact for: a seed; a size of a seed's dataset; a grounding, a
+            policy, an aligned grounding or a row, each per dataset; or the recipe.
+        reads: the stages whose artifacts it may read.
+        config: the type of its table in a recipe; None where it has no settings.
+        asked_by: the key of recipes without which the stage is left out; None if all have it.
+        result: the file of its artifacts that other stages read; None for datasets and the report.
+    """
+
+    name: str
+    run: Callable[..., object]
+    each: Literal["seed", "size", "grounding", "policy", "alignment", "row", "recipe"]
+    reads: tuple[str, ...] = ()
+    config: Any = None
+    asked_by: str | None = None
+    result: str | None = None
+
+    @property
+    def makes_dataset(self) -> bool:
+        """Whether its artifacts are datasets."""
+        return self.each in ("seed", "size")
+
+
+_OF_DATASET = ("pair", "subset")
+_OF_GROUNDING = (*_OF_DATASET, "ground")
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        Stage("collect", collect, "seed", config=CollectConfig, asked_by="collect"),
+        Stage("label", label, "seed", asked_by="data"),
+        Stage("augment", augment, "seed", ("collect", "label"), AugmentConfig, asked_by="augment"),
+        Stage("pair", pair, "seed", ("collect", "label", "augment"), PairConfig),
+        Stage("subset", subset, "size", ("pair",)),
+        Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result=GROUNDING),
+        Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result=POLICY),
+        Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result=TARGET_ENCODER),
+        Stage(
+            *("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig),
+            asked_by="select",
+            result=SELECTED,
+        ),
+        Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig, result=EVALUATION),
+        Stage("report", report, "recipe", ("evaluate",), ReportConfig),
+    )
+}
+"""In the order of the pipeline."""

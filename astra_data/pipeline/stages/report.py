@@ -1,0 +1,167 @@
+"""Report: the results of all methods and seeds of a recipe, as results.json, .md, .html and figures."""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from hashlib import sha256
+from pathlib import Path
+
+from pydantic import Field, field_validator
+
+from astra_data.core.artifact import finished_folder
+from astra_data.core.config import Config, Share
+from astra_data.core.digest import file_digest
+from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import read_manifest
+from astra_data.core.naming import artifact_key
+from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
+from astra_data.methods import method_named
+from astra_data.reports.artifacts import EVALUATION
+from astra_data.reports.blocks import html, markdown
+from astra_data.reports.choice import FOLDER, SELECTED
+from astra_data.reports.results import Results, merge, read_results, replaced, results_json
+from astra_data.reports.runs import Reported, read_run
+from astra_data.reports.verdict import verdict_of
+from astra_data.robots.registry import task_named
+from astra_data.worlds.task import Task
+
+JSON, PAGE, HTML = "results.json", "results.md", "results.html"
+_log = logging.getLogger(__name__)
+
+
+class ReportConfig(Config):
+    """Settings of the report."""
+
+    trajectory_methods: tuple[str, ...] = ()
+    """Methods whose trajectories are drawn; all if none of these is reported."""
+
+    trajectory_episodes: int = Field(default=12, ge=1)
+    """Episodes to draw per method and world: the first ones of its first seed."""
+
+    paper_success: dict[str, Share] = Field(default_factory=dict)
+    """Method → the paper's success rate, shown next to ours."""
+
+    compare: tuple[str, ...] = ("astra",)
+    """Methods to compare with every method trained the same way, each with and without the plus settings."""
+
+    @field_validator("trajectory_methods", "paper_success", "compare")
+    @classmethod
+    def _name_known_methods[R: (tuple[str, ...], dict[str, float])](cls, rows: R) -> R:
+        try:
+            for row in rows:
+                method_named(row)
+        except BadInputError as error:
+            raise ValueError(str(error)) from None
+        return rows
+
+
+def report(
+    recipe: Reported,
+    *,
+    root: Path,
+    command: str,
+    publish: Path | None = None,
+    published: Sequence[Path] = (),
+    progress: Progress = silent,
+    config: ReportConfig = ReportConfig(),
+) -> None:
+    """Write results.json, .md and .html and the figures to `root`/report.
+
+    Args:
+        recipe: names the task, the methods and the seeds.
+        root: the recipe's folder of runs.
+        command: the command line to print as the results' origin.
+        publish: a folder for copies of results.json, .md and the figures, named after the recipe; or None.
+        published: files of results that those at `root` are added to.
+        progress: called with the share done and a note.
+        config: settings.
+
+    Raises:
+        MissingStageError: no method has an evaluation.
+        BadInputError: an artifact is malformed, or methods differ in task, episodes, robot or data.
+    """
+    from astra_data.reports.figures.catalog import FIGURES, Scene, drawn
+    from astra_data.reports.page import sections_of
+
+    for row in (*config.trajectory_methods, *config.paper_success, *config.compare):
+        method_named(row)
+    task, made_from = task_named(recipe.task), _digests(recipe, root, command, config)
+    found = _added_to(published, _read(recipe, root, command, task, config))
+    progress(0.5, f"{len(found.tested())} methods, {len(found.seeds)} seeds")
+    scene = Scene(root, task, config.trajectory_methods, config.trajectory_episodes)
+    images = drawn(found, scene)
+    progress(0.9, f"{len(images)} figures")
+    sections = sections_of(found, _shown(root))
+    with finished_folder(root / "report", replace=True, made_from=made_from) as folder:
+        write_file(folder / JSON, results_json(found))
+        write_file(folder / PAGE, markdown(found.recipe, sections, {name: f"{name}.png" for name in images}))
+        write_file(folder / HTML, html(found.recipe, sections, images))
+        for name, image in images.items():
+            write_file(folder / f"{name}.png", image)
+    if publish is not None:
+        publish.mkdir(parents=True, exist_ok=True)
+        files = {name: f"{recipe.name}_{name}.png" for name in FIGURES}
+        for name, image in images.items():
+            write_file(publish / files[name], image)
+        shown = {name: file for name, file in files.items() if (publish / file).exists()}
+        write_file(publish / f"{recipe.name}.json", results_json(found))
+        write_file(publish / f"{recipe.name}.md", markdown(found.recipe, sections, shown))
+    progress(1.0, verdict_of(found).text.replace("**", ""))
+
+
+def _read(recipe: Reported, root: Path, command: str, task: Task, config: ReportConfig) -> Results:
+    return read_run(
+        replace(recipe, task=task.name),  # not where its file is
+        root=root,
+        command=command,
+        scores=task.objective.scores,
+        paper_success={row: value for row, value in config.paper_success.items() if row in recipe.methods},
+        compare=config.compare,
+        stand_in=task.facts.get("stand_in"),
+        timestep_s=task.timestep_s,
+    )
+
+
+def _added_to(published: Sequence[Path], found: Results) -> Results:
+    """Return results with those that are published, of which none is lost; warn where one is replaced."""
+    earlier = [read_results(path) for path in published]
+    for path, one in zip(published, earlier, strict=True):
+        if changed := replaced(one, found):
+            _log.warning("%s: new results replace those of %s", path, "; ".join(changed))
+    return merge([*earlier, found]) if earlier else found
+
+
+def is_current(recipe: Reported, *, root: Path, command: str, config: ReportConfig, **_: object) -> bool:
+    """Return whether the report at `root` was made of what is there now, and as it would be now."""
+    folder = root / "report"
+    try:
+        manifest = read_manifest(folder)
+        if manifest is None or manifest.faults(folder, verify=False):
+            return False
+        return manifest.made_from == _digests(recipe, root, command, config)
+    except BadInputError:
+        return False
+
+
+def _digests(recipe: Reported, root: Path, command: str, config: ReportConfig) -> dict[str, str]:
+    """Return the digest of each evaluation that is finished, of a choice, and of settings and version."""
+    folders = [
+        artifact_key("evaluate", row, seed, percent)
+        for row in recipe.methods
+        for percent in recipe.percents or (None,)
+        for seed in recipe.seeds
+    ]
+    files = {folder: root / folder / EVALUATION for folder in folders} | {FOLDER: root / FOLDER / SELECTED}
+    digests = {folder: file_digest(file) for folder, file in files.items() if file.exists()}
+    settings = json.dumps(
+        [asdict(recipe), command, config.model_dump(), origin()], sort_keys=True, default=str
+    )
+    return digests | {"settings": sha256(settings.encode()).hexdigest()}
+
+
+def _shown(root: Path) -> str:
+    """Return the folder of a run as commands name it: a relative one as it is, else by its name alone."""
+    return f"runs/{root.name}" if root.is_absolute() else str(root)

@@ -1,0 +1,244 @@
+"""Select: choose among a recipe's policies without the target, by simulators of other episodes.
+
+A judge is the grounding of another seed, which has episodes of its own; its failure model ends episodes.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.artifact import finished_folder
+from astra_data.core.config import AtOnce, Config
+from astra_data.core.digest import file_digest
+from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_made_from
+from astra_data.core.naming import artifact_key, reference_of
+from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
+from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.dataset.meta_files import read_description
+from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.methods import grounded_as, method_named
+from astra_data.policies.judging import Judge
+from astra_data.policies.policy_file import POLICY, PolicyFile, running
+from astra_data.policies.running_policy import RunningPolicy
+from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, select_page
+from astra_data.reports.runs import Reported
+from astra_data.robots.registry import task_named
+
+_BEGUN = "begun.json"
+"""Digests of a policy and of its judge → success, of a choice that was interrupted."""
+
+
+class SelectConfig(Config):
+    """How policies are chosen without the target."""
+
+    episodes: AtOnce = 100
+    """Episodes of each policy with each judge, run in one batch."""
+    judge: str | None = None
+    """Row whose groundings serve as judges; by default NAS, or else the first row that grounds."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A policy to judge: the keys of its artifacts in a run's folder; `grounding` is None without one."""
+
+    row: str
+    seed: int
+    percent: int | None
+    policy: str
+    grounding: str | None
+
+    def load(self, root: Path, task: str) -> RunningPolicy:
+        """Return the policy, with the encoder of its own grounding.
+
+        Raises:
+            BadInputError: a file was altered, or the grounding is not the one that the policy was made from.
+        """
+        policy, grounding = root / self.policy / POLICY, self.grounding and root / self.grounding / GROUNDING
+        check_made_from(policy, {"grounding": file_digest(grounding) if grounding else None})
+        return running(task_named(task), PolicyFile.load(policy), grounding_at(grounding or None))
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Who is judged by whom at one size of the dataset.
+
+    Attributes:
+        percent: the size, if there are several. entries: the policies.
+        judges: the seed of each judge → the keys of its grounding and of the dataset it was fitted to.
+    """
+
+    percent: int | None
+    entries: tuple[Entry, ...]
+    judges: dict[int, tuple[str, str]]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The artifacts that are read, each once."""
+        read = [key for one in self.entries for key in (one.policy, one.grounding) if key]
+        return tuple(dict.fromkeys([*read, *(key for judge in self.judges.values() for key in judge)]))
+
+    def finished(self, root: Path) -> "Bench":
+        """Return those whose artifacts are in a run's folder."""
+        entries = [
+            one
+            for one in self.entries
+            if (root / one.policy / POLICY).is_file()
+            and (one.grounding is None or (root / one.grounding / GROUNDING).is_file())
+        ]
+        judges = {seed: of for seed, of in self.judges.items() if (root / of[0] / GROUNDING).is_file()}
+        return Bench(self.percent, tuple(entries), judges)
+
+
+def judge_of(judge: str | None, rows: Sequence[str]) -> str:
+    """Return the method whose groundings judge the policies of `rows`.
+
+    By default that is the reference or, without it, the first row that grounds its simulator.
+
+    Raises:
+        BadInputError: it grounds nothing.
+    """
+    grounding = (row for row in rows if method_named(row).grounds)
+    asked = judge or reference_of(rows) or next(grounding, None)
+    if asked is None or not method_named(asked).grounds:
+        raise BadInputError(
+            "expected a row that grounds its simulator, such as nas or astra, as judge, got "
+            f"{asked or 'none'}"
+        )
+    return grounded_as(asked)
+
+
+def judge_in(recipe: Reported, config: SelectConfig) -> str:
+    """Return the judge of all policies of a recipe, of which only some rows may be reported.
+
+    Raises:
+        BadInputError: as `judge_of`.
+    """
+    return judge_of(config.judge, recipe.settings["methods"])  # type: ignore[arg-type]
+
+
+def benches(recipe: Reported, judge: str) -> list[Bench]:
+    """Return who is judged by whom, at each size; policies that do not act on abstract states are not."""
+    able = [row for row in recipe.methods if method_named(row).trains_without_target]
+    return [_bench(recipe, able, judge, percent) for percent in recipe.percents or (None,)]
+
+
+def digests(of: list[Bench], root: Path) -> dict[str, str]:
+    """Return the digest of each artifact that is read, by its key."""
+    keys = dict.fromkeys(key for bench in of for key in bench.keys)
+    return {key: _digest(root / key) for key in keys}
+
+
+def select(
+    recipe: Reported,
+    config: SelectConfig = SelectConfig(),
+    *,
+    root: Path,
+    progress: Progress = silent,
+) -> None:
+    """Try every finished policy of a recipe in groundings of other seeds; write `root`/select, ranked.
+
+    Where a recipe has `data`, all seeds share their episodes, and the page says so. Policies of a size are
+    judged by groundings of that size. An interrupted call goes on with the next policy.
+
+    Args:
+        recipe: names the task, the rows and the seeds.
+        config: the recipe's `[select]`.
+        root: the recipe's folder of runs.
+        progress: called with the fraction done and a note.
+
+    Raises:
+        BadInputError: there is no policy, no judge, or there are groundings of fewer than two seeds.
+    """
+    judge = judge_in(recipe, config)
+    contests = [bench.finished(root) for bench in benches(recipe, judge)]
+    for bench in contests:
+        _check(bench, recipe, root, judge)
+    made_from, stopwatch = digests(contests, root), Stopwatch()
+    total, found = sum(len(bench.entries) for bench in contests), list[Candidate]()
+    settings_text = config.model_dump_json(indent=1)
+    with finished_folder(root / FOLDER, config=settings_text, made_from=made_from) as folder:
+        begun = folder / _BEGUN
+        known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
+        for bench in contests:
+            judge_of_seed = cache(partial(_judge, bench, recipe.task, root))
+            for entry in bench.entries:
+                policy, success = entry.load(root, recipe.task), {}
+                for other in bench.judges:
+                    if other == entry.seed:
+                        continue
+                    read = f"{made_from[entry.policy]}/{made_from[bench.judges[other][0]]}"
+                    if read not in known:
+                        drawn = derive(other, f"judged: {entry.seed}")
+                        known[read] = judge_of_seed(other).success(policy, config.episodes, drawn)
+                    success[other] = known[read]
+                write_file(begun, json.dumps(known))
+                found.append(
+                    Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success)
+                )
+                note = f"{entry.row}, seed {entry.seed}: {found[-1].predicted:.2f}"
+                progress(len(found) / total * 0.99, note)
+        record: dict[str, Any] = {
+            "judge": judge,
+            "episodes": config.episodes,
+            "shares_episodes": recipe.settings.get("data") is not None,
+            "candidates": found,
+        }
+        judged = Judged(**record | origin() | stopwatch.spent())
+        begun.unlink()
+        (folder / SELECTED).write_text(judged.model_dump_json(indent=1))
+        (folder / "select.md").write_text(select_page(recipe.name, judged))
+    first = judged.ranked(judged.percents[-1])[0]
+    progress(1.0, f"{first.row}, seed {first.seed}: {first.lower:.2f} in the lower quartile of its judges")
+
+
+def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -> Bench:
+    dataset = "pair" if percent is None else "subset"
+    entries = [
+        Entry(
+            row,
+            seed,
+            percent,
+            artifact_key("train", row, seed, percent),
+            artifact_key("ground", grounded_as(row), seed, percent) if method_named(row).grounds else None,
+        )
+        for row in rows
+        for seed in recipe.seeds
+    ]
+    judges = {
+        seed: (artifact_key("ground", judge, seed, percent), artifact_key(dataset, "", seed, percent))
+        for seed in recipe.seeds
+    }
+    return Bench(percent, tuple(entries), judges)
+
+
+def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
+    size = f" at {bench.percent} %" if bench.percent else ""
+    if not bench.entries:
+        named = ", ".join(recipe.methods)
+        raise BadInputError(f"{root}: found no policy of {named}{size}: run the recipe until train first")
+    if len(bench.judges) < 2:
+        raise BadInputError(
+            f"{root}: expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}: "
+            "groundings of other episodes judge a policy: add seeds to the recipe and run it"
+        )
+
+
+def _judge(bench: Bench, task: str, root: Path, seed: int) -> Judge:
+    grounding, dataset = bench.judges[seed]
+    made, episodes = load_grounding(root / grounding / GROUNDING), PairedEpisodes.load(root / dataset)
+    check_made_from(root / grounding / GROUNDING, {"dataset": episodes.content_hash})
+    return Judge(task_named(task), made)
+
+
+def _digest(folder: Path) -> str:
+    files = [folder / name for name in (POLICY, GROUNDING)]
+    file = next((file for file in files if file.is_file()), None)
+    return file_digest(file) if file else str(read_description(folder)["content_hash"])

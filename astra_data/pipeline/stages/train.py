@@ -1,0 +1,144 @@
+"""Train: learn the policy of a row with its method."""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from astra_data.core.artifact import finished_folder
+from astra_data.core.config import Config, as_json
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import is_plus
+from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
+from astra_data.core.stopwatch import Stopwatch
+from astra_data.grounding.files import GROUNDING, grounding_at
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.methods import method_named
+from astra_data.policies.policy_file import POLICY, PolicyFile
+from astra_data.policies.restarts import with_restarts
+from astra_data.policies.train import Learn, PpoTrainConfig, SacTrainConfig, Training
+from astra_data.reports.artifacts import CURVE
+from astra_data.robots.registry import task_named
+
+
+def train(
+    task: str,
+    method: str,
+    config: PpoTrainConfig | SacTrainConfig = PpoTrainConfig(),
+    *,
+    settings: Config | None = None,
+    dataset: str | Path,
+    grounding: Path | None = None,
+    initial: Path | None = None,
+    seed: int = 0,
+    out: Path,
+    device: str = "cpu",
+    progress: Progress = silent,
+    num_threads: int | None = None,
+) -> None:
+    """Learn the policy of a row and write it with its learning curve to `out`.
+
+    Args:
+        task: see `task_named`.
+        method: a row.
+        config: the recipe's `[train]`.
+        settings: the method's own table of the recipe, if it has one.
+        dataset: paired.
+        grounding: what `ground` made for this method, if it grounds.
+        initial: what `train` made for the method whose policy this one starts from, if any.
+        seed: of all randomness.
+        out: the folder to write.
+        device: torch device.
+        progress: called with the fraction done.
+        num_threads: of the target's physics, for methods that train in the target.
+
+    Raises:
+        BadInputError: the method has no policy to train, needs an artifact and got none, or `out` was begun
+            with other settings.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import train
+        >>> from astra_data.policies.train import PpoTrainConfig
+        >>> config = PpoTrainConfig(num_envs=8, rollout_steps=8, total_steps=64)
+        >>> train("antmaze-umaze", "direct_transfer", config, dataset="pairs", out=Path("policy"))
+    """
+    base, world, made = method_named(method), task_named(task), origin(device)
+    if base.learn is None:
+        raise BadInputError(f"method '{method}' has no policy to train")
+    if base.grounds and grounding is None:
+        raise BadInputError(f"method '{method}' trains in a grounded simulator: run the stage `ground` first")
+    if base.initial and initial is None:
+        raise BadInputError(f"method '{method}' starts from the policy of {base.initial}: train that first")
+    stopwatch = Stopwatch()
+    episodes = PairedEpisodes.load(dataset, device)
+    episodes.check(world)
+    sees_data = base.grounds or base.learns_from == "episodes" or config.data_start_share > 0
+    if sees_data and world.goal and not episodes.windows.goal.shape[-1]:
+        raise BadInputError(
+            f"{episodes.reference} lacks the goals of {world.name}: run `astra-data label` first"
+        )
+    grounding_file = grounding and grounding / GROUNDING
+    initial_file = initial and initial / POLICY
+    correction = grounding_at(grounding_file, device)
+    beginning = PolicyFile.load(initial_file, device) if initial_file else None
+    if beginning and beginning.simulation and beginning.simulation.world.limits_commands:
+        raise BadInputError(
+            f"{initial} was trained with command_limit, which has no effect on '{method}': train it without"
+        )
+    grounding_digest = file_digest(grounding_file) if grounding_file else None
+    initial_digest = file_digest(initial_file) if initial_file else None
+    settings_text = as_json(
+        task=world.name,
+        method=method,
+        **episodes.named,
+        grounding_sha256=grounding_digest,
+        initial_sha256=initial_digest,
+        seed=seed,
+        train=config,
+        settings=settings,
+    )
+    read = {"dataset": episodes.content_hash, "grounding": grounding_digest, "initial": initial_digest}
+    with finished_folder(out, config=settings_text, made_from=read) as folder:
+        training = Training(
+            task=world,
+            config=config,
+            settings=settings,
+            episodes=episodes,
+            grounding=correction,
+            initial=beginning,
+            seed=seed,
+            device=device,
+            folder=folder,
+            progress=progress,
+            num_threads=num_threads,
+            is_plus=is_plus(method),
+        )
+        learn = partial(_learned, base.learn)
+        if base.in_simulator:
+            policy, curve = with_restarts(learn, training, grounding_file)
+        else:
+            policy, curve = learn(training)
+        policy.save(folder / POLICY)
+        if policy.simulation is not None:
+            curve["world"] = policy.simulation.world.model_dump()
+        (folder / CURVE).write_text(json.dumps(made | stopwatch.spent() | curve, indent=1))
+
+
+def _learned(learn: Learn, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+    """Return the policy and the learning curve that `learn`, which may be a function of the user's, returns.
+
+    Raises:
+        BadInputError: it returns something else.
+    """
+    match returned := learn(training):
+        case (PolicyFile() as policy, dict() as curve):
+            return policy, curve
+    parts = returned if isinstance(returned, tuple) else (returned,)
+    raise BadInputError(
+        f"learn returned {' and '.join(type(part).__name__ for part in parts) or 'nothing'}: expected a "
+        "PolicyFile and a dict of the learning curve; one that returns a policy of another learner is given "
+        "to an OwnLearner"
+    )

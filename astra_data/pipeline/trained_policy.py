@@ -1,0 +1,162 @@
+"""Load a policy that a run has trained, ready to act."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import check_made_from
+from astra_data.core.naming import RECORD, artifact_key
+from astra_data.dataset.column_statistics import ranges
+from astra_data.dataset.columns import STATE
+from astra_data.dataset.reader import Dataset
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
+from astra_data.methods import grounded_as, method_named
+from astra_data.pipeline.own_files import check_unchanged
+from astra_data.pipeline.own_methods import add_all
+from astra_data.pipeline.points import refuse_unmade
+from astra_data.pipeline.recipe_file import recorded_settings
+from astra_data.policies.policy_file import POLICY, PolicyFile, running
+from astra_data.policies.running_policy import RunningPolicy
+from astra_data.robots.registry import task_named
+from astra_data.worlds.own_code import found_near
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A policy that a run has trained, and what goes with it.
+
+    Attributes:
+        settings: of the run's recipe, see `settings_of`. files: those that make up the policy, by the stage
+            that wrote them. file: what that of `train` holds. dataset: that it was learned from, if it is
+            still there.
+    """
+
+    settings: dict[str, Any]
+    files: dict[str, Path]
+    file: PolicyFile
+    dataset: Dataset | None = None
+
+    def recorded(self) -> tuple[list[float], list[float]] | None:
+        """Return the least and the largest of each value of the recorded states; None if not known."""
+        if self.dataset is None:
+            return None
+        found = ranges(self.dataset.blocks([STATE]))[STATE]
+        least, largest = (np.asarray(found[end], float).tolist() for end in ("min", "max"))
+        return least, largest
+
+    def running(self) -> RunningPolicy:
+        """Return it ready to act, with the encoder that it is deployed with, if it has one."""
+        encoder = load_target_encoder(self.files["align"]) if "align" in self.files else None
+        asked = self.settings.get("evaluate", {}).get("encoder")
+        return running(
+            task_named(self.settings["task"]),
+            self.file,
+            grounding_at(self.files.get("ground")),
+            encoder if encoder is not None and (asked or encoder.is_deployed) else None,
+        )
+
+
+def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> TrainedPolicy:
+    """Return the policy of a row of a run, with its files and the settings of its recipe.
+
+    Raises:
+        BadInputError: as `load_policy`.
+    """
+    settings = settings_of(run)
+    files = _files(settings, Path(run), row, seed, percent)
+    data = Path(run) / artifact_key("pair" if percent is None else "subset", "", seed, percent)
+    dataset = Dataset.open(data) if data.is_dir() else None
+    read = {
+        "grounding": file_digest(files["ground"]) if "ground" in files else None,
+        "dataset": dataset.content_hash if dataset else None,
+    }
+    for made, file in files.items():
+        check_made_from(file, read if made != "ground" else read | {"grounding": None})
+    return TrainedPolicy(settings, files, PolicyFile.load(files["train"]), dataset)
+
+
+def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> RunningPolicy:
+    """Load the policy of a row, with the encoder that its run tests it with, if it has one.
+
+    Call `start` before the first `command`.
+
+    Args:
+        run: the folder of a run, such as "runs/quickstart".
+        row: a row of its recipe, such as "astra_plus".
+        seed: one of its seeds.
+        percent: the size of the dataset, where the recipe sweeps over sizes.
+
+    Raises:
+        BadInputError: the run has no such row or seed, the row trains no policy, an artifact of it is not
+            there, was altered or made from another than lies there now, or the code of the task or of the
+            row's method changed since the run was made.
+
+    Example:
+        >>> from astra_data import load_policy
+        >>> policy = load_policy("runs/antmaze_quick", "astra")
+        >>> policy.start(1)
+        >>> velocity = policy.command(state, goal)  # (1, 29) and (1, 2) in, (1, 2) in m/s out
+    """
+    return trained_policy(run, row, seed=seed, percent=percent).running()
+
+
+def task_of(run: str | Path) -> str:
+    """Return the task that a run's recipe names.
+
+    Raises:
+        BadInputError: as `settings_of`.
+    """
+    return str(settings_of(run)["task"])
+
+
+def settings_of(run: str | Path) -> dict[str, Any]:
+    """Return the settings of a run's recipe, as it recorded them.
+
+    Files of the user's that it names are looked up in the run's folder and those above it, and else here.
+
+    Raises:
+        BadInputError: it is not the folder of a run, its record is damaged, or the code of its task changed
+            since.
+    """
+    folder = Path(run)
+    if not (folder / RECORD).is_file():
+        raise BadInputError(
+            f"{run}: expected the folder of a run (with {RECORD}): make it with astra-data run"
+        )
+    settings = recorded_settings(folder)
+    settings["task"] = found_near(settings["task"], folder)
+    check_unchanged(settings["task"], folder)
+    for own in settings.get("own_methods", {}).values():
+        own["method"] = found_near(own["method"], folder)
+    return settings
+
+
+def _files(
+    settings: dict[str, Any], folder: Path, row: str, seed: int, percent: int | None
+) -> dict[str, Path]:
+    own_methods = settings.get("own_methods", {})
+    add_all(own_methods)
+    files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}
+    if not files["train"].is_file():
+        refuse_unmade(settings, row, seed)
+    method = method_named(row)
+    if not method.trains:
+        raise BadInputError(f"{row} has no trained policy: it is written by hand")
+    sizes = settings.get("sweep", {}).get("percent", ())
+    if (percent is None) == bool(sizes) or (sizes and percent not in sizes):
+        wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"
+        raise BadInputError(f"{folder}: percent: expected {wanted}, got {percent or 'none'}")
+    base = grounded_as(row)
+    for name in own_methods.keys() & {method.name, base}:
+        check_unchanged(own_methods[name]["method"], folder, name=name)
+    if method.grounds:
+        files["ground"] = folder / artifact_key("ground", base, seed, percent) / GROUNDING
+    if method.aligns and (settings.get("evaluate") or {}).get("encoder") != "source":
+        files["align"] = folder / artifact_key("align", base, seed, percent) / TARGET_ENCODER
+    if missing := [f"{path} (astra-data {stage})" for stage, path in files.items() if not path.is_file()]:
+        raise BadInputError(f"{row}, seed {seed}: expected {', '.join(missing)}: run the recipe first")
+    return files

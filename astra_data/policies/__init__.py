@@ -1,0 +1,1 @@
+"""Environments for policies, learners, and running what they learned."""

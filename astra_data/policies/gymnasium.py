@@ -1,0 +1,217 @@
+"""Gymnasium adapters of the batched environments of any task: an `Env` of one robot, a `VectorEnv` of B.
+
+Observations (O,) are those that policies are given: in a simulator the latent, if it has one, and what the
+task's objective shows of the abstract state and the goal; in a target the state and the goal. Actions (A,)
+are in [-1, 1] along each axis; `task.limits.in_units` returns them in the units of the robot's commands.
+`info` has whether the step reached the goal ("success"), whether it was a failure ("failed"), and whether it
+touched a wall ("wall_contact"; never, where there are none).
+"""
+
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.seeding import fresh_seed
+from astra_data.grounding.generators import seeded
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.robots.registry import task_named
+from astra_data.worlds.batched import BatchedEnv, Step
+
+Array = NDArray[Any]
+
+
+class SeededEnv(BatchedEnv, Protocol):
+    """A batched environment with its own randomness."""
+
+    @property
+    def failed(self) -> Tensor:
+        """Which rows failed in the last step, (B,) bool."""
+        ...
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Which rows touched a wall in the last step, (B,) bool."""
+        ...
+
+    def reseed(self, seed: int) -> None:
+        """Draw all later randomness from `seed`."""
+        ...
+
+
+class SeededSimulatorEnv:
+    """A simulated environment whose starts, goals and noise come from a seed of its own."""
+
+    def __init__(self, env: SimulatorEnv) -> None:
+        """Wrap `env`, which draws from torch's global generator."""
+        self.env = env
+        self.num_envs = env.num_envs
+        self.observation_size, self.action_size = env.observation_size, env.action_size
+        self.reseed(fresh_seed())
+
+    @property
+    def failed(self) -> Tensor:
+        """Which rows failed in the last step, (B,) bool."""
+        return self.env.failed
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Which rows the walls stopped in the last step, (B,) bool."""
+        return self.env.simulator.blocked
+
+    def reseed(self, seed: int) -> None:
+        """Draw later starts, goals and noise from `seed`."""
+        self._rng = np.random.default_rng(seed)
+        self._noise = torch.Generator().manual_seed(seed).get_state()
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""
+        with seeded(int(self._rng.integers(2**62)), torch.device("cpu")):
+            return self.env.reset(mask)
+
+    def step(self, action: Tensor) -> Step:
+        """Apply `action` (B, A), clipped to ±1."""
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._noise)
+            step = self.env.step(action)
+            self._noise = torch.get_rng_state()
+        return step
+
+
+class SingleEnv(gymnasium.Env[Array, Array]):
+    """One row of a batched environment."""
+
+    def __init__(self, env: SeededEnv, max_episode_steps: int | None = None) -> None:
+        """Wrap `env`, which has one row; its episodes are truncated after `max_episode_steps`, if given."""
+        self.env = env
+        self.max_episode_steps = max_episode_steps
+        self.observation_space, self.action_space = _spaces(env)
+        self._age = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode; `options` are not used."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.env.reseed(seed)
+        self._age = 0
+        return self.env.reset()[0].numpy(), dict.fromkeys(_FACTS, False)
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Apply an action (A,) for one control step."""
+        step = self.env.step(torch.tensor(action, dtype=torch.float32)[None])
+        self._age += 1
+        info = {name: bool(values[0]) for name, values in _facts(self.env, step).items()}
+        truncated = self.max_episode_steps is not None and self._age >= self.max_episode_steps
+        return step.observation[0].numpy(), float(step.reward[0]), bool(step.terminated[0]), truncated, info
+
+
+class BatchedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
+    """All rows of a batched environment; a finished one starts anew in the same step.
+
+    Its last observation and info are in the infos "final_obs" and "final_info", as in `SyncVectorEnv`.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as Gymnasium declares it
+
+    def __init__(self, env: SeededEnv, max_episode_steps: int) -> None:
+        """Wrap `env`; its episodes are truncated after `max_episode_steps`."""
+        self.env = env
+        self.num_envs = env.num_envs
+        self.max_episode_steps = max_episode_steps
+        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._age = torch.zeros(self.num_envs, dtype=torch.long)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start all episodes from one seed (of a list, the first); `options` are not used."""
+        first = seed[0] if isinstance(seed, list) else seed
+        super().reset(seed=first)
+        if first is not None:
+            self.env.reseed(first)
+        self._age.zero_()
+        nothing = np.zeros(self.num_envs, dtype=bool)
+        return self.env.reset().numpy(), _info(dict.fromkeys(_FACTS, nothing), ~nothing)
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Apply actions (B, A) for one control step."""
+        step = self.env.step(torch.tensor(actions, dtype=torch.float32))
+        self._age += 1
+        truncated = self._age >= self.max_episode_steps
+        observation, infos = self._restart(step, step.terminated | truncated)
+        rewards = step.reward.numpy().astype(np.float64)
+        return observation, rewards, step.terminated.numpy(), truncated.numpy(), infos
+
+    def _restart(self, step: Step, done: Tensor) -> tuple[Array, dict[str, Any]]:
+        facts, ended = _facts(self.env, step), done.numpy()
+        infos = _info({name: values & ~ended for name, values in facts.items()}, np.ones_like(ended))
+        if not ended.any():
+            return step.observation.numpy(), infos
+        final = np.full(self.num_envs, None, dtype=object)
+        for row in np.flatnonzero(ended):
+            final[row] = step.observation[row].numpy()
+        infos |= {"final_obs": final, "_final_obs": ended}
+        final_info = _info({name: values & ended for name, values in facts.items()}, ended)
+        infos |= {"final_info": final_info, "_final_info": ended}
+        self._age[done] = 0
+        return self.env.reset(done).numpy(), infos
+
+
+_FACTS = ("success", "failed", "wall_contact")
+
+
+def _facts(env: SeededEnv, step: Step) -> dict[str, Array]:
+    """Return what `info` says of each row, (B,) bool."""
+    values = (step.success, env.failed, env.wall_contact)
+    return {name: of_rows.numpy().copy() for name, of_rows in zip(_FACTS, values, strict=True)}
+
+
+def _info(facts: dict[str, Array], known: Array) -> dict[str, Any]:
+    return facts | {f"_{name}": known for name in facts}
+
+
+def _spaces(env: SeededEnv) -> tuple[Box, Box]:
+    observation = Box(-np.inf, np.inf, (env.observation_size,), np.float32)
+    return observation, Box(-1.0, 1.0, (env.action_size,), np.float32)
+
+
+def ant_maze(task: str, **options: Any) -> SingleEnv:  # noqa: ANN401 - handed on
+    """Build one target environment of `task`; `options` as for `AntMazeEnv`."""
+    return SingleEnv(task_named(task).target(1, seed=fresh_seed(), **options))
+
+
+def ant_maze_vector(
+    num_envs: int,
+    task: str,
+    max_episode_steps: int,
+    **options: Any,  # noqa: ANN401 - handed on
+) -> BatchedVectorEnv:
+    """Build `num_envs` target environments of `task`; `options` as for `AntMazeEnv`."""
+    env = task_named(task).target(num_envs, seed=fresh_seed(), **options)
+    return BatchedVectorEnv(env, max_episode_steps)
+
+
+def point_maze(task: str) -> SingleEnv:
+    """Build one abstract environment of `task`."""
+    return SingleEnv(_abstract(task, 1))
+
+
+def point_maze_vector(num_envs: int, task: str, max_episode_steps: int) -> BatchedVectorEnv:
+    """Build `num_envs` abstract environments of `task`."""
+    return BatchedVectorEnv(_abstract(task, num_envs), max_episode_steps)
+
+
+def _abstract(task: str, num_envs: int) -> SeededSimulatorEnv:
+    found = task_named(task)
+    return SeededSimulatorEnv(SimulatorEnv(found.objective, NO_GROUNDING.simulator(found, num_envs)))

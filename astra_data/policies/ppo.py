@@ -1,0 +1,219 @@
+"""Proximal policy optimization (Schulman et al. 2017) on a batched environment.
+
+One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are whole
+rollouts of some environments, so the same code trains policies with and without memory.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.config import Config, Count, Positive, Share
+from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import derive
+from astra_data.grounding.divergence import refuse_divergence
+from astra_data.policies.acting import Acting
+from astra_data.policies.learner import Learner, Resumable
+from astra_data.policies.networks.actor_critic import ActorCritic
+from astra_data.policies.networks.policy import gaussian_log_prob
+from astra_data.policies.return_scale import ReturnScale
+from astra_data.worlds.batched import BatchedEnv
+
+EPOCHS, MINIBATCHES = 5, 16
+"""Passes over a rollout, and updates per pass, each on the complete rollouts of some environments."""
+GAE_LAMBDA, CLIP, VALUE_WEIGHT, GRADIENT_NORM = 0.95, 0.2, 0.5, 0.5
+_CRITIC_GAIN = 0.01
+"""Initial gain of the critic's last layer. With 1, its values exceed small returns, so the first advantages
+reflect the untrained critic instead of the rewards."""
+_MAX_KL = 0.03
+"""An iteration's passes stop once a minibatch's policy has diverged this far from the one that collected the
+rollout: as action noise fades, ever smaller updates undo learning."""
+_FINAL_STD, _FADE_SHARE = 0.15, 0.5
+"""The limit of the actions' standard deviation falls to this, by equal factors, over this share of the
+training, so that the policy is trained as it is tested."""
+_PULL = 0.05
+"""Weight in the loss of the square by which clipped means are beyond ±1."""
+
+_SEEN = ("observation", "previous_action", "hidden", "start")
+_LEARNED = ("action", "action_log_prob", "advantage", "value_target")
+
+
+class PpoConfig(Config):
+    """Settings of proximal policy optimization."""
+
+    total_steps: Count = 2_000_000
+    """Maximum number of environment steps; a training whose episodes succeed ends earlier."""
+    rollout_steps: Count = 64
+    """Steps of each environment per iteration."""
+    learning_rate: Positive = 5e-4
+    """Learning rate at the start; decays linearly to zero."""
+    discount: Share = 0.99
+    """Discount factor per step."""
+
+
+class Ppo(Learner):
+    """A training in progress.
+
+    Attributes:
+        policy: the networks being trained.
+    """
+
+    def __init__(
+        self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
+    ) -> None:
+        """Prepare to train `policy` in `env`.
+
+        Args:
+            env: the environment.
+            policy: the networks.
+            config: settings.
+            horizon: steps after which episodes are truncated.
+            seed: of all randomness.
+
+        Raises:
+            BadInputError: a rollout is a single step, which has no advantage over others.
+        """
+        if env.num_envs * config.rollout_steps == 1:
+            raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")
+        self.policy, self.config = policy, config
+        with torch.no_grad():
+            policy.value_layer.weight.mul_(_CRITIC_GAIN)
+        self._first_std = float(policy.log_std.detach().exp().max())
+        self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
+        self._returns = ReturnScale(env.num_envs, config.discount, policy.log_std.device)
+        parts: dict[str, Resumable] = {
+            "policy": policy,
+            "optimizer": self._optimizer,
+            "returns": self._returns,
+        }
+        torch.manual_seed(derive(seed, "first reset"))
+        super().__init__(
+            Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=True),
+            parts,
+            total_steps=config.total_steps,
+            rollout_steps=config.rollout_steps,
+            seed=seed,
+        )
+
+    def _iterate(self) -> dict[str, float]:
+        """Collect one rollout and learn from it; return the mean "std" of the actions."""
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * self.share_left
+        self._learn(self._collect())
+        faded = min(1.0, (1.0 - self.share_left) / _FADE_SHARE)
+        with torch.no_grad():
+            self.policy.log_std.clamp_(
+                max=math.log(self._first_std) + faded * math.log(_FINAL_STD / self._first_std)
+            )
+        figures = {"std": float(self.policy.log_std.detach().exp().mean())}
+        refuse_divergence(f"after step {self.steps}", figures)
+        return figures
+
+    @torch.no_grad()
+    def _collect(self) -> dict[str, Tensor]:
+        acting, policy = self.acting, self.policy
+        columns: dict[str, list[Tensor]] = {}
+        first_hidden = acting.hidden
+        for _ in range(self.rollout_steps):
+            row = {
+                "observation": acting.observation,
+                "previous_action": acting.previous_action,
+                "start": acting.first.float(),
+            }
+            features, hidden = policy.remember(acting.observation, acting.previous_action, acting.hidden)
+            mean, std = policy.policy(features)
+            action = torch.normal(mean, std)
+            taken = acting.take(action, hidden)
+            step, expired = taken.step, taken.expired
+            row |= {
+                "features": features,
+                "mean": mean,
+                "std": std,
+                "action": action,
+                "reward": self._returns.scaled(taken.step.reward, taken.done),
+                "terminated": step.terminated,
+                "done": taken.done,
+                "beyond": torch.zeros_like(step.reward),
+            }
+            if bool(expired.any()):
+                beyond, _ = policy.remember(step.observation[expired], taken.action[expired], hidden[expired])
+                row["beyond"][expired] = policy.value(beyond)
+            for name, values in row.items():
+                columns.setdefault(name, []).append(values)
+        rollout = {name: torch.stack(values, dim=1) for name, values in columns.items()}
+        rollout["value"] = policy.value(rollout["features"])
+        rollout["action_log_prob"] = gaussian_log_prob(rollout["mean"], rollout["std"], rollout["action"])
+        last, _ = policy.remember(acting.observation, acting.previous_action, acting.hidden)
+        following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
+        following = torch.where(rollout["done"], rollout["beyond"], following)
+        parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
+        advantage = generalized_advantages(*parts, discount=self.config.discount, gae_lambda=GAE_LAMBDA)
+        target = advantage + rollout["value"]
+        return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
+
+    def _learn(self, rollout: dict[str, Tensor]) -> None:
+        policy = self.policy
+        advantage = rollout["advantage"]
+        rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        count = len(advantage)
+        for _ in range(EPOCHS):
+            order = torch.randperm(count, device=advantage.device)
+            for rows in order.chunk(MINIBATCHES):
+                loss, moved = self._loss({name: rollout[name][rows] for name in _SEEN + _LEARNED})
+                if moved.abs() > _MAX_KL:
+                    return
+                self._optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+                self._optimizer.step()
+
+    def _loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the loss, eq. 9 of Schulman et al. with the clipped objective of eq. 7, and a KL divergence.
+
+        That is an estimate of the divergence of the policy from the one that collected the rollout.
+        """
+        policy = self.policy
+        remembered = policy.remember_sequence(*(batch[name] for name in _SEEN))
+        features, action, action_log_prob, advantage, target = (
+            values.flatten(0, 1) for values in (remembered, *(batch[name] for name in _LEARNED))
+        )
+        output = policy.actor(features)
+        mean, std = policy.gaussian(output)
+        moved = gaussian_log_prob(mean, std, action) - action_log_prob
+        ratio = moved.exp()
+        clipped = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
+        gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
+        critic_loss = (policy.value(features) - target).square().mean()
+        beyond = (output.abs() - 1.0).clamp_min(0.0).square().mean()
+        loss = VALUE_WEIGHT * critic_loss - gain + _PULL * beyond
+        return loss, -moved.mean()
+
+
+def generalized_advantages(
+    value: Tensor,
+    following: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor,
+    *,
+    discount: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Return the generalized advantage estimates (B, T) of Schulman et al. 2016, eq. 16.
+
+    Args:
+        value: of the observation before each step, (B, T).
+        following: of the one after it, (B, T); without effect where a step terminates.
+        reward: (B, T).
+        done: whether the episode ends with the step, (B, T) bool.
+        terminated: whether nothing follows the step, (B, T) bool.
+        discount: per step.
+        gae_lambda: λ.
+    """
+    error = reward + discount * following * ~terminated - value
+    kept = discount * gae_lambda * (~done).to(value.dtype)
+    advantage, later = torch.empty_like(error), torch.zeros_like(error[:, 0])
+    for step in reversed(range(error.shape[1])):
+        later = advantage[:, step] = error[:, step] + kept[:, step] * later
+    return advantage

@@ -1,0 +1,114 @@
+"""Rapid motor adaptation, phase 2: a student learns to estimate its teacher's extrinsics while it acts.
+
+After Kumar et al. 2021. The student acts itself, so that it learns from the histories that its own mistakes
+lead to.
+"""
+
+import math
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn import functional
+
+from astra_data.core.config import Config, Count, Positive
+from astra_data.core.seeding import derive
+from astra_data.grounding.divergence import refuse_divergence
+from astra_data.policies.acting import Acting
+from astra_data.policies.learner import Learner
+from astra_data.policies.networks.adaptation import SHORTEST_HISTORY, Student, Teacher
+from astra_data.worlds.batched import BatchedEnv
+
+
+class RmaConfig(Config):
+    """Settings of rapid motor adaptation. The paper gives none; sizes are those of Kumar et al. 2021."""
+
+    extrinsics_size: Count = 8
+    """Size of the encoding of the simulator's parameters."""
+    history_length: Annotated[int, Field(ge=SHORTEST_HISTORY)] = 50
+    """Number of past steps from which the extrinsics are estimated."""
+    adaptation_steps: Count = 500_000
+    """Number of environment steps in phase 2."""
+    adaptation_learning_rate: Positive = 1e-3
+    """Learning rate of phase 2 at the start; decays linearly to zero."""
+
+
+class Adaptation(Learner):
+    """A phase 2 in progress: one update per step, on the current histories of all rows.
+
+    Attributes:
+        student: the networks; only the estimate of the extrinsics is trained.
+    """
+
+    def __init__(
+        self,
+        env: BatchedEnv,
+        teacher: Teacher,
+        config: RmaConfig,
+        *,
+        rollout_steps: int,
+        horizon: int,
+        seed: int,
+    ) -> None:
+        """Prepare to train a student of `teacher` in `env`.
+
+        Args:
+            env: the environment that the teacher was trained in.
+            teacher: the trained teacher.
+            config: settings.
+            rollout_steps: steps of every environment per iteration.
+            horizon: steps after which episodes are truncated.
+            seed: of all randomness.
+        """
+        self.teacher, self.config = teacher, config
+        torch.manual_seed(derive(seed, "student"))
+        self.student = Student.of_teacher(teacher)
+        learned = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
+        self._optimizer = torch.optim.Adam(learned, lr=config.adaptation_learning_rate)
+        hidden = self.student.initial_hidden(env.num_envs)
+        super().__init__(
+            Acting(env, hidden, horizon=horizon, is_staggered=True),
+            {"student": self.student, "optimizer": self._optimizer},
+            total_steps=config.adaptation_steps,
+            rollout_steps=rollout_steps,
+            seed=derive(seed, "adaptation"),
+        )
+
+    def _iterate(self) -> dict[str, float]:
+        """Take `rollout_steps` batched steps, learning after each.
+
+        Returns:
+            "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those at
+            the start of episodes, without a history; NaN where nothing varies.
+        """
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.adaptation_learning_rate * self.share_left
+        errors, true = [], []
+        for _ in range(self.rollout_steps):
+            extrinsics, features, hidden = self._learn()
+            errors.append(features[:, -extrinsics.shape[1] :] - extrinsics)
+            true.append(extrinsics)
+            with torch.no_grad():
+                self.acting.take(self.student.act(features), hidden)
+        error = float(torch.cat(errors).square().mean(0).sum())
+        refuse_divergence(f"after step {self.steps}", {"squared error": error})
+        variance = float(torch.cat(true).var(0, correction=0).sum())
+        return {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
+
+    def _learn(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Process the current observations and make one update.
+
+        Returns:
+            the true extrinsics (B, E), the features (B, F), and the next hidden (B, H).
+        """
+        acting, shape = self.acting, self.student.shape
+        with torch.no_grad():
+            extrinsics = self.teacher.extrinsics(acting.observation)
+        seen = acting.observation[:, : shape.observation_size]
+        features, hidden = self.student.remember(seen, acting.previous_action, acting.hidden)
+        loss = functional.mse_loss(features[:, -shape.extrinsics_size :], extrinsics)
+        self._optimizer.zero_grad()
+        loss.backward()
+        self._optimizer.step()
+        return extrinsics, features.detach(), hidden

@@ -1,0 +1,234 @@
+"""Soft actor-critic on a batched environment (Haarnoja et al. 2018, arXiv 1812.05905).
+
+Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
+whose first steps only fill the memories; otherwise they learn from single steps. At the start of a
+window the policy's memory is the one stored while acting, since there it spans whole episodes (Kapturowski et
+al. 2019); that of the critics, which see only windows, is empty.
+"""
+
+import copy
+from itertools import pairwise
+from typing import Self
+
+import torch
+from pydantic import model_validator
+from torch import Tensor, nn
+
+from astra_data.core.config import Config, Count, CountFromZero, Positive, Share
+from astra_data.core.errors import BadInputError
+from astra_data.core.seeding import derive
+from astra_data.grounding.divergence import refuse_divergence
+from astra_data.policies.acting import Acting
+from astra_data.policies.learner import Learner
+from astra_data.policies.networks.policy import PolicyShape, features_of
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.replay import Replay
+from astra_data.worlds.batched import BatchedEnv
+
+_REWARD_SCALE = 0.1
+"""Factor on the reward that the critics learn from."""
+_INITIAL_TEMPERATURE = 0.2
+"""Weight of the entropy in the reward at the start."""
+_TARGET_RATE = 0.005
+"""Polyak rate of the target critics, per update."""
+
+
+class SacConfig(Config):
+    """Settings of soft actor-critic."""
+
+    total_steps: Count = 1_000_000
+    """Total number of environment steps."""
+    rollout_steps: Count = 64
+    """Batched steps per iteration."""
+    updates_per_step: Count = 8
+    """Gradient updates per batched step."""
+    batch_size: Count = 256
+    """Steps per update; if the policy has a memory, split into windows."""
+    window: Count = 16
+    """Consecutive steps per window, if the policy has a memory."""
+    burn_in: CountFromZero = 4
+    """Steps at the start of a window that only warm up the memory, until an episode starts."""
+    buffer_size: Count = 160_000
+    """Number of most recent steps kept for replay."""
+    learning_rate: Positive = 3e-4
+    """Learning rate of actor, critics and temperature; decays to zero over the second half of the training.
+    Otherwise the quality of the final policy is left to chance."""
+    discount: Share = 0.99
+    """Discount factor per step."""
+
+    @model_validator(mode="after")
+    def _leaves_steps_to_learn_from(self) -> Self:
+        if self.burn_in >= self.window:
+            raise ValueError(f"burn_in: expected less than the window of {self.window}, got {self.burn_in}")
+        if self.window > self.batch_size:
+            raise ValueError(f"batch_size: expected a window of {self.window} or more, got {self.batch_size}")
+        return self
+
+
+class Sac(Learner):
+    """A training in progress.
+
+    Attributes:
+        policy: the actor.
+    """
+
+    def __init__(
+        self,
+        env: BatchedEnv,
+        policy: SoftActor,
+        config: SacConfig,
+        *,
+        horizon: int,
+        seed: int,
+    ) -> None:
+        """Prepare to train `policy` in `env`.
+
+        Args:
+            env: the environment.
+            policy: the actor.
+            config: settings.
+            horizon: steps after which episodes are truncated.
+            seed: of all randomness.
+
+        Raises:
+            BadInputError: the buffer is smaller than a window.
+        """
+        self.policy, self.config = policy, config
+        torch.manual_seed(derive(seed, "critics"))
+        device = next(policy.parameters()).device
+        self._critics = _Critics(policy.shape).to(device)
+        self._late_critics = copy.deepcopy(self._critics).requires_grad_(False)
+        self._log_temperature = nn.Parameter(torch.tensor(_INITIAL_TEMPERATURE, device=device).log())
+        learned = [*policy.parameters(), *self._critics.parameters(), self._log_temperature]
+        self._optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
+        self._window, self._burn_in = (config.window, config.burn_in) if policy.memory else (1, 0)
+        if config.buffer_size // env.num_envs <= self._window:
+            raise BadInputError(
+                f"buffer_size: expected at least {(self._window + 1) * env.num_envs} steps, for a window of "
+                f"{self._window} in {env.num_envs} environments, got {config.buffer_size}"
+            )
+        self._replay = Replay(config.buffer_size, env, policy.shape.memory_size, device)
+        torch.manual_seed(derive(seed, "first reset"))
+        super().__init__(
+            Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=False),
+            {
+                "policy": policy,
+                "critics": self._critics,
+                "late_critics": self._late_critics,
+                "temperature": nn.ParameterDict({"log": self._log_temperature}),
+                "optimizer": self._optimizer,
+                "replay": self._replay,
+            },
+            total_steps=config.total_steps,
+            rollout_steps=config.rollout_steps,
+            seed=seed,
+        )
+
+    def _iterate(self) -> dict[str, float]:
+        """Take `rollout_steps` batched steps, learning after each; return the entropy's "temperature"."""
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * min(1.0, 2.0 * self.share_left)
+        for _ in range(self.rollout_steps):
+            self._act()
+            if len(self._replay) > self._window:
+                for _ in range(self.config.updates_per_step):
+                    self._learn()
+        return {"temperature": float(self._log_temperature.detach().exp())}
+
+    def _cut(self) -> None:
+        """End the episodes in the replay buffer."""
+        self._replay.cut()
+
+    @torch.no_grad()
+    def _act(self) -> None:
+        """Take one step and add it to the buffer."""
+        acting = self.acting
+        seen = {
+            "observation": acting.observation,
+            "previous_action": acting.previous_action,
+            "hidden": acting.hidden,
+            "first": acting.first,
+        }
+        features, hidden = self.policy.remember(acting.observation, acting.previous_action, acting.hidden)
+        loc, scale = self.policy.policy(features)
+        taken = acting.take(torch.tanh(torch.normal(loc, scale)), hidden)
+        self._replay.add(
+            **seen,
+            action=taken.action,
+            reward=taken.step.reward * _REWARD_SCALE,
+            terminated=taken.step.terminated,
+            expired=taken.expired,
+        )
+
+    def _learn(self) -> None:
+        """Update actor, critics and temperature once."""
+        config = self.config
+        steps, learned = self._replay.windows(config.batch_size // self._window, self._window, self._burn_in)
+        if not bool(learned.any()):
+            return
+        total = sum(self._losses(steps, learned), torch.zeros((), device=learned.device))
+        refuse_divergence(f"after step {self.steps}", {"loss": float(total.detach())})
+        self._optimizer.zero_grad()
+        total.backward()
+        self._optimizer.step()
+        with torch.no_grad():
+            late, now = self._late_critics.parameters(), self._critics.parameters()
+            torch._foreach_lerp_([*late], [*now], _TARGET_RATE)
+
+    def _losses(self, steps: dict[str, Tensor], learned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the losses of critics, eq. 5, actor, eq. 7, and temperature, eq. 18.
+
+        They are means over the steps of windows (B, T + 1) that are `learned` (B, T) from.
+        """
+        critics, temperature = self._critics, self._log_temperature.detach().exp()
+        seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
+        acting = self.policy.remember_sequence(*seen, steps["hidden"][:, 0], first)
+        judging = critics.features(*seen, first)[:, :-1][learned]
+        reward, terminated, taken = (
+            steps[name][:, :-1][learned] for name in ("reward", "terminated", "action")
+        )
+        with torch.no_grad():
+            action, log_prob = self.policy.sample(acting[:, 1:][learned])
+            late = self._late_critics.features(*seen, first)[:, 1:][learned]
+            following = self._late_critics(late, action).amin(0) - temperature * log_prob
+            wanted = reward + self.config.discount * ~terminated * following
+        critic_loss = (critics(judging, taken) - wanted).square().mean(1).sum()
+        action, log_prob = self.policy.sample(acting[:, :-1][learned])
+        # The actor must change neither the critics nor their memory to raise its own values.
+        critics.requires_grad_(False)
+        actor_loss = (temperature * log_prob - critics(judging.detach(), action).amin(0)).mean()
+        critics.requires_grad_(True)
+        surplus = action.shape[-1] - log_prob.detach().mean()
+        return critic_loss, actor_loss, self._log_temperature * surplus
+
+
+class _Critics(nn.Module):
+    """Two action values, and the memory that both share, if the policy has one.
+
+    Layer normalization keeps them from diverging at this learning rate.
+    """
+
+    def __init__(self, shape: PolicyShape) -> None:
+        super().__init__()
+        self.memory = shape.new_memory()
+        self.networks = nn.ModuleList(_action_value(shape) for _ in range(2))
+
+    def features(self, observation: Tensor, previous_action: Tensor, first: Tensor) -> Tensor:
+        """Return the features (B, T, F) of windows of (B, T, ...), before which nothing is remembered."""
+        nothing = observation.new_zeros(
+            len(observation), 0 if self.memory is None else self.memory.latent_size
+        )
+        return features_of(self.memory, observation, previous_action, nothing, first)
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return both values (2, ...) of features (..., F) and actions (..., A)."""
+        pair = torch.cat([features, action], dim=-1)
+        return torch.stack([network(pair).squeeze(-1) for network in self.networks])
+
+
+def _action_value(shape: PolicyShape) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    sizes = shape.feature_size + shape.action_size, *shape.hidden_sizes
+    for size_in, size_out in pairwise(sizes):
+        layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], 1))

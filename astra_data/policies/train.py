@@ -1,0 +1,284 @@
+"""Train a policy: the inputs of a method's training, and the training of most methods.
+
+Most train by PPO, or by SAC, in the abstract simulator: raw, varied, or corrected by the method's grounding
+(Algorithm 2).
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Annotated, Any, Literal, Protocol
+
+import torch
+from pydantic import Discriminator, Tag
+from torch import Tensor
+
+from astra_data.core.artifact import CHECKPOINT
+from astra_data.core.config import AtOnce, Config, Count, CountFromZero, Share, choice
+from astra_data.core.logbook import Logbook
+from astra_data.core.progress import Progress
+from astra_data.core.seeding import derive
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.protocols import Grounding
+from astra_data.policies.build_env import (
+    Simulation,
+    WorldConfig,
+    data_starts,
+    plus,
+    training_env,
+)
+from astra_data.policies.command_limit import command_limit
+from astra_data.policies.learner import Learner
+from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.networks.policy import Policy, PolicyShape
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.ppo import Ppo, PpoConfig
+from astra_data.policies.ramp import FAST, is_mastered, penalty_scale
+from astra_data.policies.sac import Sac, SacConfig
+from astra_data.policies.simulator_env import RewardSource, SimulatorEnv
+from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.task import Task
+from astra_data.worlds.variation import Variation
+
+
+class TrainConfig(Config):
+    """How policies are trained, except for the learner's own settings."""
+
+    num_envs: AtOnce = 256
+    """Environments stepped in parallel."""
+    hidden_sizes: tuple[AtOnce, ...] = (64, 64)
+    """Hidden layers of actor and critic."""
+    memory_size: CountFromZero = 64
+    """Size of the policy's own GRU, used if no grounding provides a latent."""
+    data_start_share: Share = 0.5
+    """Fraction of the training episodes that start from the middle of a recorded one."""
+    episode_steps: Count | None = None
+    """Steps after which simulated episodes are truncated and their values bootstrapped; by default the task's
+    horizon. In short episodes from recorded states, errors have no time to grow (Janner et al. 2019)."""
+    tries: AtOnce = 3
+    """Maximum number of training runs. A policy that does not master its own simulator (in 100 episodes from
+    the task's starts, acting by the mean of its actions) is trained again with another seed."""
+    least_success: Share = 0.8
+    """Success in these episodes at which a simulator is mastered; if no try reaches it, the best one is kept.
+    """
+
+
+class PpoTrainConfig(TrainConfig, PpoConfig):
+    """Training by PPO."""
+
+    learner: Literal["ppo"] = "ppo"
+    """Proximal policy optimization."""
+
+
+class SacTrainConfig(TrainConfig, SacConfig):
+    """Training by SAC."""
+
+    learner: Literal["sac"]
+    """Soft actor-critic."""
+    num_envs: AtOnce = 32
+    """Environments stepped in parallel."""
+
+
+def _learner(settings: object) -> str:
+    """Return the tag of the model below that `settings` are for; by default PPO."""
+    if isinstance(settings, Mapping):
+        return choice(str(settings.get("learner", "ppo")))
+    return choice(str(getattr(settings, "learner", "ppo")))
+
+
+AnyTrainConfig = Annotated[
+    Annotated[PpoTrainConfig, Tag(choice("ppo"))] | Annotated[SacTrainConfig, Tag(choice("sac"))],
+    Discriminator(_learner),
+]
+"""Training by the `learner` that is named, by default PPO."""
+
+
+def learner_of(
+    config: PpoTrainConfig | SacTrainConfig,
+    env: BatchedEnv,
+    shape: PolicyShape,
+    device: str,
+    *,
+    horizon: int,
+    seed: int,
+) -> Ppo | Sac:
+    """Build the learner and a new policy of `shape`."""
+    if isinstance(config, SacTrainConfig):
+        actor = SoftActor(shape).to(device)
+        return Sac(env, actor, config, horizon=horizon, seed=seed)
+    policy = ActorCritic(ActorCriticShape(**asdict(shape))).to(device)
+    return Ppo(env, policy, config, horizon=horizon, seed=seed)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a method is given to train a policy.
+
+    Attributes:
+        task: the task. config: the recipe's `[train]`. is_plus: whether the row has the plus settings.
+        settings: the method's own table of the recipe, if it has one.
+        episodes: paired episodes. grounding: of the method; `NO_GROUNDING` where it fits none.
+        initial: the policy that the training starts from, if the method names one.
+        seed: of all randomness. device: of the networks.
+        folder: for checkpoints.
+        progress: called with the share done and a note.
+        num_threads: of the target's physics, for methods that train in the target; None is one per core.
+    """
+
+    task: Task
+    config: PpoTrainConfig | SacTrainConfig
+    settings: Config | None
+    episodes: PairedEpisodes
+    grounding: Grounding
+    initial: PolicyFile | None
+    seed: int
+    device: str
+    folder: Path
+    progress: Progress
+    num_threads: int | None = None
+    is_plus: bool = False
+
+    @property
+    def simulated_steps(self) -> int:
+        """Steps after which simulated episodes are cut off."""
+        return self.config.episode_steps or self.task.objective.horizon
+
+
+Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]
+"""Returns the policy and its learning curve."""
+
+
+class ResumableEnv(BatchedEnv, Protocol):
+    """A batched environment in which a training can be resumed.
+
+    Attributes:
+        penalty_scale: factor on penalties in the reward, which the training ramps up.
+    """
+
+    penalty_scale: float
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all that `load_state_dict` needs to continue from here."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
+        """Continue from `state`; return the observations (B, O)."""
+        ...
+
+
+@dataclass(frozen=True)
+class InSimulator:
+    """Train in the abstract simulator.
+
+    Attributes:
+        reward: where the reward comes from, but for the plus settings.
+        ranges: which of the task's ranges the simulator's parameters are drawn from, unless the grounding has
+            ranges or the method's own settings are ranges; None where they stay plain.
+    """
+
+    reward: RewardSource = "abstract"
+    ranges: Literal["randomized", "wide"] | None = None
+
+    def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        """Return the policy and its learning curve."""
+        env, simulation = self.world(training)
+        memory_size = 0 if env.latent_size else training.config.memory_size
+        episodes = training.episodes
+        policy, curve = train_in(env, training.config, memory_size, training, training.simulated_steps)
+        return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
+
+    def world(self, training: Training, *, shows_parameters: bool = False) -> tuple[SimulatorEnv, Simulation]:
+        """Return the environment to train in, and what a policy file records about it."""
+        config, settings = training.config, training.settings
+        task, episodes, grounding = training.task, training.episodes, training.grounding
+        world = WorldConfig(reward=self.reward, data_start_share=config.data_start_share)
+        if training.is_plus:
+            world = plus(world, command_limit(task, episodes))
+        usual: Variation | None = getattr(task.varied, self.ranges) if self.ranges else None
+        variation = settings if isinstance(settings, Variation) else usual
+        starts = data_starts(task, world, episodes, grounding)
+        simulation = Simulation(world, variation)
+        env = training_env(
+            task,
+            simulation,
+            grounding,
+            num_envs=config.num_envs,
+            device=training.device,
+            starts=starts,
+            shows_parameters=shows_parameters,
+        )
+        return env, simulation
+
+
+def train_in(
+    env: ResumableEnv,
+    config: PpoTrainConfig | SacTrainConfig,
+    memory_size: int,
+    training: Training,
+    horizon: int,
+) -> tuple[Policy, dict[str, Any]]:
+    """Train a new policy in `env`; return it and its learning curve.
+
+    The policy has a memory of `memory_size`; episodes are cut off after `horizon` steps.
+    """
+    torch.manual_seed(derive(training.seed, "policy"))
+    shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
+    learner = learner_of(config, env, shape, training.device, horizon=horizon, seed=training.seed)
+    return learner.policy, optimize(learner, env, training)
+
+
+def optimize(
+    learner: Learner,
+    env: ResumableEnv,
+    training: Training,
+    checkpoint_name: str = CHECKPOINT,
+) -> dict[str, Any]:
+    """Train to the end, from the checkpoint in the folder if there is one; return the learning curve.
+
+    Once training episodes succeed at penalties of full size, the rest of the training, whose schedules go on,
+    takes fewer steps. With SAC, which learns from rewards of long ago as well, penalties have full size from
+    the start, and so in tasks whose success is to last. The last checkpoint is left in the folder, for what
+    comes after.
+    """
+
+    def go_on(state: dict[str, Any]) -> None:
+        world = {name: values.to(training.device) for name, values in state["world"].items()}
+        learner.load_state_dict(state["learner"], env.load_state_dict(world), goes_on=bool(world))
+
+    logbook = Logbook(training.folder / checkpoint_name, go_on)
+    points, stopwatch, first = logbook.points, logbook.stopwatch, learner.steps
+    is_lasting = training.task.objective.is_lasting
+    ramps = training.is_plus and isinstance(learner, Ppo) and not is_lasting
+    while not learner.done:
+        env.penalty_scale = penalty_scale(points) if ramps else 1.0
+        learner.pace = FAST if env.penalty_scale == 1.0 and is_mastered(points) else 1.0
+        metrics = learner.iterate()
+        # JSON has no NaN: undefined figures, such as the success rate of no episodes, are null.
+        known = {name: None if math.isnan(value) else value for name, value in metrics.items()}
+        if is_lasting:
+            # Success is to last to the horizon, which is not an end here: all ends are failures.
+            known["success"] = None
+        points.append({"steps": learner.steps, "share": learner.share, **known})
+        rate = learner.steps / stopwatch.seconds
+        note = f"{rate:,.0f} steps/s  {lately(points, 'episode_steps' if is_lasting else 'success')}"
+        training.progress(learner.share, note)
+        if logbook.is_due or learner.done:
+            logbook.keep({"learner": learner.state_dict(), "world": env.state_dict()})
+    taken, seconds = learner.steps - first, learner.acting.world_seconds
+    return {
+        "steps_per_second": learner.steps / stopwatch.seconds,
+        "simulator_steps_per_second": taken / seconds if taken else None,
+        **stopwatch.spent(),
+        "points": points,
+    }
+
+
+def lately(points: Sequence[Mapping[str, float | None]], figure: str) -> str:
+    """Return a note of the mean of a `figure`, "success" or "episode_steps", over the last `points`."""
+    recent = [value for point in points[-10:] if (value := point.get(figure)) is not None]
+    if figure == "success":
+        return f"success of training episodes {f'{fmean(recent):.2f}' if recent else 'unknown yet'}"
+    return f"steps of training episodes {f'{fmean(recent):,.0f}' if recent else 'unknown yet'}"

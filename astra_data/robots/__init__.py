@@ -1,0 +1,1 @@
+"""Robots that come with the package: bodies, targets, simulators and tasks."""

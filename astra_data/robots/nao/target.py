@@ -1,0 +1,194 @@
+"""NAOs, simulated stand-ins, that follow planar velocity commands in a maze or with a ball."""
+
+import json
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from astra_data.core.arrays import Floats
+from astra_data.robots.nao.abstraction import STATE_SIZE
+from astra_data.robots.nao.perception import BallSight, Localisation, PerceptionErrors
+from astra_data.robots.nao.robot import CONTROL_STEP_S, BatchedNao
+from astra_data.worlds.batched import Step, rows_in
+from astra_data.worlds.objective import PlanarObjective
+from astra_data.worlds.planar_target import PlanarTarget
+from astra_data.worlds.plane.ball import asks_to_kick
+from astra_data.worlds.plane.geometry import wrapped
+
+SPEED_M_S = 0.25
+"""Of a command of 1, along each axis: the largest forward speed of B-Human's walk."""
+TURN_GAIN_PER_S = 2.0
+"""Turning rate per rad between heading and direction of motion."""
+TURN_LIMIT_RAD_S = 1.0
+SEARCH_AFTER_S = 1.5
+"""A robot that has not seen its ball for longer turns to search for it."""
+_STANDING = 0.05
+"""Robots do not turn at shorter commands."""
+_FOOT_LOAD_N = 50.0
+"""Scale of the pressures on the soles."""
+BALL_SIZE = 5
+"""With a ball there follow its estimated position (2) and velocity (2), and the time since it was seen."""
+
+
+class NaoEnv(PlanarTarget):
+    """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
+
+    With a ball, actions are (B, 3), and a third entry above 0.5 asks for a kick, however far the ball is: the
+    robot steps on the spot and swings forward the foot on the ball's side, or either foot if the ball is
+    straight ahead. A control step lasts 0.192 s. The robots turn by themselves to where they go, or to their
+    ball. They act on estimates, which are also all that their state (B, S) holds; rewards, success and
+    failure depend on true positions. Success, falling, and the task's own failures end an episode.
+
+    Attributes:
+        goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
+        robots: the robots.
+    """
+
+    def __init__(
+        self,
+        objective: PlanarObjective,
+        num_envs: int,
+        *,
+        seed: int,
+        ball: bool = False,
+        start_anywhere: bool = False,
+        errors: PerceptionErrors | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        """Build B robots.
+
+        Args:
+            objective: maze, goal and reward.
+            num_envs: B.
+            seed: of everything random.
+            ball: whether there is a ball.
+            start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
+            errors: of the estimates.
+            num_threads: of the physics, by default one per core.
+        """
+        super().__init__(objective, num_envs, start_anywhere=start_anywhere)
+        self.has_ball, self.action_size = ball, objective.action_size
+        self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
+        errors = errors or PerceptionErrors()
+        self.localisation = Localisation(num_envs, errors, CONTROL_STEP_S)
+        self.sight = BallSight(num_envs, errors, CONTROL_STEP_S)
+        self.observation_size = STATE_SIZE + BALL_SIZE * ball + 2
+        self.reseed(seed)
+
+    @property
+    def state(self) -> Tensor:
+        """Estimates and sensor readings of the robots, (B, S) float32."""
+        pose, senses = self.localisation.pose, self.robots.senses
+        cos, sin = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
+        forward, left, _ = np.split(senses.planned, 3, axis=1)
+        swing = np.where(senses.left_swings, 1.0, -1.0)[:, None]
+        angle = np.pi * senses.phase[:, None]
+        parts = [
+            *(pose[:, :2], cos, sin, cos * forward - sin * left, sin * forward + cos * left),
+            *(senses.angles, senses.gyro, senses.tilt, senses.pressure.sum(-1) / _FOOT_LOAD_N),
+            *(swing * np.sin(angle), swing * np.cos(angle), senses.planned),
+        ]
+        if self.has_ball:
+            sight = self.sight
+            parts += [sight.position, sight.velocity, sight.unseen_s[:, None]]
+        return torch.from_numpy(np.concatenate(parts, axis=1)).float()
+
+    @property
+    def truth(self) -> Tensor:
+        """The true abstract states, (B, X) float32."""
+        robots = self.robots
+        parts = [robots.pose[:, :2], robots.velocity[:, :2]]
+        if self.has_ball:
+            parts += [robots.ball, robots.ball_velocity]
+        return torch.from_numpy(np.concatenate(parts, axis=1)).float()
+
+    @property
+    def position(self) -> Tensor:
+        """True positions of robots, then of their balls where there are any, (B, 2) or (B, 4) float32, m."""
+        return self.objective.places(self.truth)
+
+    @property
+    def wall_contact(self) -> Tensor:
+        """Which robots touched a wall in their last step, (B,) bool."""
+        return torch.from_numpy(self.robots.touching.copy())
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers of starts, goals, headings, traits, errors and sensors at `seed`."""
+        super().reseed(seed)
+        self.robots.reseed(seed)
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Set the robots in `mask` (B,), by default all, to new starts with random headings."""
+        rows = rows_in(mask, self.num_envs)
+        start = self._start(rows)
+        self._aim(rows)
+        yaw = self._rng.uniform(-np.pi, np.pi, len(rows))
+        self._stand(rows, np.column_stack([start[:, :2], yaw]), start[:, 4:6] if self.has_ball else None)
+        return self._observe()
+
+    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
+        """Set the robots `rows` (n,) and their balls to the estimated positions in `state` (n, S)."""
+        yaw = np.arctan2(state[:, 3], state[:, 2])
+        ball = state[:, STATE_SIZE : STATE_SIZE + 2] if self.has_ball else None
+        self._stand(rows, np.column_stack([state[:, :2], yaw]), ball)
+
+    def _stand(self, rows: NDArray[np.intp], pose: Floats, ball: Floats | None) -> None:
+        self.robots.reset(rows, pose, self._rng, ball)
+        self.localisation.reset(rows, pose, self._rng)
+        if ball is not None:
+            self.sight.reset(rows, ball)
+        self.failed[rows] = False
+
+    def step(self, action: Tensor, active: Tensor | None = None) -> Step:
+        """Follow the commands `action` (B, A) for 0.192 s; rows outside `active` (B,) stay."""
+        moving = np.ones(self.num_envs, dtype=bool) if active is None else active.numpy()
+        before = self.truth
+        kick = asks_to_kick(action).squeeze(-1).numpy() if self.has_ball else None
+        self.robots.step(self._body_command(action[:, :2], kick), moving, kick)
+        self.localisation.update(self.robots.pose, self._rng, moving)
+        if self.has_ball:
+            estimated = self.localisation.pose
+            self.sight.update(self.robots.ball, self.robots.pose, estimated, self._rng, moving)
+        return self._judged(before, self.truth, self.robots.fallen)
+
+    def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
+        """Turn commands (B, 2) in the world frame into forward, left and turning speed (B, 3).
+
+        Robots turn to where they go. With a ball they turn to it and walk more slowly the farther it is to
+        the side, and not at all while they `kick` (B,); robots that have lost it turn to search.
+        """
+        command = velocity.clamp(-1.0, 1.0).double().numpy()
+        x, y = (SPEED_M_S * command).T
+        heading = self.localisation.pose[:, 2]
+        cos, sin = np.cos(heading), np.sin(heading)
+        ahead = np.arctan2(y, x)
+        if kick is not None:
+            apart = self.sight.position - self.localisation.pose[:, :2]
+            ahead = np.arctan2(apart[:, 1], apart[:, 0])
+        astray = wrapped(ahead - heading)
+        turn = (TURN_GAIN_PER_S * astray).clip(-TURN_LIMIT_RAD_S, TURN_LIMIT_RAD_S)
+        called = np.linalg.norm(command, axis=1) > _STANDING
+        turn *= called if kick is None else called | kick
+        if kick is not None:
+            turn = np.where(self.sight.unseen_s > SEARCH_AFTER_S, TURN_LIMIT_RAD_S, turn)
+            facing = ~kick * np.cos(astray).clip(0.0) ** 2
+            x, y = facing * x, facing * y
+        return np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what `load_state_dict` needs to continue from here."""
+        arrays = {**self.robots.state_dict(), **self.localisation.arrays(), **self.sight.arrays()}
+        tensors = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+        drawn = json.dumps(self._rng.bit_generator.state).encode()
+        return tensors | {"goal": self.goal.clone(), "drawn": torch.tensor(list(drawn), dtype=torch.uint8)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state`."""
+        arrays = {name: values.numpy() for name, values in state.items()}
+        self.robots.load_state_dict(arrays)
+        self.localisation.restore(arrays)
+        self.sight.restore(arrays)
+        self.goal = state["goal"].clone()
+        self._rng.bit_generator.state = json.loads(bytes(state["drawn"].tolist()))

@@ -1,0 +1,144 @@
+"""The NAO's tasks, on simulated stand-ins: navigation in an S-shaped maze, and kicking (Section V-C)."""
+
+from functools import partial
+from typing import Any
+
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
+from astra_data.robots.nao.abstraction import nao_beyond, nao_to_ball_agent, nao_to_point_mass
+from astra_data.robots.nao.body import TICK_S
+from astra_data.robots.nao.kinematics import JOINTS
+from astra_data.robots.nao.robot import CONTROL_STEP_S
+from astra_data.robots.nao.target import SPEED_M_S, NaoEnv
+from astra_data.worlds.column_entries import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, column
+from astra_data.worlds.plane.ball_agent import BallAgent
+from astra_data.worlds.plane.kicking import Kicking
+from astra_data.worlds.plane.mazes import FIELD, S_MAZE
+from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.plane.point_mass import PointMass
+from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.task import Plane, Task, Varied
+from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
+
+_RADIUS_M = 0.1
+"""Radius of the mass at walls in the simulators: as in AntMaze, and less than the robot's 0.14 m."""
+_BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
+_CONTACT: dict[str, Any] = {"kick_reach_m": 0.35, "kick_m_s": 1.0, "reach_m": 0.22, "knock_m_s": 0.7}
+"""Of the robot with its ball. The reach of a kick is that of the paper's group's published simulator of an
+attacking NAO (AbstractSim 2023); a foot really reaches 0.22 m far. Walking bodies touch the ball with feet
+and shins, at a median of 0.22 m between the centers in episodes of random commands; it leaves at a median of
+0.7 m/s."""
+
+KICK_RANGES = BallVariation(
+    **WIDE_RANGES.model_dump(),
+    ball_friction=(0.8, 1.2),
+    ball_position_noise_m=(0.03, 0.03),
+    ball_velocity_noise_m_s=(0.0, 0.02),
+    contact_direction_deg=(-5.0, 5.0),
+)
+"""Of COMPASS in kicking: the paper names the ball's friction, position, velocity and direction after contact
+without printing ranges for them; these are the robot's."""
+
+_QUANTITIES = {"position_m": (0, 1), "velocity_m_s": (2, 3)}
+_BALL_QUANTITIES = {"ball_position_m": (4, 5), "ball_velocity_m_s": (6, 7)}
+
+
+_STATE = [
+    ColumnEntry("x", "m", "world", "position"),
+    ColumnEntry("y", "m", "world", "position"),
+    ColumnEntry("cos_heading", "1", "world", "vector"),
+    ColumnEntry("sin_heading", "1", "world", "vector"),
+    ColumnEntry("vx", "m/s", "world", "vector"),
+    ColumnEntry("vy", "m/s", "world", "vector"),
+    *(ColumnEntry(joint, "rad", "joint", "invariant") for joint in JOINTS),
+    ColumnEntry("gyro_x", "rad/s", "body", "invariant"),
+    ColumnEntry("gyro_y", "rad/s", "body", "invariant"),
+    ColumnEntry("gyro_z", "rad/s", "body", "invariant"),
+    ColumnEntry("roll", "rad", "body", "invariant"),
+    ColumnEntry("pitch", "rad", "body", "invariant"),
+    ColumnEntry("load_left", "50 N", "body", "invariant"),
+    ColumnEntry("load_right", "50 N", "body", "invariant"),
+    ColumnEntry("step_sine", "1", "body", "invariant"),
+    ColumnEntry("step_cosine", "1", "body", "invariant"),
+    ColumnEntry("planned_forward", "m/s", "body", "invariant"),
+    ColumnEntry("planned_left", "m/s", "body", "invariant"),
+    ColumnEntry("planned_turn", "rad/s", "body", "invariant"),
+]
+_BALL = [
+    ColumnEntry("ball_x", "m", "world", "position"),
+    ColumnEntry("ball_y", "m", "world", "position"),
+    ColumnEntry("ball_vx", "m/s", "world", "vector"),
+    ColumnEntry("ball_vy", "m/s", "world", "vector"),
+]
+_UNSEEN = ColumnEntry("ball_unseen", "s", "body", "invariant")
+_COMMAND = [
+    ColumnEntry("command_vx", "0.25 m/s", "world", "vector"),
+    ColumnEntry("command_vy", "0.25 m/s", "world", "vector"),
+]
+_KICK = ColumnEntry("kick", "1", "body", "invariant")
+
+
+def _columns(*, ball: bool) -> dict[str, Any]:
+    state, command, abstract = _STATE, _COMMAND, [*PLANAR_STATE]
+    if ball:
+        state, command, abstract = [*state, *_BALL, _UNSEEN], [*command, _KICK], [*abstract, *_BALL]
+    meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
+    wish = ", and above 0.5 to stand and kick" if ball else ""
+    return {
+        "state": column(STATE, state, meaning),
+        "goal": column(GOAL, PLANAR_GOAL, "the middle of the goal line" if ball else "where to go"),
+        "action": column(ACTION, command, f"commanded planar velocity, ±1 per axis{wish}"),
+        "abstract_state": column(ABSTRACT_STATE, abstract, "abstract state of the target before the action"),
+    }
+
+
+def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
+    """Return a task with the fields `own` and those that all of the NAO's tasks share."""
+    return Task(
+        make_target=partial(NaoEnv, ball=ball),
+        beyond=nao_beyond,
+        **_columns(ball=ball),
+        commands=dict.fromkeys(("vx", "vy", *(["kick"] if ball else [])), (-1.0, 1.0)),
+        quantities=_QUANTITIES | (_BALL_QUANTITIES if ball else {}),
+        timestep_s=CONTROL_STEP_S,
+        facts={"stand_in": "mujoco", "tick_s": TICK_S},
+        plane=Plane(wall_reach_m=0.3),
+        **own,
+    )
+
+
+NAO_TASKS = (
+    _task(
+        name="nao-navigation",
+        ball=False,
+        instruction="walk through the maze to the goal",
+        objective=Navigation(
+            S_MAZE,
+            horizon=500,
+            success_radius_m=0.3,
+            spread_m=0.05,
+            start_clearance_m=0.3,
+            start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0)),
+            # A touch costs as much as a meter; if it cost a third of the path, policies would learn to stand.
+            meter_reward=4.0,
+            failure_reward=-4.0,
+            path_clearance_m=0.25,
+            # Policies without a memory, whose position is not in the latent, do not learn it without these.
+            position_waves=3,
+            ends_at_walls=True,
+        ),
+        make_simulator=partial(PointMass, S_MAZE, **_BODY),
+        varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),
+        abstraction=nao_to_point_mass,
+        simulator_id="point_mass",
+    ),
+    _task(
+        name="nao-kick",
+        ball=True,
+        instruction="kick the ball into the goal",
+        objective=Kicking(FIELD, horizon=156),
+        make_simulator=partial(BallAgent, FIELD, **_BODY, **_CONTACT),
+        varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, KICK_RANGES),
+        abstraction=nao_to_ball_agent,
+        simulator_id="ball_agent",
+    ),
+)

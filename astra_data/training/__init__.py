@@ -1,1 +1,0 @@
-"""Environments to train policies in, and trained policies in action."""

@@ -1,7 +1,0 @@
-"""Gymnasium's humanoid under four joint commands: model, batched bodies, target, abstract simulators."""
-
-from astra_data.worlds.humanoid.bodies import Humanoids
-from astra_data.worlds.humanoid.locomotion import Locomotion
-from astra_data.worlds.humanoid.model import CommandRanges, humanoid_model
-
-__all__ = ["CommandRanges", "Humanoids", "Locomotion", "humanoid_model"]

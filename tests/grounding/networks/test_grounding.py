@@ -1,0 +1,200 @@
+"""On a world whose error in simulation depends on the actions of the past, which no single state shows."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.grounding.networks.paired_windows import PairedWindows
+
+NAS = LossWeights(latent=0.0, reward=0.0, state=1.0)
+LATENT_ALONE = LossWeights(latent=1.0, reward=0.0, state=0.0)
+SIZE = 16
+
+
+def lagging_world(episodes: int, steps: int, seed: int) -> PairedWindows:
+    """Return episodes in which the target is dragged along by a low-pass of past actions."""
+    generator = torch.Generator().manual_seed(seed)
+    action = torch.rand(episodes, steps, 2, generator=generator) * 2 - 1
+    state, simulated = torch.zeros(episodes, steps + 1, 2), torch.zeros(episodes, steps, 2)
+    drag = torch.zeros(episodes, 2)
+    for step in range(steps):
+        simulated[:, step] = state[:, step] + 0.1 * action[:, step]
+        state[:, step + 1] = simulated[:, step] + 0.2 * drag
+        drag = 0.7 * drag + 0.3 * action[:, step]
+    return PairedWindows(
+        state=state[:, :-1],
+        action=action,
+        previous_action=torch.cat([torch.zeros(episodes, 1, 2), action[:, :-1]], dim=1),
+        goal=torch.zeros(episodes, steps, 2),
+        simulated_next=simulated,
+        next_state=state[:, 1:],
+        reward=state[:, 1:].norm(dim=-1),
+        goes_on=torch.ones(episodes, steps),
+        failed=torch.zeros(episodes, steps),
+        fails_soon=torch.zeros(episodes, steps),
+        mask=torch.ones(episodes, steps),
+    )
+
+
+TRAINING, HELD_OUT = lagging_world(32, 30, seed=0), lagging_world(64, 30, seed=1)
+
+
+def untrained() -> GroundingModel:
+    torch.manual_seed(0)
+    shape = GroundingShape(
+        2,
+        2,
+        2,
+        latent_size=SIZE,
+        embedding_size=32,
+        head_sizes=(32,),
+        position_octaves=0,
+        corrects_reward=False,
+    )
+    model = GroundingModel(shape)
+    model.set_scales(
+        {
+            "state": TRAINING.state.flatten(0, 1),
+            "goal": TRAINING.goal.flatten(0, 1),
+            "correction": (TRAINING.next_state - TRAINING.simulated_next).flatten(0, 1),
+        }
+    )
+    model.set_reward_scales(
+        TRAINING.reward.reshape(-1, 1), TRAINING.goes_on.flatten(), TRAINING.failed.flatten()
+    )
+    return model
+
+
+def fit(model: GroundingModel, weights: LossWeights, updates: int = 130) -> float:
+    """Train `model` and return the last loss of the latent, if it has one."""
+    optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
+    parts: dict[str, Tensor] = {}
+    for _ in range(updates):
+        loss, parts = model.losses(TRAINING, weights)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        model.update_target()
+    return float(parts.get("latent", torch.zeros(())).detach())
+
+
+@torch.no_grad()
+def latents(model: GroundingModel) -> Tensor:
+    latent, _ = model.encoder(model.encoder_input(HELD_OUT.state, HELD_OUT.goal, HELD_OUT.previous_action))
+    return torch.as_tensor(latent)
+
+
+@torch.no_grad()
+def error_left(model: GroundingModel) -> float:
+    """Return the squared error of the corrected simulator relative to the raw one's, on held-out episodes."""
+    corrected = model.correct(latents(model), HELD_OUT.action, HELD_OUT.simulated_next)
+    raw = HELD_OUT.simulated_next - HELD_OUT.next_state
+    return float((corrected - HELD_OUT.next_state).square().mean() / raw.square().mean())
+
+
+def spread(model: GroundingModel) -> float:
+    """Return the standard deviation of the latents' entries over held-out histories."""
+    return float(latents(model).flatten(0, 1).std(0).mean())
+
+
+def test_it_learns_what_only_the_history_tells() -> None:
+    wrong = (HELD_OUT.next_state - HELD_OUT.simulated_next).flatten(0, 1)
+    seen = torch.cat([HELD_OUT.state, HELD_OUT.action, torch.ones(64, 30, 1)], dim=-1).flatten(0, 1)
+    solution = torch.linalg.lstsq(seen, wrong).solution
+    without_history = float((seen @ solution - wrong).square().mean() / wrong.square().mean())
+    model = untrained()
+    corrected = model.correct(torch.randn(7, SIZE), torch.randn(7, 2), HELD_OUT.state[:7, 0])
+    assert torch.equal(corrected, HELD_OUT.state[:7, 0])  # untrained it is the raw simulator
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    fit(model, NAS)
+    assert error_left(model) < 0.01 < 0.5 < without_history
+    # With NAS's weights, nothing else is learned.
+    after = model.state_dict()
+    for name, value in before.items():
+        if name.startswith(("latent_dynamics", "reward_head")):
+            assert torch.equal(value, after[name]), name
+    assert not torch.equal(before["encoder.embedding.weight"], after["encoder.embedding.weight"])
+
+
+def test_all_heads_learn_together() -> None:
+    model = untrained()
+    fit(model, LossWeights())
+    assert error_left(model) < 0.1
+    with torch.no_grad():
+        predicted = model.predict_reward(latents(model), HELD_OUT.action)
+    unexplained = (predicted - HELD_OUT.reward).square().mean() / HELD_OUT.reward.var()
+    assert float(unexplained) < 0.2
+
+
+def test_where_the_ball_lies_from_the_robot_is_seen_to_the_centimeter_and_not_from_afar() -> None:
+    model = GroundingModel(GroundingShape(8, 2, 2, position_octaves=0, ball_index=4))
+    state = torch.tensor([[1.0, 2.0, 0, 0, 1.03, 1.96, 0, 0], [1.0, 2.0, 0, 0, -4.0, 2.0, 0, 0]])
+    seen = model.state_features(state)[:, -3:]
+    torch.testing.assert_close(seen, torch.tensor([[0.3, -0.4, 0.5], [-5.0, 0.0, 5.0]]))
+
+
+def test_the_latents_loss_does_not_collapse_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The LayerNorm fixes the length of each latent, but not that different histories differ in theirs.
+
+    With an encoder that follows at once, all histories come to share one latent, and the loss falls to what
+    the bounds of the predicted variance allow, having learned nothing.
+    """
+    lowest = 0.5 * GroundingShape(2, 2, 2).log_variance_bounds[0]
+    slow, online = untrained(), untrained()
+    monkeypatch.setattr(online, "_following_latent", lambda inputs: online.encoder(inputs)[0][:, 1:])
+    assert fit(online, LATENT_ALONE) == pytest.approx(lowest, abs=0.1)
+    assert fit(slow, LATENT_ALONE) > lowest + 0.2
+    assert spread(online) < 0.05 < 0.4 < spread(slow)
+
+
+def test_the_slow_encoder_follows_and_is_given_no_gradient() -> None:
+    model = untrained()
+    fit(model, LossWeights(), updates=3)
+    assert all(parameter.grad is None for parameter in model.target_encoder.parameters())
+    fast = torch.cat([p.flatten() for p in model.encoder.parameters()])
+    slow = torch.cat([p.flatten() for p in model.target_encoder.parameters()])
+    assert not torch.equal(fast, slow)
+    model.update_target()
+    moved = torch.cat([p.flatten() for p in model.target_encoder.parameters()])
+    torch.testing.assert_close(moved, slow + 0.01 * (fast - slow))
+
+
+def test_masked_steps_do_not_count() -> None:
+    model = untrained()
+    torch.nn.init.normal_(list(model.correction.parameters())[-1])
+    mask = TRAINING.mask.clone()
+    mask[:, 20:] = 0.0
+    cut = PairedWindows(
+        **{name: values[:, :20] for name, values in vars(TRAINING).items() if values is not None}
+    )
+    spoiled = replace(TRAINING, mask=mask, reward=TRAINING.reward + 1e3 * (1 - mask))
+    _, parts = model.losses(spoiled, LossWeights())
+    _, expected = model.losses(cut, LossWeights())
+    assert parts.keys() == expected.keys() == {"latent", "reward", "state"}
+    for name, value in expected.items():
+        torch.testing.assert_close(parts[name], value, msg=name)
+
+
+def test_a_window_without_two_steps_in_a_row_teaches_no_latent() -> None:
+    model = untrained()
+    mask = torch.zeros_like(TRAINING.mask)
+    mask[:, 3] = 1.0
+    total, parts = model.losses(replace(TRAINING, mask=mask), LATENT_ALONE)
+    assert parts["latent"] == 0.0 and bool(total.isfinite())
+
+
+def test_nothing_is_made_on_another_device_than_the_models() -> None:
+    """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
+    windows = lagging_world(3, 5, seed=0)
+    windows = replace(windows, own_reward=windows.reward)
+    columns = {field.name: getattr(windows, field.name).to("meta") for field in fields(windows)}
+    model = GroundingModel(GroundingShape(state_size=2, action_size=2, goal_size=2)).to("meta")
+    loss, _ = model.losses(replace(windows, **columns), LossWeights())
+    loss.backward()
+    assert loss.device.type == "meta"
+    latent, _ = model.encode(replace(windows, **columns))
+    assert (latent.device.type, latent.shape) == ("meta", (3, 5, 64))

@@ -1,0 +1,70 @@
+import math
+
+import pytest
+import torch
+
+from astra_data.grounding.networks.history import HistoryEncoder, PositionFeatures, mlp
+
+
+@pytest.fixture
+def encoder() -> HistoryEncoder:
+    torch.manual_seed(0)
+    return HistoryEncoder(5, embedding_size=16, latent_size=32)
+
+
+def test_step_by_step_is_the_whole_sequence(encoder: HistoryEncoder) -> None:
+    inputs = torch.randn(3, 20, 5)
+    latents, states = encoder(inputs)
+    hidden = torch.zeros(3, 32)
+    for step in range(20):
+        hidden = encoder.step(inputs[:, step], hidden)
+        torch.testing.assert_close(hidden, states[:, step])
+        torch.testing.assert_close(encoder.latent(hidden), latents[:, step])
+
+
+def test_latents_have_zero_mean_and_unit_variance(encoder: HistoryEncoder) -> None:
+    latents, states = encoder(3.0 * torch.randn(4, 10, 5))
+    torch.testing.assert_close(latents.mean(-1), torch.zeros(4, 10), atol=1e-5, rtol=0)
+    torch.testing.assert_close(latents.var(-1, unbiased=False), torch.ones(4, 10), atol=0.02, rtol=0)
+    # The length of the hidden state is gone from the latent, which is what the LayerNorm is for.
+    torch.testing.assert_close(encoder.latent(100.0 * states), latents, atol=0.02, rtol=0)
+
+
+def test_position_features_have_halving_wavelengths() -> None:
+    features = PositionFeatures(3)
+    values = features(torch.tensor([[1.5, -2.0]]))[0].tolist()
+    phases = [2 * math.pi * place / wavelength for place in (1.5, -2.0) for wavelength in (16, 8, 4)]
+    assert len(values) == features.size == 12
+    assert values == pytest.approx([math.sin(p) for p in phases] + [math.cos(p) for p in phases], abs=1e-6)
+
+
+def test_a_step_is_that_of_a_gru_written_out(encoder: HistoryEncoder) -> None:
+    """Cho et al. 2014: gates r and z, candidate n, h' = (1 - z) n + z h; the input is embedded with ELU."""
+    inputs, hidden = torch.randn(3, 5), torch.randn(3, 32)
+    embedded = inputs @ encoder.embedding.weight.T + encoder.embedding.bias
+    embedded = torch.where(embedded > 0, embedded, embedded.exp() - 1.0)
+    gru = dict(encoder.recurrence.named_parameters())
+    of_input = (embedded @ gru["weight_ih_l0"].T + gru["bias_ih_l0"]).split(32, dim=-1)
+    of_hidden = (hidden @ gru["weight_hh_l0"].T + gru["bias_hh_l0"]).split(32, dim=-1)
+    reset, update = ((of_input[i] + of_hidden[i]).sigmoid() for i in (0, 1))
+    candidate = torch.tanh(of_input[2] + reset * of_hidden[2])
+    expected = (1.0 - update) * candidate + update * hidden
+    torch.testing.assert_close(encoder.step(inputs, hidden), expected, atol=1e-6, rtol=1e-5)
+
+
+def test_episodes_in_one_sequence_do_not_touch(encoder: HistoryEncoder) -> None:
+    inputs, hidden, start = torch.randn(2, 6, 5), torch.randn(2, 32), torch.zeros(2, 6)
+    start[0, 4] = start[1, 0] = 1.0
+    states = encoder.through_episodes(inputs, hidden, start)
+    torch.testing.assert_close(states[:1, :4], encoder(inputs[:1, :4], hidden[:1])[1])
+    torch.testing.assert_close(states[:1, 4:], encoder(inputs[:1, 4:])[1])
+    torch.testing.assert_close(states[1:], encoder(inputs[1:])[1])
+
+
+def test_an_mlp_has_activations_between_its_layers_alone() -> None:
+    network = mlp((3, 4, 5, 2), torch.nn.ReLU)
+    assert [type(layer).__name__ for layer in network] == ["Linear", "ReLU", "Linear", "ReLU", "Linear"]
+    sizes = [
+        (layer.in_features, layer.out_features) for layer in network if isinstance(layer, torch.nn.Linear)
+    ]
+    assert sizes == [(3, 4), (4, 5), (5, 2)]

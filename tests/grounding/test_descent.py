@@ -1,0 +1,151 @@
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.descent import Descent, DescentConfig, WindowedConfig
+
+CONFIG = DescentConfig(updates=40, learning_rate=0.05)
+
+
+def model() -> nn.Linear:
+    torch.manual_seed(0)
+    return nn.Linear(3, 2)
+
+
+def loss_of(one: nn.Module, update: int) -> Tensor:
+    torch.manual_seed(100 + update)
+    seen = torch.randn(16, 3)
+    return torch.as_tensor((one(seen) - 4.0 * seen[:, :2]).square().mean())
+
+
+def fit(one: nn.Linear, descent: Descent, until: int = CONFIG.updates) -> nn.Linear:
+    while descent.done < until:
+        descent.update(loss_of(one, descent.done))
+    return one
+
+
+def test_it_is_adam_down_a_half_cosine_with_clipped_gradients() -> None:
+    ours, theirs = model(), model()
+    fit(ours, Descent(ours, CONFIG))
+    optimizer = torch.optim.Adam(theirs.parameters(), lr=0.05)
+    for update in range(40):
+        for group in optimizer.param_groups:
+            group["lr"] = 0.05 * (1 + math.cos(math.pi * update / 40)) / 2
+        gradients = torch.autograd.grad(loss_of(theirs, update), list(theirs.parameters()))
+        norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+        for parameter, gradient in zip(theirs.parameters(), gradients, strict=True):
+            parameter.grad = gradient / norm.clamp_min(1.0)
+        optimizer.step()
+    torch.testing.assert_close(ours.weight, theirs.weight, rtol=1e-4, atol=1e-5)
+
+
+def test_a_fit_that_diverged_ends_before_it_is_kept(tmp_path: Path) -> None:
+    one = model()
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    descent = Descent(one, CONFIG, checkpoint=checkpoint)
+    fit(one, descent, until=2)
+    advice = "make learning_rate smaller"
+    with pytest.raises(
+        BadInputError, match=f"diverged by update 2, with a loss that is not finite: {advice}"
+    ):
+        descent.keep(1.0, loss=float("nan"))
+    with pytest.raises(BadInputError, match=rf"diverged in update 3, with a gradient .*: {advice}"):
+        descent.update(one.weight.sum() * float("inf"))
+    assert not checkpoint.exists() and bool(one.weight.isfinite().all())
+
+
+def test_from_a_checkpoint_it_goes_on_to_the_bit(tmp_path: Path) -> None:
+    whole, begun, resumed = model(), model(), model()
+    fit(whole, Descent(whole, CONFIG))
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    first = Descent(begun, CONFIG, checkpoint=checkpoint)
+    fit(begun, first, until=15)
+    first.keep(loss=0.25, nothing=None)
+    second = Descent(resumed, CONFIG, checkpoint=checkpoint)
+    assert (second.done, second.share, second.is_over) == (15, 15 / 40, False)
+    assert second.points == [{"step": 15, "loss": 0.25, "nothing": None}]
+    assert second.stopwatch.seconds > 0
+    fit(resumed, second)
+    assert second.is_over
+    assert torch.equal(resumed.weight, whole.weight)
+
+
+def test_the_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    Descent(model(), CONFIG, checkpoint=checkpoint).keep()
+    with pytest.raises(BadInputError, match=f"remove {tmp_path}"):
+        Descent(nn.Linear(5, 2), CONFIG, checkpoint=checkpoint)
+
+
+def test_parameters_that_rest_are_left_alone() -> None:
+    one = model()
+    one.bias.requires_grad_(False)
+    before = one.bias.clone()
+    descent = Descent(one, CONFIG, weight_decay=0.1)
+    fit(one, descent)
+    assert descent.parameters == [one.weight]
+    assert torch.equal(one.bias, before)
+
+
+def test_only_a_held_out_error_of_a_number_is_kept() -> None:
+    descent = Descent(model(), CONFIG)
+    with pytest.raises(BadInputError, match="diverged by update 0, with a held_out_error that is not finite"):
+        descent.keep(math.nan)
+    assert descent.best is None and not descent.points
+
+
+@pytest.mark.parametrize("stopped", [None, 4, 8, 12])
+@pytest.mark.parametrize(
+    ("errors", "best", "last"),
+    [
+        ([3.0, 2.0, 2.5, 2.1, 2.0, 1.9, 1.0], 8, 21),  # as low as before is no better
+        ([5.0, 4.0, 3.0, 4.0, 3.5, 2.9, 2.9, 2.8, 3.0, 2.95], 32, 40),
+        ([9.0, 9.5, 9.5, 9.5, 1.0], 4, 17),
+    ],
+)
+def test_it_waits_for_a_lower_error_and_returns_to_the_lowest(
+    errors: list[float], best: int, last: int, stopped: int | None, tmp_path: Path
+) -> None:
+    """Every fourth of 40 updates is measured, and 12 without a lower error are as many as it waits."""
+    checkpoint, one = tmp_path / "checkpoint.safetensors", model()
+    descent, seen = Descent(one, CONFIG, checkpoint=checkpoint), dict[int, Tensor]()
+    while not descent.is_over:
+        descent.update(loss_of(one, descent.done))
+        if descent.done % 4 == 0:
+            descent.keep(errors[descent.done // 4 - 1])
+            seen[descent.done] = one.weight.detach().clone()
+        if descent.done == stopped:
+            one = nn.Linear(3, 2)
+            descent = Descent(one, CONFIG, checkpoint=checkpoint)
+    assert (descent.best, descent.done) == (best, last)
+    assert not torch.equal(one.weight, seen[best])
+    descent.finish()
+    assert torch.equal(one.weight, seen[best])
+
+
+def test_without_a_held_out_error_the_last_weights_are_kept() -> None:
+    one = model()
+    descent = Descent(one, CONFIG)
+    while not descent.is_over:
+        descent.update(loss_of(one, descent.done))
+        descent.keep(loss=1.0)
+    last = one.weight.detach().clone()
+    descent.finish()
+    assert descent.done == 40 and torch.equal(one.weight, last)
+
+
+@pytest.mark.parametrize(
+    ("steps", "updates", "expected"),
+    [(100, None, 600), (60_000, None, 800), (10**6, None, 1200), (60_000, 7, 7)],
+)
+def test_each_recorded_step_is_seen_32_times_unless_updates_are_given(
+    steps: int, updates: int | None, expected: int
+) -> None:
+    """60 000 * 32 are 800 updates of 48 windows of 50 steps."""
+    assert WindowedConfig(updates=updates).descent(steps) == DescentConfig(
+        updates=expected, learning_rate=3e-3
+    )

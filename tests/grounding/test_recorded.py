@@ -1,0 +1,67 @@
+import pytest
+import torch
+
+from astra_data.grounding.recorded import Recorded, draw_steps
+
+LENGTHS = torch.tensor([3, 10, 25])
+
+
+def test_each_step_is_drawn_as_often_as_any_other() -> None:
+    torch.manual_seed(0)
+    episodes, steps, drawn = draw_steps(LENGTHS, 60_000, 8)
+    assert episodes.shape == (60_000, 1) and steps.shape == drawn.shape == (60_000, 8)
+    real = drawn & (steps < LENGTHS[episodes])
+    counts = torch.zeros(3, 25)
+    counts.index_put_(
+        (episodes.expand(-1, 8)[real], steps[real]), torch.ones(int(real.sum())), accumulate=True
+    )
+    assert [int((row > 0).sum()) for row in counts] == LENGTHS.tolist()
+    usual = float(counts.sum() / LENGTHS.sum())
+    assert counts[counts > 0].sub(usual).abs().max() < 0.05 * usual
+
+
+def test_windows_are_steps_in_a_row_inside_their_episodes() -> None:
+    torch.manual_seed(0)
+    episodes, steps, drawn = draw_steps(LENGTHS, 2_000, 8)
+    assert (steps.diff(dim=1) == 1).all()
+    first, last = steps[:, 0], steps[:, -1]
+    short = episodes[:, 0] == 0
+    assert (first[short] == 0).all()  # padded at the end
+    assert (first >= 0).all() and (last[~short] < LENGTHS[episodes[~short, 0]]).all()
+    for row in range(3):
+        reach = sorted(set(first[episodes[:, 0] == row].tolist()))
+        assert reach == list(range(max(1, int(LENGTHS[row]) - 7)))
+    # Of a window that was drawn across an end only the part inside counts: one stretch of at least a step.
+    assert drawn.any(dim=1).all()
+    assert (drawn.int().diff(dim=1).abs().sum(1) <= 1).all()
+
+
+def test_a_window_is_no_longer_than_the_longest_episode() -> None:
+    _, steps, drawn = draw_steps(LENGTHS, 5, 100)
+    assert steps.shape == drawn.shape == (5, 25)
+
+
+@pytest.fixture
+def recorded() -> Recorded:
+    """Return episodes whose observation is 100 times the episode plus the step."""
+    step = (torch.arange(25.0) + 100 * torch.arange(3.0)[:, None]).unsqueeze(-1)
+    return Recorded(observation=step, previous_action=-step, action=2 * step, lengths=LENGTHS)
+
+
+@pytest.mark.parametrize("burn_in", [0, 3])
+def test_columns_belong_together_and_first_steps_fill_the_memory(recorded: Recorded, burn_in: int) -> None:
+    torch.manual_seed(1)
+    columns, learned = recorded.windows(3_000, 8, burn_in)
+    torch.manual_seed(1)
+    episodes, steps, drawn = draw_steps(LENGTHS, 3_000, 8)
+    seen = columns["observation"].squeeze(-1)
+    assert torch.equal(seen, 100.0 * episodes + steps)
+    assert torch.equal(columns["previous_action"], -columns["observation"])
+    assert torch.equal(columns["action"], 2 * columns["observation"])
+    for window in range(3_000):
+        episode, begin = int(episodes[window]), int(steps[window, 0])
+        for place in range(8):
+            is_real = begin + place < int(LENGTHS[episode])
+            is_filled = place >= burn_in or begin == 0
+            assert bool(learned[window, place]) == (is_real and is_filled and bool(drawn[window, place]))
+    assert learned.any()

@@ -1,0 +1,303 @@
+"""The Hugging Face Hub, played by a server on loopback to the real huggingface_hub."""
+
+import re
+from pathlib import Path
+
+import pytest
+from fake_dataset import DESCRIPTION, write_fake
+from fake_hub import Hub, Repository
+from shared_files import contents
+from typer.testing import CliRunner
+
+from astra_data.cli.app import app
+from astra_data.core.errors import BadInputError, SharingError
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset
+from astra_data.io.hub.pull import pull
+from astra_data.io.hub.push import push
+from astra_data.pipeline.stages.collect import CollectConfig, collect
+
+pytestmark = [
+    pytest.mark.usefixtures("quick_figure"),
+    # Of httpx, about how huggingface_hub sends large files.
+    pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning"),
+]
+
+DATA = "data/chunk-000/file-000.parquet"
+ROOT = Path(__file__).parents[3]
+ARM = {name: f"{ROOT}/recipes/examples/fetch/{name}.py:TASK" for name in ("push", "reach")}
+NOTES = sorted(path for path in (ROOT / "dataset_cards").glob("*.toml") if path.stem != "nao-guda")
+"""Of the cards of datasets that `collect` records; the other one's data are a physical robot's."""
+REWORDED = ("| qpos and qvel one control step", "| qpos (24) and qvel (23) of the humanoid, one control step")
+"""A column's meaning as it was when the humanoid's data were recorded, and as `collect` says it since."""
+
+
+def versioned(root: Path, version: str, **changes: object) -> Dataset:
+    return write_fake(root, description={**DESCRIPTION, "version": version}, **changes)
+
+
+def test_what_is_pulled_is_what_was_pushed(hub: Hub, fake: Dataset, home: Path) -> None:
+    told: list[tuple[float, str]] = []
+    pushed = push(fake.root, "me/it", progress=lambda share, note: told.append((share, note)))
+    assert pushed == "hf://datasets/me/it@data-1.0.0"
+    assert (sorted(told), told[-1]) == (told, (1.0, "data-1.0.0"))
+    repo = hub.repos["me/it"]
+    assert not repo.private
+    assert repo.history == ["initial commit", "Add fake@data-1.0.0"]
+    assert repo.tags == {"v3.0": repo.head, "data-1.0.0": repo.head}
+    assert b'LeRobotDataset("me/it", revision="data-1.0.0")' in repo.commits[repo.head]["README.md"]
+    pulled = pull("me/it")
+    assert pulled.root == home / "fake/data-1.0.0"
+    assert contents(pulled.root) == contents(fake.root)
+
+
+def test_a_pull_goes_on_where_it_stopped(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
+    push(fake.root, "me/it")
+    part = tmp_path / ".out.pull-1.0.0" / f"{DATA}.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes((fake.root / DATA).read_bytes()[:1000])
+    assert contents(pull("me/it", out=tmp_path / "out").root) == contents(fake.root)
+    assert [asked.split("=")[1].split("-")[0] for asked in hub.ranges if DATA in asked] == ["1000"]
+
+
+def test_every_version_keeps_its_tag_and_main_shows_the_newest(
+    hub: Hub, fake: Dataset, tmp_path: Path
+) -> None:
+    push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    first = dict(repo.tags)
+    # A file of an earlier version that the next one does not have.
+    left = repo.commits[repo.head] | {
+        "data/chunk-000/file-001.parquet": b"",
+        "meta/old.json": b"",
+        "LICENSE": b"",
+    }
+    repo.commit(left, "more files")
+    newer = versioned(tmp_path / "newer", "1.10.0", fps=10)
+    push(newer.root, "me/it")
+    assert repo.tags == {"data-1.0.0": first["data-1.0.0"], "data-1.10.0": repo.head, "v3.0": repo.head}
+    files = repo.commits[repo.head]
+    assert set(files) - set(contents(newer.root)) == {
+        *(".gitattributes", "LICENSE", "README.md", "README-coverage.png", "SHA256SUMS")
+    }
+    push(fake.root, "me/it")  # it is there, though not the newest
+    repo.tags = dict(sorted(repo.tags.items(), reverse=True))
+    assert contents(pull("me/it", out=tmp_path / "a").root) == contents(newer.root)
+    assert contents(pull("me/it@data-1.0.0", out=tmp_path / "b").root) == contents(fake.root)
+    with pytest.raises(BadInputError, match=r"no version data-3\.0\.0; it has data-1\.0\.0, data-1\.10\.0"):
+        pull("me/it", version="3.0.0")
+    with pytest.raises(
+        BadInputError, match=r"has data-1\.10\.0 already.*data-1\.9\.0 can no longer be added"
+    ):
+        push(versioned(tmp_path / "late", "1.9.0").root, "me/it")
+
+
+def test_a_version_there_never_changes(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
+    push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    before = (dict(repo.tags), list(repo.history))
+    push(fake.root, "hf://datasets/me/it")
+    with pytest.raises(BadInputError, match=r"data-1\.0\.0 holds other values"):
+        push(write_fake(tmp_path / "changed", fps=10).root, "me/it")
+    assert (repo.tags, repo.history) == before
+
+
+def test_an_altered_file_there_is_told_without_a_download(hub: Hub, fake: Dataset) -> None:
+    push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    files = repo.commits[repo.head]
+    files[DATA] = files[DATA][:-1] + b"?"
+    with pytest.raises(SharingError, match=f"was altered: {DATA} there differ"):
+        push(fake.root, "me/it")
+    assert not [asked for asked in hub.ranges if DATA in asked]
+
+
+def test_a_push_that_stopped_is_finished_by_the_next(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
+    tagged: list[str] = []
+
+    def no_second_tag(method: str, path: str) -> int | None:
+        tagged.extend([path] if "/tag/" in path else [])
+        return 500 if "/tag/" in path and len(tagged) == 2 else None
+
+    hub.refuse = no_second_tag
+    with pytest.raises(SharingError, match=r"it answered 500: refused$"):
+        push(fake.root, "me/it")
+    assert set(hub.repos["me/it"].tags) == {"v3.0"}
+    with pytest.raises(SharingError, match="has no dataset of astra-data"):
+        pull("me/it", out=tmp_path / "out")
+    hub.refuse = lambda method, path: None
+    push(fake.root, "me/it")
+    assert contents(pull("me/it", out=tmp_path / "out").root) == contents(fake.root)
+
+
+def test_a_commit_never_goes_on_top_of_one_that_came_between(hub: Hub, fake: Dataset) -> None:
+    def another(method: str, path: str) -> None:
+        if path.endswith("/commit/main"):
+            hub.repos["me/it"].commit({}, "of somebody else")
+
+    hub.refuse = another
+    with pytest.raises(SharingError, match="changed by somebody else at the same time"):
+        push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    assert (repo.history[-1], repo.tags) == ("of somebody else", {})
+    hub.refuse = lambda method, path: 409 if path.endswith("/commit/main") else None
+    with pytest.raises(SharingError, match="changed by somebody else at the same time"):
+        push(fake.root, "me/it")
+
+
+def test_tags_name_what_was_pushed_though_somebody_else_goes_on(hub: Hub, fake: Dataset) -> None:
+    def another(method: str, path: str) -> None:
+        if "/tag/" in path:
+            hub.repos["me/it"].commit({}, "of somebody else")
+
+    hub.refuse = another
+    push(fake.root, "me/it")
+    repo = hub.repos["me/it"]
+    pushed = list(repo.commits)[repo.history.index("Add fake@data-1.0.0")]
+    assert repo.tags == {"v3.0": pushed, "data-1.0.0": pushed} and pushed != repo.head
+
+
+def test_a_public_repository_does_not_get_what_is_to_be_private(hub: Hub, fake: Dataset) -> None:
+    hub.repos["me/it"] = Repository()
+    with pytest.raises(BadInputError, match=r"me/it exists already and is public, .*Nothing was uploaded"):
+        push(fake.root, "me/it", private=True)
+    assert hub.repos["me/it"].history == ["initial commit"]
+    assert not hub.large
+    hub.repos["me/it"].private = True
+    push(fake.root, "me/it", private=True)
+    assert "data-1.0.0" in hub.repos["me/it"].tags
+    hub.visibility = "private"  # which nobody asked to change
+    push(fake.root, "me/other")
+    assert hub.repos["me/other"].private
+
+
+def test_a_private_repository_is_hidden_from_others(
+    hub: Hub, fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    push(fake.root, "me/it", private=True)
+    assert hub.repos["me/it"].private
+    assert pull("me/it", out=tmp_path / "out").content_hash == fake.content_hash
+    monkeypatch.setenv("HF_TOKEN", "hf_other")
+    with pytest.raises(SharingError, match="no such dataset, or no rights to see it"):
+        pull("me/it", out=tmp_path / "other")
+    with pytest.raises(BadInputError, match="private is for the Hugging Face Hub"):
+        push(fake.root, f"file://{tmp_path}/shared", private=True)
+
+
+def test_missing_rights_are_told(hub: Hub, fake: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_TOKEN", "hf_other")
+    with pytest.raises(SharingError, match="no rights to do this; log in with `hf auth login`"):
+        push(fake.root, "me/it")
+    assert not hub.repos
+
+
+def test_a_repository_that_does_not_exist_is_told(hub: Hub) -> None:
+    with pytest.raises(SharingError, match="me/none on the Hugging Face Hub: no such dataset"):
+        pull("me/none")
+
+
+def test_a_name_that_the_hub_does_not_take_is_told(hub: Hub, fake: Dataset) -> None:
+    for name in ("me/a--b", "me/it.git"):
+        with pytest.raises(BadInputError, match="is not a valid repository name"):
+            push(fake.root, name)
+        with pytest.raises(BadInputError, match="is not a valid repository name"):
+            pull(name)
+
+
+def test_no_network_is_told(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(SharingError, match=r"cannot be reached \(ConnectError.*check the network"):
+        pull("me/it")
+
+
+def test_an_upload_that_breaks_off_is_told(hub: Hub, fake: Dataset) -> None:
+    hub.refuse = lambda method, path: 403 if method == "PUT" else None
+    with pytest.raises(SharingError, match="me/it on the Hugging Face Hub: no rights to do this"):
+        push(fake.root, "me/it")
+    assert hub.repos["me/it"].tags == {}
+
+
+def test_a_card_that_the_hub_refuses_is_told(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
+    (tmp_path / "notes.toml").write_text('license = "none-such"\n')
+    with pytest.raises(BadInputError, match=r'rejects this: (.|\n)*"license" must be one of a list'):
+        push(fake.root, "me/it", notes=tmp_path / "notes.toml")
+    hub.refuse = lambda method, path: 503 if "validate" in path else None
+    with pytest.raises(SharingError, match="it answered 503"):
+        push(fake.root, "me/it")
+    hub.refuse = lambda method, path: None
+    assert not hub.repos
+    push(fake.root, "me/it")
+    assert set(hub.repos["me/it"].tags) == {"v3.0", "data-1.0.0"}
+
+
+def test_a_plain_lerobot_dataset_is_neither_pulled_nor_overwritten(hub: Hub, fake: Dataset) -> None:
+    repo = hub.repos["me/it"] = Repository()
+    repo.commit({"meta/info.json": b"{}", "data/chunk-000/file-000.parquet": b""}, "by lerobot")
+    repo.tags["v3.0"] = repo.head
+    with pytest.raises(SharingError, match="A plain LeRobot dataset is opened with lerobot"):
+        pull("me/it")
+    with pytest.raises(BadInputError, match="holds a dataset that astra-data did not push"):
+        push(fake.root, "me/it")
+    repo.tags["data-1.0.0"] = repo.head
+    with pytest.raises(
+        SharingError, match=r"has no meta/astra/dataset\.json: it was not pushed by astra-data"
+    ):
+        pull("me/it")
+    assert repo.history[-1] == "by lerobot"
+
+
+def test_another_dataset_is_not_mixed_with_the_one_there(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
+    push(fake.root, "me/it")
+    other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other", "version": "2.0.0"})
+    with pytest.raises(BadInputError, match="holds the dataset 'fake'"):
+        push(other.root, "me/it")
+
+
+def test_the_command_line_shares_and_fetches(
+    hub: Hub, fake: Dataset, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("notes.toml").write_text('license = "mit"\n')
+
+    def call(*words: str) -> str:
+        result = CliRunner().invoke(app, words, catch_exceptions=False)
+        assert result.exit_code == 0
+        return result.stdout
+
+    pushed = call("push", str(fake.root), "me/it", "--notes", "notes.toml", "--private")
+    assert pushed == "shared: hf://datasets/me/it@data-1.0.0\n"
+    repo = hub.repos["me/it"]
+    assert repo.private
+    assert b"license: mit" in repo.commits[repo.head]["README.md"]
+    assert call("pull", "me/it") == f"fake@data-1.0.0: {home}/fake/data-1.0.0\n"
+    assert contents(home / "fake/data-1.0.0") == contents(fake.root)
+    assert call("card", "fake", "--notes", "notes.toml") == "written: fake.md\nwritten: fake-coverage.png\n"
+    assert "license: mit" in Path("fake.md").read_text()
+
+
+@pytest.mark.parametrize("notes", NOTES, ids=lambda notes: notes.stem)
+def test_the_datasets_of_our_cards_are_shared_with_their_notes(hub: Hub, notes: Path, home: Path) -> None:
+    """Two episodes of each by random commands, since the whole takes minutes to hours; a card that was paired
+    has columns more.
+    """
+    name = notes.stem
+    task = ARM.get(name.split("-")[1]) or re.split("-random|-suboptimal", name)[0]
+    config = CollectConfig(behavior="random", start="task", episodes=2, max_steps=20)
+    recorded = collect(task, config, seed=0, out=home / "recorded", progress=silent, name=name)
+    push(recorded, f"me/{name}", notes=notes)
+    repo = hub.repos[f"me/{name}"]
+    card = repo.commits[repo.head]["README.md"].decode()
+    committed = notes.with_suffix(".md").read_text(encoding="utf-8").replace(*REWORDED)
+    for title in ("Behavior", "Intended use", "Limits", "Columns"):
+        expected = [line for line in section(committed, title) if not line.startswith("| `abstract.")]
+        assert section(card, title) == expected
+    assert f'LeRobotDataset("me/{name}", revision="data-1.0.0")' in card
+    pulled = pull(f"me/{name}")
+    assert pulled.root == home / name / "data-1.0.0"
+    assert contents(pulled.root) == contents(recorded)
+
+
+def section(card: str, title: str) -> list[str]:
+    _, _, after = card.partition(f"\n## {title}\n")
+    assert after
+    return after.partition("\n## ")[0].splitlines()

@@ -1,0 +1,346 @@
+"""Storage at URLs: a local folder, memory, and a server that speaks S3."""
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+from fake_dataset import DESCRIPTION, write_fake
+from fsspec.implementations.local import LocalFileSystem
+from moto.server import ThreadedMotoServer
+from shared_files import contents
+
+from astra_data.core.errors import BadInputError, SharingError
+from astra_data.dataset import Dataset
+from astra_data.dataset.versions import Version
+from astra_data.io.hub.pull import pull
+from astra_data.io.hub.push import push
+from astra_data.io.hub.urls import UrlStore
+
+pytestmark = pytest.mark.usefixtures("quick_figure")
+
+
+@pytest.fixture(scope="session")
+def s3_endpoint() -> Iterator[str]:
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def s3(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+    """Make an empty bucket and set what the AWS tools read; its name."""
+    settings = {
+        "AWS_ENDPOINT_URL_S3": s3_endpoint,
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_CONFIG_FILE": str(tmp_path / "none"),
+        "AWS_SHARED_CREDENTIALS_FILE": str(tmp_path / "none"),
+    }
+    for key, value in settings.items():
+        monkeypatch.setenv(key, value)
+    bucket = tmp_path.name.replace("_", "-").lower()
+    fsspec.filesystem("s3", skip_instance_cache=True).mkdir(bucket)
+    return f"s3://{bucket}/shared"
+
+
+@pytest.fixture(params=["file", "memory", "s3"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty place of each kind."""
+    if request.param == "s3":
+        return str(request.getfixturevalue("s3"))
+    return f"file://{tmp_path}/shared" if request.param == "file" else f"memory://{tmp_path.name}"
+
+
+def changed(root: Path) -> Dataset:
+    """Write the fake dataset's version again with other values."""
+    return write_fake(root, fps=10)
+
+
+def test_what_is_pulled_is_what_was_pushed(place: str, fake: Dataset, home: Path) -> None:
+    assert push(fake.root, place) == f"{place}/fake@data-1.0.0"
+    pulled = pull(f"{place}/fake")
+    assert pulled.root == home / "fake/data-1.0.0"
+    assert contents(pulled.root) == contents(fake.root)
+    assert os.listdir(home / "fake") == ["data-1.0.0"]
+    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0")
+    assert "# fake" in filesystem.cat_file(f"{path}/README.md").decode()
+    assert filesystem.cat_file(f"{path}/README-coverage.png").startswith(b"\x89PNG")
+
+
+def test_a_version_there_never_changes(place: str, fake: Dataset, tmp_path: Path) -> None:
+    push(fake.root, place)
+    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0/SHA256SUMS")
+    push(fake.root, place)
+    filesystem.pipe_file(path, b"altered")
+    with pytest.raises(SharingError, match=r"SHA256SUMS cannot be trusted"):
+        push(fake.root, place)
+    with pytest.raises(BadInputError, match=r"data-1\.0\.0 holds other values"):
+        push(changed(tmp_path / "changed").root, place)
+    assert filesystem.cat_file(path) == b"altered"
+
+
+def test_a_file_that_was_altered_there_is_told_by_its_size(place: str, fake: Dataset) -> None:
+    push(fake.root, place)
+    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0/meta/info.json")
+    filesystem.pipe_file(path, b"altered")
+    with pytest.raises(SharingError, match=r"was altered: meta/info\.json"):
+        push(fake.root, place)
+
+
+def test_the_newest_version_is_pulled_unless_another_is_named(
+    place: str, fake: Dataset, tmp_path: Path
+) -> None:
+    push(fake.root, place)
+    for version in ("1.10.0", "1.9.0"):
+        push(write_fake(tmp_path / version, description={**DESCRIPTION, "version": version}).root, place)
+    assert pull(f"{place}/fake", out=tmp_path / "a").description["version"] == "1.10.0"
+    assert pull(f"{place}/fake", out=tmp_path / "b", version="1.9.0").description["version"] == "1.9.0"
+    assert pull(f"{place}/fake@data-1.0.0", out=tmp_path / "c").description["version"] == "1.0.0"
+    with pytest.raises(
+        BadInputError, match=r"no version data-2\.0\.0; it has data-1\.0\.0, data-1\.9\.0, data-1\.10\.0"
+    ):
+        pull(f"{place}/fake", version="2.0.0")
+    with pytest.raises(BadInputError, match=r"names data-1\.0\.0, but the version asked for is 1\.9\.0"):
+        pull(f"{place}/fake@data-1.0.0", version="1.9.0")
+
+
+def stopped(place: str) -> tuple[Any, str]:
+    """Make the pushed version one whose upload was stopped on its way; its file system and folder."""
+    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0")
+    filesystem.rm_file(f"{path}/meta/astra/dataset.json")
+    filesystem.rm_file(f"{path}/meta/info.json")
+    filesystem.pipe_file(f"{path}/data/chunk-000/file-000.parquet", b"a part")
+    return filesystem, path
+
+
+def test_an_upload_that_stopped_is_not_there_and_is_finished_by_the_next(
+    place: str, fake: Dataset, tmp_path: Path
+) -> None:
+    push(fake.root, place)
+    stopped(place)
+    with pytest.raises(SharingError, match="has no dataset of astra-data"):
+        pull(f"{place}/fake", out=tmp_path / "out")
+    push(fake.root, place)
+    assert contents(pull(f"{place}/fake", out=tmp_path / "out").root) == contents(fake.root)
+
+
+def test_a_folder_of_datasets_is_answered_with_their_addresses(
+    place: str, fake: Dataset, tmp_path: Path
+) -> None:
+    other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "walks"})
+    for dataset in (other, fake):
+        push(dataset.root, place)
+    filesystem, path = fsspec.core.url_to_fs(place)
+    filesystem.makedirs(f"{path}/notes", exist_ok=True)
+    filesystem.pipe_file(f"{path}/notes/read.me", b"no dataset")
+    with pytest.raises(BadInputError) as refused:
+        pull(place, out=tmp_path / "out")
+    assert str(refused.value) == f"{place} is a folder of datasets: pull one of {place}/fake, {place}/walks"
+    assert pull(f"{place}/walks", out=tmp_path / "out").reference == "walks@data-1.0.0"
+
+
+def test_what_else_is_in_the_folder_is_left_there(place: str, fake: Dataset, tmp_path: Path) -> None:
+    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0")
+    filesystem.makedirs(path, exist_ok=True)
+    filesystem.pipe_file(f"{path}/precious.parquet", b"of somebody else")
+    with pytest.raises(BadInputError, match=r"/fake/data-1\.0\.0 exists already and holds something else"):
+        push(fake.root, place)
+    assert [name.rpartition("/")[2] for name in filesystem.find(path)] == ["precious.parquet"]
+    filesystem.rm(path, recursive=True)
+    push(changed(tmp_path / "changed").root, place)
+    stopped(place)
+    before = filesystem.cat(filesystem.find(path))
+    with pytest.raises(BadInputError, match="a part of another push of this version"):
+        push(fake.root, place)
+    assert filesystem.cat(filesystem.find(path)) == before
+
+
+def at_the_third_file(monkeypatch: pytest.MonkeyPatch, act: Callable[[], object]) -> list[str]:
+    """Let `act` happen before a push to a local folder sends its third file; lists what was sent."""
+    put, sent = LocalFileSystem.put_file, list[str]()
+
+    def watched(self: LocalFileSystem, file: str, path: str) -> None:
+        sent.append(path)
+        if len(sent) == 3:
+            act()
+        put(self, file, path)
+
+    monkeypatch.setattr(LocalFileSystem, "put_file", watched)
+    return sent
+
+
+def test_a_second_push_at_once_takes_nothing_from_the_first(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = changed(tmp_path / "changed")
+
+    def second() -> None:
+        with pytest.raises(BadInputError, match="going on right now"):
+            push(other.root, f"file://{tmp_path}/shared")
+
+    sent = at_the_third_file(monkeypatch, second)
+    push(fake.root, f"file://{tmp_path}/shared")
+    assert len(sent) == len(contents(fake.root)) + 3
+    assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
+
+
+def test_two_pushes_of_the_same_at_once_both_succeed(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def second() -> None:
+        with monkeypatch.context() as other_process:
+            other_process.setattr("os.getpid", lambda: 1)
+            push(fake.root, f"file://{tmp_path}/shared")
+
+    at_the_third_file(monkeypatch, second)
+    push(fake.root, f"file://{tmp_path}/shared")
+    assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
+
+
+def test_a_push_stops_where_another_began_with_it(
+    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sums = tmp_path / "shared/fake/data-1.0.0/SHA256SUMS"
+    sent = at_the_third_file(monkeypatch, lambda: sums.write_text("of other values"))
+    with pytest.raises(BadInputError, match="a part of another push of this version"):
+        push(fake.root, f"file://{tmp_path}/shared")
+    assert len(sent) == 3
+
+
+def test_the_mark_is_uploaded_last(fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = UrlStore(f"file://{tmp_path}/fake")
+    sent: list[str] = []
+    put = store._filesystem.put_file
+
+    def watched(file: str, path: str) -> None:
+        sent.append(path)
+        put(file, path)
+
+    monkeypatch.setattr(store._filesystem, "put_file", watched)
+    (tmp_path / "card").mkdir()
+    (tmp_path / "card/README.md").touch()
+    (tmp_path / "card/SHA256SUMS").touch()
+    store.upload(fake, tmp_path / "card", lambda fraction, note: None)
+    assert len(sent) == len(contents(fake.root)) + 2
+    assert sent[0].endswith("SHA256SUMS")
+    assert sent[-1].endswith("dataset.json")
+
+
+def test_a_bucket_that_does_not_exist_is_told_and_not_made(s3: str, fake: Dataset) -> None:
+    with pytest.raises(SharingError, match=r"s3://no-such-bucket/x/fake: .*bucket"):
+        push(fake.root, "s3://no-such-bucket/x")
+    assert not fsspec.filesystem("s3", skip_instance_cache=True).exists("no-such-bucket")
+    with pytest.raises(SharingError, match="check the spelling"):
+        pull("s3://no-such-bucket/x/fake")
+
+
+def test_missing_rights_are_told(s3: str, fake: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = UrlStore(f"{s3}/fake")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError("Access Denied")
+
+    monkeypatch.setattr(store._filesystem, "ls", refuse)
+    with pytest.raises(SharingError, match=r"no rights to do this .*check the credentials"):
+        store.versions()
+
+
+def test_a_server_that_does_not_answer_is_told(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL_S3", "http://127.0.0.1:9")
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
+    monkeypatch.setattr("s3fs.S3FileSystem.cachable", False)
+    with pytest.raises(SharingError, match="check the address, the credentials and the network"):
+        pull(f"{s3}/fake")
+
+
+@pytest.mark.parametrize(
+    ("url", "module", "extra"), [("s3://b/x", "s3fs", "s3"), ("gs://b/x", "gcsfs", "gcs")]
+)
+def test_a_missing_back_end_is_told(
+    url: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    # fsspec remembers what it has imported before.
+    known = sys.modules["fsspec.registry"].__dict__["_registry"]
+    monkeypatch.delitem(known, url.partition(":")[0], raising=False)
+    told = rf"is not installed: uv sync --extra {extra}"
+    with pytest.raises(BadInputError, match=told):
+        UrlStore(url)
+
+
+def test_an_unknown_kind_of_url_is_told() -> None:
+    with pytest.raises(BadInputError, match="expected a URL such as"):
+        UrlStore("gopher://x/y")
+
+
+def test_a_folder_that_cannot_be_written_is_told(fake: Dataset, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SharingError, match="fake: "):
+        push(fake.root, f"file://{tmp_path}/file")
+
+
+def test_what_a_killed_push_left_does_not_stop_the_next(fake: Dataset, tmp_path: Path) -> None:
+    left = tmp_path / "shared/fake/data-1.0.0/.SHA256SUMS.tmp-999999999"
+    left.mkdir(parents=True)
+    (left / "SHA256SUMS").write_text("hal")
+    push(fake.root, f"file://{tmp_path}/shared")
+    assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
+    assert not left.exists()
+
+
+class Endless(BaseHTTPRequestHandler):
+    """A server whose folders each hold two folders and a file; it counts the requests."""
+
+    requests = 0
+
+    def do_GET(self) -> None:
+        """List the folder."""
+        Endless.requests += 1
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        names = ["data-1.0.0/"] if self.path == "/" else ["one/", "two/", "file"]
+        base = self.path.rstrip("/")
+        self.wfile.write("".join(f'<a href="{base}/{name}">{name}</a>' for name in names).encode())
+
+    def do_HEAD(self) -> None:
+        """Say that there is a page."""
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def endless() -> Iterator[str]:
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Endless)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    Endless.requests = 0
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_folders_without_end_are_listed_as_deep_as_datasets_are(
+    endless: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = UrlStore(endless).folder(Version(1, 0, 0))
+    assert max(path.count("/") for path in folder.files()) == 3
+    assert Endless.requests < 40
+    monkeypatch.setattr("astra_data.io.hub.store.MOST_FOLDERS", 5)
+    with pytest.raises(SharingError, match="lists more than 5 folders or 1,000,000 files, which no dataset"):
+        folder.files()

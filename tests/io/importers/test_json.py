@@ -1,0 +1,163 @@
+import tarfile
+from json import dumps
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import LENGTHS, MAPPING, imported, rows, write_table
+
+from astra_data.core.errors import BadInputError
+from astra_data.io.importers import json
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.recording import BLOCK_ROWS, Source
+
+
+def test_json_that_is_too_large_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_table(tmp_path / "log.json", rows())
+    monkeypatch.setattr(json, "LIMIT_BYTES", 100)
+    with pytest.raises(BadInputError, match="split the file"):
+        imported(tmp_path, path)
+
+
+def test_a_field_that_comes_twice_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.json", rows())
+    path.write_text(path.read_text().rstrip().removesuffix("}") + ', "x": [0]}')
+    with pytest.raises(BadInputError, match="an object has x more than once"):
+        imported(tmp_path, path)
+
+
+LISTS = ImportMapping.model_validate(
+    {"name": "n", "task": "t", "fps": 1, "columns": {name: {"fields": (name,)} for name in ("x", "on")}}
+)
+
+
+@pytest.mark.parametrize("name", ["log.jsonl", "LOG.NDJSON"])
+def test_lines_are_read_block_by_block(tmp_path: Path, name: str) -> None:
+    """With fields of several values, blank lines, and others that the mapping does not name."""
+    path, n = tmp_path / name, BLOCK_ROWS + 2
+    path.write_text("\n" + "".join(f'{{"x": [{row}, 0.5], "on": true, "a": "b"}}\n' for row in range(n)))
+    first, second = json.read(Source(path, None, path), LISTS)
+    assert (len(first), len(second), first.origin) == (BLOCK_ROWS - 1, 3, name)
+    x = np.concatenate([first.values["x"], second.values["x"]])
+    np.testing.assert_array_equal(x, np.stack([np.arange(n), np.full(n, 0.5)], axis=1))
+    assert second.values["on"].tolist() == [True] * 3
+
+
+@pytest.mark.parametrize("name", ["log.json", "log.jsonl"])
+def test_null_among_numbers_is_no_number_as_an_empty_cell_is(tmp_path: Path, name: str) -> None:
+    """Also in lists; text beside it stays what it is."""
+    path = tmp_path / name
+    x: list[object] = [[1, 0.5], [None, 2], [3, None]]
+    on = [True, None, "a"]
+    lines = "".join(f"{dumps({'x': x[row], 'on': on[row]})}\n" for row in range(3))
+    path.write_text(lines if name.endswith("l") else dumps({"x": x, "on": on}))
+    [block] = json.read(Source(path, None, path), LISTS)
+    np.testing.assert_array_equal(block.values["x"], [[1.0, 0.5], [np.nan, 2.0], [3.0, np.nan]])
+    assert block.values["on"].tolist() == on
+
+
+@pytest.mark.parametrize("name", ["log.json", "log.jsonl"])
+def test_rows_with_more_or_fewer_values_are_told_with_their_field(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    rows: list[dict[str, object]] = [{"x": [1, 2], "on": 0}, {"x": 1, "on": 1}]
+    lines = "".join(f"{dumps(row)}\n" for row in rows)
+    path.write_text(
+        lines if name.endswith("l") else dumps({key: [row[key] for row in rows] for key in rows[0]})
+    )
+    with pytest.raises(BadInputError, match=f"^{name}: field 'x': expected as many values in each row$"):
+        list(json.read(Source(path, None, path), LISTS))
+
+
+def test_a_folder_and_an_archive_of_lines_become_episodes(tmp_path: Path) -> None:
+    mapping = MAPPING.replace('field = "trial"', "")
+    for name in ("1.jsonl", "2.jsonl"):
+        write_table(tmp_path / "logs" / name, {k: v[: LENGTHS[0]] for k, v in rows().items()})
+    with tarfile.open(tmp_path / "logs.tar.gz", "w:gz") as archive:
+        archive.add(tmp_path / "logs", "logs")
+    for recording in ("logs", "logs.tar.gz"):
+        dataset, _ = imported(tmp_path / f"of_{recording}", tmp_path / recording, mapping)
+        assert dataset.lengths.tolist() == [LENGTHS[0] - 1] * 2
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('{"x": 1}', r"no field 'on'; known: x"),
+        ("[1, 2]", "expected an object of fields, got list"),
+        ('{"x": 1, "on": tru}', r"expected an object of fields \(Expecting value"),
+        ('{"x": 1, "x": 2, "on": 1}', r"expected an object of fields \(an object has x more than once\)"),
+    ],
+)
+def test_a_line_that_is_no_row_is_told_with_its_place(tmp_path: Path, line: str, told: str) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text(f'{{"x": 1, "on": true}}\n{line}\n{{"x": 1, "on": true}}\n')
+    with pytest.raises(BadInputError, match=rf"log\.jsonl line 2: {told}"):
+        list(json.read(Source(path, None, path), LISTS))
+
+
+@pytest.mark.parametrize("n", [3, BLOCK_ROWS])
+def test_a_last_line_that_is_cut_off_is_counted(tmp_path: Path, n: int) -> None:
+    path = tmp_path / "log.jsonl"
+    for tail, torn, more in (("", 0, 0), ('{"x": 1, "on": tr', 1, 0), ('{"x": 1, "on": true}', 0, 1)):
+        path.write_text('{"x": 1, "on": true}\n' * n + tail)
+        blocks = list(json.read(Source(path, None, path), LISTS))
+        assert sum(map(len, blocks)) == n + more
+        assert [block.torn for block in blocks] == [0] * (len(blocks) - 1) + [torn]
+
+
+def test_a_last_line_with_an_end_is_not_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text('{"x": 1, "on": true}\n{"x": 1, "on": tr\n')
+    with pytest.raises(BadInputError, match=r"log\.jsonl line 2: expected an object of fields"):
+        list(json.read(Source(path, None, path), LISTS))
+
+
+def test_a_line_that_is_too_long_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(json, "LIMIT_BYTES", 100)
+    with pytest.raises(BadInputError, match=r"log\.jsonl: expected lines of at most"):
+        imported(tmp_path, write_table(tmp_path / "log.jsonl", rows()))
+
+
+def test_a_rejected_row_is_named_by_its_line(tmp_path: Path) -> None:
+    fields = rows()
+    fields["x"][3] = np.nan
+    _, report = imported(
+        tmp_path, write_table(tmp_path / "log.jsonl", fields), 'not_finite = "split"\n' + MAPPING
+    )
+    assert report.tally.rejected_first == "log.jsonl line 4"
+
+
+def test_lines_that_are_blank_are_counted(tmp_path: Path) -> None:
+    fields = rows()
+    fields["x"][3] = np.nan
+    path = write_table(tmp_path / "log.jsonl", fields)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(["", *lines[:2], "", "  ", *lines[2:], "", '{"x": 1']))
+    _, report = imported(tmp_path, path, 'not_finite = "split"\n' + MAPPING)
+    assert report.tally.rejected_first == "log.jsonl line 7"
+    assert report.tally.torn_first == f"log.jsonl line {len(lines) + 5}"
+
+
+@pytest.mark.parametrize("kind", ["object", "list", "lines"])
+def test_objects_in_objects_are_fields_with_both_names(tmp_path: Path, kind: str) -> None:
+    rows_ = [{"pose": {"at": [k, -k], "yaw": {"rad": 0.5 * k}}, "u": k} for k in range(6)]
+    path = tmp_path / ("log.jsonl" if kind == "lines" else "log.json")
+    if kind == "object":
+        at, yaw = [row["pose"]["at"] for row in rows_], [row["pose"]["yaw"]["rad"] for row in rows_]  # type: ignore[index]
+        path.write_text(dumps({"pose": {"at": at, "yaw": {"rad": yaw}}, "u": list(range(6))}))
+    else:
+        path.write_text(dumps(rows_) if kind == "list" else "\n".join(map(dumps, rows_)))
+    mapping = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["pose/at", "pose/yaw/rad"]
+"""
+    dataset, report = imported(tmp_path, path, mapping)
+    assert dataset.columns(["observation.state"])["observation.state"].tolist() == [
+        [k, -k, 0.5 * k] for k in range(5)
+    ]
+    assert report.tally.unused_fields == ["u"]
+    with pytest.raises(BadInputError, match=r"no field 'pose/yaw'.*(known: |did you mean ')"):
+        imported(tmp_path / "bad", path, mapping.replace("pose/yaw/rad", "pose/yaw"))

@@ -1,0 +1,487 @@
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+from mcap_recordings import MAPPING, command, log, ns, pose, write_json, write_protobuf, write_ros2
+from mcap_ros2.writer import Writer
+from recordings import imported
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset import Dataset
+from astra_data.dataset.checkup.checkup import check_up
+from astra_data.dataset.columns import ACTION, STATE
+from astra_data.io.importers.mcap import check
+from astra_data.io.importing import import_dataset
+from astra_data.io.mapping import read_mapping
+from astra_data.io.recording import Source
+
+
+@pytest.mark.parametrize("write", [write_json, write_protobuf, write_ros2])
+def test_the_last_value_is_held_at_every_row(tmp_path: Path, write: Any) -> None:  # noqa: ANN401
+    messages = log()
+    dataset, report = imported(tmp_path, write(tmp_path / "log.mcap", messages), MAPPING)
+    poses = [(t, m["position"]["x"]) for topic, t, m in messages if topic == "/pose"]
+    turns = [(t, m["turn"]) for topic, t, m in messages if topic == "/command"]
+    assert len(dataset) == 2
+    assert report.tally.split_points == {"source": 1}
+    first, second = dataset.episodes()
+    # From the first command to when the pose of 2 s may be held no longer, and from the pose of 3 s on.
+    ends = ((0.13, 2.35), (3.0, 4.96))
+    for episode, (start, end) in zip((first, second), ends, strict=True):
+        ticks = [ns(start) + k * 10**8 for k in range(1000) if ns(start) + k * 10**8 <= ns(end)][:-1]
+        x = [[v for t, v in poses if ns(t) <= tick][-1] for tick in ticks]
+        expected = np.stack([x, np.add(x, 0.25), np.negative(x)], axis=1).astype(np.float32)
+        np.testing.assert_array_equal(episode.columns[STATE], expected)
+        turn = [[v for t, v in turns if ns(t) <= tick][-1] for tick in ticks]
+        np.testing.assert_array_equal(episode.columns[ACTION], np.array(turn, np.float32))
+
+
+def test_a_latched_topic_is_held_without_limit(tmp_path: Path) -> None:
+    messages = [command(0.0, 7.0), *(pose(k / 10, k) for k in range(20))]
+    path = write_json(tmp_path / "log.mcap", messages)
+    latched = MAPPING.replace('fields = ["/command:turn"]', 'fields = ["/command:turn"]\nlatched = true')
+    dataset, _ = imported(tmp_path, path, latched)
+    np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], np.full(19, 7, np.float32))
+    (tmp_path / "held").mkdir()
+    held, _ = imported(tmp_path / "held", path, MAPPING)
+    assert held.lengths.tolist() == [3]
+
+
+def test_time_far_apart_costs_nothing(tmp_path: Path) -> None:
+    messages = [
+        m for t in (0.0, 1e9) for k in range(3) for m in (pose(t + k / 10, 1), command(t + k / 10, 1))
+    ]
+    dataset, _ = imported(tmp_path, write_json(tmp_path / "log.mcap", messages), MAPPING)
+    assert dataset.lengths.tolist() == [2, 2]
+
+
+def test_a_message_in_the_far_future_is_not_waited_for(tmp_path: Path) -> None:
+    messages = [pose(0.0, 1), command(0.0, 1), pose(1.8e10, 2), command(1.8e10, 2)]
+    mapping = MAPPING.replace("gap_s = 0.35", "gap_s = 1.9e10")
+    with pytest.raises(BadInputError, match=r"log\.mcap: .* 180000000000 equal rows, .*split\.gap_s"):
+        imported(tmp_path, write_json(tmp_path / "log.mcap", messages), mapping)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("/command:turn", "/comand:turn"), r"no topic '/comand': did you mean '/command'"),
+        (
+            ("/command:turn", "/command:turns"),
+            "no part 'turns' in /command, which has turn: did you mean 'turn'",
+        ),
+        (("/pose:joints", "/pose:position"), "'/pose:position' is neither a number"),
+        (("/pose:joints", "joints"), "'joints', expected '/topic:path.in.message'"),
+        (("gap_s = 0.35", ""), "split.gap_s is missing"),
+        (("fps = 10", 'fps = 10\ntime = "/pose:t"'), "time: leave it out"),
+    ],
+)
+def test_a_wrong_mapping_is_told(tmp_path: Path, change: tuple[str, str], told: str) -> None:
+    path = write_json(tmp_path / "log.mcap", log())
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path, path, MAPPING.replace(*change))
+    assert not (tmp_path / "out").exists()
+
+
+def test_messages_that_change_in_size_are_told(tmp_path: Path) -> None:
+    messages = [command(0, 0), pose(0, 0), ("/pose", 0.1, {"position": {"x": 0}, "joints": [1.0]})]
+    with pytest.raises(BadInputError, match="/pose:joints changes in size"):
+        imported(tmp_path, write_json(tmp_path / "log.mcap", messages), MAPPING)
+
+
+def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_json(tmp_path / "log.mcap", log())
+    monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
+    with pytest.raises(BadInputError, match="uv sync --extra mcap"):
+        imported(tmp_path, path, MAPPING)
+
+
+ODOMETRY = """std_msgs/Header header
+string child_frame_id
+geometry_msgs/PoseWithCovariance pose
+geometry_msgs/TwistWithCovariance twist
+"""
+PARTS = {
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+}
+"""The messages of ROS 2 that odometry is made of."""
+
+
+def definition(text: str, *parts: str) -> str:
+    return text + "".join(f"\n{'=' * 80}\nMSG: {name}\n{PARTS[name]}\n" for name in parts)
+
+
+def test_the_bag_of_a_wheeled_base_is_read_by_the_mapping_that_comes_with_the_package(tmp_path: Path) -> None:
+    """A circle of 1 m at 0.5 m/s, odometry at 50 Hz and commands at 10 Hz."""
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = Writer(file)
+        odometry = writer.register_msgdef("nav_msgs/Odometry", definition(ODOMETRY, *PARTS))
+        twist = definition(PARTS["geometry_msgs/Twist"], "geometry_msgs/Vector3")
+        command = writer.register_msgdef("geometry_msgs/Twist", twist)
+        nothing = {"x": 0.0, "y": 0.0, "z": 0.0}
+        for tick in range(250):
+            time, heading = tick / 50, 0.5 * tick / 50
+            place = {"x": np.sin(heading), "y": 1 - np.cos(heading), "z": 0.0}
+            turned = {"x": 0.0, "y": 0.0, "z": np.sin(heading / 2), "w": np.cos(heading / 2)}
+            speed = {"linear": nothing | {"x": 0.5}, "angular": nothing | {"z": 0.5}}
+            content = {
+                "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "odom"},
+                "child_frame_id": "base_link",
+                "pose": {"pose": {"position": place, "orientation": turned}, "covariance": [0.0] * 36},
+                "twist": {"twist": speed, "covariance": [0.0] * 36},
+            }
+            writer.write_message("/odom", odometry, content, ns(time))
+            if tick % 5 == 0:
+                writer.write_message("/cmd_vel", command, speed, ns(time))
+        writer.finish()  # type: ignore[no-untyped-call]
+    mapping = Path(__file__).parents[3] / "recipes/imports/ros2_base.toml"
+    report = import_dataset([tmp_path / "drive.mcap"], mapping, out=tmp_path / "set")
+    [episode] = Dataset.open(report.root).episodes()
+    state = episode.columns[STATE]
+    yaw = 2 * np.arctan2(state[:, 2], state[:, 3])
+    assert len(episode) == 49
+    np.testing.assert_allclose(yaw, 0.05 * np.arange(49), atol=0.011)
+    np.testing.assert_allclose(state[:, 0], np.sin(yaw), atol=1e-6)
+    assert episode.columns[ACTION].tolist() == [[0.5, 0.5]] * 49
+
+
+def test_a_pause_of_all_topics_ends_the_episode_with_its_last_message(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No row is made up, and nobody is blamed for being silent."""
+    drives = [m for t in (0.0, 60.0) for k in range(5) for m in (pose(t + k / 10, k), command(t + k / 10, k))]
+    dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", drives), MAPPING)
+    assert dataset.lengths.tolist() == [4, 4] and report.tally.rows == 10
+    turns = dataset.columns([ACTION])[ACTION].tolist()
+    assert turns == [0.0, 1.0, 2.0, 3.0] * 2
+    assert not caplog.messages
+
+
+def test_a_latched_topic_keeps_no_pause_awake(tmp_path: Path) -> None:
+    messages = [pose(t + k / 10, k) for t in (1.0, 60.0) for k in range(5)]
+    messages += [command(k / 10, k) for k in (9, *range(16, 600, 3))]
+    latched = MAPPING.replace('fields = ["/command:turn"]', 'fields = ["/command:turn"]\nlatched = true')
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    dataset, _ = imported(tmp_path, path, latched)
+    # A command at 1.6 s, as one that is on time, holds the pose for a row more; those after it don't.
+    assert dataset.lengths.tolist() == [5, 4]
+    assert dataset.columns([ACTION])[ACTION].tolist() == [9.0] * 5 + [598.0] * 4
+
+
+def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages = [pose(k / 10, k) for k in range(40)] + [command(t, 1.0) for t in (0.0, 1.0, 1.2, 2.5)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    imported(tmp_path, path, MAPPING)
+    [warning] = caplog.messages
+    assert (
+        "log.mcap: /command is silent for over 0.35 s (split.gap_s) 3 times while others are not" in warning
+    )
+    assert "latched = true" in warning
+    assert "That is right if the robot stops by itself" in warning
+
+
+def test_a_topic_that_is_silent_for_longer_than_its_column_allows_is_named_with_that_key(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages = [pose(k / 10, k) for k in range(40) if k not in (10, 11)] + [
+        command(k / 10, 1.0) for k in range(40)
+    ]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    imported(tmp_path, path, MAPPING.replace("[columns.action]", "gap_s = 0.15\n[columns.action]"))
+    [warning] = caplog.messages
+    told = (
+        '/pose is silent for over 0.15 s (gap_s in [columns."observation.state"]) once while others are not'
+    )
+    assert told in warning and "latched" not in warning and "split.gap_s" not in warning
+
+
+def test_messages_that_come_a_little_late_make_even_steps(tmp_path: Path) -> None:
+    """Every third pose is 1 ms late."""
+    messages = [command(0.09 + k / 10, k) for k in range(30)]
+    messages += [pose(0.1 + k / 10 + (k % 3 == 1) / 1000, k) for k in range(30)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    dataset, report = imported(tmp_path, path, MAPPING)
+    values = dataset.columns([STATE, ACTION])
+    assert values[STATE][:, 0].tolist() == values[ACTION].tolist() == list(range(29))
+    assert "times a second" not in str(report)
+
+
+def test_a_rate_that_is_not_that_of_a_topic_is_told_in_the_report(tmp_path: Path) -> None:
+    """Poses are written twice, at one time."""
+    messages = [m for k in range(51) for m in (pose(k / 5, k), pose(k / 5, k), command(k / 5, k))]
+    dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", messages), MAPPING)
+    assert len(dataset.columns([ACTION])[ACTION]) == 100
+    for topic in ("/pose", "/command"):
+        told = (
+            f"\nlog.mcap: {topic} comes 5 times a second, fps is 10: 50 of 100 rows repeat its message before"
+        )
+        assert told in str(report)
+
+
+def drive(begin: float, end: float) -> list[tuple[str, float, dict[str, Any]]]:
+    return [
+        m
+        for k in range(round(10 * begin), round(10 * end))
+        for m in (pose(k / 10, k), command(k / 10 + 0.02, k))
+    ]
+
+
+def test_where_a_clock_is_set_back_an_episode_begins_and_is_counted(tmp_path: Path) -> None:
+    """Before, both stretches were one, with their rows in turn."""
+    back = [(topic, time - 2, content) for topic, time, content in drive(3, 6)]
+    dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", drive(0, 3) + back), MAPPING)
+    assert report.tally.split_points == {"back": 1}
+    values = dataset.columns([STATE, ACTION])
+    assert dataset.lengths.tolist() == [29, 29]
+    assert values[ACTION].tolist() == values[STATE][:, 0].tolist() == [*range(29), *range(30, 59)]
+
+
+def test_a_gap_after_a_clock_was_set_back_is_a_gap(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "log.mcap", [*drive(10, 12), *drive(5, 7), *drive(8, 10)])
+    _, report = imported(tmp_path, path, MAPPING)
+    assert report.tally.split_points == {"back": 1, "source": 1}
+
+
+def test_a_latched_topic_is_held_where_a_clock_is_set_back(tmp_path: Path) -> None:
+    latched = MAPPING.replace('fields = ["/command:turn"]', 'fields = ["/command:turn"]\nlatched = true')
+    poses = [pose(k / 10, k) for k in (*range(100, 120), *range(20))]
+    path = write_json(tmp_path / "log.mcap", [command(10.0, 7.0), *poses])
+    dataset, report = imported(tmp_path, path, latched)
+    assert report.tally.split_points == {"back": 1} and dataset.lengths.tolist() == [19, 19]
+    assert dataset.columns([ACTION])[ACTION].tolist() == [7.0] * 38
+
+
+def test_a_bag_that_is_cut_off_is_read_up_to_there_and_counted(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "0.mcap", tmp_path / "1.mcap"
+    for path in (whole, cut):
+        with path.open("wb") as file:
+            writer = McapWriter(file, chunk_size=400)
+            writer.start()
+            channels = {
+                topic: writer.register_channel(topic, "json", schema_id=0) for topic in ("/pose", "/command")
+            }
+            for topic, time, content in drive(0, 3):
+                writer.add_message(channels[topic], ns(time), json.dumps(content).encode(), ns(time))
+            writer.finish()  # type: ignore[no-untyped-call]
+    written = cut.read_bytes()
+    cut.write_bytes(written[: len(written) // 3])
+    dataset, report = imported(tmp_path, [whole, cut], MAPPING)
+    first, second = dataset.episodes()
+    assert len(first) == 29 and 5 < len(second) < 20
+    np.testing.assert_array_equal(second.columns[STATE], first.columns[STATE][: len(second)])
+    assert report.tally.torn_rows == report.tally.rejected_rows == 1
+    told = (
+        f"rejected rows: 1; cut off at the end of their files: 1, the first is 1.mcap row {len(second) + 1}"
+    )
+    assert told in str(report)
+    cut.write_bytes(written[:-1])
+    assert import_dataset([cut], tmp_path / "mapping.toml", out=tmp_path / "all").tally.torn_rows == 0
+
+
+def test_a_value_that_is_not_finite_is_named_by_its_topic_and_time(tmp_path: Path) -> None:
+    messages = drive(0, 3)
+    messages[24] = pose(1.2, float("nan"))
+    path = write_json(tmp_path / "log.mcap", messages)
+    told = (
+        r"1 of 30 rows .*: /pose:position\.x in 1 row, log\.mcap at 1200000000 ns; /pose:joints\[0\] in 1 row"
+    )
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path, path, MAPPING)
+
+
+def test_stamps_are_a_column_that_inspect_reads(tmp_path: Path) -> None:
+    """They are too large for float32, and for floats of 64 bits if they are to be exact."""
+    stamp_ns = [1_764_000_000_000_000_000 + ns(k / 10) for k in range(60)]
+    stamps = [{"sec": stamp // 10**9, "nanosec": stamp % 10**9} for stamp in stamp_ns]
+    messages = [
+        m
+        for k, stamp in enumerate(stamps)
+        for m in (
+            ("/pose", k / 10, pose(0, k)[2] | {"header": {"stamp": stamp}}),
+            command(k / 10 + 0.02, k),
+        )
+    ]
+    mapping = f'{MAPPING}\n[columns.stamp]\nfields = ["/pose:header.stamp"]\ndtype = "int64"\nunit = ["ns"]\n'
+    dataset, _ = imported(tmp_path, write_json(tmp_path / "log.mcap", messages), mapping)
+    assert dataset.columns(["stamp"])["stamp"].tolist() == stamp_ns[:59]
+    assert "10 Hz declared, 10 Hz by stamp" in str(check_up(dataset))
+
+
+def test_joints_that_change_places_are_refused_and_found_by_name(tmp_path: Path) -> None:
+    messages = drive(0, 2)
+    for number, (_, _, content) in enumerate(messages[::2]):
+        order = 1 if number % 2 else -1
+        content |= {"name": ["left", "right"][::order], "joints": [number, -number][::order]}
+    path = write_json(tmp_path / "log.mcap", messages)
+    with pytest.raises(BadInputError, match=r"log\.mcap at 100000000 ns: '/pose:joints' is in another order"):
+        imported(tmp_path, path, MAPPING)
+    dataset, _ = imported(tmp_path, path, MAPPING.replace("/pose:joints", "/pose:joints[left]"))
+    assert dataset.columns([STATE])[STATE].tolist() == [[k, k] for k in range(19)]
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("bag/bag_0.db3", r"ros2 bag convert -i BAG"),
+        ("bag.mcap.zstd", r"bag\.mcap\.zstd is compressed as a whole: run `zstd -d bag\.mcap\.zstd`"),
+    ],
+)
+def test_bags_that_another_tool_makes_readable_are_told(tmp_path: Path, name: str, told: str) -> None:
+    path = tmp_path / "given" / name
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"SQLite")
+    for options in ({}, {"file_format": "mcap"}):
+        with pytest.raises(BadInputError, match=told):
+            imported(tmp_path, path, MAPPING, **options)
+    with pytest.raises(BadInputError, match=told):
+        imported(tmp_path, path.parent, MAPPING)
+
+
+def test_a_rate_that_does_not_divide_is_told_once_for_all_files(tmp_path: Path) -> None:
+    """Poses at 15 Hz."""
+    messages = [*(pose(k / 15, k) for k in range(45)), *(command(k / 10, k) for k in range(30))]
+    messages.sort(key=lambda message: message[1])
+    paths = [write_json(tmp_path / f"{k}.mcap", messages) for k in range(3)]
+    _, report = imported(tmp_path, paths, MAPPING)
+    assert (
+        "\n0.mcap, 1.mcap and 1 more: /pose comes 15 times a second, of which 10 fps is no whole fraction: "
+        "steps of 67 and 133 ms alternate; take 3, 5 or 15\nrejected"
+    ) in str(report)
+
+
+def test_a_gap_of_a_column_ends_episodes_where_a_state_drops_out(tmp_path: Path) -> None:
+    """Poses at 20 Hz without those of 0.3 s; commands may be held for longer."""
+    messages = [
+        *(pose(k / 20, k) for k in range(60) if not 20 < k < 26),
+        *(command(k / 4, k) for k in range(12)),
+    ]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    dataset, report = imported(tmp_path, path, MAPPING)
+    assert len(dataset) == 1
+    assert "/pose is silent for up to 0.3 s once, where 2 rows repeat its message before" in str(report)
+    state = '[columns."observation.state"]\n'
+    dataset, report = imported(tmp_path / "cut", path, MAPPING.replace(state, f"{state}gap_s = 0.1\n"))
+    assert len(dataset) == 2 and "silent" not in str(report)
+    assert (np.diff(np.concatenate([e.columns[STATE][:, 0] for e in dataset.episodes()])) > 0).all()
+
+
+def test_all_bags_that_lack_something_are_told_at_once(tmp_path: Path) -> None:
+    """As far as their first messages tell."""
+    lacking = {
+        "1": [m for m in log() if m[0] == "/pose"],
+        "2": [m for m in log() if m[0] == "/pose"],
+        "4": [(topic, t, {"position": {}} if topic == "/pose" else m) for topic, t, m in log()],
+    }
+    bags = [write_json(tmp_path / f"{name}.mcap", lacking.get(name, log())) for name in "10234"]
+    bags[3].write_bytes(bags[3].read_bytes()[:8])
+    with pytest.raises(BadInputError) as caught:
+        imported(tmp_path, bags, MAPPING)
+    first, *others = str(caught.value).splitlines()
+    assert first == "1.mcap, 2.mcap: no topic '/command'; known: /pose"
+    assert [line[:6] for line in others] == ["3.mcap", "4.mcap"]
+    assert others[1].startswith("4.mcap at 0 ns: no part 'x' in /pose:position; no part 'joints' in")
+
+
+def test_a_check_reads_the_first_messages_alone(tmp_path: Path) -> None:
+    mapping = tmp_path / "mapping.toml"
+    mapping.write_text(MAPPING)
+    messages = [*log(), ("/pose", 9.0, {"position": {}})]
+    path = write_json(tmp_path / "log.mcap", messages)
+    check(Source(path, None, path), read_mapping(mapping))
+    with pytest.raises(BadInputError, match=r"at 9000000000 ns: no part 'x' in /pose:position;"):
+        import_dataset([path], mapping, out=tmp_path / "out")
+    write_json(path, messages[-1:] + messages[:1])
+    with pytest.raises(BadInputError, match="no topic '/command'"):
+        check(Source(path, None, path), read_mapping(mapping))
+
+
+def test_bags_without_a_topic_are_left_out_where_that_is_asked_for(tmp_path: Path) -> None:
+    paths = [write_json(tmp_path / f"{name}.mcap", log()) for name in "012"]
+    write_json(paths[1], [m for m in log() if m[0] == "/pose"])
+    dataset, report = imported(tmp_path, paths, MAPPING, skip_bad=True)
+    assert set(dataset.metadata["source"]) == {"0.mcap", "2.mcap"}
+    assert report.left_out == ("1.mcap: no topic '/command'; known: /pose",)
+
+
+def test_the_parts_of_a_split_bag_are_not_joined_without_a_word(tmp_path: Path) -> None:
+    messages = log()
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for number, part in enumerate((messages[:40], messages[40:])):
+        write_json(folder / f"bag_{number}.mcap", part)
+    joined = f"{MAPPING}files = false\n"
+    with pytest.raises(
+        BadInputError, match=r"bag: split.files = false cannot join its 2 MCAP files, .*ros2 bag conv"
+    ):
+        imported(tmp_path, folder, joined)
+    _, report = imported(tmp_path, folder, MAPPING)
+    assert report.tally.split_points == {"file": 1, "source": 1}
+    for number in range(2):  # a file is all of its recording
+        imported(tmp_path / str(number), folder / f"bag_{number}.mcap", joined)
+
+
+@pytest.mark.parametrize("lost", [{20}, {20, 21, 22}])
+def test_the_gap_that_a_checkup_proposes_splits_there(tmp_path: Path, lost: set[int]) -> None:
+    """Poses and their stamps are lost; mappings of MCAP take no `time`."""
+    messages = [("/pose", t, m | {"stamp": ns(t)}) for k in range(200) for _, t, m in [pose(1 + k / 10, k)]]
+    messages = [message for k, message in enumerate(messages) if k not in lost]
+    messages += [command(0.95 + k / 10, 1.0) for k in range(200)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    stamp = '[columns.stamp]\nfields = ["/pose:stamp"]\ndtype = "int64"\nunit = ["ns"]\n'
+    mapping = MAPPING.replace("gap_s = 0.35", "gap_s = 0.9").replace("[split]", f"{stamp}[split]")
+    dataset, _ = imported(tmp_path / "whole", path, mapping)
+    assert len(dataset) == 1
+    (advice,) = [f.advice for f in check_up(dataset).findings if "steps of over" in f.what]
+    assert (
+        advice
+        == 'begin new episodes there (`gap_s = 0.075` in [columns."stamp"] of the mapping) and import again'
+    )
+    dataset, _ = imported(
+        tmp_path / "cut", path, mapping.replace("[columns.stamp]\n", "[columns.stamp]\ngap_s = 0.075\n")
+    )
+    assert len(dataset) == 2
+    assert not [f for f in check_up(dataset).findings if "stamp" in f.what or "steps of over" in f.what]
+
+
+def joints(time: float, **positions: float) -> tuple[str, float, dict[str, Any]]:
+    return "/joints", time, {"name": list(positions), "position": list(positions.values()), "stamp": time}
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_publishers_of_one_topic_are_held_apart(tmp_path: Path, shared: bool) -> None:
+    """An arm at 20 Hz and a gripper at 5 Hz; `shared`: the gripper's driver sends a joint of the arm, too."""
+    messages = [joints(k / 20, b=-k, a=k) for k in range(101)]
+    more = {"a": -1.0} if shared else {}
+    messages += [joints(k / 5 + 0.011, grip=10 * k, **more) for k in range(26)]
+    messages += [command(k / 10, k) for k in range(51)]
+    path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
+    mapping = MAPPING.replace(
+        '["/pose:position.x", "/pose:joints"]',
+        '["/joints:position[a]", "/joints:position[b]", "/joints:position[grip]"]',
+    )
+    dataset, _ = imported(tmp_path, path, mapping)
+    [episode] = dataset.episodes()
+    a, b, grip = episode.columns["observation.state"].T
+    assert len(episode) == 50
+    assert set(np.diff(b)) == {-2} and set(np.unique(grip) % 10) == {0} and (np.diff(grip) >= 0).all()
+    assert (-1 in a) == shared
+    if not shared:
+        np.testing.assert_array_equal(a, -b)
+    alone, _ = imported(tmp_path / "arm", path, mapping.replace(', "/joints:position[grip]"', ""))
+    assert alone.schema[0].size == 2
+    with pytest.raises(BadInputError, match=r"no 'thumb' in /joints:position"):
+        imported(tmp_path / "none", path, mapping.replace("[grip]", "[thumb]"))

@@ -1,0 +1,124 @@
+import subprocess
+import sys
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+from recordings import STEPS, imported, rows, write_table
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import STATE
+from astra_data.io.importers import npz
+from astra_data.io.importing import import_dataset
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.recording import Source
+
+
+def test_npz_is_never_unpickled(tmp_path: Path) -> None:
+    with (tmp_path / "log.npz").open("wb") as file:
+        np.savez(file, **rows() | {"reward": np.array([{}] * 20)})  # type: ignore[arg-type]
+    with pytest.raises(BadInputError, match=r"\.npz: reward\.npy holds Python objects"):
+        imported(tmp_path, tmp_path / "log.npz")
+
+
+def test_npz_in_column_order_is_told(tmp_path: Path) -> None:
+    fields = rows() | {"command": np.asfortranarray(np.zeros((20, 2)))}
+    with pytest.raises(BadInputError, match="ascontiguousarray"):
+        imported(tmp_path, write_table(tmp_path / "log.npz", fields))
+
+
+def test_an_array_that_ends_early_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.npz", rows())
+    with ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content[:-10] if name == "x.npy" else content)
+    with pytest.raises(BadInputError, match=r"x\.npy: ends early, 10 bytes are missing"):
+        imported(tmp_path, path)
+
+
+def test_blocks_hold_consecutive_rows_of_every_array(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(npz, "BLOCK_ROWS", 7)
+    fields = {"a": np.arange(20), "b": np.arange(40.0).reshape(20, 2)}
+    path = write_table(tmp_path / "log.npz", fields)
+    columns = {name: {"fields": (name,)} for name in fields}
+    mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
+    blocks = list(npz.read(Source(path, None, path), mapping))
+    assert [len(block) for block in blocks] == [7, 7, 6]
+    for name, values in fields.items():
+        read = np.concatenate([block.values[name] for block in blocks])
+        np.testing.assert_array_equal(read, values)
+        assert read.dtype == values.dtype
+
+
+def bomb(path: Path, rows: int) -> Path:
+    """Write zeros, which are compressed to a thousandth."""
+    fields = {name: np.zeros(rows) for name in ("x", "y", "command")}
+    np.savez_compressed(path, **fields)  # type: ignore[arg-type]
+    return path
+
+
+BOMB_MAPPING = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["x", "y"]
+[columns.action]
+fields = ["command"]
+"""
+
+
+def test_a_file_that_unpacks_to_far_more_than_its_size_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.io.recording.SMALL_BYTES", 10**5)
+    path = bomb(tmp_path / "log.npz", 10**5)
+    with pytest.raises(BadInputError, match=r"holds values of 2400384 bytes or more, .* --max-bytes"):
+        imported(tmp_path, path, BOMB_MAPPING)
+    (tmp_path / "mapping.toml").write_text(BOMB_MAPPING)
+    report = import_dataset([path], tmp_path / "mapping.toml", out=tmp_path / "out", max_bytes=2_400_384)
+    assert report.frames == 10**5 - 1
+
+
+def test_a_claimed_shape_costs_no_memory(tmp_path: Path) -> None:
+    """Of 2^60 rows and a header of 4 GB, neither of which the file holds."""
+    header = np.lib.format.magic(2, 0)  # type: ignore[no-untyped-call]
+    with ZipFile(tmp_path / "log.npz", "w") as archive:
+        for name in ("x", "y"):
+            text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({2**60},)}}\n".encode()
+            archive.writestr(f"{name}.npy", header + len(text).to_bytes(4, "little") + text + b"\0" * 8)
+        archive.writestr("command.npy", header + (2**32 - 1).to_bytes(4, "little"))
+    script = (
+        "import resource, sys; from pathlib import Path;"
+        "from astra_data.core.errors import BadInputError;"
+        "from astra_data.io.importing import import_dataset;"
+        "resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32));"
+        "import_dataset([Path('log.npz')], Path('mapping.toml'), out=Path('out'))"
+    )
+    (tmp_path / "mapping.toml").write_text(BOMB_MAPPING)
+    ended = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert "BadInputError: log.npz cannot be read as npz" in ended.stderr.splitlines()[-1]
+
+
+def test_arrays_with_a_header_of_the_second_version_are_read(tmp_path: Path) -> None:
+    with ZipFile(tmp_path / "log.npz", "w") as archive:
+        for name, values in rows().items():
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array(file, values, version=(2, 0))  # type: ignore[no-untyped-call]
+    dataset, _ = imported(tmp_path, tmp_path / "log.npz")
+    assert dataset.lengths.tolist() == list(STEPS)
+    assert dataset.columns([STATE])[STATE][0, 0] == np.float32(rows()["x"][0] * 0.001)
+
+
+def test_a_header_that_claims_less_than_there_is_is_told(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "log.npz", {name: values[:12] for name, values in rows().items()})
+    with ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content.replace(b"(12,", b"(10,", 1))
+    with pytest.raises(BadInputError, match=r"\.npy holds more values than its header says"):
+        imported(tmp_path, path)

@@ -1,0 +1,523 @@
+"""What the cutter makes of rows whose outcome is known."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+)
+from astra_data.dataset.endings import Endings
+from astra_data.io.cutting import Cutter
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.recording import Block
+
+
+def cutter(**changes: Any) -> Cutter:  # noqa: ANN401
+    settings: dict[str, Any] = {
+        "name": "log",
+        "task": "walk",
+        "fps": 10,
+        "columns": {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}},
+    }
+    return Cutter(ImportMapping.model_validate(settings | changes))
+
+
+def cut(cutter: Cutter, bounds: Sequence[int] = (), **fields: ArrayLike) -> list[dict[str, Array]]:
+    """Cut one file with an `x` and an `a` that tells the row, in blocks that begin at `bounds`, too."""
+    arrays = {name: np.asarray(values) for name, values in fields.items()}
+    n = len(arrays["x"])
+    arrays.setdefault("a", np.arange(n))
+    episodes = []
+    for first, last in pairwise([0, *bounds, n]):
+        block = Block({name: array[first:last] for name, array in arrays.items()}, "log")
+        episodes += [columns for columns, _ in cutter.feed(block, first, is_apart=first == 0)]
+    return episodes + [columns for columns, _ in cutter.finish()]
+
+
+def rows(episodes: list[dict[str, Array]]) -> list[list[int]]:
+    return [episode[ACTION].astype(int).tolist() for episode in episodes]
+
+
+def test_the_next_state_is_the_next_row() -> None:
+    (episode,) = cut(cutter(), x=[0.0, 1, 4, 9])
+    assert episode[STATE].tolist() == [0, 1, 4]
+    assert episode[NEXT_STATE].tolist() == [1, 4, 9]
+    assert episode[ACTION].tolist() == [0, 1, 2]
+    assert episode[TRUNCATED].tolist() == episode[DONE].tolist() == [False, False, True]
+    assert not episode[TERMINATED].any()
+
+
+def test_a_flag_ends_an_episode() -> None:
+    cutting = cutter(split={"ends": ("end",)})
+    episodes = cut(cutting, x=np.zeros(9), end=[0, 0, 0, 1, 0, 0, 1, 1, 0])
+    assert rows(episodes) == [[0, 1, 2], [4, 5]]
+    assert cutting.tally.split_points == {"end": 3}
+    # Row 7 and row 8 are alone: without a next state nothing is left of them.
+    assert cutting.tally.last_rows == 4
+
+
+def test_columns_that_are_flags_end_episodes_too() -> None:
+    fell = {"fields": ("alive",), "scale": (-1,), "offset": (1,)}
+    columns: dict[str, Any] = {name: {"fields": ("a",)} for name in (ACTION, REWARD)}
+    columns |= {STATE: {"fields": ("x",)}, TERMINATED: fell, TRUNCATED: {"fields": ("late",)}}
+    cutting = cutter(columns=columns, terminal="stand_still")
+    episodes = cut(cutting, x=np.arange(8) * 2, alive=[1, 1, 0, 1, 1, 1, 1, 1], late=[0, 0, 0, 0, 0, 1, 0, 0])
+    # Of row 2 the next state is its own, since it is terminal; of rows 5 and 7 nobody recorded one.
+    assert rows(episodes) == [[0, 1, 2], [3, 4], [6]]
+    assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4, 4], [8, 10], [14]]
+    assert [episode[TERMINATED].tolist() for episode in episodes] == [
+        [False, False, True],
+        [False] * 2,
+        [False],
+    ]
+    assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False] * 3, [False, True], [True]]
+    assert cutting.tally.split_points == {"end": 2}
+    assert (cutting.tally.last_rows, cutting.tally.last_reward) == (2, 12)
+    assert cutting.tally.endings == Endings(terminated=1, cut_off=2, made_up=1)
+
+
+def test_a_terminated_row_without_a_next_state_hands_its_outcome_to_the_step_before() -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, REWARD: {"fields": ("a",)}}
+    columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("there",)}}
+    cutting = cutter(columns=columns)
+    over, there = [0, 0, 1, 0, 1, 1, 0, 0], [0, 0, 1, 0, 0, 0, 0, 1]
+    episodes = cut(cutting, x=np.arange(8) * 2, over=over, there=there)
+    # Row 5 is alone; row 7 is cut off, and step 6 leads to where it succeeds.
+    assert rows(episodes) == [[0, 1], [3], [6]]
+    assert [episode[REWARD].tolist() for episode in episodes] == [[0, 1 + 2], [3 + 4], [6]]
+    assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4], [8], [14]]
+    assert [episode[TERMINATED].tolist() for episode in episodes] == [[False, True], [True], [False]]
+    assert [episode[SUCCESS].tolist() for episode in episodes] == [[False, True], [False], [True]]
+    assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False, False], [False], [True]]
+    assert cutting.tally.endings == Endings(terminated=2, cut_off=1)
+    tally = cutting.tally
+    assert (tally.last_rows, tally.last_terminated, tally.last_reward) == (3, 2, 7)
+    assert tally.rows_after_end == 1
+
+
+@pytest.mark.parametrize("terminal", ["drop", "stand_still"])
+def test_a_log_that_goes_on_after_the_end_makes_no_episodes_of_it(terminal: str) -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
+    cutting = cutter(columns=columns, terminal=terminal)
+    episodes = cut(cutting, x=np.arange(9.0), over=[0, 0, 1, 1, 1, 1, 0, 0, 1])
+    wanted = [[0, 1], [6, 7]] if terminal == "drop" else [[0, 1, 2], [6, 7, 8]]
+    assert rows(episodes) == wanted
+    assert [bool(episode[TERMINATED][-1]) for episode in episodes] == [True, True]
+    assert cutting.tally.rows_after_end == 3
+
+
+def test_episodes_of_one_step_with_a_next_state_are_kept() -> None:
+    columns = {name: {"fields": (field,)} for name, field in ((STATE, "x"), (NEXT_STATE, "y"), (ACTION, "a"))}
+    cutting = cutter(columns=columns | {TERMINATED: {"fields": ("over",)}}, min_steps=1)
+    episodes = cut(cutting, x=np.arange(4.0), y=np.arange(4.0) + 1, over=[0, 1, 1, 1])
+    assert rows(episodes) == [[0, 1], [2], [3]]
+    assert cutting.tally.rows_after_end == 0
+
+
+def test_gaps_and_steps_back_in_time_begin_episodes() -> None:
+    cutting = cutter(time="t", split={"gap_s": 0.5})
+    episodes = cut(cutting, x=np.zeros(8), t=[0, 0.1, 0.2, 1.0, 1.1, 0.3, 0.4, 0.5])
+    assert rows(episodes) == [[0, 1], [3], [5, 6]]
+    assert cutting.tally.split_points == {"gap": 1, "back": 1}
+    cutting.check()
+
+
+def test_no_gap_hides_behind_a_time_that_is_not_finite() -> None:
+    cutting = cutter(time="t", split={"gap_s": 0.5}, not_finite="drop")
+    episodes = cut(cutting, x=np.zeros(7), t=[0, 0.1, np.nan, 0.3, np.nan, 3.0, 3.1])
+    assert rows(episodes) == [[0, 1], [5]]
+    assert cutting.tally.split_points == {"gap": 1}
+
+
+def test_gaps_are_measured_between_the_rows_that_are_kept() -> None:
+    """Over a row without a state too: no step from there to there is longer than 0.5 s."""
+    nan, split = np.nan, {"gap_s": 0.5}
+    x, t = [0, 0, nan, nan, 0, 0, 0, 0], [0, 0.1, 0.4, 0.7, 1.0, 1.1, 1.2, 1.3]
+    cutting = cutter(time="t", split=split, not_finite="drop")
+    assert rows(cut(cutting, x=x, t=t)) == [[0], [4, 5, 6]]
+    assert cutting.tally.split_points == {"gap": 1}
+    cutting.check()
+    alone = [0, nan, nan, 0.0]
+    assert rows(cut(cutter(time="t", split=split, not_finite="drop"), x=alone, t=t[:4])) == []
+    small = cutter(time="t", split={"gap_s": 1.0}, not_finite="drop")
+    assert rows(cut(small, x=x, t=t)) == [[0, 1, 4, 5, 6]]
+
+
+def test_a_gap_to_a_rejected_row_is_told_and_not_the_step_back_from_it() -> None:
+    cutting = cutter(time="t", not_finite="drop", split={"gap_s": 1.0})
+    episodes = cut(cutting, x=[0, 1, np.nan, 3, 4], t=[0.0, 0.1, 50.0, 0.3, 0.4])
+    assert rows(episodes) == [[0], [3]]
+    assert (cutting.tally.split_points, cutting.tally.back_rows) == ({"gap": 1}, 1)
+
+
+def test_a_rate_is_that_of_the_rows_that_are_kept() -> None:
+    cutting = cutter(time="t", not_finite="drop")
+    cut(cutting, x=np.where(np.arange(60) % 2, np.nan, 1.0), t=np.arange(60) / 20)
+    cutting.check()
+    assert cutting.tally.clock.startswith("10 Hz declared, 10 Hz by t")
+
+
+def test_a_time_that_is_missing_does_not_stand_still() -> None:
+    cutting = cutter(time="t", not_finite="drop")
+    cut(cutting, x=np.zeros(6), t=[0, 0.1, 0.2, np.nan, 0.2, 0.3])
+    assert (cutting.tally.still_rows, cutting.tally.back_rows) == (0, 0)
+
+
+def test_gaps_that_are_not_cut_and_jitter_are_tallied() -> None:
+    seconds = np.arange(200) / 10
+    seconds[1::2] += 0.004
+    seconds[70:] += 0.3
+    seconds[150:] += 3.0
+    cutting = cutter(time="t", split={"gap_s": 1.0})
+    cut(cutting, x=np.zeros(200), t=seconds)
+    cutting.check()
+    assert cutting.tally.split_points == {"gap": 1}
+    assert (
+        cutting.tally.clock
+        == "10 Hz declared, 9.994 Hz by t; gaps within episodes: 1, jitter 4.1 % of a period"
+    )
+
+
+def test_a_rate_that_is_not_fps_is_told() -> None:
+    cutting = cutter(time="t", time_scale=0.001)
+    cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)
+    with pytest.raises(BadInputError, match="'t' gives 50 rows per second, but fps is 10"):
+        cutting.check()
+
+
+def timed(*files: Array, names: Sequence[str] = ()) -> Cutter:
+    """Return a cutter that has read a file of each of these times."""
+    cutting = cutter(time="t")
+    for number, times in enumerate(files):
+        values = {"x": np.zeros(len(times)), "a": np.zeros(len(times)), "t": times}
+        origin = names[number] if names else f"{number}.csv"
+        list(cutting.feed(Block(values, origin), 0, is_apart=True))
+    list(cutting.finish())
+    return cutting
+
+
+def fed(rates: Sequence[tuple[str, float]]) -> Cutter:
+    """Return a cutter that has read a file of 50 rows at each of these rates."""
+    return timed(*(np.arange(50) / rate for _, rate in rates), names=[name for name, _ in rates])
+
+
+def test_files_of_a_few_rows_tell_no_rate() -> None:
+    cutting = timed(np.arange(20) / 5, np.arange(21) / 5, np.arange(1000) / 10)
+    cutting.check()
+    assert cutting.tally.notes == ["1.csv: 5 Hz, 10 Hz declared"]
+
+
+def test_files_of_other_rates_among_many_are_named() -> None:
+    good = [(f"{number}.csv", rate) for number, rate in enumerate(np.linspace(9.2, 10.8, 30))]
+    cutting = fed([("fast.csv", 20.0), *good, ("slow.csv", 5.0)])
+    cutting.check()
+    assert cutting.tally.notes == ["fast.csv: 20 Hz, 10 Hz declared", "slow.csv: 5 Hz, 10 Hz declared"]
+
+
+def test_episodes_of_other_rates_are_named_where_a_format_has_its_own() -> None:
+    cutting = cutter(time="t")
+    for number, rate in enumerate([10.0] * 20 + [5.0]):
+        values = {"x": np.zeros(50), "a": np.zeros(50), "t": np.arange(50) / rate}
+        list(cutting.feed(Block(values, f"demo_{number}", starts=True), 0, is_apart=number == 0))
+    list(cutting.finish())
+    cutting.check()
+    assert cutting.tally.notes == ["demo_20: 5 Hz, 10 Hz declared"]
+
+
+def test_a_refusal_of_a_rate_names_the_files_that_are_off() -> None:
+    with pytest.raises(BadInputError, match=r"fps is 10: .*; fast\.csv: 20 Hz, faster\.csv: 40 Hz$"):
+        fed([("fast.csv", 20.0), ("good.csv", 10.0), ("faster.csv", 40.0)]).check()
+
+
+def test_files_of_one_name_are_measured_one_by_one() -> None:
+    """As those of `runs/*/log.csv`."""
+    cutting = fed([("log.csv", 10.0)] * 20 + [("log.csv", 5.0)] + [("log.csv", 10.0)] * 20)
+    cutting.check()
+    assert cutting.tally.notes == ["log.csv: 5 Hz, 10 Hz declared"]
+
+
+MISSING = (np.arange(50) + np.arange(50) // 3) / 10
+"""Times at 10 Hz, of which every fourth is missing."""
+BURSTS = np.arange(50) // 4 * 0.4 + np.arange(50) % 4 * 0.01
+"""Times of 10 rows a second that come four at once."""
+PAUSES = np.arange(50) / 20 + np.arange(50) // 25 * 3.0
+"""Times at 20 Hz with a pause."""
+
+
+def test_a_file_is_of_another_rate_only_where_both_its_mean_and_its_usual_rate_are() -> None:
+    cutting = timed(MISSING, BURSTS, PAUSES, np.arange(1000) / 10)
+    cutting.check()
+    assert cutting.tally.notes == ["2.csv: 20 Hz, 10 Hz declared"]
+
+
+@pytest.mark.parametrize("files", [(MISSING, BURSTS), (np.arange(50) / 20,)])
+def test_a_refusal_of_a_rate_names_no_file_where_none_stands_out(files: tuple[Array, ...]) -> None:
+    with pytest.raises(BadInputError, match=r"or resample the recording$"):
+        timed(*files).check()
+
+
+def test_jumps_are_longer_than_their_bound() -> None:
+    position = {"fields": ("x",), "scale": (0.001,)}
+    cutting = cutter(
+        columns={STATE: position, ACTION: {"fields": ("a",)}},
+        split={"jump": {"column": STATE, "values": (0, 1), "above": 0.5}},
+    )
+    # 0.499 m, then 0.51 m in both directions together, and 10 in a value that does not count.
+    x = np.array([[0, 0, 0], [300, 399, 0], [300, 399, 9], [660, 760, 9], [660, 760, 1e4]])
+    assert rows(cut(cutting, x=x)) == [[0, 1], [3]]
+    assert cutting.tally.split_points == {"jump": 1}
+
+
+def test_a_whole_turn_of_a_heading_is_no_jump() -> None:
+    """By its role or its unit: 3.1 to -3.1 rad is a step of 0.08, and 359 to 1 degrees one of 2."""
+    heading = {"fields": ("x",), "take": (0,), "role": ("heading",)}
+    pan = {"fields": ("x",), "take": (1,), "unit": ("deg",)}
+    x = np.array([[3.1, 0], [-3.1, 359], [-3.0, 1], [-2.0, 1], [-2.0, 181]])
+    for column, above, expected in (("yaw", 0.5, [[0, 1], [3]]), ("pan", 3.0, [[0, 1, 2]])):
+        columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, "yaw": heading, "pan": pan}
+        cutting = cutter(columns=columns, split={"jump": {"column": column, "values": (0,), "above": above}})
+        assert rows(cut(cutting, x=x)) == expected
+
+
+@pytest.mark.parametrize(
+    ("not_finite", "expected", "points"), [("drop", [[0, 3, 4]], {}), ("split", [[3, 4]], {"rejected": 1})]
+)
+def test_rejected_rows(not_finite: str, expected: list[list[int]], points: dict[str, int]) -> None:
+    cutting = cutter(not_finite=not_finite)
+    episodes = cut(cutting, x=[0, np.nan, np.inf, 3, 4, 5, 1e300])
+    assert rows(episodes) == expected
+    assert cutting.tally.rejected_rows == 3
+    assert cutting.tally.rejected_first == "log row 1"
+    assert cutting.tally.split_points == points
+
+
+def test_a_rejected_row_still_ends_its_episode() -> None:
+    cutting = cutter(not_finite="drop", split={"ends": ("end",)})
+    episodes = cut(cutting, x=[0, 0, np.nan, 0, 0], end=[0, 0, 1, 0, 0])
+    assert rows(episodes) == [[0], [3]]
+    assert cutting.tally.split_points == {"end": 1}
+
+
+def test_a_flag_that_is_not_known_ends_no_episode() -> None:
+    cutting = cutter(not_finite="drop", split={"ends": ("end",)})
+    episodes = cut(cutting, x=[0, 0, np.nan, 0, 0, 0], end=[0, 0, np.nan, 0, 0, 1])
+    assert rows(episodes) == [[0, 1, 3, 4]]
+
+
+@pytest.mark.parametrize(("not_finite", "kept"), [("drop", [[0, 1, 2]]), ("split", [[0], [2]])])
+def test_a_row_that_is_cut_off_where_the_next_file_goes_on_is_a_rejected_one(
+    not_finite: str, kept: list[list[int]]
+) -> None:
+    cutting = cutter(not_finite=not_finite)
+    begun, rest = (
+        Block({"x": np.zeros(2), "a": first + np.arange(2)}, f"{first}.csv", torn=torn)
+        for first, torn in ((0, 1), (2, 0))
+    )
+    cuts = [*cutting.feed(begun, 0, is_apart=True), *cutting.feed(rest, 0, is_apart=False)]
+    assert rows([columns for columns, _ in [*cuts, *cutting.finish()]]) == kept
+    assert (cutting.tally.rows, cutting.tally.torn_rows, cutting.tally.rejected_rows) == (5, 1, 1)
+
+
+def test_a_rejected_row_that_ends_its_episode_is_no_gap_and_changes_no_rate() -> None:
+    cutting = cutter(time="t", not_finite="split", split={"gap_s": 0.15})
+    x = np.where(np.arange(60) % 3 == 2, np.nan, 0.0)
+    episodes = cut(cutting, x=x, t=np.arange(60) / 10)
+    assert rows(episodes) == [[first] for first in range(0, 60, 3)]
+    assert cutting.tally.split_points == {"rejected": 19}
+    cutting.check()
+
+
+def test_short_episodes_are_left_out_and_counted() -> None:
+    cutting = cutter(split={"field": "k"}, min_steps=2)
+    assert rows(cut(cutting, x=np.zeros(6), k=[0, 0, 1, 1, 1, 1])) == [[2, 3, 4]]
+    assert cutting.tally.short_rows == 1
+
+
+@pytest.mark.parametrize("rate", [8.0, 12.5])
+def test_a_log_that_is_slower_than_fps_is_told_as_one_that_is_faster(rate: float) -> None:
+    cutting = cutter(time="t")
+    cut(cutting, x=np.zeros(50), t=np.arange(50) / rate)
+    with pytest.raises(BadInputError, match=f"'t' gives {rate:g} rows per second, but fps is 10"):
+        cutting.check()
+
+
+def test_a_field_of_several_values_begins_an_episode_where_one_of_them_changes() -> None:
+    trial = [[0, 0], [0, 0], [0, 1], [0, 1], [1, 1], [1, 1]]
+    cutting = cutter(split={"field": "k"})
+    assert rows(cut(cutting, x=np.zeros(6), k=trial)) == [[0], [2], [4]]
+    assert cutting.tally.split_points == {"field": 2}
+
+
+def test_a_terminated_row_of_another_trial_is_no_log_that_went_on() -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
+    cutting = cutter(columns=columns, terminal="stand_still", split={"field": "k"})
+    trials = {"over": [0, 1, 1, 1, 1, 0, 1], "k": [0, 0, 0, 1, 1, 2, 2]}
+    assert rows(cut(cutting, x=np.arange(7.0), **trials)) == [[0, 1], [3], [5, 6]]
+    assert cutting.tally.rows_after_end == 2
+
+
+def test_a_recording_that_begins_with_a_terminated_row_keeps_it() -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
+    cutting = cutter(columns=columns, terminal="stand_still")
+    assert rows(cut(cutting, x=np.arange(4.0), over=[1, 0, 0, 1])) == [[0], [1, 2, 3]]
+    assert cutting.tally.rows_after_end == 0
+
+
+def test_the_order_of_the_columns_makes_no_episode_of_a_terminated_row_alone() -> None:
+    columns = {TERMINATED: {"fields": ("over",)}, STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    cutting = cutter(columns=columns, split={"field": "k"})
+    episodes = cut(cutting, x=np.arange(6.0), over=[0, 0, 0, 1, 0, 0], k=[0, 0, 0, 1, 2, 2])
+    assert [{len(values) for values in episode.values()} for episode in episodes] == [{2}, {1}]
+    assert rows(episodes) == [[0, 1], [4]]
+
+
+def test_a_success_in_the_last_row_is_that_of_the_step_that_leads_to_it() -> None:
+    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, SUCCESS: {"fields": ("there",)}}
+    cutting = cutter(columns=columns, split={"field": "k"})
+    there = [0, 1, 0, 0, 0, 1, 1, 0, 0]
+    episodes = cut(cutting, x=np.arange(9.0), there=there, k=[0, 0, 0, 1, 1, 1, 2, 2, 2])
+    assert [episode[SUCCESS].tolist() for episode in episodes] == [
+        [False, True],
+        [False, True],
+        [True, False],
+    ]
+
+
+def test_a_jump_is_longer_than_its_bound_not_as_long() -> None:
+    cutting = cutter(split={"jump": {"column": STATE, "values": (0,), "above": 0.5}})
+    assert rows(cut(cutting, x=[0.0, 0.5, 1.0, 1.75, 2.0])) == [[0, 1], [3]]
+
+
+@pytest.mark.parametrize("not_finite", ["drop", "split"])
+def test_a_failure_whose_row_is_rejected_is_that_of_the_last_row(not_finite: str) -> None:
+    flags = {name: {"fields": (field,)} for name, field in ((TERMINATED, "fell"), (SUCCESS, "won"))}
+    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    cutting = cutter(columns=columns | flags, not_finite=not_finite)
+    nan, fell = float("nan"), [0, 0, 1, 0, 0, 0, 1, 0]
+    episodes = cut(cutting, x=[0, 1, nan, 3, 4, nan, nan, 7], fell=fell, won=fell)
+    assert rows(episodes) == [[0, 1], [3, 4], [7]]
+    for name in (TERMINATED, SUCCESS):
+        assert [episode[name].tolist() for episode in episodes] == [[False, True], [False, True], [False]]
+
+
+def test_a_rejected_failure_right_after_an_end_is_of_no_episode() -> None:
+    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    columns[TERMINATED] = {"fields": ("fell",)}
+    cutting = cutter(columns=columns, not_finite="drop", split={"ends": ("end",)})
+    nan = float("nan")
+    episodes = cut(cutting, x=[0, 1, nan, 3], fell=[0, 0, 1, 0], end=[0, 1, 0, 0])
+    assert rows(episodes) == [[0, 1], [3]]
+    assert not any(episode[TERMINATED].any() for episode in episodes)
+
+
+def test_a_success_without_an_end_is_kept_where_its_row_is_rejected() -> None:
+    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
+    cutting = cutter(columns=columns | {SUCCESS: {"fields": ("won",)}}, not_finite="drop")
+    (episode,) = cut(cutting, x=[0, 1, float("nan")], won=[0, 0, 1])
+    assert episode[SUCCESS].tolist() == [False, True]
+
+
+def test_times_of_a_formats_own_episodes_may_begin_again() -> None:
+    cutting = cutter(time="t")
+    for number in range(3):
+        times = np.arange(4) / 10 + 0.3 * (number == 2)  # the last begins when the one before ends
+        block = Block({"x": np.zeros(4), "a": np.zeros(4), "t": times}, f"log/{number}", starts=True)
+        list(cutting.feed(block, 0, is_apart=number == 0))
+    list(cutting.finish())
+    tally = cutting.tally
+    assert (tally.split_points, tally.back_rows, tally.still_rows) == ({"source": 2}, 0, 0)
+
+
+def test_rows_without_a_value_of_the_field_are_one_episode_as_empty_cells_are() -> None:
+    field = [1.0, 1.0, np.nan, np.nan, np.nan, 2.0, 2.0]
+    made = cutter(split={"field": "trial"})
+    assert rows(cut(made, x=np.arange(7), trial=field)) == [[0], [2, 3], [5]]
+    assert made.tally.split_points == {"field": 2}
+
+
+def test_a_field_may_be_a_text_after_a_number() -> None:
+    made = cutter(split={"field": "trial"})
+    arrays = [np.array(["a", "a", "b"]), np.array([7, 7, 7])]
+    episodes = []
+    for number, trial in enumerate(arrays):
+        fields = {"x": np.arange(3.0), "a": 3.0 * number + np.arange(3), "trial": trial}
+        episodes += [c for c, _ in made.feed(Block(fields, "log"), 3 * number, is_apart=number == 0)]
+    assert rows(episodes + [c for c, _ in made.finish()]) == [[0], [3, 4]]
+    assert made.tally.split_points == {"field": 2}
+
+
+@pytest.mark.parametrize(
+    ("split", "fault"),
+    [
+        ({"field": "f"}, "log: split.field has 2 values, before there were 1"),
+        ({"ends": ("f",)}, "log: split.ends f has 2 values, before there were 1"),
+    ],
+)
+def test_what_splits_keeps_its_size(split: dict[str, Any], fault: str) -> None:
+    made = cutter(split=split)
+    with pytest.raises(BadInputError, match=re.escape(fault)):
+        for number, size in enumerate((1, 2)):
+            fields = {"x": np.zeros(3), "a": np.zeros(3), "f": np.zeros((3, size))}
+            list(made.feed(Block(fields, "log"), 3 * number, is_apart=number == 0))
+
+
+cells = st.sampled_from([0.0, 0.0, 0.0, 1.0, np.nan])
+steps = st.sampled_from([0.1, 0.1, 0.1, 0.0, -0.3, 2.0, np.nan])
+lines = st.tuples(cells, steps, cells, cells, cells, st.sampled_from([0, 0, 0, 5]))
+
+
+@given(
+    table=st.lists(lines, min_size=2, max_size=30),
+    bounds=st.lists(st.integers(1, 29), max_size=6),
+    not_finite=st.sampled_from(["refuse", "drop", "split"]),
+    terminal=st.sampled_from(["drop", "stand_still"]),
+    skip_bad=st.booleans(),
+)
+@settings(
+    max_examples=150, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+)
+def test_where_blocks_end_changes_nothing(
+    table: list[tuple[float, ...]],
+    bounds: list[int],
+    not_finite: str,
+    terminal: str,
+    skip_bad: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    columns = {name: {"fields": (field,)} for name, field in ((STATE, "x"), (ACTION, "a"), (REWARD, "a"))}
+    columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("won",)}}
+    split = {"gap_s": 0.5, "field": "k", "jump": {"column": STATE, "values": (0,), "above": 3.0}}
+    mapping = ImportMapping.model_validate(
+        {"name": "log", "task": "walk", "fps": 10, "time": "t", "columns": columns, "split": split}
+        | {"not_finite": not_finite, "terminal": terminal}
+    )
+    x, t, over, won, k, jump = np.array(table).T
+    fields = {"x": x + np.nancumsum(jump), "t": np.nancumsum(t) + 0 * t, "over": over, "won": won, "k": k}
+    found = []
+    for block_rows, at in ((2**13, []), (1, sorted({bound for bound in bounds if bound < len(x)}))):
+        monkeypatch.setattr("astra_data.io.cutting.BLOCK_ROWS", block_rows)
+        cutting = Cutter(mapping, skip_bad=skip_bad)
+        found.append((cut(cutting, at, **fields), asdict(cutting.tally)))
+    (whole, counts), (parts, others) = found
+    assert counts == others
+    for episode, expected in zip(parts, whole, strict=True):
+        for name, values in expected.items():
+            np.testing.assert_array_equal(episode[name], values, err_msg=name)

@@ -1,0 +1,299 @@
+"""Whatever a file or a mapping holds: a dataset that verifies, or one clear message and nothing written.
+
+ASTRA_DATA_FUZZ is how many random examples are tried of each kind; by default few, always the same.
+"""
+
+import json
+import os
+import shutil
+import tarfile
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from mcap_recordings import MAPPING as MCAP_MAPPING
+from mcap_recordings import log, write_json, write_protobuf, write_ros2
+from minari_recordings import episodes, write_minari
+from recordings import MAPPING, TABLES, rows, write_table
+
+from astra_data.core.errors import AstraDataError
+from astra_data.dataset import Dataset
+from astra_data.io.importing import import_dataset
+
+fuzzed = settings(
+    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "12")),
+    deadline=None,
+    derandomize="ASTRA_DATA_FUZZ" not in os.environ,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+
+MINARI_MAPPING = """
+name = "log"
+task = "walk"
+fps = 10
+[columns."observation.state"]
+fields = ["observations/achieved_goal"]
+[columns.action]
+fields = ["actions"]
+"""
+Edit = tuple[float, bytes, bool]
+
+
+def check(recording: Path, mapping: str) -> None:
+    """Import `recording` next to itself, and look at what is left."""
+    file = recording.parent / "mapping.toml"
+    file.write_text(mapping, encoding="utf-8", errors="surrogatepass")
+    before = sorted(recording.parent.iterdir())
+    out = recording.parent / "out"
+    try:
+        import_dataset([recording], file, out=out)
+    except AstraDataError as error:
+        assert str(error)
+        assert sorted(recording.parent.iterdir()) == before
+    else:
+        assert Dataset.open(out).verify() == []
+
+
+def write_archive(path: Path) -> Path:
+    log_path = write_table(path.parent / "log.json", rows())
+    with tarfile.open(path, "w:gz") as archive:
+        archive.add(log_path, "logs/1.json")
+    log_path.unlink()
+    return path
+
+
+FILES: dict[str, tuple[Callable[[Path], object], str]] = {
+    **{name: (lambda path: write_table(path, rows()), MAPPING) for name in TABLES},
+    "log.tar.gz": (write_archive, MAPPING),
+    "json.mcap": (lambda path: write_json(path, log()), MCAP_MAPPING),
+    "protobuf.mcap": (lambda path: write_protobuf(path, log()), MCAP_MAPPING),
+    "ros2.mcap": (lambda path: write_ros2(path, log()), MCAP_MAPPING),
+}
+
+
+@cache
+def sound(name: str) -> bytes:
+    """Return the bytes of a file that can be imported."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        FILES[name][0](path)
+        return path.read_bytes()
+
+
+shares = st.floats(0, 1, exclude_max=True)
+edits = st.lists(st.tuples(shares, st.binary(max_size=8), st.booleans()), min_size=1, max_size=6)
+"""Where, as a share of the file, bytes are overwritten or, if true, everything from there on is cut off."""
+
+
+def broken(content: bytes, changes: list[Edit]) -> bytes:
+    for share, new, is_cut in changes:
+        place = int(share * len(content))
+        content = content[:place] + new + (b"" if is_cut else content[place + len(new) :])
+    return content
+
+
+@pytest.mark.parametrize("name", FILES)
+@given(changes=edits)
+@fuzzed
+def test_broken_files(name: str, changes: list[Edit]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(broken(sound(name), changes))
+        check(path, FILES[name][1])
+
+
+@pytest.mark.parametrize("name", FILES)
+@given(content=st.binary(max_size=300))
+@example(content=b"")
+@fuzzed
+def test_random_bytes(name: str, content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(content)
+        check(path, FILES[name][1])
+
+
+@cache
+def minari_dataset() -> Path:
+    return write_minari(Path(tempfile.mkdtemp()), episodes(is_dict=True))
+
+
+@given(name=st.sampled_from(["metadata.json", "main_data.hdf5"]), changes=edits)
+@fuzzed
+def test_broken_minari_datasets(name: str, changes: list[Edit]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(shutil.copytree(minari_dataset(), Path(folder) / "log"))
+        path = root / "data" / name
+        path.write_bytes(broken(path.read_bytes(), changes))
+        check(root, MINARI_MAPPING)
+
+
+arrays = npst.arrays(
+    st.one_of(npst.scalar_dtypes(), npst.byte_string_dtypes(max_len=3)),
+    npst.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+)
+
+
+@pytest.mark.parametrize("name", ["log.npz", "log.h5"])
+@given(fields=st.dictionaries(st.sampled_from(list(rows())), arrays))
+@fuzzed
+def test_arrays_of_any_type_and_shape(name: str, fields: dict[str, Any]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        try:
+            write_table(path, {field: np.zeros(4) for field in rows()} | fields)
+        except (TypeError, ValueError):
+            return  # HDF5 has no such type.
+        check(path, MAPPING)
+
+
+leaves = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=3))
+values = st.recursive(leaves, lambda inner: st.lists(inner, max_size=4), max_leaves=8)
+
+
+@given(
+    fields=st.one_of(values, st.dictionaries(st.sampled_from(list(rows())), values)), is_whole=st.booleans()
+)
+@fuzzed
+def test_json_of_any_form(fields: object, is_whole: bool) -> None:
+    if isinstance(fields, dict) and is_whole:
+        fields = {field: [0, 1, 1, 0] for field in rows()} | fields
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.json"
+        path.write_text(json.dumps(fields))
+        check(path, MAPPING)
+
+
+cells = st.one_of(
+    st.sampled_from(["", "0", "1", "nan", "inf", "true", "1e400", '"', "a\nb"]), st.text(max_size=4)
+)
+
+
+@given(table=st.lists(st.lists(cells, min_size=7, max_size=9), max_size=5))
+@fuzzed
+def test_csv_of_any_form(table: list[list[str]]) -> None:
+    lines = [",".join(rows())] + [",".join(row) for row in table]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        path.write_text("\n".join(lines), encoding="utf-8", errors="surrogatepass")
+        check(path, MAPPING)
+
+
+contents = st.dictionaries(st.sampled_from(["position", "joints", "turn"]), values)
+
+
+messages = st.tuples(st.sampled_from(["/pose", "/command"]), st.floats(0, 1e9), contents)
+
+
+@given(more=st.lists(messages, max_size=6))
+@fuzzed
+def test_messages_of_any_form(more: list[Any]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        check(write_json(Path(folder) / "log.mcap", log()[:40] + more), MCAP_MAPPING)
+
+
+words = st.sampled_from(
+    [
+        "x",
+        "fps",
+        "columns",
+        '"action"',
+        "[",
+        "]",
+        "=",
+        "-1",
+        "0",
+        "1e999",
+        "nan",
+        "true",
+        '""',
+        "'''",
+        "\n",
+        "{",
+        "}",
+    ]
+)
+
+
+@given(
+    changes=st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.one_of(words, st.text(max_size=4)), st.booleans())
+    )
+)
+@fuzzed
+def test_broken_mappings(changes: list[tuple[float, str, bool]]) -> None:
+    tokens = MAPPING.split(" ")
+    for share, word, is_cut in changes:
+        place = int(share * len(tokens))
+        tokens = tokens[:place] + [word] + (tokens[place + 2 :] if is_cut else tokens[place + 1 :])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.npz"
+        path.write_bytes(sound("log.npz"))
+        check(path, " ".join(tokens))
+
+
+numbers = st.lists(st.one_of(st.integers(-2, 9), st.floats()), max_size=3)
+texts = st.lists(st.sampled_from(["x", "position", "trial", "m"]), max_size=3)
+
+
+@given(
+    column=st.fixed_dictionaries(
+        {},
+        optional={
+            "fields": st.lists(st.sampled_from(list(rows())), max_size=3),
+            "take": st.lists(st.integers(-1, 4), max_size=3),
+            **{key: numbers for key in ("scale", "offset", "clip")},
+            **{key: texts for key in ("names", "unit", "frame", "role")},
+            "dtype": st.sampled_from(["float32", "int64", "bool", "str"]),
+        },
+    ),
+    split=st.fixed_dictionaries(
+        {},
+        optional={
+            "field": st.sampled_from(["trial", "x"]),
+            "ends": st.lists(st.sampled_from(["fell", "x"]), max_size=2),
+            "gap_s": st.floats(),
+        },
+    ),
+)
+@fuzzed
+def test_mappings_of_any_form(column: dict[str, Any], split: dict[str, Any]) -> None:
+    def table(settings: dict[str, Any]) -> str:
+        # JSON's arrays, strings and numbers are TOML's, but for these.
+        lines = [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
+        return "\n".join(lines).replace("NaN", "nan").replace("Infinity", "inf")
+
+    mapping = f"""
+name = "log"
+task = "walk"
+fps = 10
+time = "gait"
+not_finite = "split"
+[columns."observation.state"]
+{table(column)}
+[columns.action]
+fields = ["command"]
+[split]
+{table(split)}
+"""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.npz"
+        path.write_bytes(sound("log.npz"))
+        check(path, mapping)
+
+
+def test_the_files_are_sound() -> None:
+    for name, (_, mapping) in FILES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_bytes(sound(name))
+            (path.parent / "mapping.toml").write_text(mapping)
+            assert import_dataset([path], path.parent / "mapping.toml", out=path.parent / "out").episodes > 0

@@ -1,0 +1,113 @@
+"""A dataset that our stages made passes what lerobot itself checks: frames, statistics, merging, sampling."""
+
+import json
+import shutil
+import warnings
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset
+from astra_data.pipeline.stages.collect import CollectConfig, collect
+from astra_data.pipeline.stages.pair import pair
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+TASK = f"{Path(__file__).parents[1] / 'small_cart.py'}:TASK"
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+
+@pytest.fixture(scope="module")
+def lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
+    """The modules of lerobot with checks in them, with a cache of their own and no network."""
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.setenv("HF_HUB_OFFLINE", "1")
+        names = ("aggregate", "compute_stats", "dataset_tools", "feature_utils", "lerobot_dataset", "sampler")
+        modules = {name: import_module(f"lerobot.datasets.{name}") for name in names}
+        augment = import_module("lerobot.scripts.augment_dataset_quantile_stats")
+        cache = tmp_path_factory.mktemp("cache")
+        patch.setattr(import_module("datasets").config, "HF_DATASETS_CACHE", cache)
+        yield SimpleNamespace(**modules, augment=augment)
+
+
+@pytest.fixture(scope="module")
+def paired(tmp_path_factory: pytest.TempPathFactory) -> list[Dataset]:
+    """Two datasets of a task of a user's own, collected and paired, of two seeds."""
+    folder = tmp_path_factory.mktemp("paired")
+    config = CollectConfig(episodes=6, max_steps=40, start="task", hold_s=(0.1, 0.4))
+    for seed in (0, 1):
+        collect(TASK, config, seed=seed, out=folder / f"collect_{seed}", progress=silent)
+        pair(TASK, dataset=folder / f"collect_{seed}", out=folder / f"pair_{seed}")
+    return [Dataset.open(folder / f"pair_{seed}") for seed in (0, 1)]
+
+
+def opened(lerobot: SimpleNamespace, root: Path) -> Any:  # noqa: ANN401 - lerobot has no types
+    return lerobot.lerobot_dataset.LeRobotDataset("a/b", root=root, video_backend="pyav")
+
+
+def test_every_frame_is_one_that_lerobot_would_record(
+    lerobot: SimpleNamespace, paired: list[Dataset]
+) -> None:
+    features = opened(lerobot, paired[0].root).meta.features
+    for episode in paired[0].episodes():
+        for step in range(len(episode)):
+            frame = {name: np.atleast_1d(values[step]) for name, values in episode.columns.items()}
+            frame["episode_uid"] = np.array([episode.uid])
+            lerobot.feature_utils.validate_frame({**frame, "task": "drive"}, features)
+    frame["action"] = frame["action"].astype(np.float64)
+    with pytest.raises(ValueError, match="float64"):
+        lerobot.feature_utils.validate_frame({**frame, "task": "drive"}, features)
+
+
+def test_statistics_are_those_that_lerobot_computes_anew(
+    lerobot: SimpleNamespace, paired: list[Dataset], tmp_path: Path
+) -> None:
+    shutil.copytree(paired[0].root, tmp_path / "copy")
+    ours = json.loads((tmp_path / "copy/meta/stats.json").read_text())
+    lerobot.dataset_tools.recompute_stats(opened(lerobot, tmp_path / "copy"))
+    theirs = json.loads((tmp_path / "copy/meta/stats.json").read_text())
+    assert ours.keys() == theirs.keys()
+    for name, stats in theirs.items():
+        assert stats.keys() == ours[name].keys(), name
+        for key in ("min", "max", "mean", "count"):
+            np.testing.assert_allclose(ours[name][key], stats[key], rtol=1e-5, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(ours[name]["std"], stats["std"], rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+def test_statistics_have_the_shapes_and_quantiles_that_lerobots_policies_take(
+    lerobot: SimpleNamespace, paired: list[Dataset]
+) -> None:
+    meta = opened(lerobot, paired[0].root).meta
+    lerobot.compute_stats._assert_type_and_shape([meta.stats])
+    lerobot.compute_stats.aggregate_stats([meta.stats, meta.stats])
+    assert lerobot.augment.has_quantile_stats(meta.stats)
+    values = paired[0].columns(["action", "abstract.state"])
+    for name, column in values.items():
+        for key, share in QUANTILES.items():
+            expected = np.quantile(column.reshape(len(column), -1), share, axis=0)
+            np.testing.assert_allclose(meta.stats[name][key], expected, rtol=1e-4, atol=1e-5, err_msg=key)
+
+
+def test_datasets_of_two_seeds_may_be_merged(lerobot: SimpleNamespace, paired: list[Dataset]) -> None:
+    metas = [opened(lerobot, dataset.root).meta for dataset in paired]
+    fps, _, features = lerobot.aggregate.validate_all_metadata(metas)
+    assert fps == 10
+    assert set(paired[0].features) <= set(features)
+
+
+def test_the_sampler_finds_every_frame_once_and_leaves_out_last_ones(
+    lerobot: SimpleNamespace, paired: list[Dataset]
+) -> None:
+    dataset = paired[0]
+    ends = opened(lerobot, dataset.root).meta.episodes
+    given = ends["dataset_from_index"], ends["dataset_to_index"]
+    sampled = lerobot.sampler.EpisodeAwareSampler(*given, shuffle=True)
+    assert sorted(sampled) == [*range(int(dataset.lengths.sum()))]
+    shorter = lerobot.sampler.EpisodeAwareSampler(*given, drop_n_last_frames=2)
+    assert len(list(shorter)) == int((dataset.lengths - 2).clip(0).sum())

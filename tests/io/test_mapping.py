@@ -1,0 +1,100 @@
+import re
+from pathlib import Path
+
+import pytest
+from recordings import MAPPING
+
+from astra_data.core.config import load_recipe
+from astra_data.core.errors import RecipeError
+from astra_data.dataset.columns import STATE
+from astra_data.io.mapping import ColumnMapping, ImportMapping, Jump, Split, read_mapping
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("fps", "fpx"), "fpx: unknown key: did you mean 'fps'"),
+        (("fps = 10", "fps = 0"), "fps: expected"),
+        (("clip", "clop"), "clop: unknown key"),
+        (("clip = [-1, 1]", "clip = [1, -1]"), "expected the lower bound first"),
+        (('names = ["x", "y"]', 'names = ["x", "x"]'), "names has x more than once"),
+        (('role = ["position"]', 'role = ["place"]'), "unknown role place, expected position"),
+        (("columns.gait", "columns.index"), "column index is filled in"),
+        (('columns."next.terminated"', 'columns."next.done"'), "column next.done is filled in"),
+        (('columns."next.reward"', 'columns."next/reward"'), "expected a name without '/'"),
+        (('fields = ["reward"]', "fields = []"), "columns.next.reward.fields: "),
+        (('field = "trial"', 'jump = {column = "pose", values = [0], above = 1}'), "jump.column 'pose'"),
+        (
+            ('fields = ["fell"]', 'fields = ["fell"]\ndtype = "int64"'),
+            "terminated has dtype int64, expected bool",
+        ),
+        (
+            ("[columns.action]", '[columns.action]\ndtype = "int64"'),
+            "column action has dtype int64, expected float32",
+        ),
+        (('"next.terminated"', '"next.terminate"'), "column next.terminate: did you mean 'next.terminated'"),
+        (("columns.gait", 'columns.""'), "column '': expected a name without '/'"),
+        (('"int64"', '"float64"'), "gait.dtype: expected 'float32', 'int64' or 'bool'"),
+    ],
+)
+def test_faults_are_told(tmp_path: Path, change: tuple[str, str], told: str) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(MAPPING.replace(*change))
+    with pytest.raises(RecipeError) as caught:
+        load_recipe(path, ImportMapping)
+    assert told in str(caught.value)
+
+
+def test_each_field_is_asked_for_once(tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text('time = "x"\n' + MAPPING + 'ends = ["fell"]')
+    mapping = load_recipe(path, ImportMapping)
+    assert mapping.fields == ["x", "y", "command", "reward", "fell", "gait"]
+    assert mapping.all_fields == [*mapping.fields, "trial"]
+
+
+def test_the_example_is_a_mapping_and_shows_every_key() -> None:
+    path = Path(__file__).parents[2] / "recipes/imports/example.toml"
+    load_recipe(path, ImportMapping)
+    keys = {key for model in (ImportMapping, ColumnMapping, Split, Jump) for key in model.model_fields}
+    words = set(re.findall(r"\w+", path.read_text()))
+    assert keys - words == set()
+
+
+def test_a_slip_in_a_columns_name_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(MAPPING.replace("[columns.action]", "[columns.actions]"))
+    with pytest.raises(RecipeError, match="column actions: did you mean 'action'"):
+        load_recipe(path, ImportMapping)
+
+
+def test_a_name_like_that_of_a_column_beside_it_is_no_slip(tmp_path: Path) -> None:
+    path = tmp_path / "mapping.toml"
+    path.write_text(MAPPING.replace("columns.gait", "columns.actions"))
+    assert "actions" in load_recipe(path, ImportMapping).columns
+
+
+@pytest.mark.parametrize(
+    ("recipe", "command"), [("quickstart", "run {path}"), ("nao_real", "gap {path} --data LOGS")]
+)
+def test_a_recipe_in_place_of_a_mapping_is_told(recipe: str, command: str) -> None:
+    path = Path(__file__).parents[2] / f"recipes/{recipe}.toml"
+    with pytest.raises(RecipeError) as caught:
+        read_mapping(path)
+    assert str(caught.value) == (
+        f"{path} is a recipe: `astra-data {command.format(path=path)}`; expected a mapping, which "
+        "`astra-data new` writes"
+    )
+
+
+def test_a_gap_of_a_column_is_for_mcap_and_for_what_may_go_stale() -> None:
+    state: dict[str, object] = {"fields": ("/odom:x",), "gap_s": 0.1}
+    given: dict[str, object] = {"name": "log", "task": "drive", "fps": 10, "columns": {STATE: state}}
+    mapping = ImportMapping.model_validate(given)
+    mapping.refuse_timeless("mcap", "mapping.toml")
+    with pytest.raises(
+        RecipeError, match=r'mapping.toml: columns."observation.state".gap_s: only MCAP has it'
+    ):
+        mapping.refuse_timeless("csv", "mapping.toml")
+    with pytest.raises(ValueError, match="latched holds without limit, and gap_s is a limit"):
+        ImportMapping.model_validate(given | {"columns": {STATE: state | {"latched": True}}})

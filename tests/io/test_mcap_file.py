@@ -1,0 +1,358 @@
+import re
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+from mcap_recordings import Message, command, ns, pose, write_json
+
+from astra_data.core.errors import BadInputError
+from astra_data.io.mcap_file import McapFile, McapMessage, Timeline
+from astra_data.io.recording import Source
+
+CHUNK = 2000
+LENGTH = 300
+
+
+def write(path: Path, *, is_finished: bool = True, **options: Any) -> Path:  # noqa: ANN401
+    """Write messages of one topic, and some of another, whose contents end in zeros."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=CHUNK, **options)
+        writer.start()
+        used = writer.register_channel("/used", "json", schema_id=0)
+        other = writer.register_channel("/other", "json", schema_id=0)
+        for number in range(LENGTH):
+            channel = other if number % 5 == 0 or 100 < number < 200 else used
+            writer.add_message(channel, number, b"%03d" % number + bytes(20), number)
+        if is_finished:
+            writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def numbers(path: Path, *, checked: bool = True) -> tuple[list[int], bool]:
+    """Return which messages are read, and whether the file is cut off."""
+    file = McapFile(Source(path, None, path), ["/used"])
+    read = [message.log_time for _, message in file.messages(checked=checked)]
+    file.check_topics()
+    return read, file.is_cut
+
+
+WANTED = [number for number in range(LENGTH) if number % 5 and not 100 < number < 200]
+FORMS: dict[str, dict[str, Any]] = {
+    "usual": {},
+    "lz4": {"compression": CompressionType.LZ4},
+    "without chunks": {"use_chunking": False},
+    "without indexes of messages": {"index_types": IndexType.CHUNK},
+    "without an index": {"index_types": IndexType.NONE},
+    "without channels in the summary": {"repeat_channels": False, "repeat_schemas": False},
+    "without a summary": {
+        "index_types": IndexType.NONE,
+        "repeat_channels": False,
+        "repeat_schemas": False,
+        "use_statistics": False,
+        "use_summary_offsets": False,
+    },
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_is_read(tmp_path: Path, form: str) -> None:
+    assert numbers(write(tmp_path / "log.mcap", **FORMS[form])) == (WANTED, False)
+
+
+PACKED = [CompressionType.ZSTD, CompressionType.LZ4]
+
+
+@pytest.mark.parametrize("compression", PACKED)
+def test_no_more_is_unpacked_than_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType
+) -> None:
+    path = write(tmp_path / "log.mcap", compression=compression)
+    unpacked = 300 * (22 + 9 + 23)  # of a message: what stands before it, and its content
+    monkeypatch.setattr("astra_data.io.mcap_file.MOST_UNPACKED", 0)
+    for limit, is_read in ((unpacked + 1000, True), (unpacked - 5000, False)):
+        monkeypatch.setattr("astra_data.io.mcap_file.SMALL_BYTES", limit)
+        file = McapFile(Source(path, None, path, most_bytes=0), ["/used", "/other"])
+        if is_read:
+            assert len(list(file.messages(checked=True))) == LENGTH
+            continue
+        with pytest.raises(BadInputError, match=r"once unpacked: if you trust it, pass a larger --max-bytes"):
+            list(file.messages(checked=True))
+
+
+@pytest.mark.parametrize("compression", PACKED)
+@pytest.mark.parametrize("declared", [0, 100, 10**6])
+def test_a_chunk_is_unpacked_as_far_as_it_says(
+    tmp_path: Path, compression: CompressionType, declared: int
+) -> None:
+    path = write(tmp_path / "log.mcap", compression=compression)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    content = bytearray(path.read_bytes())
+    start = summary.chunk_indexes[0].chunk_start_offset + 9 + 16
+    content[start : start + 8] = struct.pack("<Q", declared)
+    path.write_bytes(content)
+    with pytest.raises(BadInputError, match="has another size than its header says"):
+        numbers(path)
+
+
+def test_chunks_without_wanted_messages_are_not_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap", compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    for number in (150, 250):
+        place = content.index(b"%03d" % number + bytes(20))
+        content[place] ^= 1
+        path.write_bytes(content)
+        if number == 150:
+            assert numbers(path) == (WANTED, False)
+    with pytest.raises(BadInputError, match="has another checksum than was written"):
+        numbers(path)
+    assert numbers(path, checked=False) == (WANTED, False)
+
+
+@pytest.mark.parametrize("form", ["usual", "without chunks"])
+@pytest.mark.parametrize("zeros", [0, 1, 8, 9, 1000, 200_000])
+def test_a_file_that_is_cut_off_is_read_up_to_there(tmp_path: Path, form: str, zeros: int) -> None:
+    whole = write(tmp_path / "whole.mcap", **FORMS[form]).read_bytes()
+    path = tmp_path / "log.mcap"
+    lengths = set()
+    for cut in range(200, len(whole) - 1, 97):
+        path.write_bytes(whole[:cut] + bytes(zeros))
+        try:
+            read, is_cut = numbers(path)
+        except BadInputError as error:
+            assert re.search("no topic '/used'|is cut off before its first message ends", str(error))
+            read, is_cut = [], True
+        assert read == WANTED[: len(read)]
+        assert is_cut or read == WANTED
+        lengths.add(len(read))
+    assert len(lengths) > 5 and max(lengths) == len(WANTED)
+
+
+def test_no_message_before_a_cut_is_lost(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole.mcap", use_chunking=False).read_bytes()
+    path = tmp_path / "log.mcap"
+    end = whole.index(b"%03d" % WANTED[99]) + 23
+    path.write_bytes(whole[:end])
+    assert numbers(path) == (WANTED[:100], True)
+    path.write_bytes(whole[: end - 1])
+    assert numbers(path) == (WANTED[:99], True)
+
+
+def test_a_recorder_that_was_killed_leaves_whole_chunks(tmp_path: Path) -> None:
+    read, is_cut = numbers(write(tmp_path / "log.mcap", is_finished=False))
+    assert is_cut and 0 < len(read) < len(WANTED) and read == WANTED[: len(read)]
+
+
+def test_what_follows_the_end_changes_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap")
+    path.write_bytes(path.read_bytes() + bytes(4096))
+    assert numbers(path) == (WANTED, False)
+
+
+def test_damage_before_a_cut_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap", compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"050" + bytes(20))] ^= 1
+    path.write_bytes(content[: 3 * len(content) // 4])
+    with pytest.raises(BadInputError, match="has another checksum than was written"):
+        numbers(path)
+
+
+def test_damage_without_chunks_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap", use_chunking=False, enable_data_crcs=True)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"051" + bytes(20))] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="crc validation failed in DataEnd"):
+        numbers(path)
+
+
+def test_an_end_within_a_message_is_damage(tmp_path: Path) -> None:
+    """It takes the place of the last bytes of a message, after which nothing comes."""
+    path = write(tmp_path / "log.mcap", use_chunking=False, **FORMS["without a summary"])
+    whole = path.read_bytes()
+    end = whole[-37:]
+    path.write_bytes(whole[: whole.index(b"099" + bytes(20)) + 23 - len(end)] + end)
+    with pytest.raises(EndOfFile):
+        numbers(path)
+
+
+@pytest.mark.parametrize("content", [b"", bytes(100)])
+def test_an_empty_file_is_told(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(content)
+    with pytest.raises(BadInputError, match=r"^log\.mcap is empty: nothing was recorded, leave it out$"):
+        numbers(path)
+
+
+def test_a_file_that_was_only_begun_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap")
+    for size in (3, 8, 20):
+        path.write_bytes(write(tmp_path / "whole.mcap").read_bytes()[:size])
+        with pytest.raises(BadInputError, match=r"^log\.mcap is cut off before its first message ends"):
+            numbers(path)
+
+
+def test_topics_without_messages_are_known(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.register_channel("/used", "json", schema_id=0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and not summary.chunk_indexes
+    assert numbers(path) == ([], False)
+
+
+def test_schemas_may_stand_in_the_data_alone(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=200, repeat_schemas=False)
+        writer.start()
+        other = writer.register_channel("/other", "json", schema_id=0)
+        schema = writer.register_schema("demo/Turn", "ros2msg", b"float64 turn")
+        used = writer.register_channel("/used", "cdr", schema)
+        writer.add_message(other, 0, bytes(200), 0)
+        writer.add_message(used, 0, bytes([0, 1, 0, 0]) + struct.pack("<d", 0.5), 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    read = McapFile(Source(path, None, path), ["/used"])
+    [(_, message)] = read.messages(checked=True)
+    assert read.decoder(message.channel_id)(message.data).turn == 0.5
+
+
+def test_an_encoding_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Twist", "ros1msg", b"float64 x")
+        used = writer.register_channel("/used", "ros1", schema)
+        writer.add_message(used, 0, bytes(8), 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    file_of = McapFile(Source(path, None, path), ["/used"])
+    [(_, message)] = file_of.messages(checked=True)
+    with pytest.raises(BadInputError, match="messages of /used are ros1 with ros1msg schema, expected json"):
+        file_of.decoder(message.channel_id)
+
+
+GAP_S = 0.5
+PAUSE_S = 0.7
+
+
+def timeline(path: Path, messages: Iterable[Message]) -> Timeline:
+    write_json(path, messages)
+    return Timeline(McapFile(Source(path, None, path), ["/pose", "/command"]), GAP_S, PAUSE_S)
+
+
+def drive(begin: float, end: float) -> list[Message]:
+    """Poses at 20 Hz, commands at 10 Hz, numbered by their times."""
+    messages = [pose(k / 20, k / 20) for k in range(round(20 * begin), round(20 * end))]
+    messages += [command(k / 10 + 0.01, k / 10) for k in range(round(10 * begin), round(10 * end))]
+    return sorted(messages, key=lambda message: message[1])
+
+
+def log_times(messages: Iterable[McapMessage]) -> list[int]:
+    return [message.log_time for message in messages]
+
+
+def check(read: Timeline) -> list[McapMessage]:
+    """Compare the times of messages with the moments, and return the messages."""
+    messages = list(read.messages())
+    times = [message.time for message in messages]
+    assert times == sorted(times)
+    assert read.moments.keys() == {"/pose", "/command"}
+    for topic, moments in read.moments.items():
+        assert moments.tolist() == [message.time for message in messages if message.topic == topic]
+    return messages
+
+
+@pytest.mark.parametrize("mixed", ["in order", "in windows", "by topic", "wholly"])
+def test_messages_come_in_the_order_of_their_times(tmp_path: Path, mixed: str) -> None:
+    ordered = drive(0, 10)
+    rng = np.random.default_rng(0)
+    keys = {
+        "in order": np.arange(len(ordered)),
+        "in windows": np.arange(len(ordered)) + rng.uniform(0, 10, len(ordered)),
+        "by topic": np.array([(time // 3, topic == "/pose") for topic, time, _ in ordered]) @ [2, 1],
+        "wholly": rng.permutation(len(ordered)),
+    }
+    order = np.argsort(keys[mixed], kind="stable")
+    messages = check(timeline(tmp_path / "log.mcap", [ordered[at] for at in order]))
+    assert log_times(messages) == [ns(time) for _, time, _ in ordered]
+    assert all(message.time == message.log_time and not message.is_back for message in messages)
+
+
+def test_equal_times_keep_the_order_of_the_file(tmp_path: Path) -> None:
+    messages = [pose(1.0, 0), command(1.0, 1), pose(1.0, 2), command(0.9, 3), pose(1.0, 4), pose(1.2, 5)]
+    contents = [message.content for message in check(timeline(tmp_path / "log.mcap", messages))]
+    values = [content["turn"] if "turn" in content else content["position"]["x"] for content in contents]
+    assert values == [3, 0, 1, 2, 4, 5]
+
+
+@pytest.mark.parametrize("step_s", [0.6, 2.0, 100.0])
+def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path, step_s: float) -> None:
+    before, after = drive(100, 105), drive(105, 110)
+    set_back = [(topic, time - step_s, content) for topic, time, content in after]
+    messages = check(timeline(tmp_path / "log.mcap", before + set_back))
+    assert log_times(messages) == [ns(time) for _, time, _ in before + set_back]
+    assert [at for at, message in enumerate(messages) if message.is_back] == [len(before)]
+    pause_ns = messages[len(before)].time - messages[len(before) - 1].time
+    assert pause_ns > ns(PAUSE_S)
+
+
+def test_a_clock_may_be_set_back_again_and_again(tmp_path: Path) -> None:
+    messages = check(timeline(tmp_path / "log.mcap", drive(10, 13) + drive(10, 13) + drive(5, 8)))
+    assert [at for at, message in enumerate(messages) if message.is_back] == [90, 180]
+
+
+def test_a_little_back_and_far_ahead_is_no_new_beginning(tmp_path: Path) -> None:
+    ahead = [(topic, time + 3600, content) for topic, time, content in drive(4, 8)]
+    back = [(topic, time - 0.4, content) for topic, time, content in drive(8, 12)]
+    messages = check(timeline(tmp_path / "log.mcap", drive(0, 4) + ahead))
+    assert not any(message.is_back for message in messages)
+    messages = check(timeline(tmp_path / "log.mcap", drive(4, 8) + back))
+    assert not any(message.is_back for message in messages)
+    assert log_times(messages) == sorted(log_times(messages))
+
+
+def test_no_more_is_held_than_may_be_out_of_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each message is asked for when those before it, but for the last few, were given."""
+    ordered = drive(0, 10)
+    swapped = [message for pair in zip(ordered[1::2], ordered[::2], strict=True) for message in pair]
+    read = timeline(tmp_path / "log.mcap", swapped)
+    asked = 0
+    messages = McapFile.messages
+
+    def counted(self: McapFile, *, checked: bool) -> Iterable[object]:
+        nonlocal asked
+        for message in messages(self, checked=checked):
+            asked += 1
+            yield message
+
+    monkeypatch.setattr(McapFile, "messages", counted)
+    for given, _ in enumerate(read.messages()):
+        assert asked - given <= 4
+
+
+def test_the_sum_of_the_whole_file_is_compared(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=False, enable_data_crcs=True)
+        writer.start()
+        for topic in ("/pose", "/command"):
+            channel = writer.register_channel(topic, "json", schema_id=0)
+            writer.add_message(channel, 0, b'{"turn": 0.125}', 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    path.write_bytes(path.read_bytes().replace(b"0.125", b"0.135", 1))
+    read = Timeline(McapFile(Source(path, None, path), ["/pose", "/command"]), GAP_S, PAUSE_S)
+    with pytest.raises(ValueError, match="crc validation failed in DataEnd"):
+        list(read.messages())

@@ -1,0 +1,198 @@
+import io
+import os
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.io.recording import (
+    MOST_UNPACKED,
+    SMALL_BYTES,
+    Source,
+    bounded,
+    find_sources,
+    identities,
+    is_archive,
+    named_apart,
+    row_count,
+)
+
+
+def archive(path: Path, *members: tarfile.TarInfo, content: bytes = b"{}") -> Path:
+    with tarfile.open(path, "w:gz") as opened:
+        for member in members:
+            if member.isreg():
+                member.size = len(content)
+            opened.addfile(member, io.BytesIO(content))
+    return path
+
+
+def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "") -> tarfile.TarInfo:
+    info = tarfile.TarInfo(name)
+    info.type, info.linkname = kind, link
+    return info
+
+
+HIDDEN = (".log_3.csv", "._log_1.csv", ".ipynb_checkpoints/log_1-checkpoint.csv", "__MACOSX/log_1.csv")
+
+
+def test_files_come_in_the_order_of_their_numbers_without_those_that_are_hidden(tmp_path: Path) -> None:
+    names = ("log_10.csv", "log_2.csv", "log_1.csv", "notes.txt", *HIDDEN)
+    for name in names:
+        (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "logs" / name).write_text("")
+    found = find_sources(tmp_path / "logs", [".csv"])
+    assert [str(source) for source in found] == ["log_1.csv", "log_2.csv", "log_10.csv"]
+    path = archive(tmp_path / "logs.tar.gz", *(member(f"logs/{name}") for name in names))
+    in_archive = find_sources(path, [".csv"])
+    assert [source.member.name for source in in_archive if source.member] == [
+        "logs/log_1.csv",
+        "logs/log_2.csv",
+        "logs/log_10.csv",
+    ]
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    for run in ("run_1", "run_2"):
+        (tmp_path / "logs" / run).mkdir(parents=True)
+        (tmp_path / "logs" / run / "log.csv").write_text(run)
+    found = [*find_sources(tmp_path / "logs", [".csv"]), *find_sources(tmp_path / "logs/run_1/log.csv", [])]
+    assert [str(source) for source in found] == ["run_1/log.csv", "run_2/log.csv", "log.csv"]
+    named = identities(find_sources(tmp_path / "logs", [".csv"]))
+    assert [one["name"] for one in named] == ["run_1/log.csv", "run_2/log.csv"]
+    assert identities(found[2:])[0] == {"name": "log.csv", "sha256": named[0]["sha256"]}
+
+
+def test_members_are_read_without_unpacking(tmp_path: Path) -> None:
+    path = archive(tmp_path / "logs.tgz", member("a/1.json"), member("a/2.json"), content=b'{"x": [1]}')
+    before = sorted(tmp_path.rglob("*"))
+    for source in find_sources(path, [".json"]):
+        with source.open() as stream:
+            assert stream.read() == b'{"x": [1]}'
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("hostile", "told"),
+    [
+        (member("/etc/log.json"), "/etc/log.json lies outside"),
+        (member("a/../../log.json"), "a/../../log.json lies outside"),
+        (member("log.json", tarfile.SYMTYPE, "/etc/passwd"), "log.json is a link"),
+        (member("log.json", tarfile.LNKTYPE, "../secret"), "log.json is a link"),
+        (member("log.json", tarfile.CHRTYPE), "log.json is a link, a device"),
+        (member("log.json", tarfile.GNUTYPE_SPARSE), "log.json is a link, a device or sparse"),
+        (member("log.json", tarfile.FIFOTYPE), "log.json is a link, a device"),
+    ],
+)
+def test_hostile_members_are_refused(tmp_path: Path, hostile: tarfile.TarInfo, told: str) -> None:
+    path = archive(tmp_path / "logs.tar.gz", member("fine.json"), hostile)
+    with pytest.raises(BadInputError, match=told):
+        find_sources(path, [".json"])
+
+
+def test_a_member_that_claims_to_be_huge_is_refused(tmp_path: Path) -> None:
+    info = member("log.json")
+    info.size = 2**40
+    (tmp_path / "logs.tar").write_bytes(info.tobuf(tarfile.GNU_FORMAT) + b"{}".ljust(512, b"\0"))
+    with pytest.raises(BadInputError, match="cannot be read as an archive"):
+        find_sources(tmp_path / "logs.tar", [".json"])
+
+
+def test_a_truncated_archive_is_refused(tmp_path: Path) -> None:
+    path = archive(tmp_path / "logs.tar.gz", member("log.json"), content=bytes(range(256)) * 400)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(BadInputError, match="cannot be read as an archive"):
+        find_sources(path, [".json"])
+
+
+def test_what_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="does not exist"):
+        find_sources(tmp_path / "none", [".csv"])
+    with pytest.raises(BadInputError, match=r"files that end with \.csv or \.tsv, found none"):
+        find_sources(tmp_path, [".csv", ".tsv"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BadInputError, match="empty: expected files, found none"):
+        find_sources(tmp_path / "empty", [""])
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log.csv")
+    for path in (tmp_path / "log.csv", Path("/dev/zero")):
+        with pytest.raises(BadInputError, match="is a device or a pipe, expected a file or a folder"):
+            find_sources(path, [".csv"])
+
+
+def test_small_recordings_may_unpack_to_what_is_small_and_others_to_a_multiple(tmp_path: Path) -> None:
+    for name, size in (("small.npz", 10), ("large.npz", SMALL_BYTES)):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(size)
+    sources = [Source(tmp_path / name, None, tmp_path) for name in ("small.npz", "large.npz")]
+    assert [source.most_bytes for source in bounded(sources[:1], None)] == [SMALL_BYTES]
+    assert [source.most_bytes for source in bounded(sources, None)] == [
+        MOST_UNPACKED * (10 + SMALL_BYTES)
+    ] * 2
+    assert [source.most_bytes for source in bounded(sources, 7)] == [7, 7]
+
+
+def test_capitals_and_linked_folders_hide_no_log(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "far").mkdir()
+    for name in ("logs/a.csv", "logs/b.CSV", "far/c.Csv"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "logs/day_2").symlink_to(tmp_path / "far", target_is_directory=True)
+    (tmp_path / "far/back").symlink_to(tmp_path / "logs", target_is_directory=True)  # no end of its own
+    (tmp_path / "logs/.hidden").symlink_to(tmp_path / "far", target_is_directory=True)
+    (tmp_path / "logs/again").symlink_to(tmp_path / "logs/deep", target_is_directory=True)
+    (tmp_path / "logs/up").symlink_to(tmp_path, target_is_directory=True)
+    (tmp_path / "logs/deep").mkdir()
+    (tmp_path / "logs/deep/d.csv").write_text("d")
+    found = find_sources(tmp_path / "logs", [".csv"])
+    assert [str(source) for source in found] == ["a.csv", "b.CSV", "day_2/c.Csv", "deep/d.csv"]
+    assert is_archive(Path("LOGS.TGZ"))
+
+
+def test_of_a_member_that_was_appended_again_the_last_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "logs.tar"
+    with tarfile.open(path, "w") as opened:
+        for content in (b"first", b"the last one"):
+            (tmp_path / "log.csv").write_bytes(content)
+            opened.add(tmp_path / "log.csv", "log.csv")
+    (source,) = find_sources(path, [".csv"])
+    with source.open() as stream:
+        assert stream.read() == b"the last one"
+
+
+def test_a_field_that_is_read_already_is_not_proposed() -> None:
+    shapes = {"q1_deg": (3,), "q2_rad": (3,), "load": (3,)}
+    with pytest.raises(BadInputError, match=r"^a: no field 'q1_dog': did you mean 'q1_deg'\?$"):
+        row_count("a", ["q1_dog", "load"], shapes)
+    with pytest.raises(BadInputError, match=r"^a: no field 'q2_deg': did you mean 'q2_rad'\?$"):
+        row_count("a", ["q1_deg", "q2_deg"], shapes)
+    with pytest.raises(BadInputError, match=r"^a: no field 'q3'; known: q1_deg, q2_rad, load$"):
+        row_count("a", [*shapes, "q3"], shapes)
+
+
+def test_files_of_one_name_in_several_recordings_are_told_apart_by_their_paths(tmp_path: Path) -> None:
+    for name in ("a/run/log.csv", "b/run/log.csv", "b/log.csv", "c/other.csv"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(name)
+    files = ["a/run/log.csv", "b/run/log.csv", "b/log.csv", "c/other.csv", "c/other.csv"]
+    sources = [source for name in files for source in find_sources(tmp_path / name, [])]
+    expected = ["a/run/log.csv", "b/run/log.csv", "b/log.csv", "other.csv", "other.csv"]
+    assert [str(source) for source in named_apart(sources)] == expected
+    assert [one["name"] for one in identities(sources)] == expected[:4]
+    folders = [*find_sources(tmp_path / "a", [".csv"]), *find_sources(tmp_path / "b", [".csv"])]
+    assert [str(source) for source in named_apart(folders)] == ["a/run/log.csv", "log.csv", "b/run/log.csv"]
+
+
+def test_members_of_archives_of_one_name_are_told_apart_by_the_folders_of_these(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        with tarfile.open(tmp_path / folder / "logs.tgz", "w:gz") as opened:
+            for name in ("1.json", f"{folder}.json"):
+                opened.addfile(tarfile.TarInfo(name))
+    sources = [s for folder in ("a", "b") for s in find_sources(tmp_path / folder / "logs.tgz", [".json"])]
+    names = ["a/logs.tgz/1.json", "logs.tgz/a.json", "b/logs.tgz/1.json", "logs.tgz/b.json"]
+    assert [str(source) for source in named_apart(sources)] == names
+    assert [one["name"] for one in identities(sources)] == ["a/logs.tgz", "b/logs.tgz"]

@@ -1,0 +1,400 @@
+"""Which message of each topic a row takes, where it is known which one is due."""
+
+import re
+
+import numpy as np
+import pytest
+
+from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, STATE, Array
+from astra_data.io.mapping import ImportMapping
+from astra_data.io.resampling import Resampler, uneven_steps, usual_periods
+
+MS = 10**6
+
+
+def sampled(
+    fps: int,
+    odom: Array,
+    commands: Array,
+    *,
+    latched: bool = False,
+    state_gap_s: float | None = None,
+    more: dict[str, dict[str, object]] | None = None,
+) -> tuple[Resampler, list[tuple[int, int]]]:
+    """Return, for each row, which message of each topic it holds; times are in ms.
+
+    `more` are further columns or, as `split`, keys of that table.
+    """
+    columns = dict(more or {})
+    split: dict[str, object] = {"gap_s": 0.4} | columns.pop("split", {})
+    command = {"fields": ("/cmd:k",), "latched": latched}
+    mapping = ImportMapping.model_validate(
+        {
+            "name": "log",
+            "task": "drive",
+            "fps": fps,
+            "columns": {STATE: {"fields": ("/odom:k",), "gap_s": state_gap_s}, ACTION: command, **columns},
+            "split": split,
+        }
+    )
+    times = {"/odom": odom, "/cmd": commands}
+    resampler = Resampler(mapping, "log", {topic: t * MS for topic, t in times.items()})
+    messages = sorted((t, topic, k) for topic, series in times.items() for k, t in enumerate(series))
+    rows = []
+    for t, topic, k in messages:
+        rows += [row for _, row in resampler.rows_before(round(t * MS))]
+        resampler.receive(topic, round(t * MS), {f"{topic}:k": np.array(k)})
+    rows += [row for _, row in resampler.last_rows(round(messages[-1][0] * MS))]
+    return resampler, [(int(row["/odom:k"]), int(row["/cmd:k"])) for row in rows]
+
+
+@pytest.mark.parametrize("late_ms", [1.0, 12.0, -12.0])
+@pytest.mark.parametrize(("phase_ms", "lead"), [(0.0, 0), (1.0, 0), (10.0, 0), (40.0, 1), (49.0, 1)])
+def test_jitter_neither_repeats_nor_skips_a_state(phase_ms: float, lead: int, late_ms: float) -> None:
+    """At 20 Hz, every third state is late; it meets the command that is in force for most of its step."""
+    odom = 1000 + 50.0 * np.arange(100)
+    odom[1::3] += late_ms
+    resampler, rows = sampled(20, odom, 1000 + phase_ms + 50.0 * np.arange(-3, 97))
+    # The command of the same number came 150 ms before, less its phase.
+    expected = [(k, k + 3 - lead) for k in range(97 + lead)]
+    assert rows[: len(expected)] == expected
+    assert resampler.unevenness() == ()
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("phase_ms", [20.0, 25.0, 30.0])
+def test_jitter_of_the_first_messages_moves_no_row(phase_ms: float, seed: int) -> None:
+    """Up to 8 ms of it, of states at 20 Hz with commands about half a step after them."""
+    odom = 1000 + 50.0 * np.arange(500) + np.random.default_rng(seed).uniform(-8, 8, 500)
+    resampler, rows = sampled(20, odom, 1000 + phase_ms + 50.0 * np.arange(-3, 497))
+    states = np.array(rows)[:, 0]
+    assert (np.diff(states) == 1).all() and len(states) > 497
+    assert resampler.repeated["/odom"] == resampler.skipped["/odom"] == 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_jitter_moves_no_row_toward_fast_commands_or_slow_states(seed: int) -> None:
+    """Commands at 100 Hz; states at 10 Hz, each in two rows."""
+    jitter = np.random.default_rng(seed).uniform(-8, 8, 500)
+    _, rows = sampled(20, 1000 + 50.0 * np.arange(500) + 2.4 * jitter, 900.0 + 10 * np.arange(2500))
+    assert (np.diff(np.array(rows)[:, 0]) == 1).all()
+    _, rows = sampled(20, 1000 + 100.0 * np.arange(500) + jitter, 1025 + 50.0 * np.arange(-3, 997))
+    _, held = np.unique(np.array(rows)[:, 0], return_counts=True)
+    assert (held[1:-1] == 2).all()
+
+
+def test_jitter_changes_no_row_of_a_state_that_comes_five_times_a_row() -> None:
+    odom = 20.0 * np.arange(100)
+    odom[5::10] += 1
+    _, rows = sampled(10, odom, 100.0 * np.arange(20))
+    assert rows == [(5 * k, k) for k in range(20)]
+
+
+@pytest.mark.parametrize("phase_ms", [18.0, 32.0])
+def test_jitter_moves_no_command_to_another_state(phase_ms: float) -> None:
+    commands = phase_ms + 50.0 * np.arange(100)
+    commands[1::3] += 12
+    commands[2::3] -= 12
+    resampler, rows = sampled(20, 50.0 * np.arange(100), commands)
+    assert {k - command for k, command in rows} == {0 if phase_ms < 25 else 1}
+    assert resampler.unevenness() == ()
+
+
+def test_jitter_changes_no_row_of_a_state_that_comes_every_other_row() -> None:
+    odom = 50.0 * np.arange(100)
+    odom[1::3] += 8
+    _, rows = sampled(40, odom, 25.0 * np.arange(200))
+    assert rows == [(row // 2, row) for row in range(200)]
+
+
+def test_a_command_out_of_step_moves_no_row_toward_the_states() -> None:
+    """Commands at 16 Hz, the first of them 20 ms after the first state."""
+    odom = 50.0 * np.arange(100)
+    odom[1::3] += 20
+    odom[2::3] -= 20
+    _, rows = sampled(20, odom, 20 + 62.5 * np.arange(79))
+    assert [k for k, _ in rows] == list(range(100))
+
+
+def test_a_state_that_falls_silent_is_held_for_as_long_as_it_may_be() -> None:
+    """The last state is at 500 ms; the row of 900 ms is 400 ms after it, as long as the longest gap."""
+    resampler, rows = sampled(20, 50.0 * np.arange(11), 50.0 * np.arange(60))
+    assert len(rows) == 19 and resampler.silences == {"/odom": 1}
+
+
+@pytest.mark.parametrize("early_ms", [0.0, 1200.0])
+def test_a_pause_before_all_topics_are_there_ends_nothing(early_ms: float) -> None:
+    """A command alone, long before the states and the commands of a drive."""
+    odom, commands = 2000 + 50.0 * np.arange(20), 2000 + 50.0 * np.arange(20)
+    resampler, rows = sampled(20, odom, np.insert(commands, 0, early_ms))
+    assert rows == [(k, k + 1) for k in range(20)]
+    assert not resampler.silences
+
+
+@pytest.mark.parametrize("late_ms", [2000.0, 7_200_000.0])
+def test_clocks_that_never_meet_are_refused_in_a_line(late_ms: float) -> None:
+    odom = 50.0 * np.arange(20)
+    told = (
+        rf"log: /cmd begins {late_ms / 1000 - 0.95:.4g} s after the last message of /odom, .* clocks differ"
+    )
+    with pytest.raises(BadInputError, match=told):
+        sampled(20, odom, late_ms + odom)
+    assert sampled(20, odom, 1350 + odom)[1]  # 0.4 s, as long as a state may be held
+
+
+def test_a_latched_topic_may_be_repeated() -> None:
+    resampler, _ = sampled(20, 50.0 * np.arange(100), 500.0 * np.arange(10), latched=True)
+    assert resampler.repeated["/cmd"] == 90 and resampler.unevenness() == ()
+
+
+def test_a_topic_out_of_step_is_held_as_it_is_at_the_time_of_the_row() -> None:
+    """A state at 25 Hz, of which each row takes the last one."""
+    odom, commands = 40.0 * np.arange(100), 100.0 * np.arange(40)
+    _, rows = sampled(10, odom, commands)
+    assert rows == [(int(100 * k // 40), k) for k in range(40)]
+
+
+def test_no_row_is_made_up_after_the_last_state() -> None:
+    """The last command came just before a state that was not recorded any more."""
+    _, rows = sampled(20, 50.0 * np.arange(20), 49 + 50.0 * np.arange(20))
+    assert rows == [(k, k - 1) for k in range(1, 20)]
+
+
+def test_no_row_is_made_up_after_the_last_message() -> None:
+    """The next state, at 5 Hz, was not recorded any more, and neither were commands."""
+    _, rows = sampled(20, 200.0 * np.arange(10), 50.0 * np.arange(37))
+    assert rows == [(row // 4, row) for row in range(37)]
+
+
+def test_a_period_is_the_mean_one_of_the_messages_that_go_on() -> None:
+    """Jitter, a pause, a message that is lost, and one that is written twice change nothing."""
+    times = 50.0 * np.arange(99)
+    times[1::3] += 20
+    times[2::3] -= 20
+    times = np.concatenate([times, times[-1] + 60_000 + 50.0 * np.arange(90), times[:5]])
+    moments = {"/odom": np.sort(np.delete(times, 120)), "/map": np.array([0, 300]), "/goal": np.array([3])}
+    periods = usual_periods({topic: each.astype(np.int64) for topic, each in moments.items()}, 400)
+    assert periods == {"/odom": pytest.approx(50, rel=0.01)}
+
+
+@pytest.mark.parametrize(("size", "period"), [(5, 20.0), (2, 40.0)])
+def test_a_period_of_messages_in_bursts_is_the_mean_one(size: int, period: float) -> None:
+    times = np.add.outer(size * period * np.arange(50), np.arange(size)).flatten()
+    periods = usual_periods({"/odom": times.astype(np.int64)}, 400)
+    assert periods == {"/odom": pytest.approx(period, rel=0.02)}
+
+
+def test_a_topic_that_rows_repeat_is_told_with_its_rate_and_counts() -> None:
+    resampler, rows = sampled(40, 50.0 * np.arange(101), 25.0 * np.arange(201))
+    assert len(rows) == 201
+    assert resampler.unevenness() == (
+        "log: /odom comes 20 times a second, fps is 40: 100 of 200 rows repeat its message before, "
+        "0 of 100 messages are in no row",
+    )
+
+
+def test_a_topic_of_which_messages_are_skipped_is_told_with_its_rate_and_counts() -> None:
+    resampler, _ = sampled(20, 50.0 * np.arange(100), 10.0 * np.arange(496))
+    assert resampler.unevenness() == (
+        "log: /cmd comes 100 times a second, fps is 20: 0 of 99 rows repeat its message before, "
+        "396 of 495 messages are in no row",
+    )
+
+
+def test_a_state_that_is_taken_less_often_than_it_comes_is_not_told_where_the_steps_are_even() -> None:
+    resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100))
+    assert resampler.skipped["/odom"] == 396 and resampler.unevenness() == ()
+
+
+@pytest.mark.parametrize(
+    ("more", "counts"),
+    [
+        ({"stamp": {"fields": ("/odom:stamp",), "dtype": "int64"}}, False),
+        ({"wheels": {"fields": ("/odom:velocity",)}}, False),
+        ({"next.observation.state": {"fields": ("/odom:next",)}}, False),
+        ({"action.gripper": {"fields": ("/odom:gripper",)}}, True),
+        ({"next.success": {"fields": ("/odom:arrived",)}}, True),
+        ({"next.reward": {"fields": ("/odom:reward",)}}, True),
+        ({"bumper": {"fields": ("/odom:bumper",), "dtype": "bool"}}, True),
+        ({"split": {"field": "/odom:trial"}}, True),
+        ({"split": {"ends": ("/odom:end",)}}, True),
+    ],
+)
+def test_messages_in_no_row_are_told_where_commands_flags_outcomes_or_ends_are_lost(
+    more: dict[str, dict[str, object]], counts: bool
+) -> None:
+    """A state at 100 Hz whose messages hold something else, too."""
+    resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100), more=more)
+    told = (
+        "log: /odom comes 100 times a second, fps is 20: 0 of 99 rows repeat its message before, "
+        "396 of 495 messages are in no row",
+    )
+    assert resampler.unevenness() == (told if counts else ())
+
+
+def test_joints_of_a_column_of_their_own_may_be_in_no_row_and_are_told_where_rows_repeat_them() -> None:
+    """Not observed, and no command."""
+    more: dict[str, dict[str, object]] = {
+        ACTION: {"fields": ("/odom:k",)},
+        "wheels": {"fields": ("/cmd:k",)},
+    }
+    resampler, _ = sampled(20, 50.0 * np.arange(100), 10.0 * np.arange(496), more=more)
+    assert resampler.skipped["/cmd"] == 396 and resampler.unevenness() == ()
+    [told] = sampled(20, 50.0 * np.arange(100), 100.0 * np.arange(50), more=more)[0].unevenness()
+    assert "/cmd comes 10 times a second" in told
+
+
+def test_uneven_steps_of_a_state_are_told_instead_of_the_messages_in_no_row() -> None:
+    resampler, rows = sampled(20, 100 / 3 * np.arange(300), 50.0 * np.arange(200))
+    steps = np.diff([k for k, _ in rows])
+    assert set(steps) == {1, 2} and abs(steps.mean() - 1.5) < 0.01
+    assert resampler.unevenness() == (
+        "log: /odom comes 30 times a second, of which 20 fps is no whole fraction: steps of 33 and 67 ms "
+        "alternate; take 10, 15 or 30",
+    )
+
+
+def with_dropouts() -> tuple[Array, Array]:
+    """Return the times of states at 50 Hz, with three holes of up to 0.36 s, and of commands at 10 Hz."""
+    odom = 20.0 * np.arange(1000)
+    holes = ((odom > at) & (odom < at + 340) for at in (4000, 9010, 15030))
+    return odom[~np.any(list(holes), axis=0)], 100.0 * np.arange(200)
+
+
+def test_dropouts_of_a_state_are_told_with_the_gap_that_ends_episodes_there() -> None:
+    odom, commands = with_dropouts()
+    resampler, rows = sampled(10, odom, commands)
+    states = [k for k, _ in rows]
+    repeats = int((np.diff(states) == 0).sum())
+    assert repeats >= 6
+    told = (
+        f"log: /odom is silent for up to 0.36 s in 3 places, where {repeats} rows repeat its message before: "
+    )
+    assert resampler.unevenness() == (
+        told + 'gap_s = 0.08 in [columns."observation.state"] ends episodes there',
+    )
+    cut, rows = sampled(10, odom, commands, state_gap_s=0.08)
+    assert cut.silences == {"/odom": 3} and cut.unevenness() == ()
+    assert len({k for k, _ in rows}) == len(rows) > 180
+
+
+def test_silences_that_the_gap_of_the_column_accepts_are_not_told() -> None:
+    """Of 0.36 s, where the column holds values for 0.38; what is longer ends episodes and is told as that."""
+    odom, commands = with_dropouts()
+    accepted, rows = sampled(10, odom, commands, state_gap_s=0.38)
+    assert len({k for k, _ in rows}) < len(rows)
+    assert accepted.unevenness() == accepted.endings() == ()
+    stamp: dict[str, dict[str, object]] = {"stamp": {"fields": ("/odom:stamp",)}}
+    assert sampled(10, odom, commands, state_gap_s=0.38, more=stamp)[0].unevenness() == ()
+    [told] = sampled(10, odom, commands, state_gap_s=0.08)[0].endings()
+    assert told.startswith(
+        'log: /odom is silent for over 0.08 s (gap_s in [columns."observation.state"]) 3 times'
+    )
+    assert "latched" not in told
+
+
+@pytest.mark.parametrize("gap_s", [None, 0.3, 0.6])
+def test_the_shortest_gap_of_the_columns_of_a_topic_is_the_one_that_is_named(gap_s: float | None) -> None:
+    odom = np.concatenate([50.0 * np.arange(20), 2000 + 50.0 * np.arange(20)])
+    more: dict[str, dict[str, object]] = {"pose": {"fields": ("/odom:pose",), "gap_s": gap_s}}
+    [told] = sampled(20, odom, 50.0 * np.arange(60), more=more)[0].endings()
+    key = '0.3 s (gap_s in [columns."pose"])' if gap_s == 0.3 else "0.4 s (split.gap_s)"
+    assert told.startswith(f"log: /odom is silent for over {key} once")
+
+
+@pytest.mark.parametrize("period_ms", [20.0, 50.0, 100.0])
+def test_a_message_that_is_lost_is_no_dropout(period_ms: float) -> None:
+    odom = np.delete(period_ms * np.arange(round(20_000 / period_ms)), [100, 150])
+    resampler, _ = sampled(10, odom, 100.0 * np.arange(200))
+    assert resampler.unevenness() == ()
+
+
+def test_rows_that_repeat_a_state_before_the_next_one_is_due_are_of_no_dropout() -> None:
+    """Each of the states is in two rows, one in eight: six of these are a dropout's."""
+    odom = np.delete(50.0 * np.arange(100), [41, 42, 43])
+    resampler, rows = sampled(40, odom, 25.0 * np.arange(200))
+    assert [k for k, _ in rows].count(40) == 8
+    assert "/odom is silent for up to 0.2 s once, where 6 rows repeat" in resampler.unevenness()[1]
+
+
+def test_a_state_that_stops_before_the_log_ends_is_told() -> None:
+    """The states end at 1 s, and the command goes on."""
+    resampler, rows = sampled(20, 50.0 * np.arange(21), 50.0 * np.arange(60))
+    [*_, told] = resampler.unevenness()
+    held = [k for k, _ in rows].count(20) - 1
+    assert f"/odom is silent for up to 0.4 s once, where {held} rows repeat" in told
+
+
+@pytest.mark.parametrize("gap_s", [0.13, 0.31])
+def test_the_gap_of_a_column_is_that_of_its_topics_alone(gap_s: float) -> None:
+    """Each row after a state that is the last holds it for so long, while commands may be held for longer."""
+    odom = 50.0 * np.arange(41)
+    _, rows = sampled(20, odom, 300.0 * np.arange(20), state_gap_s=gap_s)
+    held = [k for k, _ in rows].count(40) - 1
+    assert held == gap_s * 1000 // 50
+    assert [k for k, _ in rows][: len(odom)] == list(range(41))
+
+
+def test_a_clock_that_is_a_little_off_is_not_told() -> None:
+    """20.2 Hz: one message in a hundred is in no row."""
+    resampler, _ = sampled(20, 49.5 * np.arange(400), 50.0 * np.arange(396))
+    assert 3 <= resampler.skipped["/odom"] <= 5 and resampler.unevenness() == ()
+
+
+def test_a_step_as_long_as_the_gap_is_one_of_the_period() -> None:
+    times = {"/odom": np.array([0, 100, 200, 301], np.int64)}
+    assert usual_periods(times, 100) == {"/odom": 100.0}
+
+
+def odd_share(rate: float, fps: int) -> float:
+    """Return the share of the steps between rows that have not as many messages as most, counted out."""
+    messages = np.floor(rate / fps * np.arange(10_000) + 1e-6)
+    counts = np.unique(np.diff(messages), return_counts=True)[1]
+    return float(1 - counts.max() / counts.sum())
+
+
+@pytest.mark.parametrize(
+    ("rate", "fps", "steps", "proposed"),
+    [
+        (30, 20, "33 and 67", "10, 15 or 30"),
+        (29.98, 20, "33 and 67", "10, 15 or 30"),
+        (50, 20, "40 and 60", "10, 25 or 50"),
+        (250, 100, "8 and 12", "50, 125 or 250"),
+        (31, 20, "32 and 65", "31"),
+    ],
+)
+def test_rates_that_divide_are_proposed(rate: float, fps: int, steps: str, proposed: str) -> None:
+    assert uneven_steps("/odom", rate, fps) == (
+        f"/odom comes {round(rate)} times a second, of which {fps} fps is no whole fraction: "
+        f"steps of {steps} ms alternate; take {proposed}"
+    )
+    assert odd_share(round(rate), fps) > 0.05
+    for each in re.findall("[0-9]+", proposed):
+        assert odd_share(round(rate), int(each)) == 0
+
+
+@pytest.mark.parametrize(("rate", "fps"), [(28.7, 20), (28.7, 10), (103, 20), (12.5, 10)])
+def test_where_no_rate_divides_the_spread_is_told_and_the_rate_that_divides_best(
+    rate: float, fps: int
+) -> None:
+    told = uneven_steps("/odom", rate, fps)
+    match = re.search(
+        r"at (\d+), (\d+)% .* of (\d+) ms, the others of (\d+); at (\d+) only (\d+)% are odd", told
+    )
+    assert match is not None, told
+    at, percent, long, short, best, odd = map(int, match.groups())
+    share = rate / fps % 1
+    assert at == fps and percent == round(100 * share)
+    assert long - short == pytest.approx(1000 / rate, abs=1.1)
+    assert odd_share(rate, best) == pytest.approx(odd / 100, abs=0.006)
+    assert odd_share(rate, best) < 0.05 < odd_share(rate, fps)
+    assert "no fps nearby is a whole fraction" in told
+
+
+@pytest.mark.parametrize(
+    ("rate", "fps"), [(50, 10), (49.9, 10), (20, 20), (20.2, 20), (30, 40), (20, 40), (0.4, 1), (400, 30)]
+)
+def test_even_steps_are_not_told(rate: float, fps: int) -> None:
+    """Nor rows that repeat messages, nor steps of which one is 13 messages long and the next 14."""
+    assert uneven_steps("/odom", rate, fps) == ""

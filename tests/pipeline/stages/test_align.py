@@ -1,0 +1,176 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_run import ALIGN
+from stopping import Stopped
+from toy_episodes import no_episodes
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, silent
+from astra_data.dataset import Dataset
+from astra_data.dataset.columns import STATE
+from astra_data.grounding.files import load_history_model, load_target_encoder, save_grounding
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.alignment import TargetEncoder, gaussian_mmd
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.pipeline.stages.align import align
+
+
+def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
+    assert {file.name for file in aligned.iterdir()} == {
+        "config.json",
+        "manifest.json",
+        "metrics.json",
+        "target_encoder.safetensors",
+    }
+    metrics = json.loads((aligned / "metrics.json").read_text())
+    assert {"git_commit", "packages", "machine"} <= metrics.keys()
+    first, last = metrics["points"]
+    assert (first["step"], last["step"]) == (100, 200)
+    assert 0 < last["held_out_error"] < first["held_out_error"]
+    for point in (first, last):
+        assert point["held_out_error"] == pytest.approx(point["mmd"] + point["latent_rmse"] ** 2)
+    assert last["mmd"] == metrics["mmd"]
+    encoder = load_target_encoder(aligned / "target_encoder.safetensors")
+    assert encoder.encoder.latent_size == 16
+    assert float(encoder.latent_r2) == pytest.approx(metrics["latent_r2"])
+    assert metrics["deployed"] == ("target" if metrics["latent_r2"] >= 0.9 else "source")
+
+
+def test_the_agreement_is_that_of_held_out_episodes_alone(
+    paired: Path, grounded: Path, aligned: Path
+) -> None:
+    model = load_history_model(grounded / "grounding.safetensors")
+    encoder = load_target_encoder(aligned / "target_encoder.safetensors")
+    _, held_out = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)
+    windows, squares, discrepancies, latents = held_out.windows, [], [], []
+    bandwidths = 4.0 * torch.tensor((0.25, 0.5, 1.0, 2.0))  # of 16 latents
+    for row, length in enumerate(held_out.lengths.tolist()):
+        steps = slice(row, row + 1), slice(0, length)
+        history = [windows.goal[steps], windows.previous_action[steps]]
+        source, _ = model.encoder(model.encoder_input(windows.state[steps], *history))
+        target, _ = encoder.encoder(encoder.encoder_input(held_out.target_state[steps], *history))
+        latents.append(source[0])
+        squares.append((target - source).square().flatten())
+        (mean, log_variance), (other, other_log_variance) = (
+            model.predict_latent(latent, windows.action[steps]) for latent in (source, target)
+        )
+        apart = gaussian_mmd(mean, log_variance.exp(), other, other_log_variance.exp(), bandwidths)
+        discrepancies.append(apart.flatten())
+    metrics = json.loads((aligned / "metrics.json").read_text())
+    assert metrics["latent_rmse"] == pytest.approx(float(torch.cat(squares).mean().sqrt()), rel=1e-4)
+    unexplained = torch.cat(squares).mean() / torch.cat(latents).var(0, correction=0).mean()
+    assert metrics["latent_r2"] == pytest.approx(1 - float(unexplained), abs=1e-3)
+    assert metrics["mmd"] == pytest.approx(float(torch.cat(discrepancies).mean()), rel=1e-3)
+
+
+def test_states_are_scaled_by_training_episodes_alone(paired: Path, aligned: Path) -> None:
+    _, held_out = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)
+    states = [episode.columns[STATE] for episode in Dataset.open(paired).episodes([STATE])]
+    known = [held_out.target_state[row, :length].numpy() for row, length in enumerate(held_out.lengths)]
+    training = [values for values in states if not any(np.array_equal(values, other) for other in known)]
+    assert len(training) == len(states) - len(held_out)
+    encoder = load_target_encoder(aligned / "target_encoder.safetensors")
+    values = np.concatenate(training).astype(np.float64)
+    np.testing.assert_allclose(encoder.state_mean.numpy(), values.mean(0), atol=1e-4)
+    np.testing.assert_allclose(
+        encoder.state_std.numpy(), values.std(0, ddof=1).clip(1e-3), rtol=1e-3, atol=1e-5
+    )
+
+
+def test_the_paired_weight_adds_the_distance_of_paired_latents(
+    paired: Path, grounded: Path, tmp_path: Path
+) -> None:
+    """It is far larger than the discrepancy here, so that a few updates with it come closer."""
+    distances = []
+    for weight in (0.0, 100.0):
+        out = tmp_path / str(weight)
+        config = ALIGN.model_copy(update={"updates": 10, "paired_weight": weight})
+        align(config, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=silent)
+        distances.append(json.loads((out / "metrics.json").read_text())["latent_rmse"])
+    assert distances[1] < distances[0]
+
+
+def test_the_same_seed_gives_the_same_bytes(
+    paired: Path, grounded: Path, aligned: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "again"
+    inputs = {"dataset": paired, "grounding": grounded}
+    align(ALIGN, **inputs, seed=0, out=out, device="cpu", progress=silent)
+    name = "target_encoder.safetensors"
+    assert (out / name).read_bytes() == (aligned / name).read_bytes()
+
+
+@pytest.mark.parametrize(("latent_r2", "deployed"), [(0.899, False), (0.9, True)])
+def test_a_coarse_encoder_is_not_deployed(latent_r2: float, deployed: bool) -> None:
+    encoder = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
+    assert not encoder.is_deployed  # before it was measured
+    encoder.latent_r2.fill_(latent_r2)
+    assert encoder.is_deployed == deployed
+
+
+def test_where_phi_drops_the_place_the_encoder_does_not_see_it(
+    paired: Path, grounded: Path, aligned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = PairedEpisodes.load(paired)
+    placeless = replace(whole, dropped_place=(0, 1))
+    monkeypatch.setattr(PairedEpisodes, "load", lambda *_: placeless)
+    config, out = ALIGN.model_copy(update={"updates": 1}), tmp_path / "align"
+    align(config, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=silent)
+    scale = load_target_encoder(out / "target_encoder.safetensors").state_std
+    assert scale[:2].isinf().all()
+    torch.testing.assert_close(
+        scale[2:], load_target_encoder(aligned / "target_encoder.safetensors").state_std[2:]
+    )
+
+
+def stop(fraction: float, note: str) -> None:
+    raise Stopped
+
+
+def test_after_an_interruption_it_goes_on(
+    paired: Path, grounded: Path, aligned: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "interrupted"
+
+    def begin(progress: Progress) -> None:
+        align(ALIGN, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=progress)
+
+    with pytest.raises(Stopped):
+        begin(stop)
+    assert not out.exists()
+    seen: list[float] = []
+    begin(lambda done, note: seen.append(done))
+    assert seen == [1.0]
+    name = "target_encoder.safetensors"
+    assert (out / name).read_bytes() == (aligned / name).read_bytes()
+    told, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (out, aligned))
+    assert told["points"] == expected["points"]
+
+
+def test_what_was_begun_with_another_grounding_is_refused(
+    paired: Path, grounded: Path, grounded_anew: Path, tmp_path: Path
+) -> None:
+    def begin(grounding: Path, progress: Progress) -> None:
+        out = tmp_path / "out"
+        align(ALIGN, dataset=paired, grounding=grounding, seed=0, out=out, device="cpu", progress=progress)
+
+    with pytest.raises(Stopped):
+        begin(grounded, stop)
+    with pytest.raises(BadInputError, match=r"partial was started with other settings .*: remove it"):
+        begin(grounded_anew, silent)
+
+
+def test_the_encoder_is_as_large_as_the_source_and_sees_as_many_waves(paired: Path, tmp_path: Path) -> None:
+    shape = GroundingShape(4, 2, 2, latent_size=8, embedding_size=24, position_octaves=1)
+    made = HistoryGrounding(GroundingModel(shape))
+    save_grounding(tmp_path / "grounding.safetensors", made, no_episodes())
+    config = ALIGN.model_copy(update={"updates": 1})
+    align(config, dataset=paired, grounding=tmp_path, out=tmp_path / "out", progress=silent)
+    sizes = load_target_encoder(tmp_path / "out/target_encoder.safetensors").sizes
+    assert (sizes["latent_size"], sizes["embedding_size"], sizes["position_octaves"]) == (8, 24, 1)

@@ -1,0 +1,418 @@
+import hashlib
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_run import COLLECT, TASK
+from stopping import Stopped
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset, StagedWriter
+from astra_data.dataset.columns import (
+    ACTION,
+    DONE,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Episode,
+)
+from astra_data.dataset.doctor.check import check
+from astra_data.pipeline.stages import collect as stage
+from astra_data.pipeline.stages.collect import CollectConfig, collect
+from astra_data.policies import suboptimal
+from astra_data.policies.behaviors import WallWatch
+from astra_data.policies.recording import record
+from astra_data.robots.registry import TASKS
+
+TINY = CollectConfig(episodes=3, max_steps=15)
+
+
+def test_episodes_are_whole_and_their_steps_follow_each_other(collected: Path) -> None:
+    dataset = Dataset.open(collected)
+    assert dataset.reference == f"{TASK}-random-seed0@data-1.0.0"
+    assert len(dataset) == COLLECT.episodes
+    for index, episode in enumerate(dataset.episodes()):
+        columns = episode.columns
+        np.testing.assert_array_equal(columns[NEXT_STATE][:-1], columns[STATE][1:])
+        assert np.abs(columns[ACTION]).max() <= 1.0
+        ended = columns[TERMINATED] | columns[TRUNCATED]
+        assert ended[-1]
+        assert not ended[:-1].any()
+        np.testing.assert_array_equal(columns[DONE], ended)
+        assert columns[TERMINATED][-1] == (len(episode) < COLLECT.max_steps)
+        assert dataset.metadata["success"][index] == columns[SUCCESS].any()
+        assert dataset.metadata["return"][index] == pytest.approx(columns[REWARD].sum(), abs=1e-4)
+
+
+def test_commands_are_held_for_a_while(collected: Path) -> None:
+    for episode in Dataset.open(collected).episodes([ACTION]):
+        changes = np.flatnonzero((np.diff(episode.columns[ACTION], axis=0) != 0).any(axis=1)) + 1
+        held = np.diff(changes, prepend=0)
+        fewest, most = (round(seconds * 20) for seconds in COLLECT.hold_s)
+        assert (held >= fewest).all()
+        assert (held <= most).all()
+
+
+def test_stress_is_recorded_with_its_reversals(task: str, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"behavior": "stress", "hold_s": (0.05, 0.05)})
+    collect(task, config, seed=0, out=tmp_path / "stress", progress=silent)
+    dataset = Dataset.open(tmp_path / "stress")
+    assert dataset.description["config"]["behavior"] == "stress"
+    commands = [episode.columns[ACTION] for episode in dataset.episodes([ACTION])]
+    assert all(np.abs(each).max(axis=1) == pytest.approx(1.0) for each in commands)
+    assert any((each[1:] == -each[:-1]).all(axis=1).any() for each in commands)
+
+
+def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path: Path) -> None:
+    hashes, contents = [], []
+    for number, (seed, threads) in enumerate([(1, 1), (1, 2), (2, 2)]):
+        out = tmp_path / str(number)
+        collect(task, TINY, seed=seed, out=out, progress=silent, num_threads=threads)
+        hashes.append(Dataset.open(out).content_hash)
+        files = [path for path in sorted(out.rglob("*")) if path.is_file() and path.name != "dataset.json"]
+        contents.append([path.read_bytes() for path in files])
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert contents[0] == contents[1] != contents[2]
+
+
+def test_what_it_took_and_earned_is_recorded(collected: Path) -> None:
+    dataset = Dataset.open(collected)
+    said = dataset.description
+    assert 0 < dataset.lengths.sum() / said["target_steps_per_second"] <= said["wall_seconds"]
+    assert said["machine"].keys() == {"cpu", "cores", "memory_gib", "gpu"}
+    told = dataset.description["behavior"]
+    for name, key in (("return", "return_mean"), ("success", "success_rate")):
+        values = np.array(dataset.metadata[name], dtype=np.float64)
+        assert told[key] == pytest.approx(values.mean())
+
+
+@pytest.mark.usefixtures("batches_of_two")
+def test_batches_follow_each_other(task: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    config = TINY.model_copy(update={"episodes": 5})
+    collect(task, config, seed=0, out=out, progress=silent)
+    collect(task, TINY.model_copy(update={"episodes": 2}), seed=0, out=tmp_path / "two", progress=silent)
+    batched, two = Dataset.open(out), Dataset.open(tmp_path / "two")
+    assert batched.uids.tolist() == [0, 1, 2, 3, 4]
+    first, second, *others = batched.episodes()
+    for one, other in zip((first, second), two.episodes(), strict=True):
+        np.testing.assert_array_equal(one.columns[STATE], other.columns[STATE])
+    for name in (STATE, ACTION):  # starts and commands of each batch are its own
+        begun = {tuple(episode.columns[name][0].tolist()) for episode in (first, second, *others)}
+        assert len(begun) == 5
+
+
+@pytest.mark.usefixtures("batches_of_two")
+def test_an_interrupted_recording_goes_on_to_the_same_bytes(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TINY.model_copy(update={"episodes": 5})
+    collect(task, config, seed=0, out=tmp_path / "whole", progress=silent)
+    add = StagedWriter.add
+    told: list[int | None] = []
+
+    def failing(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
+        if len(told) == 3:
+            raise KeyboardInterrupt
+        add(writer, episode, position)
+        told.append(position)
+
+    out = tmp_path / "out"
+    monkeypatch.setattr(StagedWriter, "add", failing)
+    with pytest.raises(KeyboardInterrupt):
+        collect(task, config, seed=0, out=out, progress=silent)
+    monkeypatch.setattr(StagedWriter, "add", add)
+    with pytest.raises(BadInputError, match="left 3 episodes; resume it"):
+        collect(task, config, seed=0, out=out, progress=silent, resume=False)
+    assert not out.exists()
+    collect(task, config, seed=0, out=out, progress=silent)
+    assert Dataset.open(out).content_hash == Dataset.open(tmp_path / "whole").content_hash
+
+
+@pytest.mark.parametrize(
+    ("start", "has_maze", "anywhere"),
+    [("task", True, False), (None, True, True), (None, False, False), ("anywhere", True, True)],
+)
+def test_episodes_begin_where_the_task_does_or_by_default_anywhere_in_a_maze(
+    start: str | None,
+    has_maze: bool,
+    anywhere: bool,
+    task: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if not has_maze:
+        monkeypatch.setitem(TASKS, task, replace(TASKS[task], plane=None))
+    config = TINY.model_copy(update={"start": start, "max_steps": 1})
+    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    position = Dataset.open(tmp_path / "out").columns([STATE])[STATE][:, :2]
+    near = np.abs(position - [-4.0, 4.0]).max() < 0.7
+    assert near == (not anywhere)
+
+
+@pytest.fixture
+def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    sac = suboptimal._SAC.model_copy(update={"rollout_steps": 8, "updates_per_step": 1, "batch_size": 8})
+    small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TEST_EPISODES": 2}
+    for name, value in small.items():
+        monkeypatch.setattr(suboptimal, name, value)
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage, "_SAC_STEPS", 3 * 8 * 4)
+    monkeypatch.setattr(stage, "_SAC_EPISODE_STEPS", 71)
+
+
+@pytest.fixture
+def batches_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage, "_NUM_ENVS", 2)
+
+
+@pytest.mark.usefixtures("small_training")
+def test_a_part_of_a_policys_episodes_may_have_random_commands(task: str, tmp_path: Path) -> None:
+    datasets = {}
+    kinds = (("policy", "suboptimal_ppo", 0.0), ("random", "random", 0.0), ("mixed", "suboptimal_ppo", 0.5))
+    for name, behavior, share in kinds:
+        config = TINY.model_copy(
+            update={
+                "behavior": behavior,
+                "random_share": share,
+                "ppo_steps": 1,
+                "max_steps": 3,
+                "episodes": 4,
+            }
+        )
+        collect(task, config, seed=0, out=tmp_path / name, progress=silent)
+        datasets[name] = Dataset.open(tmp_path / name)
+    assert datasets["mixed"].reference == f"{TASK}-suboptimal-ppo-and-random-seed0@data-1.0.0"
+    first = {
+        name: [episode.columns[ACTION][0] for episode in dataset.episodes([ACTION])]
+        for name, dataset in datasets.items()
+    }
+    for index, command in enumerate(first["mixed"]):
+        same, other = ("random", "policy") if index % 2 else ("policy", "random")
+        np.testing.assert_array_equal(command, first[same][index])
+        assert (command != first[other][index]).all()
+
+
+@pytest.mark.usefixtures("batches_of_two")
+def test_only_as_many_episodes_are_kept_as_have_the_steps(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = TINY.model_copy(update={"episodes": 6})
+    collect(task, every, seed=0, out=tmp_path / "all", progress=silent)
+    whole = Dataset.open(tmp_path / "all")
+    lengths = [len(episode) for episode in whole.episodes([ACTION])]
+    steps = sum(lengths[:2]) + 1  # the third episode is needed, the fourth of its batch is not
+    some = CollectConfig(**every.model_dump() | {"least_steps": steps})
+    batches: list[range] = []
+
+    def counted(*args: Any, **keywords: Any) -> int:  # noqa: ANN401 - handed on as they are
+        batches.append(args[3])
+        return record(*args, **keywords)
+
+    monkeypatch.setattr("astra_data.pipeline.stages.collect.record", counted)
+    collect(task, some, seed=0, out=tmp_path / "some", progress=silent)
+    kept = Dataset.open(tmp_path / "some")
+    assert batches == [range(2), range(2, 4)]
+    assert [len(episode) for episode in kept.episodes([ACTION])] == lengths[:3]
+    for one, other in zip(whole.episodes([ACTION]), kept.episodes([ACTION]), strict=False):
+        np.testing.assert_array_equal(one.columns[ACTION], other.columns[ACTION])
+    assert kept.description["config"]["least_steps"] == steps
+    assert "least_steps" not in whole.description["config"]
+    exactly = some.model_copy(update={"least_steps": sum(lengths[:2])})
+    batches.clear()
+    collect(task, exactly, seed=0, out=tmp_path / "exactly", progress=silent)
+    assert len(Dataset.open(tmp_path / "exactly")) == 2 and batches == [range(2)]
+
+
+@pytest.mark.usefixtures("batches_of_two")
+def test_an_episode_that_an_interruption_cut_off_counts_before_later_ones(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TINY.model_copy(update={"episodes": 4, "least_steps": 15})
+    add = StagedWriter.add
+
+    def failing(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
+        if position == 1:
+            add(writer, episode, position)
+            raise KeyboardInterrupt  # while episode 0 still goes on
+
+    monkeypatch.setattr(StagedWriter, "add", failing)
+    with pytest.raises(KeyboardInterrupt):
+        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    monkeypatch.setattr(StagedWriter, "add", add)
+    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    assert Dataset.open(tmp_path / "out").uids.tolist() == [0]
+
+
+def test_too_few_episodes_for_the_steps_are_told(task: str, tmp_path: Path) -> None:
+    config = TINY.model_copy(update={"episodes": 2, "max_steps": 5, "least_steps": 11})
+    with pytest.raises(
+        BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: raise episodes"
+    ):
+        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("small_training")
+@pytest.mark.parametrize("learner", ["ppo", "sac"])
+def test_after_interruptions_the_policy_is_not_trained_again(
+    learner: str, task: str, lasting: str, tmp_path: Path
+) -> None:
+    """The first comes in the training, after two of its three iterations, the second while it is recorded."""
+    name, settings = {
+        "ppo": (task, {"behavior": "suboptimal_ppo", "ppo_steps": 3 * 64 * 4}),
+        "sac": (lasting, {"behavior": "suboptimal_sac"}),
+    }[learner]
+    config = CollectConfig(**settings, episodes=3, max_steps=3)  # type: ignore[arg-type]
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    collect(name, config, seed=0, out=whole, progress=silent)
+
+    def notes_until(kind: str, count: int) -> int:
+        """Return how many notes on the training there are before the `count`-th note of a `kind` stops it."""
+        notes: list[str] = []
+
+        def stop(share: float, note: str) -> None:
+            notes.append(note)
+            if sum(kind in told for told in notes) == count:
+                raise Stopped
+
+        with pytest.raises(Stopped):
+            collect(name, config, seed=0, out=out, progress=stop)
+        assert not out.exists()
+        return sum("training" in note for note in notes)
+
+    assert notes_until("training", 3) == 3
+    with pytest.raises(BadInputError, match="left an unfinished recording; resume it"):
+        collect(name, config, seed=0, out=out, progress=silent, resume=False)
+    assert notes_until("target steps/s", 1) == 1
+    assert notes_until("target steps/s", 1) == 0
+    collect(name, config, seed=0, out=out, progress=silent)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+    policy = "meta/astra/policy.safetensors"
+    assert (out / policy).read_bytes() == (whole / policy).read_bytes()
+    one, other = Dataset.open(out), Dataset.open(whole)
+    assert one.content_hash == other.content_hash
+    for key in ("trained_steps", "learner"):
+        assert one.description["behavior"][key] == other.description["behavior"][key]
+    assert one.description["wall_seconds"] > one.description["behavior"]["spent"]["wall_seconds"] > 0
+
+
+@pytest.mark.usefixtures("small_training")
+def test_the_policy_that_acted_acts_again(lasting: str, tmp_path: Path) -> None:
+    short = {"start": "task", "episodes": 3, "max_steps": 3}
+    config = CollectConfig(behavior="suboptimal_sac", **short)  # type: ignore[arg-type]
+    first = Dataset.open(collect(lasting, config, seed=0, out=tmp_path / "first", progress=silent))
+    again = CollectConfig(behavior="policy", policy=str(first.root / "meta/astra"), **short)  # type: ignore[arg-type]
+    second = Dataset.open(collect(lasting, again, seed=0, out=tmp_path / "second", progress=silent))
+    assert second.content_hash == first.content_hash
+    report = check(first.root)
+    assert not report.notes and not report.faults
+    (first.root / "meta/astra/policy.safetensors").write_bytes(b"another")
+    assert re.search(r"policy\.safetensors is [0-9a-f]{64}, expected the sha256", check(first.root).faults[0])
+    (first.root / "meta/astra/policy.safetensors").unlink()
+    assert "policy.safetensors is not there, expected the sha256" in check(first.root).faults[0]
+    assert not (second.root / "meta/astra/policy.safetensors").exists()
+
+
+@pytest.fixture
+def lasting() -> Iterator[str]:
+    usual = TASKS["humanoid-kinematics"]
+    name = "humanoid-short"
+    TASKS[name] = replace(usual, name=name, objective=replace(usual.objective, horizon=70))
+    yield name
+    del TASKS[name]
+
+
+@pytest.mark.usefixtures("small_training")
+@pytest.mark.parametrize(("episode_steps", "iterations"), [(20, 1), (71, 3)])
+def test_by_sac_it_stops_when_episodes_last_long_enough_or_at_the_end(
+    lasting: str, tmp_path: Path, episode_steps: int, iterations: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Episodes of this task last 70 steps at most; an iteration has 8 of each of 4 targets, too few for a
+    training episode to end: what stops it are trials."""
+    monkeypatch.setattr(stage, "_SAC_EPISODE_STEPS", episode_steps)
+    config = CollectConfig(behavior="suboptimal_sac", episodes=3, max_steps=3)
+    collect(lasting, config, seed=0, out=tmp_path / "out", progress=silent)
+    dataset = Dataset.open(tmp_path / "out")
+    assert dataset.reference == f"{lasting}-suboptimal-sac-seed0@data-1.0.0"
+    assert dataset.description["behavior"]["trained_steps"] == iterations * 8 * 4
+
+
+def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:
+    latent = {"policy": str(trained), "grounding": str(grounded), "target_encoder": str(aligned)}
+    config = TINY.model_copy(update={"behavior": "policy", "max_steps": 4, **latent})
+    collect(task, config, seed=0, out=tmp_path / "out", progress=silent, name="walks")
+    dataset = Dataset.open(tmp_path / "out")
+    assert dataset.reference == "walks@data-1.0.0"
+    told = dataset.description["config"]
+    for kind, folder in (("policy", trained), ("grounding", grounded), ("target_encoder", aligned)):
+        digest = hashlib.sha256((folder / f"{kind}.safetensors").read_bytes()).hexdigest()
+        assert told[f"{kind}_sha256"] == digest
+    told = dataset.description["behavior"]
+    assert told["policy_dataset"] == f"{TASK}-random-seed0@data-2.0.0"
+    actions = dataset.columns([ACTION])[ACTION]
+    by_source = TINY.model_copy(update=config.model_dump() | {"target_encoder": None})
+    collect(task, by_source, seed=0, out=tmp_path / "source", progress=silent)
+    assert (Dataset.open(tmp_path / "source").columns([ACTION])[ACTION][0] != actions[0]).any()
+    # Drawn, not the mean: alike starts would give alike commands.
+    assert np.abs(np.diff(actions, axis=0)).min() > 0
+    assert np.abs(actions).max() <= 1.0
+
+
+def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r'behavior "policy": expected the folder'):
+        CollectConfig(behavior="policy")
+    with pytest.raises(ValueError, match=r'policy: expected behavior "policy", got "random"'):
+        CollectConfig(policy=str(trained))
+    with pytest.raises(ValueError, match=r'random_share: expected the behavior of a policy, got "stress"'):
+        CollectConfig(behavior="stress", random_share=0.5)
+    without_latent = TINY.model_copy(update={"behavior": "policy", "policy": str(trained)})
+    with pytest.raises(BadInputError, match=r"takes 24 values, .* gives 8: expected a policy of"):
+        collect(task, without_latent, seed=0, out=tmp_path / "out", progress=silent)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_steps_that_take_terabytes_are_refused() -> None:
+    assert CollectConfig(episodes=10**8, max_steps=100).episodes == 10**8
+    with pytest.raises(ValueError, match=r"episodes: 100000001 of .*: expected at most 10000000000 steps"):
+        CollectConfig(episodes=10**8 + 1, max_steps=100)
+
+
+@pytest.mark.parametrize("behavior", ["random", "stress"])
+def test_commands_that_lead_to_walls_are_replaced_where_it_is_asked_for(
+    behavior: str, task: str, tmp_path: Path
+) -> None:
+    foreseen = {}
+    for clearance_m in (0.0, 1.0):
+        settings = {"behavior": behavior, "hold_s": (0.05, 0.05), "clearance_m": clearance_m}
+        out = tmp_path / str(clearance_m)
+        collect(task, TINY.model_copy(update=settings), seed=0, out=out, progress=silent)
+        columns = Dataset.open(out).columns([STATE, ACTION])
+        watch = WallWatch(TASKS[task], 1.0)
+        commands = columns[ACTION][:, None].astype(np.float64)
+        near = watch.clearance(torch.from_numpy(columns[STATE]), commands) < 1.0
+        foreseen[clearance_m] = near.mean()
+    assert foreseen[1.0] < 0.5 * foreseen[0.0]
+
+
+@pytest.mark.usefixtures("small_training", "batches_of_two")
+@pytest.mark.parametrize("behavior", ["random", "suboptimal_ppo"])
+def test_progress_goes_on_from_the_training_and_from_batch_to_batch(
+    behavior: str, task: str, tmp_path: Path
+) -> None:
+    settings = {"behavior": behavior, "ppo_steps": 1, "episodes": 4, "max_steps": 3}
+    told = list[float]()
+    config = TINY.model_copy(update=settings)
+    collect(task, config, seed=0, out=tmp_path / "out", progress=lambda share, _: told.append(share))
+    assert told == sorted(told) and told[-1] == 1.0 and len(told) >= 2 * 3
+    if behavior == "random":
+        assert told[:6] == pytest.approx([(step + 1) / 6 for step in range(6)])

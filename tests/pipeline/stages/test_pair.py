@@ -1,0 +1,334 @@
+import hashlib
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_dataset import writer
+from toy_logs import write_logs
+
+from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.columns import (
+    ABSTRACT_NEXT_STATE,
+    ABSTRACT_SIMULATED_NEXT_STATE,
+    ABSTRACT_STATE,
+    ACTION,
+    NEXT_STATE,
+    STATE,
+    Column,
+    Episode,
+)
+from astra_data.pipeline.stages.pair import PairConfig, pair, pair_steps
+from astra_data.robots.registry import TASKS
+from astra_data.robots.simulator_loader import pairing_named
+
+_PLANAR = [0, 1, 15, 16]
+"""x, y, vx and vy in an ant's qpos (15) and qvel (14)."""
+MINE = Path(__file__).parents[2] / "my_simulator.py"
+
+
+def test_the_simulator_starts_where_the_target_was_and_takes_its_action(paired: Path) -> None:
+    names = (STATE, ACTION, NEXT_STATE, ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE)
+    columns = Dataset.open(paired).columns(names)
+    np.testing.assert_array_equal(columns[ABSTRACT_STATE], columns[STATE][:, _PLANAR])
+    np.testing.assert_array_equal(columns[ABSTRACT_NEXT_STATE], columns[NEXT_STATE][:, _PLANAR])
+    position = columns[STATE][:, :2].astype(np.float64)
+    landed = columns[ABSTRACT_SIMULATED_NEXT_STATE]
+    free = TASKS["antmaze-umaze"].maze.clearance(position) > 0.4
+    assert free.sum() > 100
+    np.testing.assert_allclose(landed[free, :2], (position + 0.05 * columns[ACTION])[free], atol=1e-5)
+    np.testing.assert_allclose(landed[free, 2:], columns[ACTION][free], atol=1e-4)
+
+
+def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path) -> None:
+    before, after = Dataset.open(collected), Dataset.open(paired)
+    assert after.description["parents"] == [before.identity]
+    assert after.reference == before.reference.replace("1.0.0", "2.0.0")
+    assert after.description["reset_error"] == 0.0
+    assert after.description["simulator"] == {
+        "id": "point_mass",
+        "task": "antmaze-short",
+        "timestep_s": 0.05,
+        "radius_m": 0.1,
+        "speed_m_s": 1.0,
+    }
+    steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
+    assert steps == pytest.approx(after.lengths.sum())
+    assert after.description["simulated_pairs_per_second"] > after.description["pairs_per_second"]
+    assert after.description["machine"] == before.description["machine"]
+    assert after.order == before.order
+    assert after.metadata == before.metadata
+    for one, other in zip(before.episodes(), after.episodes(), strict=True):
+        assert one.uid == other.uid
+        for name, values in one.columns.items():
+            np.testing.assert_array_equal(values, other.columns[name])
+
+
+def test_abstract_columns_have_units_frames_and_roles(paired: Path) -> None:
+    features = Dataset.open(paired).features
+    meanings = set()
+    for name in (ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE):
+        astra = features[name]["astra"]
+        meanings.add(astra["meaning"])
+        assert features[name]["names"] == ["x", "y", "vx", "vy"]
+        for key in ("unit", "frame", "role"):  # as in the target's columns
+            assert astra[key] == [features[STATE]["astra"][key][index] for index in _PLANAR]
+    assert len(meanings) == 3
+
+
+def test_many_simulators_give_what_one_gives(collected: Path) -> None:
+    columns = Dataset.open(collected).columns([STATE, ACTION, NEXT_STATE])
+    steps = [values[:25] for values in columns.values()]
+    pairing = pairing_named("antmaze-umaze")
+    wide, _ = pair_steps(pairing, pairing.simulator(64), *steps, tolerance=0.0)
+    for size in (1, 7, 25):
+        narrow, error = pair_steps(pairing, pairing.simulator(size), *steps, tolerance=0.0)
+        assert error == 0.0
+        for name, values in wide.items():
+            np.testing.assert_array_equal(narrow[name], values)
+
+
+def test_a_simulator_of_your_own(collected: Path, tmp_path: Path) -> None:
+    pair(f"{MINE}:Glider", PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
+    dataset = Dataset.open(tmp_path / "out")
+    digest = hashlib.sha256(MINE.read_bytes()).hexdigest()
+    assert dataset.description["simulator"] == {"id": "Glider", "file_sha256": digest, "timestep_s": 0.05}
+    assert dataset.features[ABSTRACT_STATE]["names"] == ["x", "y"]
+    columns = dataset.columns([STATE, ACTION, ABSTRACT_SIMULATED_NEXT_STATE])
+    expected = columns[STATE][:, :2] + np.float32(0.05) * columns[ACTION]
+    np.testing.assert_array_equal(columns[ABSTRACT_SIMULATED_NEXT_STATE], expected)
+
+
+def glider_that_is_off(place: Path, error: float, later: str) -> str:
+    """Write a simulator that is reset with an error, and at each time after with that which `later` gives."""
+    (place / "off.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
+        "class Off(Glider):\n"
+        f"    error = {error}\n"
+        "    def reset_to(self, state, rows=None):\n"
+        "        super().reset_to(state + self.error, rows)\n"
+        f"        self.error = {later}\n"
+    )
+    return f"{place}/off.py:Off"
+
+
+def glider_that_gets_lost(place: Path) -> str:
+    """Write a simulator whose second step has no y in its fourth row."""
+    (place / "lost.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(MINE.parent)!r})\nfrom my_simulator import Glider\n"
+        "class Lost(Glider):\n"
+        "    steps = 0\n"
+        "    def step(self, action):\n"
+        "        self.steps += 1\n"
+        "        super().step(action)[3, 1] /= float(self.steps < 2)\n"
+        "        return self.state\n"
+    )
+    return f"{place}/lost.py:Lost"
+
+
+@pytest.mark.parametrize("size", ["_BLOCK", "BATCH"])
+def test_the_largest_reset_error_of_all_blocks_is_recorded(
+    size: str, collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A block for each of the eight episodes, or all in one and a batch for each ten steps.
+    monkeypatch.setattr(f"astra_data.pipeline.stages.pair.{size}", {"_BLOCK": 1, "BATCH": 10}[size])
+    config = PairConfig(reset_tolerance=0.1)
+    simulator = glider_that_is_off(tmp_path, 0.08, "self.error / 2")
+    pair(simulator, config, dataset=collected, out=tmp_path / "out", progress=silent)
+    assert Dataset.open(tmp_path / "out").description["reset_error"] == pytest.approx(0.08, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("simulator", "told"),
+    [
+        (f"{MINE}:Forgetful", r"reset to φ\(s\) of step \d+, has [xy] = .*, expected .*: check its reset_to"),
+        (f"{MINE}:Exploding", r"stepped from φ\(s\) of step 0, gives x = .*: expected finite states"),
+        (f"{MINE}:Greedy", r"abstraction of Greedy, given states \(\d+, 29\), fails with IndexError"),
+        (f"{MINE}:Clumsy", r"Clumsy\(4096\) fails with TypeError"),
+        (f"{MINE}:Stateless", r"Stateless\(4096\) fails with AttributeError"),
+        (f"{MINE}:Narrow", r"Narrow\(4096\).state has shape \(4096, 1\), expected \(4096, 2\)"),
+        (f"{MINE}:Bare", r"Bare.parameters: expected numbers or texts for maze"),
+        (f"{MINE}:Squeezing", r"step of Squeezing returns shape \(4096, 1\), expected \(4096, 2\)"),
+        ("antmaze-long", r"was collected for antmaze-short, which has another maze .*: give --simulator"),
+        (f"{MINE}:Numeric", r"Numeric\(4096\).state: expected a torch tensor, got a ndarray"),
+        (f"{MINE}:Relapsing", r"after reset_to, Relapsing.state: expected a torch tensor, got a ndarray"),
+        (f"{MINE}:Sliding", r"step of Sliding changes the states handed out before: expected a new tensor"),
+        (f"{MINE}:Lazy", r"step of Lazy fails with NotImplementedError"),
+        (f"{MINE}:Wide", r"abstraction of Wide makes \(\d+, 3\) of states .* expected \(\d+, 2\)"),
+        (f"{MINE}:Half", r"Half has no abstraction, parameters, reset_to, step"),
+        (f"{MINE}:Gilder", r"has no 'Gilder'; it has .*Glider"),
+        (f"{MINE}", r"expected the class after a colon"),
+        ("nowhere.py:Glider", r"nowhere.py does not exist in .*: expected a Python file"),
+        ("antmaze-umase", r"unknown task 'antmaze-umase': did you mean 'antmaze-umaze'"),
+    ],
+)
+def test_a_simulator_that_does_not_fit_is_refused(
+    task: str, collected: Path, tmp_path: Path, simulator: str, told: str
+) -> None:
+    with pytest.raises(BadInputError, match=told) as caught:
+        pair(simulator, PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_data_of_another_rate_are_refused(collected: Path, tmp_path: Path) -> None:
+    source = Dataset.open(collected)
+    description = {"name": "slow", "stage": "import", "environment": source.description["environment"]}
+    slow = tmp_path / "slow"
+    with DatasetWriter(slow, source.schema, fps=10, task="slow", description=description) as writer:
+        writer.add(next(source.episodes()))
+    told = r"slow has 10 steps per second, where point_mass makes 20; expected a dataset to be paired"
+    with pytest.raises(BadInputError, match=told):
+        pair("antmaze-umaze", PairConfig(), dataset=slow, out=tmp_path / "out", progress=silent)
+    simulator = f"{MINE}:Glider"  # of no task, and of no rate
+    pair(simulator, PairConfig(), dataset=slow, out=tmp_path / "out", progress=silent)
+
+
+def rewritten(source: Dataset, out: Path, changed: dict[str, Column]) -> Path:
+    """Write the first episode of a dataset with some columns called, and cut, as `changed` has them."""
+    columns = [changed.get(column.name, column) for column in source.schema]
+    description = {"name": "other", "stage": "import", "environment": source.description["environment"]}
+    with DatasetWriter(out, columns, fps=20, task="other", description=description) as writer:
+        episode = next(source.episodes())
+        cut = {name: episode.columns[name][:, : column.size] for name, column in changed.items()}
+        writer.add(replace(episode, columns={**episode.columns, **cut}))
+    return out
+
+
+def test_bounds_of_the_commands_are_recorded(tmp_path: Path) -> None:
+    """They say what the commands are multiples of to whoever learns from the pairs."""
+    columns = [Column(STATE, size=2), Column(NEXT_STATE, size=2), Column(ACTION, size=1)]
+    still = np.zeros((3, 2), np.float32)
+    with writer(tmp_path / "logs", columns=columns, fps=10) as logs:
+        logs.add(Episode(0, {STATE: still, NEXT_STATE: still, ACTION: still[:, 0]}, {}))
+    cart = f"{MINE.with_name('small_cart.py')}:TASK"
+    out = pair(cart, dataset=tmp_path / "logs", out=tmp_path / "out", progress=silent)
+    assert Dataset.open(out).description["simulator"]["commands"] == {"v": [-1.0, 4.0]}
+
+
+@pytest.mark.usefixtures("task")  # known, and in the maze of the task that the simulator is of
+def test_names_that_are_not_the_tasks_are_told(
+    collected: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    action = next(column for column in Dataset.open(collected).schema if column.name == ACTION)
+    other = replace(action, names=("left", "right"))
+    source = rewritten(Dataset.open(collected), tmp_path / "other", {ACTION: other})
+    pair("antmaze-umaze", PairConfig(), dataset=source, out=tmp_path / "out", progress=silent)
+    assert "takes left, right of action as " in caplog.text
+
+
+def test_commands_of_another_robot_are_refused(collected: Path, tmp_path: Path) -> None:
+    other = Column(ACTION, size=1, names=("throttle",))
+    source = rewritten(Dataset.open(collected), tmp_path / "other", {ACTION: other})
+    with pytest.raises(BadInputError, match=r"action has 1 values, expected those of antmaze-umaze: 2"):
+        pair("antmaze-umaze", PairConfig(), dataset=source, out=tmp_path / "out", progress=silent)
+
+
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        (Column(STATE, size=2), r"observation.state has 2 values, expected those of antmaze-umaze: "),
+        (None, r"has the values .* in observation.state, expected the order "),
+    ],
+)
+def test_data_of_another_robot_are_refused(
+    collected: Path, tmp_path: Path, state: Column | None, told: str
+) -> None:
+    source = Dataset.open(collected)
+    columns = {column.name: column for column in source.schema}
+    if state is None:
+        names = columns[STATE].names
+        assert names is not None
+        state = replace(columns[STATE], names=(names[1], names[0], *names[2:]))
+    changed = {STATE: state, NEXT_STATE: replace(state, name=NEXT_STATE)}
+    other = rewritten(source, tmp_path / "other", changed)
+    with pytest.raises(BadInputError, match=told):
+        pair("antmaze-umaze", PairConfig(), dataset=other, out=tmp_path / "out", progress=silent)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_paired_dataset_is_not_paired_again(paired: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"has abstract.state already: it is paired"):
+        pair("antmaze-umaze", PairConfig(), dataset=paired, out=tmp_path / "out", progress=silent)
+
+
+def test_a_damaged_dataset_is_refused(task: str, collected: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(collected, damaged)
+    data = next(damaged.glob("data/*/*.parquet"))
+    data.write_bytes(data.read_bytes()[:-200])
+    with pytest.raises(CorruptDatasetError, match="incomplete or was altered") as caught:
+        pair(task, PairConfig(), dataset=damaged, out=tmp_path / "out", progress=silent)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_step_that_is_told_is_that_of_the_dataset(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A simulator that is reset rightly once, for the first episode, and never again, or lost."""
+    monkeypatch.setattr("astra_data.pipeline.stages.pair._BLOCK", 1)
+    simulator, out = glider_that_is_off(tmp_path, 0.0, "0.5"), tmp_path / "out"
+    with pytest.raises(BadInputError) as caught:
+        pair(simulator, PairConfig(), dataset=collected, out=out, progress=silent)
+    told = re.search(r"of step (\d+), has ([xy]) = .*, expected (\S+) \(", str(caught.value))
+    assert told is not None
+    source, step, entry = Dataset.open(collected), int(told[1]), "xy".index(told[2])
+    assert source.lengths[0] <= step < source.lengths[:2].sum()
+    assert float(told[3]) == pytest.approx(source.columns([STATE])[STATE][step, entry], rel=1e-5)
+    lost = f"stepped from φ(s) of step {source.lengths[0] + 3}, gives y = "
+    with pytest.raises(BadInputError, match=re.escape(lost)):
+        pair(glider_that_gets_lost(tmp_path), PairConfig(), dataset=collected, out=out, progress=silent)
+
+
+@pytest.mark.parametrize(
+    ("unit", "half", "scale"),
+    [
+        (", astra={'unit': ('m', 'rad')}", "π", 1.0),
+        ("", "π", 1.0),
+        (", astra={'unit': ('m', '1')}", "π", 1.0),
+        (", astra={'unit': ('m', 'deg')}", "180°", 57.29578),
+        (", astra={'unit': ('m', '1')}", "180°", 57.29578),
+        ("", "180°", 57.29578),
+    ],
+)
+def test_a_heading_that_wraps_is_told(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    unit: str,
+    half: str,
+    scale: float,
+) -> None:
+    monkeypatch.setattr("astra_data.pipeline.stages.pair._BLOCK", 1)
+    (tmp_path / "cart.py").write_text(
+        "import torch\nfrom astra_data import Column\n"
+        "class Turning:\n"
+        f"    abstract_state = Column('abstract.state', size=2, names=('x', 'yaw'){unit})\n"
+        "    parameters = {}\n"
+        "    def __init__(self, num_envs):\n"
+        "        self.state = torch.zeros(num_envs, 2)\n"
+        "    def abstraction(state):\n"
+        "        abstract = state[..., [0, 2]]\n"
+        f"        abstract[..., 1] *= {scale}\n"
+        "        return abstract\n"
+        "    def reset_to(self, state, rows=None):\n"
+        "        self.state = state.clone()\n"
+        "    def step(self, command):\n"
+        f"        self.state = self.state + command[:, [0, 1]] * torch.tensor([100.0, {0.05 * scale}])\n"
+        "        return self.state\n"
+    )
+    logs = write_logs(tmp_path / "logs")
+    yaw, turned = (logs.columns([name])[name][:, 2] for name in (STATE, NEXT_STATE))
+    wraps = int((np.abs(turned - yaw) > 6).sum())
+    assert wraps > 3
+    pair(f"{tmp_path}/cart.py:Turning", dataset=logs.root, out=tmp_path / "out")
+    (told,) = [record.getMessage() for record in caplog.records if "φ" in record.getMessage()]
+    assert told == (
+        f"Turning lands more than {half} from where the robot was: yaw in {wraps} of 3000 rows; "
+        "a heading that wraps: make cos and sin of it in φ"
+    )

@@ -1,0 +1,321 @@
+"""The report over small runs, one of each kind: what it writes where, and what stands on its pages."""
+
+import logging
+import shutil
+from base64 import b64decode
+from collections.abc import Iterator
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from fake_dataset import write_fake
+from fake_report import COMMAND, CONFIG, FIGURES, REPLAY, images, make, task
+from fake_runs import (
+    ROWS,
+    SEEDS,
+    FakeRecipe,
+    edit_json,
+    outcomes,
+    write_choice,
+    write_elsewhere,
+    write_evaluation,
+    write_json,
+    write_runs,
+)
+from html_pages import read_page
+from matplotlib.figure import Figure
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError, MissingStageError
+from astra_data.core.manifest import read_manifest
+from astra_data.core.naming import seed_folder
+from astra_data.pipeline.stages import report as stage
+from astra_data.pipeline.stages.report import is_current, report
+from astra_data.reports.figures import catalog as figures
+from astra_data.reports.results import read_results
+from astra_data.worlds.score import RETURN, SURVIVED_STEPS
+
+DRAWN = figures.drawn
+
+
+@pytest.fixture(autouse=True)
+def known_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give the report a task of its own, and no figures, which take seconds."""
+    monkeypatch.setattr(stage, "task_named", {"antmaze-u": task()}.__getitem__)
+    monkeypatch.setattr("astra_data.reports.figures.catalog.drawn", lambda *_: {})
+
+
+@pytest.fixture
+def rough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw figures, quickly, and without a target to replay commands in."""
+
+    def png(figure: Figure) -> bytes:
+        figure.set_layout_engine("none")
+        figure.savefig(content := BytesIO(), format="png", dpi=20)
+        return content.getvalue()
+
+    monkeypatch.setattr("astra_data.reports.figures.catalog.drawn", DRAWN)
+    monkeypatch.setattr("astra_data.reports.figures.motion.replay_commands", lambda _: REPLAY)
+    monkeypatch.setattr("astra_data.reports.figures.catalog.png", png)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_runs(tmp_path)
+
+
+@pytest.fixture
+def target(root: Path) -> Iterator[str]:
+    make(root)
+    yield (root / "report/results.md").read_text()
+
+
+def test_a_report_is_complete_and_its_pages_say_the_same(rough: None, root: Path, target: str) -> None:
+    folder = root / "report"
+    assert images(folder) == FIGURES
+    assert {name for name in FIGURES if f"]({name}.png)" in target} == FIGURES
+    html = read_page((folder / "results.html").read_text())
+    inlined = [b64decode((image["src"] or "").partition("base64,")[2]) for image in html.attributes("img")]
+    assert sorted(inlined) == sorted(path.read_bytes() for path in folder.glob("*.png"))
+    for text in ("Deploy", "0.92 ± 0.14", "--row astra_plus --seed 0", COMMAND, "floor", "Every seed"):
+        assert text in target and text in html.text
+    assert "select" not in target
+    manifest = read_manifest(folder)
+    assert manifest and manifest.faults(folder, verify=True) == manifest.foreign(folder) == []
+    evaluations = {path.parent: path for path in root.glob("evaluate/*/*/evaluation.json")}
+    digests = {str(key.relative_to(root)): file_digest(path) for key, path in evaluations.items()}
+    assert evaluations and manifest.made_from.items() >= digests.items()
+
+
+def test_the_table_of_methods_has_the_targets_column_first(target: str) -> None:
+    lines = [line.strip("| ").split(" | ") for line in target.splitlines() if line.startswith("| ")]
+    head = next(line for line in lines if line[0] == "method")
+    assert head[:4] == ["method", "success in the target", "95 % interval", "in its simulator"]
+    table = {line[0]: dict(zip(head, line, strict=True)) for line in lines if len(line) == len(head)}
+    astra, plus = table["ASTRA"], table["**ASTRA+**"]
+    assert (astra["success in the target"], astra["in its simulator"]) == ("0.50 ± 0.25", "0.75 ± 0.00")
+    assert (astra["lost"], astra["failed"], astra["seeds"]) == ("0.25", "0.50 ± 0.25", "3")
+    assert plus["path length to success (m)"] == "8.0 ± 0.0"
+    assert table["Careful follower (ceiling)"]["in its simulator"] == "-"
+    assert "Direct transfer (floor)" in table
+
+
+def test_a_finished_report_is_current_until_something_changes(root: Path) -> None:
+    make(root)
+    asked = {"root": root, "command": COMMAND, "config": CONFIG}
+    assert is_current(FakeRecipe(), **asked, publish=None)  # type: ignore[arg-type]
+    assert not is_current(replace(FakeRecipe(), seeds=(0, 1)), **asked)  # type: ignore[arg-type]
+    changed = CONFIG.model_copy(update={"trajectory_episodes": 3})
+    assert not is_current(FakeRecipe(), root=root, command=COMMAND, config=changed)
+    path = root / "evaluate/astra/seed_0/evaluation.json"
+    before = path.read_text()
+    edit_json(path, wall_seconds=11.0)
+    assert not is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
+    path.write_text(before)
+    assert is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
+    (root / "report/results.html").unlink()
+    assert not is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
+    shutil.rmtree(root / "report")
+    assert not is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("changed", [{"paper_success": {"astar": 0.4}}, {"compare": ("astar",)}])
+def test_a_row_that_is_no_method_is_refused(root: Path, changed: dict[str, object]) -> None:
+    with pytest.raises(BadInputError, match="astar"):
+        report(FakeRecipe(), root=root, command="", config=CONFIG.model_copy(update=changed))
+
+
+def test_intervals_and_probabilities_of_improvement_need_three_seeds(root: Path, target: str) -> None:
+    assert "| ASTRA | Direct transfer | 0.89 [" in target
+    make(root, recipe=FakeRecipe(seeds=(0, 1)))
+    for name in ("results.md", "results.html"):
+        page = (root / "report" / name).read_text()
+        assert "Probability of improvement" not in page and "need 3 seeds, ASTRA+ has 2" in page
+
+
+def test_r2_of_rewards_stands_on_the_page(root: Path) -> None:
+    for seed in SEEDS:
+        epochs = [{"r2_final_reward": 0.9}, {"step": 2, "r2_reward": 0.5, "r2_final_reward": -2.7}]
+        edit_json(root / f"ground/astra/seed_{seed}/metrics.json", epochs=epochs)
+    make(root)
+    page = read_page((root / "report/results.html").read_text())
+    assert page.table("R² of what groundings predict")[1] == ["ASTRA", "0.50", "-2.70"]
+
+
+def test_predicted_failures_are_reported(root: Path) -> None:
+    for seed in SEEDS:
+        found = {
+            "failures": 3 + seed,
+            "auc": {"1-20": 0.9, "11-30": 0.8, "21-40": None},
+            "brier_skill": 0.25,
+            "reliability": [(0.005, 0.0, 90), (0.4, 0.5, 10)],
+        }
+        edit_json(root / f"ground/astra/seed_{seed}/metrics.json", failures={"failure_model": found})
+    make(root)
+    page = read_page((root / "report/results.html").read_text())
+    line = page.table("Failures, predicted on held-out episodes")[1]
+    assert line[:3] == ["ASTRA: failure model", "12", "0.90"] and line[-2:] == ["0.25", "0.50 of 0.40"]
+
+
+def test_publishing_adds_to_what_is_there(
+    rough: None, root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "results"
+    file = folder / "antmaze_u.json"
+    make(root, folder, FakeRecipe(seeds=(0, 1)))
+    pictures = {f"antmaze_u_{name}.png" for name in FIGURES}
+    assert {path.name for path in folder.iterdir()} == pictures | {"antmaze_u.json", "antmaze_u.md"}
+    drawn = (folder / "antmaze_u_trajectories.png").read_bytes()
+    for row in ROWS:
+        for seed in (0, 1):
+            shutil.rmtree(root / f"evaluate/{row}/seed_{seed}")
+    shutil.rmtree(root / "evaluate/astra_plus")
+    make(root, folder, published=(file,))
+    found = read_results(file)
+    assert found.values("astra", "success") == {0: 0.5, 1: 0.25, 2: 0.75}
+    assert found.values("astra_plus", "success") == {0: 1.0, 1: 0.75}
+    # The trajectories of ASTRA+ are not here: the figure stays as it is.
+    page = (folder / "antmaze_u.md").read_text()
+    assert "](antmaze_u_trajectories.png)" in page
+    assert (folder / "antmaze_u_trajectories.png").read_bytes() == drawn
+    assert not caplog.records
+    # A changed result replaces the earlier one, and it is said.
+    edit_json(root / "evaluate/astra/seed_2/evaluation.json", target=outcomes([0, 0, 0, 0], 2))
+    with caplog.at_level(logging.WARNING):
+        make(root, folder, FakeRecipe(methods=("astra",)), published=(file,))
+    assert "new results replace those of astra seed 2 (success 0.75, now 0)" in caplog.text
+    assert read_results(file).values("astra_plus", "success") == {0: 1.0, 1: 0.75}
+    (tmp_path / "broken.json").write_text("{}")
+    with pytest.raises(BadInputError, match=r"broken.json does not hold results in the current format"):
+        make(root, published=(tmp_path / "broken.json",))
+
+
+def test_a_choice_without_the_target_is_reported_and_stays_published(root: Path, tmp_path: Path) -> None:
+    write_choice(root)
+    make(root, tmp_path / "results")
+    page = (tmp_path / "results/antmaze_u.md").read_text()
+    assert "**ASTRA, seed 2**, chosen from 6 policies: predicted success 1.00 [" in page
+    assert "| ASTRA | 3 | +0.40 | 0.40 |" in page and "| ASTRA+ | 3 | -0.58 | 0.58 |" in page
+    # ASTRA has 0.5, 0.25 and 0.75 in the target, its ranks are right; the best there is ASTRA+ with 1.
+    assert "Regret of the chosen policy, in success in the target: 0.25; of a random policy: 0.29." in page
+    assert "| select | 8 s | - |" in page
+    manifest = read_manifest(root / "report")
+    assert manifest and manifest.made_from["select"] == file_digest(root / "select/select.json")
+    shutil.rmtree(root / "select")
+    make(root, tmp_path / "results", published=(tmp_path / "results/antmaze_u.json",))
+    assert "**ASTRA, seed 2**, chosen from 6" in (tmp_path / "results/antmaze_u.md").read_text()
+
+
+def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path) -> None:
+    root = tmp_path / "runs" / "sizes"
+    for percent in (50, 100):
+        for seed in SEEDS:
+            write_evaluation(root, "astra", seed, percent)
+            write_fake(root / "subset" / seed_folder(seed, percent))
+    for seed in SEEDS[:2]:
+        write_evaluation(root, "direct_transfer", seed, 100)
+    # At 50 % one seed of ASTRA is worse.
+    path = root / "evaluate/astra" / seed_folder(2, 50) / "evaluation.json"
+    edit_json(path, target=outcomes([0, 0, 0, 0], 2))
+    sized = FakeRecipe("sizes", methods=("direct_transfer", "astra"), percents=(10, 100, 50))
+    found = make(root, tmp_path / "results", sized)
+    assert found.percents == [50, 100]
+    html = read_page((root / "report/results.html").read_text())
+    head, direct, astra = html.table("Success in the target, mean")
+    assert (head, astra) == (["method", "50 %", "100 %"], ["ASTRA", "0.25 ± 0.25", "0.50 ± 0.25"])
+    assert direct == ["Direct transfer", "-", "0.12 ± 0.18 (2 of 3 seeds)"]
+    assert "Not finished yet: Direct transfer at 50 %." in html.text
+    assert "data_efficiency" in images(root / "report")
+    assert (tmp_path / "results/sizes_data_efficiency.png").exists()
+
+
+def test_lasting_tasks_are_reported_by_survived_steps_and_return(
+    rough: None, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objective = SimpleNamespace(scores=(SURVIVED_STEPS, RETURN), horizon=1000)
+    lasting = task(plane=None, objective=objective, make_target=None)
+    monkeypatch.setattr(stage, "task_named", {"antmaze-u": lasting}.__getitem__)
+    for seed, steps in enumerate((60.0, 90.0, 600.0)):
+        edit_json(
+            root / f"evaluate/astra/seed_{seed}/evaluation.json",
+            target=outcomes([0, 0, 0, 1], seed) | {"steps": [steps] * 4},
+        )
+        points = [{"steps": at, "success": None, "episode_steps": at / 10} for at in (100, 200)]
+        edit_json(root / f"train/astra/seed_{seed}/curve.json", points=points)
+    found = make(root)
+    page = (root / "report/results.md").read_text()
+    assert "| method | survived steps in the target | 95 % interval | return in the target |" in page
+    assert "| **ASTRA** | 250 ± 303 |" in page
+    assert images(root / "report") == {"steps", "return", "learning", "gap", "validity"}
+    assert found.trainings[-1].score != [] and [10.0, 20.0] in [one.score for one in found.trainings]
+
+
+def test_what_no_target_tested_is_said_before_all_else(root: Path) -> None:
+    for path in root.glob("evaluate/*/*/evaluation.json"):
+        edit_json(path, target=None, tested_in="raw")
+        if "follower" in path.parts:
+            path.unlink()
+    for path in root.glob("evaluate/*/*/trajectories.safetensors"):
+        path.unlink()
+    make(root, recipe=FakeRecipe(methods=ROWS[:3]))
+    page = (root / "report/results.md").read_text()
+    assert page.splitlines()[2].startswith("**Nothing was tested on a robot: the task has no target.**")
+    assert "Try first" in page and "Does a simulator show" not in page
+
+
+def test_a_robot_that_is_a_stand_in_and_code_of_the_users_are_named(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "task_named", {"antmaze-u": task(facts={"stand_in": "mujoco"})}.__getitem__)
+    digests = {"task": "0a", "astra": "1b", "astra.settings": "{}", "gone": "2c"}
+    write_json(root / "code.json", digests)
+    assert make(root).user_code == {"task": "0a", "astra": "1b"}
+    page = (root / "report/results.md").read_text()
+    assert "**A simulated stand-in (`mujoco`) replaces the physical robot" in page
+    assert "- User code: task `0a`, astra `1b`." in page
+    assert "- Code: commit `abc` with uncommitted changes (evaluate, train, ground, collect, pair);" in page
+
+
+def test_wall_time_is_that_of_the_whole_not_the_sum_of_what_ran_at_once(root: Path) -> None:
+    for row in ROWS:
+        for seed in SEEDS:
+            path = root / f"evaluate/{row}/seed_{seed}/evaluation.json"
+            edit_json(path, wall_seconds=600.0, finished_at=1000.0 + seed)
+    make(root)
+    page = (root / "report/results.md").read_text()
+    # Twelve evaluations at once take 602 s, what has no end 15 s of collect and 21 s of ground.
+    assert "Wall time of the whole recipe: 11 min" in page
+    assert "| evaluate | 2.0 h |" in page
+
+
+def test_methods_without_simulator_or_seeds_and_datasets_are_reported(root: Path) -> None:
+    write_elsewhere(root, "iql")
+    made = {"name": "antmaze-u-random", "version": "data-2.0.0", "content_hash": "hash"}
+    write_json(root / "label/seed_1/meta/astra/dataset.json", made | {"wall_seconds": 11.0})
+    found = make(root, recipe=FakeRecipe(methods=("iql", "nas", "follower"), seeds=(1, 9)))
+    assert [(one.stage, one.seed) for one in found.datasets if one.version == "data-2.0.0"] == [("label", 1)]
+    page = (root / "report/results.md").read_text()
+    assert "| IQL | - | 3 s | - | 10 s | 13 s | 20 s |" in page and "| label | 11 s |" in page
+    assert "Not finished yet: NAS." in page
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"task": "antmaze-long"}, "seed 1 on antmaze-long with 4 episodes"),
+        ({"leg_scale": 1.25}, "legs 1.25 times as long"),
+        ({"seed": None}, r"evaluation.json is not .*seed: "),
+    ],
+)
+def test_what_cannot_stand_in_one_table_is_refused(
+    root: Path, changes: dict[str, object], message: str
+) -> None:
+    edit_json(root / "evaluate/astra/seed_1/evaluation.json", **changes)
+    with pytest.raises(BadInputError, match=message):
+        make(root)
+    shutil.rmtree(root / "evaluate")
+    with pytest.raises(MissingStageError, match="found none for direct_transfer, astra"):
+        make(root)
+    assert not (root / "report").exists()

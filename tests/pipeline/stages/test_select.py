@@ -1,0 +1,200 @@
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rail_run import make_rail_run
+
+from astra_data.core.digest import file_digest
+from astra_data.core.errors import BadInputError
+from astra_data.core.manifest import read_manifest
+from astra_data.core.progress import Progress, silent
+from astra_data.pipeline.stages.select import SelectConfig, benches, judge_of, select
+from astra_data.policies.judging import Judge
+from astra_data.reports.choice import Judged, read_judged
+from astra_data.reports.runs import Reported
+
+pytestmark = pytest.mark.usefixtures("quick_failures")
+
+ROWS, SEEDS = ("direct_transfer", "nas"), (0, 1, 2)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_rail_run(tmp_path_factory.mktemp("select"))
+
+
+@pytest.fixture
+def root(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "rail"))
+
+
+def reported(root: Path, **changes: Any) -> Reported:  # noqa: ANN401
+    settings = json.loads((root / "recipe.json").read_text()) | changes.pop("settings", {})
+    usual = {"name": "rail", "task": settings["task"], "methods": ROWS, "seeds": SEEDS}
+    return Reported(**usual | {"settings": settings} | changes)
+
+
+def judged(
+    root: Path,
+    recipe: Reported | None = None,
+    progress: Progress = silent,
+    **settings: Any,  # noqa: ANN401
+) -> Judged:
+    config = SelectConfig(**{"episodes": 5} | settings)
+    select(recipe or reported(root), config, root=root, progress=progress)
+    found = read_judged(root)
+    assert found is not None
+    return found
+
+
+def test_each_policy_is_judged_by_the_groundings_of_other_seeds(root: Path) -> None:
+    found = judged(root)
+    assert [(one.row, one.seed) for one in found.candidates] == [(r, s) for r in ROWS for s in SEEDS]
+    assert all(one.success.keys() == {*SEEDS} - {one.seed} for one in found.candidates)
+    assert found.judge == "nas" and found.episodes == 5 and not found.shares_episodes
+    assert found.wall_seconds and found.packages
+    page = (root / "select/select.md").read_text()
+    assert page.count("| 2 | - |") == 6 and "fitted to the episodes of other seeds" in page
+    assert "Regret" not in page and "no judge is independent" not in page
+
+
+def test_who_judges_whom_with_what_drawn_where(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def success(self: Judge, policy: Any, episodes: int, seed: int) -> float:  # noqa: ANN401
+        asked.append((policy, episodes, seed))
+        return len(asked) / 100
+
+    monkeypatch.setattr(Judge, "success", success)
+    found = judged(root, episodes=7)
+    assert {episodes for _, episodes, _ in asked} == {7}
+    # In the order of rows, seeds and judges; rows of one seed meet the same starts and goals.
+    assert found.candidates[0].success == {1: 0.01, 2: 0.02}
+    assert found.candidates[5].success == {0: 0.11, 1: 0.12}
+    drawn = [seed for *_, seed in asked]
+    assert drawn[:6] == drawn[6:] and len(set(drawn)) == 6
+    latents = [policy.source_encoder is not None for policy, *_ in asked]
+    assert latents == [False] * 6 + [True] * 6  # NAS brings the encoder of its own grounding
+
+
+def test_the_artifact_names_all_that_it_was_made_from(root: Path) -> None:
+    judged(root)
+    manifest = read_manifest(root / "select")
+    assert manifest is not None and set(manifest.files) == {"config.json", "select.json", "select.md"}
+    policies = {f"train/{row}/seed_{seed}" for row in ROWS for seed in SEEDS}
+    groundings = {f"ground/nas/seed_{seed}" for seed in SEEDS}
+    assert set(manifest.made_from) == policies | groundings
+    assert manifest.made_from["train/nas/seed_1"] == file_digest(root / "train/nas/seed_1/policy.safetensors")
+    grounding = root / "ground/nas/seed_2/grounding.safetensors"
+    assert manifest.made_from["ground/nas/seed_2"] == file_digest(grounding)
+    keys = benches(reported(root), "nas")[0].keys
+    assert set(keys) == set(manifest.made_from) and len(keys) == len(set(keys))
+    with pytest.raises(BadInputError, match="is already finished"):
+        judged(root)
+
+
+def test_an_interrupted_choice_goes_on_with_the_next_policy(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, original, asked = judged(root), Judge.success, []
+    shutil.rmtree(root / "select")
+
+    def success(self: Judge, *given: Any) -> float:  # noqa: ANN401
+        asked.append(given)
+        if len(asked) == 6:
+            raise KeyboardInterrupt
+        return original(self, *given)
+
+    monkeypatch.setattr(Judge, "success", success)
+    with pytest.raises(KeyboardInterrupt):
+        judged(root)
+    assert not (root / "select").exists()
+    assert judged(root).candidates == whole.candidates
+    assert len(asked) == 6 + 12 - 4  # two policies of two judges were done
+    assert not (root / "select/begun.json").exists()
+
+
+def test_another_policy_is_judged_anew_after_an_interruption(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def success(self: Judge, policy: object, episodes: int, seed: int) -> float:
+        asked.append(seed)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return 0.5
+
+    monkeypatch.setattr(Judge, "success", success)
+    with pytest.raises(KeyboardInterrupt):
+        judged(root)
+    first, second = (root / f"train/direct_transfer/seed_{seed}" for seed in (0, 1))
+    shutil.copytree(second, first, dirs_exist_ok=True)
+    judged(root)
+    assert asked[3:5] == asked[:2]
+
+
+def test_policies_of_a_size_are_judged_by_groundings_of_that_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = "[sweep]\npercent = [100, 150]\n"
+    root = make_rail_run(tmp_path, seeds="[0, 1]", methods='["nas"]', more=more)
+    loaded, told = [], list[tuple[float, str]]()
+
+    def success(self: Judge, *_: object) -> float:
+        model: Any = self.grounding
+        loaded.append(float(model.model.state_mean))
+        return len(loaded) / 10
+
+    monkeypatch.setattr(Judge, "success", success)
+    recipe = reported(root, methods=("nas",), seeds=(0, 1), percents=(100, 150))
+    found = judged(root, recipe, progress=lambda done, note: told.append((done, note)))
+    assert [done for done, _ in told] == pytest.approx([0.99 / 4, 0.99 / 2, 0.99 * 3 / 4, 0.99, 1.0])
+    assert told[-1][1] == "nas, seed 1: 0.40 in the lower quartile of its judges"  # of the largest size
+    assert [(one.seed, one.percent, *one.success) for one in found.candidates] == [
+        *((0, 100, 1), (1, 100, 0)),
+        *((0, 150, 1), (1, 150, 0)),
+    ]
+    assert found.percents == [100, 150] and len(found.ranked(100)) == 2
+    manifest = read_manifest(root / "select")
+    assert manifest is not None
+    assert "ground/nas/percent_100/seed_1" in manifest.made_from
+    assert len(set(loaded)) == 4
+    page = (root / "select/select.md").read_text()
+    assert "## 100 %" in page and "## 150 %" in page and page.count("**NAS, seed") == 2
+
+
+def test_who_learned_in_the_target_or_nowhere_is_not_judged(root: Path) -> None:
+    (bench,) = benches(reported(root, methods=("follower", "target", "full_obs", "nas")), "nas")
+    assert {one.row for one in bench.entries} == {"nas"}
+
+
+def test_judges_of_the_same_episodes_are_named(root: Path) -> None:
+    found = judged(root, reported(root, methods=("nas",), settings={"data": "logs@data-1.0.0"}))
+    assert found.shares_episodes
+    page = (root / "select/select.md").read_text()
+    assert (
+        "fitted to the same episodes" in page and "no judge is independent of the policies it judges" in page
+    )
+
+
+def test_what_is_not_there_is_asked_for(root: Path) -> None:
+    with pytest.raises(BadInputError, match=r"as judge, got direct_transfer"):
+        judged(root, judge="direct_transfer")
+    with pytest.raises(BadInputError, match=r"expected groundings of astra for two seeds or more, found 0"):
+        judged(root, judge="astra")
+    with pytest.raises(BadInputError, match=r"found no policy of astra: run the recipe until train first"):
+        judged(root, reported(root, methods=("astra",)))
+    with pytest.raises(BadInputError, match="such as nas or astra, as judge, got none"):
+        judge_of(None, ("direct_transfer",))
+    assert judge_of("astra_plus", ()) == "astra" and judge_of(None, ("astra", "nas_plus")) == "nas"
+    assert judge_of(None, ("direct_transfer", "astra_plus")) == "astra"  # without NAS, it grounds as well
+    (root / "alone").mkdir()
+    alone = Path(shutil.copytree(root / "train", root / "alone/train")).parent
+    shutil.copytree(root / "ground/nas/seed_1", alone / "ground/nas/seed_1")
+    with pytest.raises(BadInputError, match="groundings of nas for two seeds or more, found 1"):
+        select(reported(root), root=alone)
+    shutil.rmtree(root / "ground/nas/seed_1")
+    assert len(judged(root, reported(root)).candidates) == 5  # of NAS, seed 1 has no encoder

@@ -1,0 +1,108 @@
+"""An arm of gymnasium-robotics, named by its id: collected in, and a policy tested there."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.core.progress import silent
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
+from astra_data.dataset.reader import Dataset
+from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.plan import plan
+from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
+from astra_data.robots.registry import task_named
+from astra_data.worlds.own_code import own_object
+from astra_data.worlds.walk_through import check_task
+
+FETCH = Path(__file__).parents[2] / "recipes/examples/fetch"
+SMALL = {
+    'methods = ["direct_transfer", "nas", "astra", "astra_task_reward"]\nseeds = [1, 2, 3, 4, 5]': (
+        'methods = ["nas"]\nseeds = [0]'
+    ),
+    "episodes = 400": "episodes = 3",
+    "episodes = 100": "episodes = 2",
+    "max_steps = 50": "max_steps = 12",
+    "updates = 1000": "updates = 2",
+    "updates = 500": "updates = 2",
+    "window = 20": "window = 5",
+    "batch_windows = 32": "batch_windows = 4",
+    "held_out_share = 0.2": "held_out_share = 0.34",
+    "num_envs = 64": "num_envs = 4\nhidden_sizes = [8]\nmemory_size = 4",
+    "rollout_steps = 64": "rollout_steps = 8",
+    "total_steps = 500_000": "total_steps = 64",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The artifacts of the recipe, made small."""
+    made = tmp_path_factory.mktemp("fetch")
+    for file in FETCH.glob("*.py"):
+        shutil.copy(file, made)
+    text = (FETCH / "reach.toml").read_text()
+    for given, small in SMALL.items():
+        assert given in text
+        text = text.replace(given, small)
+    (made / "reach.toml").write_text(text)
+    experiment = load_experiment(made / "reach.toml", made / "runs")
+    for item in plan(experiment.recipe, made / "reach.toml", experiment.folder):
+        if not item.key.startswith("report"):
+            item.call(progress=silent)
+    return experiment.folder
+
+
+def test_the_recipe_runs_until_a_policy_is_tested_in_the_arm(folder: Path) -> None:
+    evaluation = read_json(Evaluation, folder / "evaluate/nas/seed_0" / EVALUATION)
+    assert evaluation.tested_in == "target" and evaluation.target is not None
+
+
+def test_recorded_steps_are_those_of_the_environment(folder: Path) -> None:
+    """Repeat an episode in the environment itself, with the fingers closed."""
+    columns = Dataset.open(folder / "collect/seed_0").columns([STATE, ACTION, NEXT_STATE])
+    task = task_named(f"{folder.parents[1]}/reach.py:TASK")
+    assert task.robot is not None
+    env = task.robot().env  # type: ignore[attr-defined]
+    start = columns[STATE][0]
+    env.reset(seed=0)
+    np.testing.assert_allclose(env.unwrapped._get_obs()["observation"], start, atol=1e-5)
+    for action, following in list(zip(columns[ACTION], columns[NEXT_STATE], strict=True))[:5]:
+        observation, *_ = env.step(np.array([*action, 0.0], dtype=np.float64))
+        np.testing.assert_allclose(observation["observation"], following, atol=1e-5)
+
+
+def test_the_simulator_does_at_once_what_it_is_told() -> None:
+    task = task_named(f"{FETCH}/reach.py:TASK")
+    simulator = task.simulator(1)
+    simulator.reset_to(torch.tensor([[1.0, 2.0, 3.0]]))
+    assert simulator.step(torch.tensor([[1.0, 0.0, -0.5]]))[0].tolist() == pytest.approx([1.05, 2.0, 2.975])
+
+
+def test_the_puck_is_pushed_at_one_height_until_it_falls() -> None:
+    """In the environment; and in the simulator by what the gripper would overlap."""
+    task = task_named(f"{FETCH}/push.py:TASK")
+    assert check_task(task) == []
+    assert task.robot is not None
+    robot = task.robot()
+    robot.reset(seed=0)  # type: ignore[call-arg]
+    for _ in range(60):
+        state, failed = robot.step(np.array([0.0, 0.0]))
+    assert state[2] == pytest.approx(0.425, abs=0.01) and not failed
+    simulator = task.simulator(1)
+    simulator.reset_to(torch.tensor([[0.0, 0.0, 0.08, 0.0]]))
+    assert simulator.step(torch.tensor([[1.0, 0.0]]))[0].tolist() == pytest.approx([0.05, 0.0, 0.095, 0.0])
+
+
+def test_the_script_pushes_the_puck_to_its_goal() -> None:
+    task, method = task_named(f"{FETCH}/push.py:TASK"), own_object(f"{FETCH}/script.py:METHOD")
+    env, script = task.target(4, seed=3, num_threads=1), method.learn.learn(None, None)
+    assert script.from_file(*script.to_file()).act(np.ones((1, 4))).shape == (1, 2)
+    env.reset()
+    arrived = torch.zeros(4, dtype=torch.bool)
+    for _ in range(task.objective.horizon):
+        observation = task.objective.observe(task.abstraction(env.state), env.goal)
+        step = env.step(torch.from_numpy(script.act(observation.numpy())), ~arrived)
+        arrived |= step.success
+    assert arrived.all() and method.role == "ceiling"

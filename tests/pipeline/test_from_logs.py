@@ -1,0 +1,176 @@
+"""From CSV logs alone, with a task that has no target, to a policy and a page."""
+
+import json
+import re
+import runpy
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.core.progress import silent
+from astra_data.dataset.columns import GOAL, REWARD
+from astra_data.dataset.edit import delete, subset
+from astra_data.dataset.reader import Dataset
+from astra_data.io.importing import import_dataset
+from astra_data.pipeline.condition import can_be_made_again, condition
+from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.held_out import write_errors
+from astra_data.pipeline.plan import plan
+from astra_data.pipeline.points import Selection
+from astra_data.pipeline.run import check, set_aside
+from astra_data.pipeline.stages.label import label
+from astra_data.pipeline.trained_policy import load_policy
+from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
+
+CART = Path(__file__).parents[2] / "recipes/examples/cart"
+SMALL = """
+[ground]
+updates = 2
+batch_windows = 4
+window = 5
+latent_size = 4
+held_out_share = 0.25
+[train]
+num_envs = 4
+rollout_steps = 8
+total_steps = 64
+hidden_sizes = [8]
+memory_size = 4
+[align]
+updates = 2
+batch_windows = 4
+window = 5
+[evaluate]
+episodes = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the cart's task, a dataset of 8 drives, imported from CSV, and no target."""
+    folder = tmp_path_factory.mktemp("cart")
+    with pytest.MonkeyPatch.context() as as_a_script:
+        as_a_script.syspath_prepend(CART)
+        runpy.run_path(str(CART / "robot.py"))["record"](folder / "csv", drives=8, seconds=6)
+    (folder / "cart.py").write_text((CART / "cart.py").read_text())
+    import_dataset(sorted((folder / "csv").glob("*.csv")), CART / "logs.toml", out=folder / "logs")
+    return folder
+
+
+def made(
+    folder: Path, name: str, text: str, wanted: Callable[[str], bool] = lambda stage: True
+) -> tuple[Path, list[str]]:
+    """Make the artifacts of a recipe in this process; return its folder and their keys."""
+    path = folder / f"{name}.toml"
+    path.write_text(f'task = "cart.py:TASK"\ndata = "logs"\nseeds = [0]\n{text}{SMALL}')
+    experiment = load_experiment(path, folder / "runs")
+    items = [item for item in plan(experiment.recipe, path, experiment.folder) if wanted(item.key)]
+    for item in items:
+        item.call(progress=silent)
+    (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    return experiment.folder, [item.key for item in items]
+
+
+def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
+    folder, keys = made(logs, "cart", 'methods = ["direct_transfer", "nas", "astra"]\n')
+    assert keys[:2] == ["label/seed_0", "pair/seed_0"] and not any(key.startswith("collect") for key in keys)
+    labeled = Dataset.open(folder / "label/seed_0")
+    assert REWARD in labeled.features and GOAL not in labeled.features and len(labeled) == 8
+    for row in ("direct_transfer", "nas", "astra"):
+        evaluation = read_json(Evaluation, folder / "evaluate" / row / "seed_0" / EVALUATION)
+        assert evaluation.tested_in == "grounded" and evaluation.target is None
+        assert evaluation.outcomes == evaluation.grounded and evaluation.raw is not None
+    assert evaluation.grounded != evaluation.simulated
+    page = (folder / "report/results.md").read_text().splitlines()
+    assert page[2].startswith(
+        "**Nothing was tested on a robot: the task has no target.** All rows were tested"
+    )
+    assert "in which only NAS trained" in page[2]
+    text = "\n".join(page[3:])
+    assert "over seeds, in the simulator grounded by NAS" in text and "n the target." not in text
+    assert (
+        not re.search(r"wall contact|maze|path length to success", text) and "Predictive validity" not in text
+    )
+    results = json.loads((folder / "report/results.json").read_text())
+    assert results["tested_in"] == "simulators" and results["predictive_validity"] == {}
+    assert [dataset["stage"] for dataset in results["datasets"]] == ["label", "pair"]
+    policy = load_policy(folder, "astra")
+    policy.start(2)
+    action = policy.act(torch.zeros(2, 8), torch.ones(2, 0))
+    assert action.shape == (2, 2) and bool(np.isfinite(action.numpy()).all())
+
+
+def test_rows_without_a_common_simulator_say_where_they_were_tested(logs: Path) -> None:
+    folder, _ = made(logs, "alone", 'methods = ["direct_transfer"]\n')
+    evaluation = read_json(Evaluation, folder / "evaluate/direct_transfer/seed_0" / EVALUATION)
+    assert evaluation.tested_in == "raw" and evaluation.outcomes == evaluation.raw
+    page = (folder / "report/results.md").read_text()
+    assert "Each row was tested in the simulator it was trained in" in page.splitlines()[2]
+
+
+def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
+    until = ("label", "pair", "subset", "ground")
+    text = 'methods = ["nas"]\n[sweep]\npercent = [50, 100]\n'
+    folder, keys = made(logs, "sizes", text, lambda key: key.split("/")[0] in until)
+    assert "subset/percent_050/seed_0" in keys
+    assert len(Dataset.open(folder / "subset/percent_050/seed_0")) == 4
+    experiment = load_experiment(logs / "sizes.toml", logs / "runs")
+    page = write_errors(experiment, Selection.of(experiment.recipe))
+    assert page is not None
+    lines = page.read_text().splitlines()
+    gap = json.loads((folder / "ground/nas/percent_050/seed_0/gap.json").read_text())
+    of_yaw = lines[next(i for i, line in enumerate(lines) if "`heading_x`" in line) :]
+    assert of_yaw[2].startswith("| 50 % | Standing still |") and of_yaw[7].startswith("| 100 % | NAS |")
+    # One drive of four is held out: it has no interval.
+    assert f"| 50 % | No grounding | {gap['raw']['heading_x']['mean'][0]:.3g} |" in of_yaw[3]
+    assert f"| 50 % | NAS | {gap['grounded']['heading_x']['mean'][0]:.3g} |" in of_yaw[4]
+    assert sum(line.startswith("- NAS, `") for line in lines) == 4
+
+
+def test_other_data_of_the_same_name_are_labeled_anew(logs: Path, tmp_path: Path) -> None:
+    shutil.copy(logs / "cart.py", tmp_path / "cart.py")
+    drives = sorted((logs / "csv").glob("*.csv"))
+    import_dataset(drives, CART / "logs.toml", out=tmp_path / "logs")
+    made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
+    path = tmp_path / "again.toml"
+
+    def labeled() -> tuple[str, str]:
+        found = check(path, root=tmp_path / "runs")["label/seed_0"]
+        return found.state, found.why
+
+    assert labeled() == ("finished", "")
+    shutil.rmtree(tmp_path / "logs")
+    import_dataset(drives[:4], CART / "logs.toml", out=tmp_path / "logs")
+    assert labeled() == ("stale", "made from another dataset than cart-logs@data-1.0.0")
+    set_aside(tmp_path / "runs/again", "label/seed_0")
+    made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
+    assert labeled() == ("finished", "")
+    assert len(Dataset.open(tmp_path / "runs/again/label/seed_0")) == 4
+    # Data that lack nothing are linked to.
+    whole = subset(Dataset.open(tmp_path / "runs/again/label/seed_0"), percent=100, out=tmp_path / "whole")
+    path = path.rename(tmp_path / "linked.toml")
+    path.write_text(path.read_text().replace('data = "logs"', 'data = "whole"'))
+    experiment = load_experiment(path, tmp_path / "runs")
+    (item,) = [
+        item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"
+    ]
+    item.call(progress=silent)
+    assert (experiment.folder / "label/seed_0").is_symlink()
+    assert condition(item, experiment).is_finished and not can_be_made_again(item.key, experiment)
+    # What was made of it since is no other; what was made of another is.
+    link = experiment.folder / "label/seed_0"
+    older = shutil.copytree(whole, tmp_path / "older")
+    shutil.rmtree(whole)
+    delete(Dataset.open(older), Dataset.open(older).uids[:1].tolist(), out=whole)
+    link.unlink()
+    link.symlink_to(older)
+    assert condition(item, experiment).is_finished
+    import_dataset(drives[4:], CART / "logs.toml", out=tmp_path / "others")
+    link.unlink()
+    link.symlink_to(label(experiment.recipe.task, data=tmp_path / "others", out=tmp_path / "labeled"))
+    assert condition(item, experiment).why.startswith("made from another dataset than cart-logs@")
+    assert can_be_made_again(item.key, experiment)

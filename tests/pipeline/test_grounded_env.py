@@ -1,0 +1,347 @@
+"""Grounded-v0 and policies of other learners, on a run of a user's own cart and on one in a maze."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+import astra_data.envs
+from astra_data.cli.app import app
+from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.manifest import read_manifest, write_manifest
+from astra_data.core.progress import silent
+from astra_data.grounding.files import load_target_encoder, save_target_encoder
+from astra_data.io.importing import import_dataset
+from astra_data.pipeline import grounded_env
+from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.grounded_env import OPTIONS, evaluate_policy
+from astra_data.pipeline.plan import plan, stage_of
+from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
+from astra_data.pipeline.trained_policy import load_policy, settings_of
+from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SingleEnv
+from astra_data.policies.own_policy import OwnPolicy
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.train import InSimulator
+from astra_data.worlds.own_code import own_object
+
+gymnasium.register_envs(astra_data.envs)
+ID = "astra_data/Grounded-v0"
+EXAMPLES = Path(__file__).parents[2] / "recipes/examples"
+RECIPE = """
+task = "cart.py:TASK"
+data = "logs"
+methods = ["direct_transfer", "nas", "astra", "astra_plus"]
+seeds = [0]
+[ground]
+updates = 2
+batch_windows = 4
+window = 5
+latent_size = 4
+held_out_share = 0.25
+[train]
+num_envs = 4
+rollout_steps = 8
+total_steps = 64
+hidden_sizes = [8]
+memory_size = 4
+data_start_share = 0.0
+tries = 1
+[align]
+updates = 2
+batch_windows = 4
+window = 5
+[evaluate]
+episodes = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of the cart, with a policy of one row; its recipe stands beside `runs`."""
+    folder = tmp_path_factory.mktemp("grounded")
+    own_object(f"{EXAMPLES}/cart/robot.py:record")(folder / "csv", drives=8, seconds=6)
+    (folder / "cart.py").write_text((EXAMPLES / "cart/cart.py").read_text())
+    import_dataset(sorted((folder / "csv").glob("*.csv")), EXAMPLES / "cart/logs.toml", out=folder / "logs")
+    (folder / "cart.toml").write_text(RECIPE)
+    experiment = load_experiment(folder / "cart.toml", folder / "runs")
+    for item in plan(experiment.recipe, experiment.path, experiment.folder):
+        if item.key == "train/astra/seed_0" or stage_of(item) in ("label", "pair", "ground", "align"):
+            item.call(progress=silent)
+    (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
+    return experiment.folder
+
+
+def world_of(run: Path, row: str, **options: Any) -> SimulatorEnv:  # noqa: ANN401
+    """Return what Grounded-v0 wraps, as `train` builds it."""
+    env = gymnasium.make(ID, run=run, row=row, **options).unwrapped
+    assert isinstance(env, SingleEnv)
+    world: SimulatorEnv = env.env.env  # type: ignore[attr-defined]
+    return world
+
+
+@pytest.mark.filterwarnings("ignore:.*infinity")
+@pytest.mark.parametrize(
+    ("row", "size"), [("direct_transfer", 2), ("nas", 2 + 4), ("astra", 2 + 4), ("astra_plus", 2 + 4)]
+)
+def test_gymnasiums_own_checks_pass_for_a_task_of_ones_own(run: Path, row: str, size: int) -> None:
+    env = gymnasium.make(ID, run=str(run), row=row, seed=0)
+    assert env.observation_space.shape == (size,)
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,))
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_direct_transfer_is_the_raw_simulator_driven_in_its_units(run: Path) -> None:
+    env = gymnasium.make(ID, run=run, row="direct_transfer")
+    (ahead, left), _ = env.reset(seed=3)
+    seen = np.array([ahead, left]) * 3.0
+    assert np.hypot(*seen) == pytest.approx(3.0, rel=1e-5)
+    observation, reward, *_ = env.step(np.array([1.0, 0.0], dtype=np.float32))
+    # +1 of v's bounds (-0.2, 1.0) m/s over 0.1 s, and 0 of w's: 0.1 m ahead.
+    np.testing.assert_allclose(observation * 3.0, seen - [0.1, 0.0], atol=1e-5)
+    nearer = 3.0 - np.hypot(seen[0] - 0.1, seen[1])
+    assert reward == pytest.approx(nearer, abs=1e-5)
+
+
+def test_the_row_and_the_recipe_give_the_defaults_and_keywords_change_them(run: Path) -> None:
+    plain, predicted, plus = (world_of(run, row) for row in ("nas", "astra", "astra_plus"))
+    assert (plain.reward, predicted.reward, plus.reward) == ("abstract", "predicted", "priced")
+    assert (plain.change_penalty, plus.change_penalty) == (0.0, 0.02)
+    assert plain.data_start_share == plus.data_start_share == 0.0 and plain.starts is None
+    changed = world_of(run, "nas", data_start_share=1.0)
+    assert changed.data_start_share == 1.0 and changed.starts is not None
+
+
+def test_it_is_the_environment_that_the_row_was_trained_in(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built: list[SimulatorEnv] = []
+    build = InSimulator.world
+
+    def kept(self: InSimulator, training: Any, **more: Any) -> Any:  # noqa: ANN401
+        made = build(self, training, **more)
+        built.append(made[0])
+        return made
+
+    monkeypatch.setattr(InSimulator, "world", kept)
+    experiment = load_experiment(run.parents[1] / "cart.toml", run.parent)
+    items = {item.key: item for item in plan(experiment.recipe, experiment.path, run)}
+    call: Any = items["train/astra_plus/seed_0"].call
+    config = call.keywords["config"].model_copy(update={"data_start_share": 0.25})
+    call(config=config, out=run.parents[1] / "again", progress=silent)
+    trained, ours = built[0], world_of(run, "astra_plus", seed=0, data_start_share=0.25)
+    plain = (str, float, int, bool)
+    switches = {name: value for name, value in vars(trained).items() if isinstance(value, plain)}
+    assert {name: vars(ours)[name] for name in switches} == switches | {"num_envs": 1, "penalty_scale": 1.0}
+    assert trained.starts is not None and ours.starts is not None
+    assert torch.equal(trained.starts.state, ours.starts.state)
+
+
+def test_a_recipe_that_chooses_has_the_same_environments(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A choice needs a second seed and a judge, which a single row and seed do not have."""
+    settings = settings_of(run) | {"seeds": [0, 1], "select": {}}
+    monkeypatch.setattr(grounded_env, "settings_of", lambda _: settings)
+    for row in ("direct_transfer", "nas", "astra_plus"):
+        assert world_of(run, row, seed=0).num_envs == 1
+
+
+@pytest.mark.usefixtures("forgotten_methods")
+def test_methods_of_the_run_s_own_are_added_when_it_is_opened(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fresh process knows none of them."""
+    (tmp_path / "mine.py").write_text(
+        "from astra_data.methods import METHODS\nMETHOD = METHODS['direct_transfer']\n"
+    )
+    own = {"mine": f"{tmp_path}/mine.py:METHOD"}
+    settings = settings_of(run) | {"own_methods": own, "methods": ["direct_transfer", "mine"]}
+    monkeypatch.setattr(grounded_env, "settings_of", lambda _: settings)
+    mine, raw = (gymnasium.make(ID, run=run, row=row) for row in ("mine", "direct_transfer"))
+    np.testing.assert_array_equal(mine.reset(seed=3)[0], raw.reset(seed=3)[0])
+
+
+def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
+    def steps(**options: Any) -> int:  # noqa: ANN401
+        env = gymnasium.make(ID, run=run, row="nas", **options)
+        env.reset(seed=0)
+        back = np.array([-1.0, 0.0], dtype=np.float32)
+        for number in range(1, 1000):
+            if env.step(back)[3]:
+                return number
+        raise AssertionError
+
+    env = gymnasium.make(ID, run=run, row="nas", episode_steps=2).unwrapped
+    ends = [env.reset() and [env.step(np.zeros(2, dtype=np.float32))[3] for _ in range(2)] for _ in range(2)]
+    assert ends == [[False, True], [False, True]]
+    assert (steps(), steps(episode_steps=7), steps(max_episode_steps=5)) == (150, 7, 5)
+    make: Callable[..., Any] = gymnasium.make_vec
+    limits: list[dict[str, int]] = [{}, {"max_episode_steps": 6}, {"max_episode_steps": 400}]
+    vectors = [make(ID, num_envs=3, run=run, row="nas", **more) for more in limits]
+    assert [env.max_episode_steps for env in vectors] == [150, 6, 150]
+    assert all(isinstance(env, BatchedVectorEnv) for env in vectors)
+
+
+def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: Path) -> None:
+    options: dict[str, Any] = {"run": run, "row": "nas"}
+    make: Any = gymnasium.make
+    many, one = gymnasium.make_vec(ID, num_envs=1, **options), make(ID, **options)
+    simulator: Any = world_of(run, "nas").simulator
+    assert simulator.scatter_model is not None
+    action = np.array([0.5, 0.2], dtype=np.float32)
+
+    def seen(env: Any, actions: Array) -> Array:  # noqa: ANN401
+        return np.stack([env.reset(seed=5)[0], *(env.step(actions)[0] for _ in range(5))])
+
+    single = seen(one, action)
+    np.testing.assert_array_equal(seen(many, action[None])[:, 0], single)
+    torch.rand(3)
+    np.testing.assert_array_equal(seen(one, action), single)
+
+
+def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> None:
+    make: Callable[..., Any] = gymnasium.make
+
+    def refused(message: str, **options: Any) -> None:  # noqa: ANN401
+        with pytest.raises(AstraDataError, match=message) as raised:
+            make(ID, **{"run": run, "row": "nas"} | options)
+        assert "\n" not in str(raised.value)
+
+    refused("expected the folder of a run", run=tmp_path)
+    refused("unknown method 'nass'", row="nass")
+    refused("iql is not trained in a simulator: .* direct_transfer for the raw simulator", row="iql")
+    refused(r"expected .*pair/seed_3, .*ground/nas/seed_3: run the recipe first", seed=3)
+    refused("the recipe has no size 50", percent=50)
+    refused("unknown option 'episode_step': did you mean 'episode_steps'", episode_step=3)
+    refused("unknown option 'reward'", reward="abstract")
+    refused("data_start_share: expected less than or equal to 1, got 2", data_start_share=2.0)
+    settings = json.loads((run / "recipe.json").read_text())
+    (tmp_path / "recipe.json").write_text(json.dumps(settings | {"sweep": {"percent": [50, 100]}}))
+    refused(r"has several sizes: expected percent, one of \[50, 100\]", run=tmp_path)
+    assert OPTIONS == ("data_start_share", "episode_steps")
+
+
+class OurPolicyAgain:
+    """The run's own network, behind the protocol."""
+
+    def __init__(self, run: Path, row: str) -> None:
+        self.network, self.seen = load_policy(run, row).policy, []  # type: ignore[var-annotated]
+
+    def act(self, observation: Array) -> Array:
+        self.seen.append(observation)
+        features, _ = self.network.remember(
+            torch.from_numpy(observation), torch.zeros(len(observation), 2), torch.zeros(len(observation), 0)
+        )
+        return self.network.act(features).numpy()
+
+
+def test_a_rows_own_network_behind_the_protocol_has_the_rows_figures(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, read = OurPolicyAgain(run, "astra"), Mock(wraps=settings_of)
+    monkeypatch.setattr(grounded_env, "settings_of", read)
+    evaluate_policy(run, "astra", policy, out=tmp_path / "own")
+    read.assert_called_once_with(run)
+    experiment = load_experiment(run.parents[1] / "cart.toml", run.parent)
+    items = {item.key: item for item in plan(experiment.recipe, experiment.path, run)}
+    items["evaluate/astra/seed_0"].call(out=tmp_path / "row", progress=silent)
+    own, row = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("own", "row"))
+    for simulator in ("simulated", "raw", "grounded"):
+        assert own[simulator] == row[simulator]
+    assert own["dataset_hash"] == row["dataset_hash"] and own["policy"] == "OurPolicyAgain"
+    assert {observation.shape for observation in policy.seen} == {(3, 2 + 4)}
+
+
+def test_in_a_target_latents_come_from_the_aligned_encoder(run: Path, tmp_path: Path) -> None:
+    task = f"{EXAMPLES}/cart/robot.py:TASK"  # the cart with a target
+    settings = json.loads((run / "recipe.json").read_text())
+    moved = tmp_path / "cart"
+    moved.mkdir()
+    for stage in ("pair", "ground", "align", "train"):
+        (moved / stage).symlink_to(run / stage)
+    tested = settings["evaluate"] | {"encoder": "target"}
+    (moved / "recipe.json").write_text(json.dumps(settings | {"task": task, "evaluate": tested}))
+    evaluate_policy(moved, "astra", OurPolicyAgain(run, "astra"), out=tmp_path / "own")
+    parts = {"policy": "train", "grounding": "ground", "target_encoder": "align"}
+    inputs: dict[str, Any] = {name: run / stage / "astra/seed_0" for name, stage in parts.items()}
+    evaluate(task, "astra", EvaluateConfig(episodes=3, encoder="target"), **inputs, out=tmp_path / "row")
+    own, row = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("own", "row"))
+    assert own["target"] == row["target"] and own["encoders"] == row["encoders"]
+    assert own["encoder"] == "target"
+
+
+@pytest.mark.parametrize(("latent_r2", "deployed"), [(0.89, False), (0.95, True)])
+def test_a_policy_is_deployed_with_the_encoder_that_explains_the_latents(
+    run: Path, tmp_path: Path, latent_r2: float, deployed: bool
+) -> None:
+    moved = Path(shutil.copytree(run, tmp_path / "cart"))
+    file = moved / "align/astra/seed_0/target_encoder.safetensors"
+    encoder = load_target_encoder(file)
+    encoder.latent_r2.fill_(latent_r2)
+    save_target_encoder(file, encoder)
+    manifest = read_manifest(file.parent)
+    assert manifest is not None
+    write_manifest(file.parent, manifest.made_from)
+    loaded = load_policy(moved, "astra").target_encoder
+    assert (loaded is not None) == deployed
+
+
+def test_a_policy_that_gives_no_actions_is_named(run: Path, tmp_path: Path) -> None:
+    class Wide:
+        def act(self, observation: Array) -> Array:
+            return observation
+
+    with pytest.raises(BadInputError, match=r"Wide\.act: expected actions of shape \(3, 2\), got \(3, 6\)"):
+        evaluate_policy(run, "nas", Wide(), out=tmp_path / "own")
+    assert not (tmp_path / "own").exists()
+
+
+def test_the_example_learns_and_is_tested_by_the_command_line(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(EXAMPLES / "random_search.py", tmp_path)
+    own_object("random_search.py:learn")(run, "nas", rounds=4)
+    returns = [float(line.split()[3].rstrip(",")) for line in capsys.readouterr().out.splitlines()]
+    assert len(returns) == 4 and returns[-1] > returns[0] + 1.0
+    shutil.copy("random_search.py", "learned.py")
+    given = ["evaluate", "cart.toml", "--root", str(run.parent), "--method", "nas", "--seed", "0"]
+    out = tmp_path / "tested"
+    app([*given, "--policy", "learned.py:POLICY", "--out", str(out)], standalone_mode=False)
+    tested = json.loads((out / "evaluation.json").read_text())
+    assert tested["policy"] == "Linear" and len(tested["grounded"]["success"]) == 3
+    observation = torch.ones(1, 2 + 4)
+    by_hand = np.tanh(np.ones((1, 2 + 4)) @ np.load("linear.npy"))
+    acted = OwnPolicy(own_object("learned.py:POLICY"), 6, 2).act(observation)
+    np.testing.assert_allclose(acted, by_hand, atol=1e-6)
+
+
+def test_the_command_says_what_a_policy_of_ones_own_is_given_with(tmp_path: Path) -> None:
+    policy, out = ["--policy", "mine.py:POLICY"], ["--out", str(tmp_path / "tested")]
+    one = ["--method", "nas", "--seed", "0"]
+    for given in (
+        policy,
+        [*policy, *one],
+        [*policy, *out, "--seed", "0"],
+        [*policy, *out, *one, "--seed", "1"],
+        [*policy, *out, *one, "--method", "astra"],
+    ):
+        with pytest.raises(BadInputError, match="with --policy, give one --method, one --seed and --out"):
+            app(["evaluate", "cart.toml", *given], standalone_mode=False)
+    with pytest.raises(BadInputError, match="--out goes with --policy"):
+        app(["evaluate", "cart.toml", *one, *out], standalone_mode=False)
+
+
+def test_a_policy_needs_what_its_row_is_tested_with(run: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "cart"
+    moved.mkdir()
+    for stage in ("recipe.json", "pair", "ground"):
+        (moved / stage).symlink_to(run / stage)
+    with pytest.raises(BadInputError, match=r"expected .*align/astra/seed_0: run the recipe first"):
+        evaluate_policy(moved, "astra", OurPolicyAgain(run, "astra"), out=tmp_path / "own")

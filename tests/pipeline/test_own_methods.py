@@ -1,0 +1,158 @@
+"""Methods of one's own, as recipes name them."""
+
+from pathlib import Path
+
+import pytest
+from fake_runs import bare_results
+
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.methods import METHODS
+from astra_data.pipeline import run
+from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.own_methods import OwnMethod, add_all, looked_up, with_offered
+from astra_data.reports.results import results_json
+
+EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"
+pytestmark = pytest.mark.usefixtures("forgotten_methods")
+DELTA, ENSEMBLE = (f"{EXAMPLES}/{name}.py:METHOD" for name in ("delta_action", "residual_ensemble"))
+
+
+def test_a_place_alone_is_a_method_with_its_usual_settings() -> None:
+    own = OwnMethod.model_validate(DELTA)
+    own.add("delta")
+    settings = own.settings("delta")
+    assert settings is not None and settings.model_dump() == {"memory": 32, "learning_rate": 0.003}
+    assert own.model_dump() == {"method": DELTA}
+    plain = OwnMethod.model_validate(ENSEMBLE)
+    plain.add("plain")
+    assert plain.settings("plain") is None
+
+
+def test_further_keys_are_its_settings() -> None:
+    own = OwnMethod.model_validate({"method": DELTA, "memory": 5})
+    own.add("delta")
+    settings = own.settings("delta")
+    assert settings is not None and settings.model_dump() == {"memory": 5, "learning_rate": 0.003}
+    assert OwnMethod.model_validate(own.model_dump()) == own
+
+
+def test_those_that_it_does_not_have_are_refused_before_anything_runs() -> None:
+    with pytest.raises(BadInputError, match=r"^delta: memory: expected a whole number"):
+        add_all({"delta": {"method": DELTA, "memory": "much"}})
+    with pytest.raises(BadInputError, match=r"^plain: .* has no settings, got memory"):
+        add_all({"plain": {"method": ENSEMBLE, "memory": 5}})
+
+
+def test_all_of_a_recipe_are_added_as_recipe_json_has_them() -> None:
+    add_all({"one": DELTA, "other": {"method": ENSEMBLE}})
+    assert {"one", "other"} <= METHODS.keys()
+
+
+def test_the_process_of_an_item_knows_them_and_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+    monkeypatch.setattr("torch.set_num_threads", told.append)
+    run._prepare({"one": OwnMethod.model_validate(DELTA)})
+    assert "one" in METHODS and told == [1]
+
+
+def test_files_are_looked_up_beside_the_recipe() -> None:
+    found = looked_up(
+        {
+            "a": "a.py:METHOD",
+            "b": {"method": "b.py:METHOD", "memory": 5},
+            "c": "package.mod:METHOD",
+            "d": 7,
+        },
+        Path("there"),
+    )
+    assert found == {
+        "a": {"method": "there/a.py:METHOD"},
+        "b": {"method": "there/b.py:METHOD", "memory": 5},
+        "c": {"method": "package.mod:METHOD"},
+        "d": 7,
+    }
+
+
+def test_those_that_packages_offer_are_named_as_if_the_recipe_gave_their_places(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    offered = {"theirs": "their.module:METHOD", "unused": "no.module:METHOD", "nas": "no.module:METHOD"}
+    monkeypatch.setattr("astra_data.methods.offered", lambda _: offered)
+    tables = {"methods": ["nas", "theirs_plus"], "theirs": {"memory": 5}, "own_methods": {"mine": DELTA}}
+    assert with_offered(tables, ("methods", "own_methods")) == {
+        "methods": ["nas", "theirs_plus"],
+        "own_methods": {"mine": DELTA, "theirs": {"memory": 5, "method": "their.module:METHOD"}},
+    }
+    for as_it_is in ({"methods": ["nas"], "mine": {}}, {"methods": "theirs"}, {"theirs": 5}):
+        assert with_offered(as_it_is, ("methods", "own_methods")) == as_it_is
+    given = {"methods": ["theirs"], "own_methods": {"theirs": DELTA}}
+    assert with_offered(given, ("methods", "own_methods")) == given
+
+
+OWN = """task = "antmaze-umaze"
+methods = ["delta", "nas"]
+seeds = [0]
+[own_methods]
+delta = {{ method = "{place}", memory = {memory} }}
+"""
+
+
+def test_a_recipe_that_changes_their_settings_borrows_nothing_made_with_those_of_its_base(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "base.toml").write_text(OWN.format(place=DELTA, memory=32))
+    other = tmp_path / "other.toml"
+    for memory, borrowed in ((32, {"collect", "pair", "ground", "train", "align", "evaluate"}), (8, None)):
+        other.write_text(f'based_on = "base"\n{OWN.format(place=DELTA, memory=memory)}')
+        assert load_experiment(other, tmp_path).borrowed == (borrowed or {"collect", "pair"})
+    # Another method that the base does not know of changes nothing of it.
+    other.write_text(f'based_on = "base"\n[own_methods]\nplain = "{ENSEMBLE}"\n')
+    assert "ground" in load_experiment(other, tmp_path).borrowed
+    # That its default is written out is no change.
+    (tmp_path / "base.toml").write_text(OWN.format(place=DELTA, memory=32).replace(", memory = 32", ""))
+    other.write_text(f'based_on = "base"\n{OWN.format(place=DELTA, memory=32)}')
+    assert "ground" in load_experiment(other, tmp_path).borrowed
+
+
+def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_recipe_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tmp_path / "own.toml"
+    recipe.write_text(OWN.format(place=DELTA, memory=32))
+    settings = load_experiment(recipe, tmp_path).recipe.settings
+
+    def published(**changes: object) -> None:
+        row = "nas" if changes.pop("other", None) else "delta"
+        (tmp_path / "results").mkdir(exist_ok=True)
+        found = bare_results("own", {row: [0]}, settings | changes)
+        (tmp_path / "results/own.json").write_text(results_json(found))
+
+    published()
+    assert len(load_experiment(recipe, tmp_path).published()) == 1
+    recipe.write_text(OWN.format(place=DELTA, memory=8))
+    with pytest.raises(RecipeError, match=r"^own_methods\.delta changed in .* since the results"):
+        load_experiment(recipe, tmp_path).published()
+    other = {"own_methods": {"delta": {"method": DELTA, "no_setting": 3}}}
+    published(**other)
+    with pytest.raises(RecipeError, match=r"^own_methods\.delta changed"):
+        load_experiment(recipe, tmp_path).published()
+    published(other=True, **other)
+    assert len(load_experiment(recipe, tmp_path).published()) == 1
+
+
+@pytest.mark.parametrize("row", ["delta", "delta_plus", "astra"])
+@pytest.mark.parametrize(
+    "table", ["compare = ['{}']", "trajectory_methods = ['{}']", "paper_success.{} = 0.5"]
+)
+def test_a_report_names_them_like_others_and_a_wrong_name_is_told_before_the_run(
+    tmp_path: Path, row: str, table: str
+) -> None:
+    path = tmp_path / "own.toml"
+    recipe = OWN.format(place=DELTA, memory=32) + "[report]\n"
+    path.write_text(recipe + table.format(row))
+    load_experiment(path, tmp_path)
+    path.write_text(recipe + table.format("delt"))
+    with pytest.raises(
+        RecipeError, match=r"report\.(compare|trajectory_methods|paper_success): unknown .*'delt'"
+    ):
+        load_experiment(path, tmp_path)

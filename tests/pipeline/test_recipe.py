@@ -1,0 +1,136 @@
+import re
+from typing import Any
+
+import pytest
+
+from astra_data.core.config import Config, validated
+from astra_data.core.errors import RecipeError
+from astra_data.methods.method import Table
+from astra_data.pipeline.recipe import Recipe, with_tables
+from astra_data.pipeline.stages.registry import STAGES
+from astra_data.policies.iql import IqlConfig
+from astra_data.policies.train import PpoTrainConfig, SacTrainConfig
+from astra_data.policies.train_in_target import TargetConfig
+
+BASE = {
+    "task": "humanoid-walker2d",
+    "methods": ["direct_transfer"],
+    "seeds": [0],
+}
+SAC = {"learner": "sac"}
+
+
+def read(**tables: Any) -> Recipe:  # noqa: ANN401
+    return validated(BASE | tables, Recipe, "r.toml")
+
+
+def test_the_learner_decides_what_the_training_is_told() -> None:
+    assert isinstance(read().train, PpoTrainConfig)
+    recipe = read(train=SAC | {"window": 24})
+    assert isinstance(recipe.train, SacTrainConfig) and recipe.train.window == 24
+    assert read(**recipe.settings) == recipe
+
+
+class MyConfig(Config):
+    rate: float = 0.5
+
+
+def test_the_table_of_a_new_method_is_read() -> None:
+    tables = [Table("mine", MyConfig), Table("yours", MyConfig, default=MyConfig(rate=2.0))]
+    model = with_tables(Recipe, STAGES.values(), tables)
+    recipe = validated(BASE | {"mine": {"rate": 0.7}}, model, "r.toml")
+    assert recipe.mine == MyConfig(rate=0.7) and recipe.yours == MyConfig(rate=2.0)
+    with pytest.raises(RecipeError, match=r"mine\.rat: unknown key: did you mean 'rate'"):
+        validated(BASE | {"mine": {"rat": 0.7}}, model, "r.toml")
+
+
+def test_settings_are_those_of_the_rows_method_for_the_stage_that_takes_them() -> None:
+    rows = ["iql", "behavior_cloning", "direct_transfer_iql", "target", "full_obs", "astra"]
+    recipe = read(methods=rows, iql={"batch_windows": 5}, target={"num_envs": 3})
+    assert recipe.settings_of("iql", "train") == IqlConfig(batch_windows=5)
+    assert recipe.settings_of("behavior_cloning", "train") == IqlConfig(batch_windows=5)
+    assert recipe.settings_of("direct_transfer_iql", "train") == IqlConfig(batch_windows=5)
+    assert recipe.settings_of("full_obs", "train") == TargetConfig(num_envs=3)
+    assert recipe.settings_of("target", "ground") is recipe.settings_of("astra", "train") is None
+
+
+def test_alignment_holds_out_what_grounding_does() -> None:
+    assert read().align.held_out_share == read().ground.held_out_share
+    assert read(ground={"held_out_share": 0.3}).align.held_out_share == 0.3
+    both = {"held_out_share": 0.25}
+    assert read(ground=both, align=both | {"updates": 7}).align.updates == 7
+    message = r"align: held_out_share: expected that of \[ground\], 0.3, got 0.1"
+    with pytest.raises(RecipeError, match=message):
+        read(ground={"held_out_share": 0.3}, align={"held_out_share": 0.1})
+
+
+def test_stages_get_their_tables() -> None:
+    recipe = read(train={"num_envs": 8}, collect={"episodes": 40}, sweep={"percent": [50]})
+    assert recipe.config_of("train").num_envs == 8  # type: ignore[union-attr]
+    assert recipe.config_of("evaluate") == recipe.evaluate
+    # What is collected is the largest size.
+    assert recipe.config_of("collect").episodes == 20  # type: ignore[union-attr]
+    assert recipe.config_of("subset") is None
+    assert "select" not in recipe.settings, "a choice is made where a recipe asks for one"
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"train": {"learner": "foo"}}, "train.learner: expected 'ppo' or 'sac', got 'foo'"),
+        ({"train": {"burn_in": 4}}, "train.burn_in: unknown key: 'sac' has it, not 'ppo'"),
+        ({"train": SAC | {"num_env": 9}}, "train.num_env: unknown key: did you mean 'num_envs'?"),
+        ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
+        ({"train": SAC, "methods": ["rma_plus"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
+        *(
+            ({table: {}}, f"{table}: unknown key")
+            for table in ("plus", "compass", "domain_randomization", "nas_golemo", "direct_transfer_iql")
+        ),
+        ({"train": {"reward": "predicted"}}, "train.reward: unknown key"),
+        ({"train": {"command_limit": 1.0}}, "train.command_limit: unknown key"),
+        ({"ground": {"members": 3}}, "ground.members: unknown key"),
+        ({"select": {"failure_members": 3}}, "select.failure_members: unknown key"),
+        ({"methods": ["compass_uniform"]}, "unknown method 'compass_uniform'"),
+        ({"methods": ["iql_plus"]}, "'iql_plus' trains nothing in a simulator"),
+        ({"train": 3}, "train: expected a table, got 3"),
+        ({"rma": 3}, "rma: expected a table, got 3"),
+        ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
+        ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),
+        (
+            {"collect": {"hold_s": [3.0, 0.5]}},
+            "collect.hold_s: expected the lower end first, got [3.0, 0.5]",
+        ),
+        ({"collect": {"episodes": 10**18}}, "collect.episodes: expected less than or equal"),
+        ({"collect": {"episodes": 10**10}}, "collect: episodes: 10000000000 of up to 500"),
+        (
+            {"sweep": {"percent": [50], "ground.latent_weight": [0, 1]}},
+            "sweep: expected percent alone, got ground.latent_weight: for values of another setting",
+        ),
+        ({"sweep": {"percent": [10**9]}}, "sweep.percent.0: expected less than or equal to 10000"),
+        (
+            {"task": "antmaze-umaze", "sweep": {"percent": [50]}, "augment": {"copies": 2}},
+            "sweep.percent: counts recorded episodes, but [augment] adds copies",
+        ),
+        ({"train": {"num_envs": 10**9}}, "train.num_envs: expected less than or equal to 1000000"),
+        ({"train": {"hidden_sizes": [10**9]}}, "train.hidden_sizes.0: expected less than or equal to"),
+        ({"evaluate": {"episodes": 10**9}}, "evaluate.episodes: expected less than or equal to 1000000"),
+        ({"task": "antmaze-umaze", "collect": {"behavior": "suboptimal_sac"}}, "use 'suboptimal_ppo'"),
+    ],
+)
+def test_what_does_not_fit_the_learner_is_told_in_a_line(tables: dict[str, Any], message: str) -> None:
+    with pytest.raises(RecipeError, match=f"^r.toml: .*{re.escape(message)}") as caught:
+        read(**tables)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_method_of_ones_own_that_is_not_there_is_told_once() -> None:
+    with pytest.raises(RecipeError, match=r"own_methods: .*nothing\.py") as caught:
+        read(own_methods={"mine": "nothing.py:METHOD"}, methods=["mine"])
+    assert "unknown method" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 2**64])
+def test_seeds_are_those_that_every_stage_takes(seed: int) -> None:
+    assert read(seeds=[0, 2**63 - 1]).seeds[1] == 2**63 - 1
+    with pytest.raises(RecipeError, match=r"seeds\.1: "):
+        read(seeds=[0, seed])

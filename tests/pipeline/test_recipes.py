@@ -1,0 +1,110 @@
+from pathlib import Path
+
+import pytest
+
+from astra_data.core.config import load_recipe
+from astra_data.core.errors import RecipeError
+from astra_data.pipeline.experiment import load_experiment
+from astra_data.pipeline.plan import plan
+from astra_data.studies.gap_recipe import GapRecipe
+
+HOUSE = Path(__file__).parents[2]
+
+
+WALKS = [HOUSE / f"recipes/{name}.toml" for name in ("nao_real", "icub_joints", "pace_joints")]
+"""Recipes of `astra-data gap`, which have no stages."""
+
+
+@pytest.mark.parametrize("path", WALKS, ids=lambda path: path.stem)
+def test_a_recipe_of_walks_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
+    first = path.read_text().splitlines()[0]
+    assert first == f"# uv run astra-data gap recipes/{path.name} --data FOLDER"
+    assert (path.parent / load_recipe(path, GapRecipe).mapping).is_file()
+
+
+EXAMPLES = [path for path in (HOUSE / "recipes/examples").glob("*/*.toml") if path.name != "logs.toml"]
+
+
+@pytest.mark.usefixtures("forgotten_methods")
+@pytest.mark.parametrize(
+    "path",
+    sorted({*(HOUSE / "recipes").glob("*.toml"), *EXAMPLES} - {*WALKS}),
+    ids=lambda path: path.stem,
+)
+def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
+    first, experiment = path.read_text().split("\n\n")[0], load_experiment(path, Path("runs"))
+    command = "sweep" if experiment.recipe.sweep.percent else "run"
+    assert any(
+        line.startswith("# ") and line.endswith(f"astra-data {command} {path.relative_to(HOUSE)}")
+        for line in first.splitlines()
+    )
+    assert plan(experiment.recipe, path, experiment.folder)
+
+
+def test_only_the_legs_differ_in_the_morphology_test() -> None:
+    experiment = load_experiment(HOUSE / "recipes" / "leg_scale.toml", Path("runs"))
+    assert experiment.recipe.evaluate.leg_scale == 1.25
+    assert experiment.borrowed == {"collect", "pair", "ground", "train", "align", "select"}
+
+
+@pytest.mark.parametrize("name", ["kinematics", "extended"])
+def test_only_the_simulator_differs_in_the_humanoids_tests(name: str) -> None:
+    ours, base = (
+        load_experiment(HOUSE / "recipes" / f"humanoid_{kind}.toml", Path("runs"))
+        for kind in (name, "walker2d")
+    )
+    assert ours.borrowed == {"collect"}
+    kept = ours.recipe.model_copy(update={"task": base.recipe.task, "based_on": None})
+    assert kept == base.recipe
+
+
+HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[collect]\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "end", "asked"),
+    [
+        (', "rma", "follower"', "", "methods: follower"),
+        ("", "clearance_m = 0.2\n[augment]\ncopies = 2\n", "augment, collect.clearance_m"),
+        ("", 'start = "anywhere"\n', 'collect.start = "anywhere"'),
+        ("", "[evaluate]\nleg_scale = 1.25\n", "evaluate.leg_scale"),
+        ("", "[evaluate]\nleg_scale = 0.8\n", "evaluate.leg_scale"),
+        ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),
+    ],
+)
+def test_what_needs_a_maze_is_refused_where_there_is_none(
+    tmp_path: Path, more: str, end: str, asked: str
+) -> None:
+    path = tmp_path / "humanoid.toml"
+    path.write_text(HUMANOID.format(""))
+    assert load_experiment(path, tmp_path).recipe.task == "humanoid-walker2d"
+    path.write_text(HUMANOID.format(more) + end)
+    with pytest.raises(RecipeError, match=f"humanoid-walker2d has no maze, which these need: {asked};"):
+        load_experiment(path, tmp_path)
+
+
+@pytest.mark.parametrize("task", ["nao-navigation", "antmaze-umaze"])
+def test_legs_of_another_length_are_for_tasks_that_have_them(tmp_path: Path, task: str) -> None:
+    path = tmp_path / "legs.toml"
+    recipe = f'task = "{task}"\nmethods = ["astra"]\nseeds = [0]\n[evaluate]\nleg_scale = '
+    path.write_text(f"{recipe}1.0\n")
+    assert load_experiment(path, tmp_path).recipe.evaluate.leg_scale == 1.0
+    path.write_text(f"{recipe}1.25\n")
+    if task == "antmaze-umaze":
+        assert load_experiment(path, tmp_path).recipe.evaluate.leg_scale == 1.25
+        return
+    with pytest.raises(RecipeError, match=r"evaluate\.leg_scale: nao-navigation has legs of one length"):
+        load_experiment(path, tmp_path)
+
+
+def test_robots_start_no_training_in_recorded_states(tmp_path: Path) -> None:
+    path, cart = tmp_path / "cart.toml", HOUSE / "recipes/examples/cart/robot.py"
+    started = f'task = "{cart}:TASK"\nmethods = ["nas", {{}}]\nseeds = [0]\n[train]\n'
+    for text in (started.format('"direct_transfer"'), f"{started}data_start_share = 0.0".format('"target"')):
+        path.write_text(text)
+        load_experiment(path, tmp_path)
+    path.write_text(started.format('"target"'))
+    with pytest.raises(RecipeError, match=r"data_start_share: .*would start: methods: target: expected 0$"):
+        load_experiment(path, tmp_path)
+    path.write_text(started.format('"target"').replace(f"{cart}:TASK", "antmaze-umaze"))
+    load_experiment(path, tmp_path)

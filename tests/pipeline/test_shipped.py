@@ -1,0 +1,115 @@
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from astra_data.cli.app import app
+from astra_data.core.errors import BadInputError
+from astra_data.pipeline.shipped import RECIPES, copy_recipe, shipped, shipped_recipes
+
+
+def recipes_of_the_repository() -> set[str]:
+    """Names of all that have rows, or models to compare; imports and the like have neither."""
+    files = (Path(__file__).parents[2] / "recipes").rglob("*.toml")
+    tables = {path.stem: tomllib.loads(path.read_text()) for path in files}
+    return {name for name, table in tables.items() if {"methods", "based_on", "models"} & table.keys()}
+
+
+def test_every_recipe_is_shipped_and_says_what_it_is() -> None:
+    recipes = shipped_recipes()
+    assert [recipe.name for recipe in recipes] == sorted(recipes_of_the_repository())
+    for recipe in recipes:
+        assert recipe.about.endswith("."), recipe.name
+        assert "astra-data run" not in recipe.about
+    assert shipped("leg_scale").task == "antmaze-umaze"
+    assert shipped("humanoid_extended").task == "humanoid-extended"
+
+
+def checked(path: Path) -> str:
+    """Return what `astra-data check` prints; in another process where methods of one's own are registered."""
+    if "own_methods" in tomllib.loads(path.read_text()):
+        command = [sys.executable, "-m", "astra_data", "check", str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.stdout + done.stderr
+    result = CliRunner().invoke(app, ["check", str(path)])
+    return f"{result.output}{result.exception or ''}"
+
+
+@pytest.mark.parametrize("name", sorted(recipes_of_the_repository()))
+def test_a_copy_has_all_that_it_needs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    copy_recipe(name, tmp_path / "recipes")
+    told = checked(tmp_path / "recipes" / shipped(name).path)
+    if name in {"cart", "fetch_push"}:
+        assert "data: no dataset" in told  # it comes from elsewhere
+    else:
+        assert "items are finished" in told or "no errors" in told, told
+
+
+def test_a_copy_brings_nothing_but_what_is_needed(tmp_path: Path) -> None:
+    def copied(name: str) -> list[str]:
+        return sorted(str(path.relative_to(tmp_path / name)) for path in copy_recipe(name, tmp_path / name))
+
+    assert copied("leg_scale") == ["antmaze_umaze.toml", "leg_scale.toml"]
+    assert copied("nao_real") == ["imports/nao_guda.toml", "nao_real.toml"]
+    assert copied("quickstart") == ["examples/cart/cart.py", "examples/cart/robot.py", "quickstart.toml"]
+    assert "examples/cart/robot.py" in copied("methods")
+    assert "examples/cart/logs.toml" in copied("cart")  # its head names it
+    for path in (tmp_path / "quickstart").rglob("*.*"):
+        assert path.read_bytes() == (RECIPES / path.relative_to(tmp_path / "quickstart")).read_bytes()
+
+
+def test_what_is_there_is_kept(tmp_path: Path) -> None:
+    copy_recipe("quickstart", tmp_path)
+    assert copy_recipe("quickstart", tmp_path) == []
+    changed = tmp_path / "examples/cart/robot.py"
+    changed.write_text("TASK = None\n")
+    (tmp_path / "quickstart.toml").unlink()
+    with pytest.raises(BadInputError, match=r"robot\.py exists and differs"):
+        copy_recipe("quickstart", tmp_path)
+    assert changed.read_text() == "TASK = None\n"
+    assert not (tmp_path / "quickstart.toml").exists()
+
+
+def test_in_a_checkout_all_is_there() -> None:
+    assert copy_recipe("quickstart", RECIPES) == []
+
+
+def test_the_package_may_be_reached_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(RECIPES.parent)
+    code = "from astra_data.pipeline.shipped import shipped; print(len(shipped('cart').files))"
+    settings = os.environ | {"PYTHONPATH": str(tmp_path / "link")}
+    told = subprocess.run(
+        [sys.executable, "-c", code], env=settings, cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    assert int(told.stdout) == len(shipped("cart").files)
+
+
+def test_a_misspelt_name_is_told_what_comes_close() -> None:
+    with pytest.raises(BadInputError, match=r"no recipe 'quickstrat' .*: did you mean 'quickstart'\?"):
+        shipped("quickstrat")
+
+
+def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
+    listed = CliRunner().invoke(app, ["recipes", "list"], env={"COLUMNS": "80"}).output.splitlines()
+    assert listed[0].strip() == "Start here" and listed[2].split()[:3] == ["quickstart", "3", "minutes"]
+    names = [line.split()[0] for line in listed if line.strip()]
+    assert [names.count(recipe.name) for recipe in shipped_recipes()] == [1] * len(shipped_recipes())
+    assert max(map(len, listed)) <= 80
+    copied = CliRunner().invoke(app, ["recipes", "copy", "quickstart", str(tmp_path)])
+    assert copied.output == f"finished: 3 files; astra-data run {tmp_path}/quickstart.toml\n"
+    assert (tmp_path / "quickstart.toml").is_file()
+
+
+def test_mappings_are_listed_and_copied(tmp_path: Path) -> None:
+    listed = CliRunner().invoke(app, ["recipes", "list"], env={"COLUMNS": "200"})
+    assert "ros2_base" in listed.output.partition("Mappings")[2] and "A wheeled base that" in listed.output
+    copied = CliRunner().invoke(app, ["recipes", "copy", "ros2_base", str(tmp_path)])
+    mapping = tmp_path / "imports/ros2_base.toml"
+    assert copied.output == f"finished: 2 files; astra-data import LOGS --mapping {mapping}\n"
+    assert mapping.is_file() and (tmp_path / "examples/ros2/drive.py").is_file()

@@ -1,0 +1,231 @@
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+from rail_run import ROOT, make_rail_run
+from typer.testing import CliRunner
+
+from astra_data.cli.app import app
+from astra_data.core.errors import BadInputError
+from astra_data.core.lock import held
+from astra_data.core.manifest import read_manifest
+from astra_data.core.seeding import derive
+from astra_data.pipeline import trials as module
+from astra_data.pipeline.recipe_file import recorded_settings
+from astra_data.pipeline.selecting import select
+from astra_data.pipeline.trained_policy import TrainedPolicy, trained_policy
+from astra_data.pipeline.trials import choose_by_trials
+from astra_data.policies.judging import Judge
+from astra_data.policies.running_policy import RunningPolicy
+from astra_data.reports.trials import TrialsFile, halve
+
+pytestmark = pytest.mark.usefixtures("quick_failures")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rows = '["direct_transfer", "nas", "astra"]'
+    folder = make_rail_run(tmp_path_factory.mktemp("trials"), seeds="[0, 1]", methods=rows)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Judge, "success", lambda self, policy, episodes, seed: (seed % 97) / 97)
+        select(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "rail"))
+
+
+class Tries:
+    """In place of `in_target`: who was tried how often from which seed; succeeds as it is asked."""
+
+    def __init__(self, *, breaks_at: int = 0, success: float = 1.0) -> None:
+        self.made: list[tuple[RunningPolicy, int, int, dict[str, Any]]] = []
+        self.breaks_at, self.success = breaks_at, success
+
+    def __call__(self, task: object, begin: Any, episodes: int, seed: int, **more: Any) -> Any:  # noqa: ANN401
+        if len(self.made) + 1 == self.breaks_at:
+            raise KeyboardInterrupt
+        self.made.append((begin.args[0], episodes, seed, more))
+        return SimpleNamespace(outcome=SimpleNamespace(success=[self.success] * episodes))
+
+
+@pytest.fixture
+def tries(monkeypatch: pytest.MonkeyPatch) -> Tries:
+    made = Tries()
+    monkeypatch.setattr(module, "in_target", made)
+    return made
+
+
+def test_trials_are_made_in_the_target(folder: Path) -> None:
+    shown = CliRunner().invoke(app, ["select", str(folder), "--trials", "12"])
+    assert shown.exit_code == 0, shown.output
+    record = TrialsFile.model_validate_json((folder / "select/trials.json").read_text())
+    assert record.field == 4 and record.spent == 12 and record.percent is None
+    assert [(of.trials, len(of.tried)) for of in record.rounds] == [(2, 4), (2, 2)]
+    assert record.chosen is not None and record.chosen in record.rounds[-1].candidates
+    row, seed = record.chosen
+    assert f"chosen with 12 trials: {row}, seed {seed}: success {record.mean:.2f}" in shown.output
+    assert "## Trials in the target" in (folder / "select/select.md").read_text()
+    manifest = read_manifest(folder / "select")
+    assert manifest is not None and "trials.json" in manifest.files
+    assert manifest.faults(folder / "select", verify=True) == manifest.foreign(folder / "select") == []
+
+
+def test_the_best_predicted_are_tried_and_the_posterior_decides(folder: Path, tries: Tries) -> None:
+    ranked = select(folder).ranked()
+    found = choose_by_trials(folder, 40, field=4)
+    assert found.rounds[0].candidates == [(one.row, one.seed) for one in ranked[:4]]
+    expected = halve([one.lower for one in ranked], 40, lambda _, those, each: [each] * len(those), field=4)
+    first = ranked[expected.chosen]
+    assert found.chosen == (first.row, first.seed) and found.mean == pytest.approx(expected.mean)
+    assert select(folder) == select(folder)  # the ranking stays, and so do the trials
+    assert (folder / "select/trials.json").is_file()
+
+
+def test_what_was_predicted_is_the_lower_quartile_over_the_judges(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = select(folder)
+    split = [one.model_copy(update={"success": {8: 0.0, 9: 1.0}}) for one in judged.candidates]
+    monkeypatch.setattr(module, "select", lambda *_, **__: judged.model_copy(update={"candidates": split}))
+    found = choose_by_trials(folder, 4, field=2)
+    # Of two successes in two trials, with a prediction of 0.25 that counts as four.
+    assert found.mean == pytest.approx((4 * 0.25 + 2) / (4 + 2))
+
+
+def test_candidates_of_a_round_meet_the_same_starts_and_goals(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = Mock(wraps=recorded_settings)
+    monkeypatch.setattr("astra_data.pipeline.trained_policy.recorded_settings", read)
+    choose_by_trials(folder, 20, field=4)
+    assert read.call_count == 1 + 1 + len(tries.made)  # by it, by the choice, and for each that is tried
+    seeds = [seed for *_, seed, _ in tries.made]
+    assert [made[1] for made in tries.made] == [2] * 4 + [6] * 2
+    assert len(set(seeds[:4])) == len(set(seeds[4:])) == 1 and seeds[0] != seeds[4]
+    assert not set(seeds) & {derive(seed, "evaluation") for seed in range(9)}
+
+
+def test_progress_goes_on_from_the_choice_to_the_trials(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
+    shares: list[float] = []
+    choose_by_trials(folder, 20, field=4, episodes=7, progress=lambda share, note: shares.append(share))
+    assert shares == sorted(shares) and shares[-1] == 1.0 and 0.5 in shares
+    assert sum(share > 0.5 for share in shares) == len(tries.made)
+
+
+@pytest.mark.parametrize("encoder", ["target", "source"])
+def test_policies_are_deployed_as_they_are_evaluated(folder: Path, tries: Tries, encoder: str) -> None:
+    recipe = folder / "recipe.json"
+    settings = json.loads(recipe.read_text())
+    recipe.write_text(json.dumps(settings | {"evaluate": {"encoder": encoder, "leg_scale": 1.25}}))
+    choose_by_trials(folder, 8, rows=["astra"], episodes=3)
+    assert [made[0].target_encoder is not None for made in tries.made] == [encoder == "target"] * 2
+    assert all(made[3]["leg_scale"] == 1.25 for made in tries.made)
+
+
+def test_an_interruption_costs_one_candidate_at_most(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    whole = choose_by_trials(other, 20, field=4)
+    broken = Tries(breaks_at=4)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "in_target", broken)
+        with pytest.raises(KeyboardInterrupt):
+            choose_by_trials(folder, 20, field=4)
+        found = TrialsFile.model_validate_json((folder / "select/trials.json").read_text())
+        assert found.spent == 6 and found.chosen is None
+        assert "Not finished" in (folder / "select/select.md").read_text()
+        broken.breaks_at = 0
+        choose_by_trials(folder, 20, field=4)
+        assert len(broken.made) == 3 + 3  # one of the first round and both of the second were left
+        choose_by_trials(folder, 20, field=4)
+        assert len(broken.made) == 6
+    shutil.rmtree(folder / "select")
+    shutil.copytree(other / "select", folder / "select")
+    assert choose_by_trials(folder, 20, field=4) == whole
+
+
+def test_what_trials_cannot_be_made_of_is_refused(folder: Path, tries: Tries) -> None:
+    with pytest.raises(BadInputError, match=r"--trials of 4 or more, for a first round of 2 .* got 3: give"):
+        choose_by_trials(folder, 3)
+    with pytest.raises(BadInputError, match=r"--trials of 12 or more, for a first round of 4 .* got 11"):
+        choose_by_trials(folder, 11, field=4)
+    with pytest.raises(BadInputError, match=r"another --field of 2 or more"):
+        choose_by_trials(folder, 30, field=1)
+    with pytest.raises(BadInputError, match=r"of the 6 that were judged, got 7: give another --field"):
+        choose_by_trials(folder, 300, field=7)
+    with pytest.raises(BadInputError, match=r"expected --percent to be a size of the run \(none\), got 50"):
+        choose_by_trials(folder, 30, percent=50)
+    with pytest.raises(BadInputError, match="nothing"):
+        choose_by_trials(folder, 30, rows=["nothing"])
+    assert not tries.made
+    choose_by_trials(folder, 12)
+    with pytest.raises(
+        BadInputError, match=r"with trials = 13, found 12 made with 12: use the same settings"
+    ):
+        choose_by_trials(folder, 13)
+    shown = CliRunner().invoke(app, ["select", str(folder), "--field", "3"])
+    assert isinstance(shown.exception, BadInputError) and "add --trials" in str(shown.exception)
+
+
+def test_trials_keep_others_out_and_go_on_only_as_they_began(folder: Path, tries: Tries) -> None:
+    held_once: list[bool] = []
+
+    def told(fraction: float, note: str) -> None:
+        with held(folder) as ours:
+            held_once.append(ours)
+        notes.append(note)
+
+    notes: list[str] = []
+    found = choose_by_trials(folder, 20, field=4, progress=told)
+    assert held_once and not any(held_once), "nobody else may work there"
+    first = found.rounds[0].tried[0]
+    assert f"{first.row}, seed {first.seed}: 2 of 2" in notes
+    with pytest.raises(BadInputError, match=r"with field = 3, found 20 made with 4: use the same settings"):
+        choose_by_trials(folder, 20, field=3)
+
+
+def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:
+    recipe = folder / "recipe.json"
+    task = {"task": f"{ROOT}/tests/small_cart.py:LOGS_ALONE"}
+    recipe.write_text(json.dumps(json.loads(recipe.read_text()) | task))
+    with pytest.raises(BadInputError, match=r"expected a task with a target, got .*LOGS_ALONE: leave out"):
+        choose_by_trials(folder, 12)
+
+
+def test_trials_are_of_the_size_that_is_asked_for(
+    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged, made, loaded = select(folder), trained_policy, list[int | None]()
+    sized = [one.model_copy(update={"percent": size}) for size in (50, 100) for one in judged.candidates]
+    both = judged.model_copy(update={"candidates": sized})
+
+    def noted(run: Path, row: str, *, seed: int, percent: int | None = None) -> TrainedPolicy:
+        loaded.append(percent)
+        return made(run, row, seed=seed)
+
+    monkeypatch.setattr(module, "trained_policy", noted)
+    monkeypatch.setattr(module, "select", lambda *_, **__: both)
+    with pytest.raises(BadInputError, match=r"a size of the run \(50, 100\), got none"):
+        choose_by_trials(folder, 20, field=4)
+    found = choose_by_trials(folder, 20, field=4, percent=50)
+    assert found.percent == 50 and loaded == [50] * 6
+    assert found.rounds[0].candidates == [(one.row, one.seed) for one in both.ranked(50)[:4]]
+    with pytest.raises(
+        BadInputError, match=r"with percent = 100, found 20 made with 50: use the same settings"
+    ):
+        choose_by_trials(folder, 20, field=4, percent=100)
+    alone = judged.model_copy(update={"candidates": judged.candidates[:1]})
+    monkeypatch.setattr(module, "select", lambda *_, **__: alone)
+    with pytest.raises(BadInputError, match=r"two candidates or more to try, of the 1 that were judged"):
+        choose_by_trials(folder, 20)

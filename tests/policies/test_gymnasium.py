@@ -1,0 +1,248 @@
+import subprocess
+import sys
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import astra_data.envs
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
+from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.robots.registry import TASKS
+
+gymnasium.register_envs(astra_data.envs)
+
+NAMES = [f"astra_data/{world}{maze}-v0" for world in ("AntMaze", "PointMaze") for maze in ("UMaze", "Long")]
+
+
+def point_mazes(num_envs: int, max_episode_steps: int) -> BatchedVectorEnv:
+    env = gymnasium.make_vec(
+        NAMES[2],
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=max_episode_steps,
+    )
+    assert isinstance(env, BatchedVectorEnv)
+    return env
+
+
+def goal_ward(observation: Array) -> Array:
+    """Return commands that turn a point mass around the inner wall of the U."""
+    x, y = observation[:, 0] * 10, observation[:, 1] * 10
+    east, west = (y > 2.5) & (x < 3), y < -2.5
+    command = np.zeros((len(observation), 2), dtype=np.float32)
+    command[east, 0], command[west, 0] = 1, -1
+    command[~east & ~west, 1] = -1
+    command[west, 1] = (observation[west, 5] - observation[west, 1]).clip(-0.1, 0.1) * 10
+    return command
+
+
+def test_registration_loads_no_world() -> None:
+    code = "import sys, astra_data.envs; assert not {'torch', 'mujoco'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+
+
+def test_without_gymnasium_one_line_says_how_to_install_it() -> None:
+    code = "import sys; sys.modules['gymnasium'] = None; import astra_data.envs"
+    ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 1
+    last = ran.stderr.splitlines()[-1]
+    assert last.endswith("BadInputError: gymnasium is needed but not installed: uv sync --extra sim")
+
+
+def test_failures_are_told_apart_from_successes() -> None:
+    task = TASKS["antmaze-umaze"]
+    walls = replace(task.objective, ends_at_walls=True)
+    simulator = NO_GROUNDING.simulator(task, 2)
+    env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(walls, simulator)), max_episode_steps=200)
+    env.reset(seed=0)
+    commands = np.array([[0.0, 0.0], [-1.0, 1.0]], dtype=np.float32)
+    for _ in range(100):
+        *_, terminated, _, infos = env.step(commands)
+        if terminated.any():
+            break
+    assert terminated.tolist() == [False, True]
+    assert infos["final_info"]["failed"].tolist() == [False, True]
+    assert not infos["failed"].any() and not infos["final_info"]["success"].any()
+
+
+@pytest.mark.filterwarnings("ignore:.*infinity")
+@pytest.mark.parametrize("name", NAMES)
+def test_gymnasiums_own_checks_pass(name: str) -> None:
+    env = gymnasium.make(name)
+    assert isinstance(env.unwrapped, SingleEnv)
+    assert env.observation_space.shape == ((31,) if "Ant" in name else (8,))
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,))
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_time_limits_are_the_tasks_horizons(name: str) -> None:
+    spec = gymnasium.spec(name)
+    assert spec.max_episode_steps == TASKS[spec.kwargs["task"]].objective.horizon
+    assert spec.kwargs["task"].endswith("long" if "Long" in name else "umaze")
+
+
+def test_an_option_reaches_the_world() -> None:
+    env = gymnasium.make(NAMES[0], leg_scale=1.25)
+    assert env.unwrapped.env.leg_scale == 1.25  # type: ignore[attr-defined]
+
+
+def test_one_env_is_truncated_and_tells_of_walls() -> None:
+    env = gymnasium.make(NAMES[2], max_episode_steps=60)
+    env.reset(seed=0)
+    for _ in range(60):
+        _, _, terminated, truncated, info = env.step(np.array([-1.0, 1.0], dtype=np.float32))
+    assert (terminated, truncated) == (False, True)
+    assert info == {"success": False, "failed": False, "wall_contact": True}
+
+
+def test_the_same_seed_repeats_all_episodes() -> None:
+    def run() -> list[bytes]:
+        env = point_mazes(3, max_episode_steps=5)
+        observations = [env.reset(seed=4)[0]]
+        for _ in range(12):
+            observations.append(env.step(np.ones((3, 2), dtype=np.float32))[0])
+        return [observation.tobytes() for observation in observations]
+
+    assert run() == run()
+
+
+def test_a_seed_of_a_list_is_the_first_and_nothing_else_is_drawn_from() -> None:
+    env = point_mazes(2, max_episode_steps=5)
+    drawn = torch.get_rng_state()
+    listed, (first, second) = env.reset(seed=[3, 9])[0], (env.reset(seed=seed)[0] for seed in (3, 9))
+    assert np.array_equal(listed, first) and not np.array_equal(listed, second)
+    assert torch.equal(torch.get_rng_state(), drawn)
+
+
+def test_noise_comes_from_the_seed_and_differs_from_step_to_step() -> None:
+    task = TASKS["antmaze-umaze"]
+    model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
+    inputs = 16 + 2 + model.state_features(torch.zeros(1, 4)).shape[1]
+    scatters = ScatterModel(ScatterShape(inputs, 4, 50))
+    scatters.forms.copy_(torch.randn(50, 4))
+    simulator = HistoryGrounding(model, scatter_model=scatters).simulator(task, 1)
+    env = SeededSimulatorEnv(SimulatorEnv(task.objective, simulator))
+
+    def velocities(seed: int) -> list[list[float]]:
+        env.reseed(seed)
+        env.reset()
+        shown = []
+        for _ in range(2):
+            env.step(torch.zeros(1, 2))
+            shown.append(simulator.state[0, 2:].tolist())
+            simulator.state[0, 2:] = 0.0
+        return shown
+
+    one, again, other = (velocities(seed) for seed in (1, 1, 2))
+    assert one == again and one[0] != one[1] and one[0] != other[0]
+
+
+def test_episodes_are_cut_off_so_long_after_their_start() -> None:
+    env = point_mazes(2, max_episode_steps=4)
+
+    def cut(steps: int) -> list[int]:
+        still = np.zeros((2, 2), dtype=np.float32)
+        return [number for number in range(1, steps + 1) if env.step(still)[3].all()]
+
+    env.reset(seed=0)
+    assert cut(10) == [4, 8]
+    env.reset()  # in the middle of one
+    assert cut(5) == [4]
+    one = SingleEnv(gymnasium.make(NAMES[2]).unwrapped.env, max_episode_steps=3)  # type: ignore[attr-defined]
+    for steps in (2, 3):
+        one.reset()
+        truncated = [one.step(np.zeros(2, dtype=np.float32))[3] for _ in range(steps)]
+        assert truncated == [False, False, True][:steps]
+
+
+def test_the_vector_env_declares_and_does_same_step_resets() -> None:
+    env = point_mazes(3, max_episode_steps=4)
+    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert env.observation_space.shape == (3, 8)
+    observation, infos = env.reset(seed=0)
+    for _ in range(4):
+        before = observation
+        observation, rewards, terminated, truncated, infos = env.step(np.ones((3, 2), dtype=np.float32))
+    assert truncated.all()
+    assert not terminated.any()
+    assert rewards.dtype == np.float64
+    assert env.observation_space.contains(observation)
+    np.testing.assert_array_equal(observation[:, 2:4], 0)  # anew: at rest
+    final = np.stack(infos["final_obs"])
+    np.testing.assert_allclose(final[:, 0] - before[:, 0], 0.05 / 10, atol=1e-5)
+    assert infos["_final_info"].all()
+
+
+def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
+    ours = point_mazes(2, max_episode_steps=700)
+    theirs = gymnasium.make_vec(
+        NAMES[2],
+        num_envs=2,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+    )
+    for env in (ours, theirs):
+        observation, infos = env.reset(seed=1)
+        facts = ("success", "failed", "wall_contact")
+        assert set(infos) == {*facts, *(f"_{fact}" for fact in facts)}
+        successes = 0
+        for _ in range(500):
+            observation, rewards, terminated, _, infos = env.step(goal_ward(observation))
+            if terminated.any():
+                rows = np.flatnonzero(terminated)
+                final = infos["final_info"]
+                assert final["success"][rows].all()
+                assert not infos["success"][rows].any()
+                assert (rewards[rows] > 9).all()
+                np.testing.assert_array_equal(infos["_final_obs"], terminated)
+                np.testing.assert_array_equal(final["_success"], terminated)
+                assert infos["final_obs"][rows[0]].shape == (8,)
+                assert infos["final_obs"].dtype == object
+                assert all(infos["final_obs"][row] is None for row in np.flatnonzero(~terminated))
+                successes += len(rows)
+        assert successes == 2
+
+
+def test_ants_in_a_vector_env() -> None:
+    env = gymnasium.make_vec(NAMES[1], num_envs=2, vectorization_mode="vector_entry_point")
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    observation, _, terminated, truncated, infos = env.step(env.action_space.sample())
+    assert observation.shape == (2, 31)
+    assert not (terminated | truncated).any()
+    assert infos["wall_contact"].tolist() == [False, False]
+
+
+def test_a_grounded_simulator_shows_its_latents() -> None:
+    task = TASKS["antmaze-umaze"]
+    model = GroundingModel(GroundingShape(state_size=4, action_size=2, goal_size=2, latent_size=16))
+    grounded = HistoryGrounding(model.requires_grad_(False)).simulator(task, 3)
+    env = BatchedVectorEnv(SeededSimulatorEnv(SimulatorEnv(task.objective, grounded)), max_episode_steps=5)
+    raw = point_mazes(3, max_episode_steps=5)
+    first, _ = env.reset(seed=1)
+    expected, _ = raw.reset(seed=1)
+    assert env.observation_space.shape == (3, 16 + 8)
+    for _ in range(4):
+        # An untrained model corrects nothing: behind the latents lies what the raw simulator shows.
+        np.testing.assert_allclose(first[:, 16:], expected, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(first[:, :16], axis=1), 1.0, rtol=1e-3)
+        command = np.full((3, 2), 0.5, dtype=np.float32)
+        first, expected = env.step(command)[0], raw.step(command)[0]
+
+
+def test_resets_leave_the_generators_of_other_devices_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds.append)
+    env = point_mazes(2, 10)
+    env.reset(seed=0)
+    assert not seeds

@@ -1,0 +1,64 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rail_run import make_rail_run
+from small_cart import TASK
+
+from astra_data.grounding.files import load_grounding
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.policies import judging
+from astra_data.policies.judging import Judge
+from astra_data.policies.policy_file import PolicyFile, running
+from astra_data.policies.running_policy import RunningPolicy
+from astra_data.policies.simulator_env import SimulatorEnv
+
+pytestmark = pytest.mark.usefixtures("quick_failures")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_rail_run(tmp_path_factory.mktemp("judging"), seeds="[0]", methods='["nas"]')
+
+
+@pytest.fixture
+def judge(folder: Path) -> Judge:
+    made = load_grounding(folder / "ground/nas/seed_0/grounding.safetensors")
+    return Judge(TASK, made)
+
+
+@pytest.fixture
+def policy(folder: Path, judge: Judge) -> RunningPolicy:
+    return running(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge.grounding)
+
+
+def test_failures_are_drawn_in_the_whole_simulator_of_the_grounding(
+    judge: Judge, policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = list[tuple[SimulatorEnv, int, int]]()
+
+    def seen(world: SimulatorEnv, begin: object, horizon: int, seed: int) -> object:
+        made.append((world, horizon, seed))
+        raise StopIteration
+
+    monkeypatch.setattr(judging, "in_simulator", seen)
+    with pytest.raises(StopIteration):
+        judge.success(policy, 5, 7)
+    world, horizon, seed = made[0]
+    assert (world.num_envs, horizon, seed) == (5, TASK.objective.horizon, 7)
+    used: Any = world.simulator
+    whole: Any = judge.grounding
+    assert world.draws_failures and whole.failures is not None and whole.scatter_model is not None
+    assert (used.failures, used.scatter_model) == (whole.failures, whole.scatter_model)
+
+
+def test_success_is_the_share_of_the_episodes(policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A policy that drives on reaches every goal within the horizon, where nothing fails."""
+    for speed, success in ((0.5, 1.0), (-0.6, 0.0)):
+
+        def act(_: object, state: object, goal: torch.Tensor, speed: float = speed) -> torch.Tensor:
+            return goal * 0 + speed
+
+        monkeypatch.setattr(RunningPolicy, "act_in_simulator", act)
+        assert Judge(TASK, NO_GROUNDING).success(policy, 5, 0) == success

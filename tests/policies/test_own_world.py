@@ -1,0 +1,52 @@
+"""A policy in the simulator that it was trained in."""
+
+from dataclasses import replace
+
+import pytest
+from constant_policy import Constant
+from small_cart import TASK
+
+from astra_data.core.errors import BadInputError
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.policies.build_env import Simulation, WorldConfig
+from astra_data.policies.own_policy import OwnPolicy
+from astra_data.policies.own_world import own_world, reached_in_own_world
+from astra_data.policies.policy_file import PolicyFile
+
+SIMULATION = Simulation(WorldConfig())
+
+
+def constant(command: float, simulation: Simulation = SIMULATION) -> PolicyFile:
+    return PolicyFile(OwnPolicy(Constant(command), 2, 1), simulation, None, None)
+
+
+def test_what_it_reaches_is_what_the_simulator_s_rule_says() -> None:
+    """Forward at 0.4 m a step, goals from 1 to 2 m, uniform: 3, 4 or 5 steps; 4.2 on average."""
+    reached = reached_in_own_world(TASK, constant(1.0), NO_GROUNDING, seed=0)
+    assert reached.success == 1.0 and reached.steps == pytest.approx(4.2, abs=0.2)
+    # At 0.4 m/s goals up to 1.6 m are in reach in 4 s.
+    some = reached_in_own_world(TASK, constant(-0.44), NO_GROUNDING, seed=0)
+    assert some.success == pytest.approx(0.6, abs=0.15)
+    assert some.steps == pytest.approx(32.5, abs=1.5)  # of those that arrive, in 25 to 40
+    none = reached_in_own_world(TASK, constant(-1.0), NO_GROUNDING, seed=0)
+    assert (none.success, none.steps) == (0.0, 40.0)
+    assert reached_in_own_world(TASK, constant(-0.44), NO_GROUNDING, seed=1) != some
+
+
+def test_a_policy_that_knows_no_simulator_cannot_be_tried() -> None:
+    trained = PolicyFile(OwnPolicy(Constant(1.0), 2, 1), None, None, None)
+    with pytest.raises(BadInputError, match=r"tries: expected a policy that knows its simulator"):
+        reached_in_own_world(TASK, trained, NO_GROUNDING, seed=0)
+
+
+def test_it_starts_where_the_task_does() -> None:
+    simulation = Simulation(WorldConfig(data_start_share=1.0))
+    world = own_world(TASK, simulation, NO_GROUNDING, 5)
+    world.reset()
+    assert world.starts is None and not world.simulator.state.any()
+
+
+def test_its_parameters_vary_as_they_did_when_it_was_trained() -> None:
+    varied = replace(SIMULATION, variation=TASK.varied.randomized)
+    shown = [own_world(TASK, known, NO_GROUNDING, 5).simulator.parameters for known in (SIMULATION, varied)]
+    assert shown[0] is None and shown[1] is not None and float(shown[1].std()) > 0

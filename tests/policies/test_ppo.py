@@ -1,0 +1,305 @@
+import copy
+import math
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, train, whole_and_resumed
+
+from astra_data.core.errors import BadInputError
+from astra_data.policies import ppo as module
+from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.ppo import Ppo, PpoConfig, generalized_advantages
+from astra_data.worlds.batched import BatchedEnv
+
+
+@pytest.fixture(autouse=True)
+def _two_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MINIBATCHES", 2)
+
+
+def ppo(
+    env: BatchedEnv,
+    iterations: int,
+    *,
+    horizon: int,
+    memory: int = 0,
+    **settings: Any,  # noqa: ANN401
+) -> Ppo:
+    config = PpoConfig(
+        total_steps=iterations * env.num_envs * 16,
+        **{"rollout_steps": 16, "learning_rate": 3e-3, **settings},
+    )
+    torch.manual_seed(0)
+    shape = ActorCriticShape(env.observation_size, env.action_size, memory, 16, (32,))
+    return Ppo(env, ActorCritic(shape), config, horizon=horizon, seed=1)
+
+
+def distance_after(policy: ActorCritic, steps: int) -> float:
+    """Return how far from 0 the policy's mean action leaves points that start at ±1."""
+    place = torch.tensor([[-1.0], [1.0]])
+    with torch.no_grad():
+        for _ in range(steps):
+            place = (place + 0.2 * policy.policy(place)[0]).clamp(-1.0, 1.0)
+    return float(place.abs().max())
+
+
+def test_learns_to_go_to_a_target() -> None:
+    learner = ppo(GoToZero(32), 40, horizon=20)
+    assert distance_after(learner.policy, 10) > 0.8
+    train(learner)
+    assert distance_after(learner.policy, 10) < 0.3
+
+
+def last_layer(learner: Ppo) -> nn.Linear:
+    layer = learner.policy.actor[-1]
+    assert isinstance(layer, nn.Linear)
+    return layer
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
+    whole, resumed = whole_and_resumed(lambda: ppo(GoToZero(8), 6, horizon=7, memory=memory))
+    for name, value in whole.policy.state_dict().items():
+        assert torch.equal(value, resumed.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(("terminates_after", "expected"), [(float("inf"), 10.0), (10.0, 4.1)])
+def test_running_out_of_time_bootstraps_and_ending_does_not(
+    terminates_after: float, expected: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One unit each step is worth 1 / (1 - 0.9) = 10, or the mean over an ending episode of 10 steps.
+
+    In units of the returns' deviation: those of 1 to 10 steps of a unit.
+    """
+    monkeypatch.setattr(module, "GRADIENT_NORM", 10.0)
+    horizon = 10 if terminates_after > 10 else 1000
+    env = ConstantReward(16, terminates_after)
+    learner = ppo(env, 60, horizon=horizon, discount=0.9, learning_rate=0.01)
+    train(learner)
+    with torch.no_grad():
+        value = float(learner.policy.value(torch.ones(1, 1)))
+    assert value * deviation(0.9, 10) == pytest.approx(expected, rel=0.12)
+
+
+def deviation(discount: float, steps: int) -> float:
+    """Return that of discounted sums of 1 to so many units."""
+    sums = [(1 - discount**age) / (1 - discount) for age in range(1, steps + 1)]
+    return math.sqrt(fmean(value**2 for value in sums) - fmean(sums) ** 2)
+
+
+def test_rewards_are_in_units_of_the_returns_deviation() -> None:
+    learner = ppo(ConstantReward(64, 8.0), 20, horizon=10**6, discount=0.9)
+    train(learner)
+    reward = learner._collect()["reward"]
+    torch.testing.assert_close(reward, torch.full_like(reward, 1 / deviation(0.9, 8)), rtol=0.02, atol=0)
+
+
+def test_generalized_advantages_are_discounted_sums_of_errors_up_to_the_episodes_end() -> None:
+    rng = np.random.default_rng(0)
+    value, following, reward = rng.normal(size=(3, 4, 30))
+    done, terminated = rng.random((4, 30)) < 0.2, rng.random((4, 30)) < 0.5
+    terminated &= done
+    expected = np.zeros((4, 30))
+    for row, first in np.ndindex(4, 30):
+        for step in range(first, 30):
+            error = reward[row, step] - value[row, step]
+            error += 0 if terminated[row, step] else 0.9 * following[row, step]
+            expected[row, first] += (0.9 * 0.8) ** (step - first) * error
+            if done[row, step]:
+                break
+    parts = [torch.from_numpy(part) for part in (value, following, reward, done, terminated)]
+    found = generalized_advantages(*parts, discount=0.9, gae_lambda=0.8).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_advantages_are_those_of_a_plain_loop(memory: int) -> None:
+    env = EndsAtZero(32)
+    learner = ppo(env, 3, horizon=5, memory=memory, discount=0.9)
+    learner.iterate()  # from here on, memories and actions go on from the last stretch
+    env.steps.clear()
+    policy, acting = learner.policy, learner.acting
+    hidden, previous = acting.hidden.clone(), acting.previous_action.clone()
+    torch.manual_seed(3)
+    returns = copy.deepcopy(learner._returns)
+    rollout = learner._collect()
+    assert torch.equal(rollout["hidden"], hidden)
+    done, terminated = rollout["done"], rollout["terminated"]
+    ends = done.nonzero()
+    assert terminated.any() and (done & ~terminated).any() and len(ends) > 64
+    value, after = torch.zeros(2, 32, 16)
+    with torch.no_grad():
+        for step in range(16):
+            assert torch.equal(rollout["previous_action"][:, step], previous)
+            features, hidden = policy.remember(rollout["observation"][:, step], previous, hidden)
+            action = rollout["action"][:, step]
+            mean, std = policy.policy(features)
+            log_prob = -((action - mean) / std).square() / 2 - std.log() - math.log(2 * math.pi) / 2
+            torch.testing.assert_close(rollout["action_log_prob"][:, step], log_prob.sum(-1))
+            value[:, step] = policy.value(features)
+            executed = action.clamp(-1.0, 1.0)
+            beyond, _ = policy.remember(env.steps[step].observation, executed, hidden)
+            after[:, step] = policy.value(beyond)
+            going = (~done[:, step]).float().unsqueeze(-1)
+            hidden, previous = hidden * going, executed * going
+    reward = [returns.scaled(taken.reward, done[:, step]) for step, taken in enumerate(env.steps)]
+    advantage = torch.zeros(32, 17)
+    for step in reversed(range(16)):
+        wrong = reward[step] + 0.9 * after[:, step] * ~env.steps[step].terminated - value[:, step]
+        advantage[:, step] = wrong + 0.9 * 0.95 * advantage[:, step + 1] * ~done[:, step]
+    torch.testing.assert_close(rollout["value"], value)
+    torch.testing.assert_close(rollout["advantage"], advantage[:, :-1], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(rollout["value_target"], advantage[:, :-1] + value, atol=1e-5, rtol=1e-4)
+
+
+def test_an_update_is_that_of_the_printed_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With means that are clipped to ±1, and pulled back there."""
+    settings = {"EPOCHS": 3, "MINIBATCHES": 1, "CLIP": 0.05, "VALUE_WEIGHT": 0.7, "_MAX_KL": math.inf}
+    for name, value in {**settings, "GRADIENT_NORM": 0.3, "_PULL": 0.4}.items():
+        monkeypatch.setattr(module, name, value)
+    learner = ppo(EndsAtZero(32), 3, horizon=5)
+    last_layer(learner).weight.data.mul_(300.0)
+    last_layer(learner).bias.data.fill_(0.8)
+    ours, theirs = learner.policy, copy.deepcopy(learner.policy)
+    rollout = learner._collect()
+    kept = {name: values.clone() for name, values in rollout.items()}
+    learner._learn(rollout)
+    optimizer = torch.optim.Adam(theirs.parameters(), lr=3e-3, eps=1e-5)
+    target = kept["value_target"]
+    advantage = (kept["advantage"] - kept["advantage"].mean()) / kept["advantage"].std()
+    for epoch in range(3):
+        output, std = theirs.actor(kept["observation"]), theirs.log_std.exp()
+        beyond = output.detach().abs() > 1.0
+        assert beyond.any() and not beyond.all()
+        mean = torch.where(beyond, output - output.detach() + output.detach().sign(), output)
+        normal = torch.distributions.Normal(mean, std)
+        ratio = (normal.log_prob(kept["action"]).sum(-1) - kept["action_log_prob"]).exp()
+        clipped = ratio.clamp(0.95, 1.05)
+        assert epoch == 0 or ((ratio - clipped).abs() > 0).any()
+        gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
+        wrong = (theirs.value(kept["observation"]) - target).square().mean()
+        pull = torch.where(beyond, output.abs() - 1.0, 0.0).square().mean()
+        loss = 0.7 * wrong - gain + 0.4 * pull
+        gradients = torch.autograd.grad(loss, list(theirs.parameters()))
+        norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+        assert norm > 0.3
+        for parameter, gradient in zip(theirs.parameters(), gradients, strict=True):
+            parameter.grad = gradient * 0.3 / norm
+        optimizer.step()
+    for name, value in ours.state_dict().items():
+        torch.testing.assert_close(value, theirs.state_dict()[name], atol=1e-5, rtol=1e-3, msg=name)
+
+
+def test_the_learning_rate_falls_to_zero_along_a_line() -> None:
+    learner = ppo(GoToZero(4), 4, horizon=5)
+    rates = []
+    while not learner.done:
+        learner.iterate()
+        rates.append(learner._optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([3e-3 * left for left in (1.0, 0.75, 0.5, 0.25)])
+
+
+def test_an_epoch_learns_from_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"EPOCHS": 2, "MINIBATCHES": 4, "_MAX_KL": math.inf}.items():
+        monkeypatch.setattr(module, name, value)
+    learner = ppo(GoToZero(10), 1, horizon=5, memory=2)
+    rollout = learner._collect()
+    starts = rollout["observation"][:, 0, 0]
+    learned: list[list[int]] = []
+    remember = learner.policy.remember_sequence
+
+    def watched(observation: Tensor, *rest: Tensor) -> Tensor:
+        learned.append([int((starts == start).nonzero()) for start in observation[:, 0, 0]])
+        return remember(observation, *rest)
+
+    monkeypatch.setattr(learner.policy, "remember_sequence", watched)
+    learner._learn(rollout)
+    assert [len(rows) for rows in learned] == [3, 3, 3, 1] * 2
+    for epoch in (learned[:4], learned[4:]):
+        assert sorted(row for rows in epoch for row in rows) == list(range(10))
+    assert learned[:4] != learned[4:]
+
+
+def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
+    settings: dict[str, Any] = {"horizon": 100, "learning_rate": 1e-2}
+    with_memory = train(ppo(Recall(32), 25, memory=8, **settings))
+    without = train(ppo(Recall(32), 25, **settings))
+    # An episode of three steps is worth at most 1.
+    assert 3 * fmean(point["reward"] for point in with_memory[-5:]) > 0.7
+    assert 3 * fmean(point["reward"] for point in without[-5:]) < 0.2
+
+
+def test_a_training_that_diverges_says_so() -> None:
+    learner = ppo(GoToZero(4), 8, horizon=20, learning_rate=1e30)
+    with pytest.raises(
+        BadInputError, match=r"diverged after step .* std that is not finite: make learning_rate sm"
+    ):
+        train(learner)
+
+
+def test_a_single_step_has_no_advantage_over_others() -> None:
+    with pytest.raises(
+        BadInputError, match="rollout_steps: expected 2 or more in a single environment, got 1"
+    ):
+        ppo(GoToZero(1), 2, horizon=5, rollout_steps=1)
+    # Fewer environments than minibatches are enough.
+    train(ppo(GoToZero(1), 1, horizon=5, rollout_steps=2))
+    train(ppo(GoToZero(2), 1, horizon=5, rollout_steps=1))
+
+
+def test_an_untrained_critic_begins_near_zero() -> None:
+    torch.manual_seed(0)
+    plain = ActorCritic(ActorCriticShape(1, 1, 0, 16, (32,)))
+    small, seen = ppo(GoToZero(8), 1, horizon=7).policy, torch.linspace(-1, 1, 9)[:, None]
+    torch.testing.assert_close(small.value(seen), 0.01 * plain.value(seen))
+    assert torch.equal(small.policy(seen)[0], plain.policy(seen)[0])
+
+
+@pytest.mark.parametrize(("learned", "share"), [(1.0, 0.5), (1.0, 1.0), (0.1, 0.5)])
+def test_the_actions_scatter_falls_to_what_is_tested_and_may_be_less(
+    learned: float, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_FADE_SHARE", share)
+    learner = ppo(GoToZero(8), 4, horizon=7)
+    monkeypatch.setattr(learner, "_learn", lambda _: learner.policy.log_std.data.fill_(math.log(learned)))
+    first, done = math.exp(-0.5), [min(1.0, one / share) for one in (0.0, 0.25, 0.5, 0.75)]
+    expected = [min(learned, first ** (1 - one) * 0.15**one) for one in done]
+    assert [point["std"] for point in train(learner)] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("most_kl", "updates"), [(1e9, 10), (1e-9, 1)])
+def test_an_iteration_ends_once_the_policy_has_moved_too_far(
+    most_kl: float, updates: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the first update nothing has moved; the second minibatch of the first pass sees that it has."""
+    monkeypatch.setattr(module, "_MAX_KL", most_kl)
+    learner = ppo(GoToZero(8), 3, horizon=7)
+    made: list[None] = []
+    learner._optimizer.register_step_post_hook(lambda *_: made.append(None))
+    learner.iterate()
+    assert len(made) == updates
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_a_loss_is_all_on_the_device_of_the_policy(memory: int) -> None:
+    """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
+    learner = ppo(GoToZero(8), 1, horizon=7, memory=memory)
+    rollout = learner._collect()
+    learner.policy.to("meta")
+    loss, moved = learner._loss({name: values.to("meta") for name, values in rollout.items()})
+    loss.backward()
+    assert (loss.device.type, moved.device.type) == ("meta", "meta")
+
+
+def test_where_it_begins_is_of_the_seed_whatever_was_drawn_before() -> None:
+    begun = []
+    for drawn, seed in ((5, 1), (6, 1), (5, 2)):
+        torch.manual_seed(drawn)
+        policy = ActorCritic(ActorCriticShape(1, 1, hidden_sizes=(8,)))
+        acting = Ppo(GoToZero(8), policy, PpoConfig(), horizon=100, seed=seed).acting
+        begun.append(torch.cat([acting.observation[:, 0], acting.state_dict()["age"]]))
+    assert torch.equal(begun[0], begun[1]) and not torch.equal(begun[0], begun[2])

@@ -1,0 +1,37 @@
+from pathlib import Path
+
+import numpy as np
+import torch
+from fake_dataset import writer
+
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
+from astra_data.policies.recorded_range import RecordedRange
+from astra_data.worlds.commands import Commands
+
+LIMITS = Commands({"v": (-1.0, 3.0), "w": (-2.0, 2.0)})
+
+
+def test_steps_of_active_robots_beyond_any_axis_are_counted() -> None:
+    asked = RecordedRange(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]), LIMITS)
+    commands = torch.tensor([[0.5, 0.0], [1.005, -1.01], [1.2, 0.0], [0.5, -1.2], [-0.02, 0.0], [3.0, 2.0]])
+    active = torch.tensor([True, True, True, True, True, False])
+    asked.count(LIMITS.normal(commands), active)
+    assert asked.share == 3 / 5
+    asked.count(torch.full((6, 2), -0.5), torch.ones(6, dtype=torch.bool))  # v = 0, w = -1: at the edge
+    assert asked.share == 3 / 11
+    asked.count(torch.full((1, 2), -40.0), torch.ones(1, dtype=torch.bool))  # is given as the least command
+    assert asked.share == 4 / 12
+
+
+def test_the_range_is_that_of_the_dataset(tmp_path: Path) -> None:
+    columns = [Column(STATE, size=2), Column(NEXT_STATE, size=2), Column(ACTION, size=2)]
+    states = np.zeros((3, 2), np.float32)
+    with writer(tmp_path / "set", columns=columns) as made:
+        actions = np.array([[0.0, -1.0], [1.0, 0.0], [0.5, 1.0]], np.float32)
+        made.add(Episode(0, {STATE: states, NEXT_STATE: states, ACTION: actions}, {}))
+    asked = RecordedRange.of(tmp_path / "set", LIMITS)
+    assert asked is not None
+    asked.count(LIMITS.normal(torch.tensor([[1.0, 1.0], [1.1, 1.0]])), torch.ones(2, dtype=torch.bool))
+    assert asked.share == 0.5
+    (tmp_path / "set/meta/stats.json").unlink()
+    assert RecordedRange.of(tmp_path / "set", LIMITS) is RecordedRange.of(tmp_path, LIMITS) is None

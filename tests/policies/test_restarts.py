@@ -1,0 +1,166 @@
+"""Trainings that are done again where a policy did not master its own simulator."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+import torch
+from constant_policy import Constant
+from small_cart import TASK
+from toy_episodes import toy_episodes
+
+from astra_data.core.progress import Progress, silent
+from astra_data.core.seeding import derive
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.policies.own_learner import OwnLearner
+from astra_data.policies.own_policy import KINDS, OwnPolicy
+from astra_data.policies.own_world import Reached
+from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.restarts import _masters, with_restarts
+from astra_data.policies.train import PpoTrainConfig, Training
+
+SEEDS = [7, derive(7, "try 1"), derive(7, "try 2")]
+
+
+@pytest.fixture(autouse=True)
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, "constant", Constant)
+
+
+def restarted(
+    folder: Path,
+    commands: Iterable[float],
+    progress: Progress = silent,
+    clocks: bool = False,
+    **settings: Any,  # noqa: ANN401
+) -> tuple[float, dict[str, Any], list[int]]:
+    """Train policies that give these commands, one a try; return what is kept, the curve and the seeds."""
+    rest, seeds, one = iter(commands), [], torch.zeros(1, 3, 1)
+
+    def learn(env: Any, given: Training) -> Constant:  # noqa: ANN401
+        seeds.append(given.seed)
+        given.progress(1.0, "")
+        assert given.folder.is_dir()
+        policy = Constant(next(rest))
+        observation, _ = env.reset()
+        env.step(policy.act(observation))
+        return policy
+
+    training = Training(
+        task=TASK,
+        config=PpoTrainConfig(num_envs=4, total_steps=4, data_start_share=0.0, **settings),
+        settings=None,
+        episodes=toy_episodes(one, one, next_state=one),
+        grounding=NO_GROUNDING,
+        initial=None,
+        seed=7,
+        device="cpu",
+        folder=folder,
+        progress=progress,
+    )
+    learner = OwnLearner(learn=learn, policy=Constant)
+
+    def timed(given: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        kept, curve = learner(given)
+        return kept, curve | ({"wall_seconds": 2.0 * len(seeds), "cpu_seconds": len(seeds)} if clocks else {})
+
+    kept, curve = with_restarts(timed, training, None)
+    assert isinstance(kept, PolicyFile) and isinstance(kept.policy, OwnPolicy)
+    return kept.policy.acting.command, curve, seeds  # type: ignore[attr-defined]
+
+
+def test_a_policy_that_masters_its_simulator_is_kept(tmp_path: Path) -> None:
+    command, curve, seeds = restarted(tmp_path, [1.0], tries=3)
+    assert (command, seeds) == (1.0, SEEDS[:1])
+    assert [(one["seed"], one["success"]) for one in curve["tries"]] == [(7, 1.0)]
+    assert curve["points"] == curve["tries"][0]["points"]
+
+
+def test_it_is_trained_again_until_it_does(tmp_path: Path) -> None:
+    shares, notes = list[float](), list[str]()
+
+    def progress(share: float, note: str) -> None:
+        shares.append(share)
+        notes.append(note.partition("  ")[0])
+
+    command, curve, seeds = restarted(tmp_path, [-1.0, 0.9, 1.0], progress, tries=3)
+    assert (command, seeds) == (0.9, SEEDS[:2])
+    assert [one["success"] for one in curve["tries"]] == [0.0, 1.0]
+    # Forward at 3.75 m/s goals from 1 to 2 m are reached in 3 to 6 steps; backward none in all 40.
+    assert curve["tries"][0]["episode_steps"] == 40 and 3 < curve["tries"][1]["episode_steps"] < 6
+    assert shares == sorted(shares) and max(shares) == pytest.approx(2 / 3)
+    assert sorted(set(notes)) == ["try 1 of 3", "try 2 of 3"]
+    assert not (tmp_path / "try_1").exists()
+
+
+def test_of_those_that_do_not_the_best_is_kept(tmp_path: Path) -> None:
+    # At 0.4 m/s, -0.44 of the range, goals up to 1.6 m are in reach within the 4 s of an episode.
+    command, curve, seeds = restarted(tmp_path, [-1.0, -0.44, -0.9], tries=3)
+    assert (command, seeds) == (-0.44, SEEDS)
+    assert 0.4 < curve["tries"][1]["success"] < 0.8
+
+
+def test_all_tries_cost_time(tmp_path: Path) -> None:
+    command, curve, _ = restarted(tmp_path, [-0.44, -1.0, -0.9], tries=3, clocks=True)
+    assert command == -0.44
+    assert (curve["wall_seconds"], curve["cpu_seconds"]) == (2 + 4 + 6, 1 + 2 + 3)
+    assert "wall_seconds" not in restarted(tmp_path, [-1.0, 1.0], tries=2)[1]
+
+
+def test_without_tries_nothing_is_tested(tmp_path: Path) -> None:
+    command, curve, seeds = restarted(tmp_path, [-1.0], tries=1)
+    assert (command, seeds) == (-1.0, [7]) and "tries" not in curve
+
+
+@pytest.mark.parametrize(
+    ("device", "tries", "read"), [("cpu", 1, 0), ("cpu", 2, 0), ("cuda", 1, 0), ("cuda", 2, 1)]
+)
+def test_a_grounding_is_read_again_only_to_test_on_the_cpu_what_is_trained_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, tries: int, read: int
+) -> None:
+    grounding_at, given = Mock(), list[object]()
+    monkeypatch.setattr("astra_data.policies.restarts.grounding_at", grounding_at)
+
+    def tested(task: Any, policy: Any, grounding: object, seed: int) -> Reached:  # noqa: ANN401
+        given.append(grounding)
+        return Reached(1.0, 1.0)
+
+    monkeypatch.setattr("astra_data.policies.restarts.reached_in_own_world", tested)
+    kept: Any = Mock()
+    monkeypatch.setattr(PolicyFile, "load", Mock())
+    training: Any = Training(
+        task=TASK,
+        config=PpoTrainConfig(tries=tries),
+        settings=None,
+        episodes=Mock(),
+        grounding=NO_GROUNDING,
+        initial=None,
+        seed=7,
+        device=device,
+        folder=tmp_path,
+        progress=silent,
+    )
+    with_restarts(lambda _: (kept, {"points": []}), training, tmp_path / "grounding")
+    assert grounding_at.call_count == read
+    assert given == ([grounding_at.return_value if read else NO_GROUNDING] if tries > 1 else [])
+
+
+def test_all_tries_meet_the_same_starts_and_goals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+
+    def tested(task: Any, policy: Any, grounding: Any, seed: int) -> Reached:  # noqa: ANN401
+        seeds.append(seed)
+        return Reached(0.0, 40.0)
+
+    monkeypatch.setattr("astra_data.policies.restarts.reached_in_own_world", tested)
+    restarted(tmp_path, [-1.0, -0.9], tries=2)
+    assert seeds == [7, 7]
+
+
+def test_what_is_just_enough_masters_it() -> None:
+    training: Any = SimpleNamespace(config=PpoTrainConfig())
+    assert training.config.tries == 3
+    assert _masters(Reached(0.8, 40.0), training) and not _masters(Reached(0.79, 1.0), training)

@@ -1,0 +1,302 @@
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, train, whole_and_resumed
+
+from astra_data.core.errors import BadInputError
+from astra_data.policies import sac as module
+from astra_data.policies.networks.policy import PolicyShape, features_of
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.sac import Sac, SacConfig
+from astra_data.worlds.batched import BatchedEnv
+
+
+def sac(
+    env: BatchedEnv,
+    steps: int,
+    *,
+    horizon: int,
+    memory: int = 0,
+    **settings: Any,  # noqa: ANN401
+) -> Sac:
+    usual = {"rollout_steps": 10, "updates_per_step": 2, "batch_size": 64, "discount": 0.9}
+    config = SacConfig(total_steps=steps * env.num_envs, **{**usual, **settings})
+    torch.manual_seed(0)
+    shape = PolicyShape(env.observation_size, env.action_size, memory, 16, (32, 32))
+    return Sac(env, SoftActor(shape), config, horizon=horizon, seed=1)
+
+
+def distance_after(policy: SoftActor, steps: int) -> float:
+    """Return how far from 0 the policy's likeliest action leaves points that start at ±1."""
+    place, hidden = torch.tensor([[-1.0], [1.0]]), policy.initial_hidden(2)
+    action = torch.zeros(2, 1)
+    with torch.no_grad():
+        for _ in range(steps):
+            features, hidden = policy.remember(place, action, hidden)
+            action = policy.act(features)
+            place = (place + 0.2 * action).clamp(-1.0, 1.0)
+    return float(place.abs().max())
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_learns_to_go_to_a_target(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_REWARD_SCALE", 1.0)
+    settings: dict[str, Any] = {"window": 8, "burn_in": 2, "batch_size": 128, "updates_per_step": 3}
+    settings["learning_rate"] = 1e-3
+    learner = sac(GoToZero(16), 100, horizon=20, memory=memory, **settings)
+    assert distance_after(learner.policy, 10) > 0.5
+    metrics = train(learner)
+    assert distance_after(learner.policy, 10) < 0.15
+    assert learner.steps == 100 * 16
+    assert metrics[-1]["reward"] > metrics[0]["reward"]
+
+
+def test_the_second_half_learns_ever_more_slowly() -> None:
+    learner = sac(GoToZero(8), 80, horizon=7, updates_per_step=1)
+    rates = []
+    while not learner.done:
+        learner.iterate()
+        rates.append(learner._optimizer.param_groups[0]["lr"] / 3e-4)
+    assert rates == pytest.approx([1.0, 1.0, 1.0, 1.0, 1.0, 0.75, 0.5, 0.25])
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_resuming_gives_the_same_parameters_to_the_bit(memory: int) -> None:
+    # The replay has wrapped around by then.
+    settings: dict[str, Any] = {"window": 6, "burn_in": 2, "buffer_size": 8 * 25, "updates_per_step": 1}
+    whole, resumed = whole_and_resumed(lambda: sac(GoToZero(8), 60, horizon=7, memory=memory, **settings))
+    for name, value in whole.policy.state_dict().items():
+        assert torch.equal(value, resumed.policy.state_dict()[name]), name
+
+
+def test_where_the_episodes_cannot_go_on_its_replay_does_not_either() -> None:
+    """The first step of the new ones doesn't follow the last one that was kept."""
+    learner, again = (sac(GoToZero(4), 40, horizon=20) for _ in range(2))
+    learner.iterate()
+    again.load_state_dict(learner.state_dict(), again.env.reset(), goes_on=False)
+    kept, cut = (torch.as_tensor(one.state_dict()["replay"]["expired"]) for one in (learner, again))
+    assert torch.equal(cut[:-1], kept[:-1])
+    assert cut[-1].all() and not kept[-1].any()
+
+
+@pytest.mark.parametrize(
+    ("terminates_after", "memory", "expected"), [(math.inf, 0, 10.0), (math.inf, 8, 10.0), (10.0, 0, 5.26)]
+)
+def test_running_out_of_time_bootstraps_and_ending_does_not(
+    terminates_after: float, memory: int, expected: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One unit each step is worth 1 / (1 - 0.9) = 10; where a tenth of like steps are the last, 1 / 0.19."""
+    for name, value in {"_TARGET_RATE": 0.2, "_INITIAL_TEMPERATURE": 1e-6, "_REWARD_SCALE": 1.0}.items():
+        monkeypatch.setattr(module, name, value)
+    horizon = 10 if terminates_after > 10 else 1000
+    env = ConstantReward(16, terminates_after)
+    learner = sac(*(env, 100), horizon=horizon, memory=memory, window=4, burn_in=1, learning_rate=5e-3)
+    train(learner)
+    begun = torch.ones(1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1)
+    with torch.no_grad():
+        features = learner._critics.features(*begun)[:, 0]
+        value = float(learner._critics(features, torch.zeros(1, 1))[0])
+    assert value == pytest.approx(expected, rel=0.12)
+
+
+def test_a_window_begins_with_the_memory_that_the_policy_had_when_it_acted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    learner = sac(GoToZero(8), 40, horizon=9, memory=4, window=2, burn_in=0)
+    policy = learner.policy
+    acting, learning = policy.remember, policy.remember_sequence
+    acted: dict[tuple[float, ...], list[float]] = {}
+    begun: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def remember(
+        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        for moment, memory in zip(torch.cat([observation, previous], dim=-1), hidden, strict=True):
+            acted[tuple(moment.tolist())] = memory.tolist()
+        return acting(observation, previous, hidden)
+
+    def remember_sequence(
+        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor, start: torch.Tensor
+    ) -> torch.Tensor:
+        begun.append((torch.cat([observation, previous], dim=-1)[:, 0], hidden))
+        return learning(observation, previous, hidden, start)
+
+    monkeypatch.setattr(policy, "remember", remember)
+    monkeypatch.setattr(policy, "remember_sequence", remember_sequence)
+    train(learner)
+    moments, memories = (torch.cat(column) for column in zip(*begun, strict=True))
+    assert memories.tolist() == [acted[tuple(moment.tolist())] for moment in moments]
+    assert float((memories.abs().amax(-1) > 0).float().mean()) > 0.5
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Haarnoja et al. (2018), by hand from the windows that were drawn."""
+    settings: dict[str, Any] = {"window": 6, "burn_in": 2, "batch_size": 512}
+    for name, value in {"_TARGET_RATE": 0.3, "_INITIAL_TEMPERATURE": 0.4, "_REWARD_SCALE": 3.0}.items():
+        monkeypatch.setattr(module, name, value)
+    learner = sac(EndsAtZero(8), 60, horizon=9, memory=memory, **settings)
+    for _ in range(3):
+        learner.iterate()
+    policy, critics, replay = learner.policy, learner._critics, learner._replay
+    drawn: list[tuple[dict[str, torch.Tensor], torch.Tensor]] = []
+    draw, compute, sample = replay.windows, learner._losses, policy.sample
+
+    def windows(count: int, length: int, burn_in: int) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        drawn.append(draw(count, length, burn_in))
+        return drawn[-1]
+
+    losses: list[torch.Tensor] = []
+    gradients: list[torch.Tensor] = []
+
+    def computed(*given: Any) -> tuple[torch.Tensor, ...]:  # noqa: ANN401
+        found = compute(*given)
+        losses.extend(loss.detach() for loss in found)
+        gradients.extend(torch.autograd.grad(found[0], [*critics.parameters()], retain_graph=True))
+        return found
+
+    def sampled(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        torch.manual_seed(11)
+        return sample(features)
+
+    monkeypatch.setattr(replay, "windows", windows)
+    monkeypatch.setattr(learner, "_losses", computed)
+    monkeypatch.setattr(policy, "sample", sampled)
+    before = copy.deepcopy((policy, critics, learner._late_critics))
+    temperature = float(learner._log_temperature.detach().exp())
+    learner._learn()
+    (steps, learned) = drawn[0]
+    actor, online, slow = before
+    seen = steps["observation"], steps["previous_action"]
+    first, nothing = steps["first"].float(), actor.initial_hidden(len(learned))
+
+    def action_values(critics: Any, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:  # noqa: ANN401
+        values = []
+        for network in critics.networks:
+            hidden = torch.cat([features, action], dim=-1)
+            *inner, last = [layer for layer in network if not isinstance(layer, nn.ReLU)]
+            for linear, norm in zip(inner[::2], inner[1::2], strict=True):
+                hidden = hidden @ linear.weight.T + linear.bias
+                hidden = (hidden - hidden.mean(-1, keepdim=True)) / (
+                    hidden.var(-1, correction=0, keepdim=True) + 1e-5
+                ).sqrt()
+                hidden = torch.relu(hidden * norm.weight + norm.bias)
+            values.append((hidden @ last.weight.T + last.bias)[..., 0])
+        return torch.stack(values)
+
+    def squashed(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        torch.manual_seed(11)
+        normal = torch.distributions.Normal(*actor.policy(features))
+        raw = normal.rsample()
+        return torch.tanh(raw), (normal.log_prob(raw) - torch.log(1.0 - torch.tanh(raw).square())).sum(-1)
+
+    with torch.no_grad():
+        acting = actor.remember_sequence(*seen, steps["hidden"][:, 0], first)
+        judging = features_of(online.memory, *seen, nothing, first)
+        late = features_of(slow.memory, *seen, nothing, first)
+        following, log_prob = squashed(acting[:, 1:][learned])
+        beyond = action_values(slow, late[:, 1:][learned], following).amin(0) - temperature * log_prob
+        over, reward = steps["terminated"][:, :-1][learned], steps["reward"][:, :-1][learned]
+        assert over.any() and not over.all()
+        within = learned & ~steps["first"][:, 1:]
+        shown = steps["observation"][:, 1:, 0][within]
+        torch.testing.assert_close(steps["reward"][:, :-1][within], -3.0 * shown.square())
+        target = reward + 0.9 * ~over * beyond
+        given = action_values(online, judging[:, :-1][learned], steps["action"][:, :-1][learned])
+        wrong = (given - target).square().sum(0).mean()
+        action, log_prob = squashed(acting[:, :-1][learned])
+        costs = (
+            temperature * log_prob - action_values(online, judging[:, :-1][learned], action).amin(0)
+        ).mean()
+        # The temperature rises where actions are less random than one unit of entropy per dimension below 0.
+        calm = -math.log(temperature) * (log_prob.mean() - 1.0)
+    torch.testing.assert_close(torch.stack(losses), torch.stack([wrong, costs, calm]), rtol=1e-4, atol=1e-4)
+    assert learner._log_temperature.grad is not None
+    torch.testing.assert_close(learner._log_temperature.grad, 1.0 - log_prob.mean(), rtol=1e-4, atol=1e-5)
+    # The critics and their memory learn from their own loss alone.
+    for parameter, gradient in zip(critics.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient)
+    after = zip(learner._late_critics.parameters(), slow.parameters(), critics.parameters(), strict=True)
+    for late, then, now in after:
+        torch.testing.assert_close(late, 0.7 * then + 0.3 * now)
+    assert all(parameter.requires_grad for parameter in critics.parameters())
+
+
+def test_it_learns_so_often_after_each_step_that_a_window_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = sac(GoToZero(8), 20, horizon=9, memory=4, window=4, burn_in=1, updates_per_step=3)
+    at: list[int] = []
+    monkeypatch.setattr(learner, "_learn", lambda: at.append(len(learner._replay)))
+    learner.iterate()
+    assert at == [kept for kept in range(5, 11) for _ in range(3)]
+
+
+def test_a_memory_recalls_what_a_single_observation_does_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_REWARD_SCALE", 1.0)
+    settings: dict[str, Any] = {"horizon": 100, "window": 3, "burn_in": 0, "batch_size": 96}
+    settings["updates_per_step"] = 3
+    with_memory = train(sac(Recall(32), 120, memory=8, learning_rate=3e-3, **settings))
+    without = train(sac(Recall(32), 120, learning_rate=3e-3, **settings))
+    # An episode of three steps is worth at most 1.
+    assert 3 * with_memory[-1]["reward"] > 0.7
+    assert 3 * without[-1]["reward"] < 0.3
+
+
+def test_a_training_that_diverges_says_so() -> None:
+    learner = sac(GoToZero(4), 40, horizon=20, learning_rate=1e30)
+    with pytest.raises(BadInputError, match=r"diverged after step .* with a loss that is not finite: make"):
+        train(learner)
+
+
+def test_a_window_has_to_hold_steps_to_learn_from() -> None:
+    with pytest.raises(ValueError, match=r"burn_in: expected less than the window of 8, got 8"):
+        SacConfig(window=8, burn_in=8)
+    with pytest.raises(ValueError, match=r"batch_size: expected a window of 16 or more, got 15"):
+        SacConfig(batch_size=15)
+
+
+def test_the_buffer_has_to_hold_a_window() -> None:
+    sizes: dict[str, Any] = {"horizon": 9, "memory": 8, "window": 6, "burn_in": 0}
+    with pytest.raises(BadInputError, match=r"buffer_size: expected at least 56 steps.* got 55"):
+        sac(GoToZero(8), 10, buffer_size=55, **sizes)
+    sac(GoToZero(8), 10, buffer_size=56, **sizes)
+
+
+@pytest.mark.parametrize(("memory", "windows"), [(0, (64, 1, 0)), (8, (10, 6, 2))])
+def test_an_update_takes_as_many_windows_as_its_steps_make(
+    memory: int, windows: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their number, their steps, and those that only warm up a memory."""
+    learner = sac(GoToZero(8), 40, horizon=9, memory=memory, window=6, burn_in=2)
+    drawn: list[tuple[int, ...]] = []
+    draw = learner._replay.windows
+
+    def counted(*sizes: int) -> Any:  # noqa: ANN401
+        drawn.append(sizes)
+        return draw(*sizes)
+
+    monkeypatch.setattr(learner._replay, "windows", counted)
+    learner.iterate()
+    assert set(drawn) == {windows}
+
+
+def test_where_every_step_runs_out_of_time_nothing_is_learned() -> None:
+    learner = sac(GoToZero(8), 20, horizon=1)
+    before = copy.deepcopy(learner.policy)
+    assert [point["temperature"] for point in train(learner)] == pytest.approx([0.2] * 2)
+    pairs = zip(before.parameters(), learner.policy.parameters(), strict=True)
+    assert all(torch.equal(*pair) for pair in pairs)
+
+
+def test_where_it_begins_is_of_the_seed_whatever_was_drawn_before() -> None:
+    begun = []
+    for drawn, seed in ((5, 1), (6, 1), (5, 2)):
+        torch.manual_seed(drawn)
+        policy, config = SoftActor(PolicyShape(1, 1, hidden_sizes=(8,))), SacConfig(buffer_size=1000)
+        learner = Sac(GoToZero(8), policy, config, horizon=7, seed=seed)
+        critics = [values.detach().flatten() for values in learner._critics.parameters()]
+        begun.append(torch.cat([*critics, learner.acting.observation[:, 0]]))
+    assert torch.equal(begun[0], begun[1]) and not torch.equal(begun[0], begun[2])

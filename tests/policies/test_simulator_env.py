@@ -1,0 +1,285 @@
+from typing import Any
+
+import pytest
+import torch
+
+from astra_data.grounding.grounded_simulator import GroundedSimulator
+from astra_data.grounding.networks.failure import FailureModel, FailureShape
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.policies.simulator_env import DataStarts, SimulatorEnv, policy_observation
+from astra_data.robots.registry import TASKS
+from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.plane.point_mass import PointMass
+from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.variation import PlanarVariation
+
+TASK = Navigation(U_MAZE, horizon=700)
+
+
+def world(num_envs: int = 4, **options: Any) -> SimulatorEnv:  # noqa: ANN401
+    simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
+    return SimulatorEnv(TASK, simulator, **options)
+
+
+class Risky(GroundedSimulator):
+    """A grounded simulator in which failures come with a probability that is known."""
+
+    risk = 0.05
+
+    def failure_risk(self) -> torch.Tensor:
+        return torch.full((len(self.state),), self.risk)
+
+
+def risky(count: int, risk: float, **options: Any) -> SimulatorEnv:  # noqa: ANN401
+    """Return episodes of which every second one reaches the goal in the first step."""
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    simulator = Risky(PointMass(U_MAZE, count, timestep_s=0.05), model)
+    simulator.risk = risk
+    one = SimulatorEnv(TASK, simulator, **options)
+    state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
+    goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
+    one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(count, 8)})
+    return one
+
+
+BACK = torch.tensor([[-1.0, 0.0]])
+
+
+def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
+    state, goal = torch.tensor([[5.0, -10.0, 0.5, -0.5]]), torch.tensor([[-4.0, 4.0]])
+    seen = policy_observation(TASK, state, goal, None)
+    assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -0.9, 1.4])
+    with_latent = policy_observation(TASK, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
+    assert with_latent.tolist() == [[3.5, 0.5, -2.5, 2.5, *seen[0].tolist()]]
+
+
+def test_the_same_torch_seed_gives_the_same_starts() -> None:
+    observations = []
+    for seed in (0, 0, 1):
+        torch.manual_seed(seed)
+        observations.append(world().reset())
+    assert torch.equal(observations[0], observations[1])
+    assert not torch.equal(observations[0], observations[2])
+
+
+def test_it_resumes_where_it_was_from_a_state_that_stays_as_it_was() -> None:
+    first, second = (world(change_penalty=1.0) for _ in range(2))
+    first.reset()
+    first.step(torch.ones(4, 2))
+    saved = {name: values.clone() for name, values in first.state_dict().items()}
+    kept = {name: values.clone() for name, values in saved.items()}
+    assert second.load_state_dict(saved).shape == (4, 8)
+    for _ in range(3):
+        action = 2 * torch.rand(4, 2) - 1
+        a, b = first.step(action), second.step(action)
+        assert torch.equal(a.observation, b.observation)
+        assert torch.equal(a.reward, b.reward)
+    second.reset(torch.tensor([True, False, False, True]))
+    assert all(torch.equal(saved[name], values) for name, values in kept.items())
+
+
+@pytest.mark.parametrize("is_varied", [False, True])
+def test_resumes_on_the_floors_where_walkers_were(is_varied: bool) -> None:
+    task = TASKS["humanoid-walker2d"]
+    variation = task.varied.wide if is_varied else None
+    first, second = (
+        SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, 3, variation=variation)) for _ in range(2)
+    )
+    first.reset()
+    inner = first.simulator.simulator
+    inner.reset_to(inner.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.15], [0.2]]))
+    for _ in range(4):
+        first.step(torch.zeros(3, 4))
+    second.load_state_dict(first.state_dict())
+    for _ in range(4):
+        after = []
+        for one in (first, second):
+            torch.manual_seed(0)
+            after.append(one.step(torch.zeros(3, 4)).observation)
+        assert torch.equal(*after)
+
+
+def test_episodes_may_start_from_recorded_moments() -> None:
+    moment = torch.tensor([[4.0, 0.0, 0.1, -0.9]])
+    starts = DataStarts(moment, torch.tensor([[-4.2, -4.1]]), torch.zeros(1, 2), hidden=None)
+    torch.manual_seed(0)
+    one = world(1000, starts=starts, data_start_share=0.3)
+    one.reset()
+    recorded = (one.simulator.state == moment).all(dim=1)
+    assert float(recorded.float().mean()) == pytest.approx(0.3, abs=0.05)
+    assert bool((one.goal[recorded] == starts.goal).all())
+    # At rest near the task's start otherwise.
+    other = one.simulator.state[~recorded]
+    assert bool((other[:, 2:] == 0).all())
+    assert float((other[:, :2] - torch.tensor([-4.0, 4.0])).abs().max()) <= 0.6 + 1e-5
+
+
+def test_reaching_the_goal_is_success() -> None:
+    one = world(1)
+    one.load_state_dict(
+        {"state": torch.tensor([[-3.54, -4.0, 0.0, 0.0]]), "goal": torch.tensor([[-4.0, -4.0]])}
+    )
+    step = one.step(torch.tensor([[-1.0, 0.0]]))
+    assert bool(step.success)
+    assert bool(step.terminated)
+    assert float(step.reward) == pytest.approx(10.05, abs=0.01)
+
+
+def test_the_price_of_failures_is_four_times_what_they_cost_as_far_as_it_has_grown() -> None:
+    plain = risky(2, 0.01).step(BACK.expand(2, 2)).reward
+    for scale, price in ((0.0, 0.0), (0.5, 0.2), (1.0, 0.4)):  # a failure costs 10
+        priced = risky(2, 0.01, reward="priced")
+        priced.penalty_scale = scale
+        step = priced.step(BACK.expand(2, 2))
+        assert (plain - step.reward).tolist() == pytest.approx([price] * 2, abs=1e-5)
+        assert step.success.tolist() == [False, True] and not priced.failed.any()
+
+
+def test_without_a_failure_model_nothing_is_priced() -> None:
+    rewards = [world(2, reward=reward) for reward in ("abstract", "priced")]
+    rewards[1].load_state_dict(rewards[0].state_dict())
+    assert torch.equal(*(one.step(BACK.expand(2, 2)).reward for one in rewards))
+
+
+@pytest.mark.parametrize(("risk", "share"), [(0.05, 0.05), (0.0, 0.0), (1.0, 1.0)])
+def test_failures_are_drawn_at_their_probability_and_end_episodes_that_did_not_succeed(
+    risk: float, share: float
+) -> None:
+    count = 4000
+    one = risky(count, risk, draws_failures=True)
+    before, goal = one.simulator.state, one.goal
+    step = one.step(BACK.expand(count, 2))
+    assert step.success[1::2].all() and not step.success[::2].any()
+    assert not one.failed[1::2].any()
+    assert float(one.failed[::2].float().mean()) == pytest.approx(share, abs=0.015)
+    assert torch.equal(step.terminated, step.success | one.failed)
+    own = TASK.reward(before, one.simulator.state, goal, one.failed)
+    torch.testing.assert_close(step.reward, own)
+
+
+def test_a_predicted_reward_is_the_tasks_own_corrected_and_what_the_risk_costs() -> None:
+    """By hand: the residual by R_pred, shrunk, the task's own, and hazard times the cost of a failure."""
+    torch.manual_seed(1)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    for name, value in {"mean": 0.3, "std": 2.0, "shrinkage": 0.25}.items():
+        getattr(model, f"reward_{name}").fill_(value)
+    model.failure_cost.fill_(-8.0)
+    failures = FailureModel(FailureShape(4, 2, 0.05, members=1, risk_steps=2)).eval()
+    grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model, failures)
+    one = SimulatorEnv(TASK, grounded, reward="predicted")
+    one.reset()
+    before, latent, action = one.simulator.state, grounded.latent, torch.full((3, 2), 0.2)
+    step = one.step(action)
+    hazard = grounded.failure_risk()
+    assert hazard is not None and (hazard > 0).all()
+    normal = model.reward_head(torch.cat([latent, action], dim=-1))[:, -1]
+    own = TASK.reward(before, one.simulator.state, one.goal, torch.zeros(3, dtype=torch.bool))
+    torch.testing.assert_close(step.reward, own + 0.25 * (0.3 + 2.0 * normal) - 8.0 * hazard)
+
+
+def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() -> None:
+    torch.manual_seed(0)
+    task = TASKS["nao-kick"]
+    model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, ball_index=4, corrects_reward=False))
+    one = SimulatorEnv(task.objective, GroundedSimulator(task.simulator(3), model), reward="predicted")
+    # Balls that roll on in the field, into the goal, and over the side line.
+    balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
+    state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
+    goal = torch.tensor([[1.5, 0.0]]).expand(3, 2)
+    one.load_state_dict(one.state_dict() | {"state": state, "goal": goal, "hidden": torch.zeros(3, 8)})
+    latent = one.simulator.latent
+    assert latent is not None
+    action = torch.zeros(3, 3)
+    step = one.step(action)
+    own = task.objective.reward(state, one.simulator.state, goal, torch.tensor([False, False, True]))
+    predicted = model.predict_reward(latent, action).detach()
+    assert step.terminated.tolist() == [False, True, True]
+    torch.testing.assert_close(step.reward, torch.cat([predicted[:1], own[1:]]))
+    assert float(own[1]) > 9.0
+    assert float(own[2]) < -9.0
+    assert float(predicted[0]) != pytest.approx(float(own[0]))
+
+
+def test_commands_are_clipped_and_shortened() -> None:
+    commands = torch.tensor([[3.0, 0.0], [0.6, 0.8], [1.0, 1.0], [0.1, -0.2], [0.0, 0.0]])
+    limited = TASK.limit_command(commands, 0.5)
+    expected = torch.tensor([[0.5, 0.0], [0.3, 0.4], [0.5 / 2**0.5] * 2, [0.1, -0.2], [0.0, 0.0]])
+    torch.testing.assert_close(limited, expected)
+    torch.testing.assert_close(TASK.limit_command(commands, 2.0), commands.clamp(-1.0, 1.0))
+
+
+def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -> None:
+    still, penalized = world(2), world(2, change_penalty=0.5, command_limit=0.5)
+    penalized.penalty_scale = 0.0
+    paid = []
+    for command in ([0.0, 0.4], [0.0, 0.4], [3.0, 0.0]):  # the last is shortened to 0.5
+        state = penalized.state_dict()
+        still.load_state_dict(state)
+        reward = penalized.step(torch.tensor([command] * 2)).reward
+        paid.append((still.step(torch.tensor([command] * 2).clamp(-0.5, 0.5)).reward - reward).tolist())
+    for row, change in zip(paid, (0.16, 0.0, 0.41), strict=True):
+        assert row == pytest.approx([0.5 * change] * 2, abs=1e-5)
+    penalized.reset(torch.tensor([True, False]))
+    still.load_state_dict(penalized.state_dict())
+    same = torch.tensor([[0.5, 0.0]] * 2)
+    less = still.step(same).reward - penalized.step(same).reward
+    assert less.tolist() == pytest.approx([0.125, 0.0], abs=1e-5)
+
+
+def test_from_a_recorded_moment_the_first_change_is_from_the_recorded_command() -> None:
+    starts = DataStarts(
+        state=torch.tensor([[-4.0, 4.0, 0.0, 0.0]]),
+        goal=torch.tensor([[4.0, 4.0]]),
+        hidden=None,
+        previous_action=torch.tensor([[0.3, 0.0]]),
+    )
+    one = world(1, change_penalty=1.0, starts=starts, data_start_share=1.0)
+    one.reset()
+    assert one.state_dict()["command"].tolist() == [pytest.approx([0.3, 0.0])]
+
+
+def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
+    variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
+    simulator = VariedPlanar(PointMass(U_MAZE, 4, timestep_s=0.05), variation)
+    assert SimulatorEnv(TASK, EpisodeSimulator(simulator)).observation_size == 8
+    showing = SimulatorEnv(TASK, EpisodeSimulator(simulator), shows_parameters=True)
+    assert (showing.observation_size, showing.parameter_count) == (8 + 7, 7)
+    before = showing.reset()
+    torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)
+    torch.testing.assert_close(before[:, 13], simulator.parameters[:, 5] / 5.0)
+    assert not before[:, [9, 10, 11, 12, 14]].any()  # these do not vary
+    assert torch.equal(showing.step(torch.ones(4, 2)).observation[:, 8:], before[:, 8:])
+    after = showing.reset(torch.tensor([True, False, False, False]))
+    assert (after[0, [8, 13]] != before[0, [8, 13]]).all()
+    assert torch.equal(after[1:, 8:], before[1:, 8:])
+    assert torch.equal(showing.load_state_dict(showing.state_dict()), after)
+
+
+def test_recorded_starts_hand_over_their_history() -> None:
+    torch.manual_seed(0)
+    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
+    state, goal = torch.tensor([[4.0, 0.0, 0.1, -0.9]]), torch.tensor([[-4.2, -4.1]])
+    starts = DataStarts(state, goal, torch.tensor([[0.5, -1.0]]), hidden=torch.randn(1, 8))
+    grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model)
+    one = SimulatorEnv(TASK, grounded, starts=starts, data_start_share=1.0)
+    one.reset()
+    assert starts.hidden is not None
+    expected = model.encoder.step(model.encoder_input(state, goal, starts.previous_action), starts.hidden)
+    torch.testing.assert_close(grounded.hidden, expected.expand(3, 8))
+    assert torch.equal(one.goal, goal.expand(3, 2)) and torch.equal(grounded.goal, one.goal)
+
+
+def test_whoever_reaches_the_goal_at_a_wall_has_not_failed() -> None:
+    task = TASKS["nao-navigation"]
+    one = SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, 2))
+    # Both touch the wall at x = -2; the goal of the first is there.
+    state = torch.tensor([[-1.999, 2.0, 0.0, 0.0]]).expand(2, 4)
+    goal = torch.tensor([[-1.9, 2.0], [1.9, 2.0]])
+    one.load_state_dict(one.state_dict() | {"state": state, "goal": goal})
+    step = one.step(torch.tensor([[-1.0, 0.0]]).expand(2, 2))
+    assert one.simulator.blocked.all() and step.terminated.all()
+    assert step.success.tolist() == [True, False] and one.failed.tolist() == [False, True]

@@ -1,0 +1,56 @@
+"""A policy in a simulator, here in that of its training."""
+
+from dataclasses import replace
+from functools import partial
+from statistics import fmean
+
+import torch
+from constant_policy import Constant
+from small_cart import TASK, Last
+
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.policies.build_env import Simulation, WorldConfig
+from astra_data.policies.own_policy import OwnPolicy
+from astra_data.policies.own_world import own_world
+from astra_data.policies.policy_file import PolicyFile, running
+from astra_data.policies.recorded_range import RecordedRange
+from astra_data.policies.simulator_episodes import in_simulator, started
+
+SIMULATION = Simulation(WorldConfig())
+SPEED = 4.0
+FORWARD = PolicyFile(OwnPolicy(Constant(1.0), 2, 1), SIMULATION, None, None)
+
+
+def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
+    acting = running(TASK, FORWARD, NO_GROUNDING)
+    begin = partial(started, acting, acting.act_in_simulator)
+    asked = RecordedRange(torch.tensor([0.0]), torch.tensor([2.0]), TASK.limits)
+    runs = [
+        in_simulator(
+            own_world(TASK, simulation, NO_GROUNDING, 9), begin, 40, seed, asked if not seed else None
+        )
+        for simulation in (SIMULATION, Simulation(WorldConfig(), TASK.varied.randomized))
+        for seed in (0, 1)
+    ]
+    goals = [start_goal["goal"] for _, start_goal in runs]
+    assert torch.equal(goals[0], goals[2]) and not torch.equal(goals[0], goals[1])
+    outcome = runs[0][0]
+    # It stops where the last episode ends; every command of 4 m/s is beyond 2 m/s.
+    assert outcome.position.shape[1] - 1 == max(outcome.steps) <= 5 and asked.share == 1.0
+    assert [steps for steps in outcome.steps] == [
+        int(torch.ceil(goal / (0.1 * SPEED) - 1e-4)) for goal in goals[0][:, 0]
+    ]
+    assert fmean(outcome.success) == 1.0
+
+
+def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
+    world = own_world(replace(TASK, objective=Last(horizon=6)), SIMULATION, NO_GROUNDING, 3)
+    found, _ = in_simulator(world, lambda goal: lambda state, goal: torch.full_like(goal, -0.6), 6, seed=0)
+    assert found.success == [1.0] * 3 and found.steps == [6] * 3
+
+
+def test_what_was_told_of_episodes_stays_when_others_follow_in_the_same_simulator() -> None:
+    world, acting = own_world(TASK, SIMULATION, NO_GROUNDING, 3), running(TASK, FORWARD, NO_GROUNDING)
+    begin = partial(started, acting, acting.act_in_simulator)
+    (_, first), (_, second), (_, again) = (in_simulator(world, begin, 40, seed) for seed in (0, 1, 0))
+    assert torch.equal(first["goal"], again["goal"]) and not torch.equal(first["goal"], second["goal"])

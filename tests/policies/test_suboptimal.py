@@ -1,0 +1,173 @@
+"""With learners that only count: what stops a training, what it goes on from, and what is recorded of it."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from small_cart import TASK as CART
+from stopping import Stopped, stop_past
+from torch import Tensor
+
+from astra_data.core.errors import BadInputError
+from astra_data.core.progress import silent
+from astra_data.core.seeding import derive
+from astra_data.policies import suboptimal
+from astra_data.policies.networks.actor_critic import ActorCritic
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.ppo import PpoConfig
+from astra_data.policies.sac import SacConfig
+from astra_data.policies.suboptimal import suboptimal_by_ppo, suboptimal_by_sac
+from astra_data.robots.registry import TASKS
+from astra_data.worlds.task import Task
+
+MAZE, WALKER = TASKS["antmaze-umaze"], TASKS["humanoid-kinematics"]
+
+
+class Counting:
+    """Stands for PPO and SAC: 100 steps per iteration, and nothing is learned."""
+
+    made: list["Counting"] = []  # noqa: RUF012 - of all tests, emptied by the fixture
+
+    def __init__(self, env: Any, policy: Any, config: Any, *, horizon: int, seed: int) -> None:  # noqa: ANN401
+        self.env, self.policy, self.config, self.horizon, self.seed = env, policy, config, horizon, seed
+        self.steps, self.went_on_from, self.goes_on = 0, 0, True
+        self.made.append(self)
+
+    def iterate(self) -> dict[str, float]:
+        self.steps += 100
+        return {"reward": 0.25}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"steps": torch.tensor(self.steps)}
+
+    def load_state_dict(self, state: dict[str, Tensor], observation: Tensor, *, goes_on: bool) -> None:
+        self.steps = self.went_on_from = int(state["steps"])
+        self.goes_on = goes_on
+
+
+@pytest.fixture(autouse=True)
+def counting(monkeypatch: pytest.MonkeyPatch) -> None:
+    Counting.made = []
+    for name in ("Ppo", "Sac"):
+        monkeypatch.setattr(suboptimal, name, Counting)
+    for name in ("_PPO_ENVS", "_SAC_ENVS"):
+        monkeypatch.setattr(suboptimal, name, 2)
+
+
+def test_ppo_stops_after_its_steps(tmp_path: Path) -> None:
+    shares: list[float] = []
+    notes: list[str] = []
+
+    def progress(share: float, note: str) -> None:
+        shares.append(share)
+        notes.append(note)
+
+    trained, metadata = suboptimal_by_ppo(
+        MAZE, steps=250, seed=7, folder=tmp_path, num_threads=1, progress=progress
+    )
+    (ppo,) = Counting.made
+    assert shares == pytest.approx([0.4, 0.8, 1.0])
+    assert notes[0].endswith("reward per step 0.250")
+    assert (ppo.horizon, ppo.seed, ppo.config) == (MAZE.objective.horizon, 7, PpoConfig(total_steps=250))
+    assert type(trained.policy) is ActorCritic and trained.policy.memory is None
+    assert (trained.observed, trained.simulation, trained.dataset) == ("abstract", None, None)
+    assert trained.policy.shape.observation_size == 8
+    assert not any(parameter.requires_grad for parameter in trained.policy.parameters())
+    assert metadata["trained_steps"] == 300
+    assert metadata["learner"]["num_envs"] == 2
+    assert metadata["learner"]["hidden_sizes"] == [64, 64]
+    assert metadata["learner"]["total_steps"] == 250
+    assert metadata["spent"].keys() == {"wall_seconds", "cpu_seconds"}
+
+
+@pytest.mark.parametrize(("task", "episodes_go_on"), [(MAZE, True), (CART, False)])
+def test_it_goes_on_from_its_checkpoint(
+    task: Task, episodes_go_on: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+
+    given: dict[str, Any] = {"steps": 250, "seed": 7, "folder": tmp_path, "num_threads": 1}
+    with pytest.raises(Stopped):
+        suboptimal_by_ppo(task, **given, progress=stop_past(0.7))
+    _, metadata = suboptimal_by_ppo(task, **given, progress=silent)
+    assert [one.went_on_from for one in Counting.made] == [0, 100]
+    assert Counting.made[-1].goes_on == episodes_go_on
+    assert metadata["trained_steps"] == 300
+    # What is finished is not trained again.
+    suboptimal_by_ppo(task, **given, progress=silent)
+    assert Counting.made[-1].steps == Counting.made[-1].went_on_from == 300
+
+
+@pytest.mark.parametrize(
+    ("lasting", "steps", "trained"), [((10, 20, 60), 10_000, 300), ((10, 20, 30, 40), 350, 400)]
+)
+def test_sac_stops_once_episodes_last_or_after_its_steps(
+    lasting: tuple[int, ...], steps: int, trained: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds: list[int] = []
+
+    def lasts(deployed: Any, seed: int, num_threads: int | None) -> float:  # noqa: ANN401
+        seeds.append(seed)
+        return float(lasting[len(seeds) - 1])
+
+    monkeypatch.setattr(suboptimal, "_lasts", lasts)
+    shares: list[float] = []
+    policy, metadata = suboptimal_by_sac(
+        WALKER,
+        steps=steps,
+        episode_steps=50,
+        seed=3,
+        folder=tmp_path,
+        num_threads=1,
+        progress=lambda share, note: shares.append(share),
+    )
+    assert metadata["trained_steps"] == trained
+    assert shares[0] == pytest.approx(max(100 / steps, 10 / 50))
+    assert shares[-1] == 1.0
+    assert seeds == [derive(3, f"trial {100 * (count + 1)}") for count in range(len(seeds))]
+    assert type(policy.policy) is SoftActor and policy.observed == "full"
+    config = Counting.made[0].config
+    assert isinstance(config, SacConfig)
+    assert (config.total_steps, config.discount) == (steps, 0.99)
+
+
+def test_where_good_episodes_are_short_sac_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="good episodes are short: use 'suboptimal_ppo'"):
+        suboptimal_by_sac(
+            MAZE, steps=1, episode_steps=1, seed=0, folder=tmp_path, num_threads=1, progress=silent
+        )
+    assert not Counting.made
+
+
+def test_how_long_episodes_last_is_the_mean_over_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three robots one fails in its second step, one in its fourth, one not within the horizon of 6."""
+
+    class Env:
+        state, goal = torch.zeros(3, 1), torch.zeros(3, 0)
+        steps = 0
+
+        def reset(self) -> None:
+            self.steps = 0
+
+        def step(self, action: Tensor, active: Tensor) -> Any:  # noqa: ANN401
+            self.steps += 1
+            self.actives = [*getattr(self, "actives", []), active.tolist()]
+            ends = torch.tensor([self.steps == 2, self.steps == 4, False])  # in this step alone
+            return type("Step", (), {"terminated": ends})()
+
+    class Deployed:
+        class task:  # noqa: N801 - stands for an attribute
+            objective = type("Objective", (), {"horizon": 6})()
+            target = staticmethod(lambda count, seed, num_threads: env)
+
+        def start(self, count: int, generator: torch.Generator) -> None:
+            assert count == 3
+
+        def act(self, state: Tensor, goal: Tensor) -> Tensor:
+            return torch.zeros(3, 1)
+
+    env = Env()
+    monkeypatch.setattr(suboptimal, "_TEST_EPISODES", 3)
+    assert suboptimal._lasts(Deployed(), 0, 1) == pytest.approx((2 + 4 + 6) / 3)  # type: ignore[arg-type]
+    assert env.actives[2] == [False, True, True]

@@ -1,0 +1,334 @@
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from pydantic import TypeAdapter, ValidationError
+from torch import Tensor
+from toy_episodes import toy_episodes
+from toy_worlds import GoToZero
+
+from astra_data.core.progress import Progress, silent
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.protocols import Grounding
+from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.policies.acting import Acting
+from astra_data.policies.build_env import WorldConfig
+from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.networks.policy import PolicyShape
+from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.ppo import Ppo
+from astra_data.policies.sac import Sac
+from astra_data.policies.simulator_env import RewardSource
+from astra_data.policies.train import (
+    AnyTrainConfig,
+    InSimulator,
+    PpoTrainConfig,
+    SacTrainConfig,
+    Training,
+    lately,
+    learner_of,
+    optimize,
+    train_in,
+)
+from astra_data.robots.registry import TASKS
+from astra_data.worlds.task import Task
+from astra_data.worlds.variation import PlanarVariation
+
+TASK = TASKS["antmaze-umaze"]
+PPO = PpoTrainConfig(num_envs=4, rollout_steps=4, total_steps=4 * 4 * 3, hidden_sizes=(8, 6), memory_size=5)
+SAC = SacTrainConfig(
+    learner="sac",
+    num_envs=4,
+    rollout_steps=4,
+    total_steps=32,
+    updates_per_step=1,
+    batch_size=8,
+    window=4,
+    burn_in=1,
+    hidden_sizes=(8,),
+    memory_size=5,
+)
+
+
+class ToyWorld(GoToZero):
+    penalty_scale = 1.0
+
+
+def training(
+    folder: Path,
+    config: PpoTrainConfig | SacTrainConfig = PPO,
+    *,
+    task: Task = TASK,
+    grounding: Grounding = NO_GROUNDING,
+    settings: PlanarVariation | None = None,
+    progress: Progress = silent,
+    seed: int = 0,
+) -> Training:
+    torch.manual_seed(0)
+    state = torch.tensor([-4.0, 4.0, 0.0, 0.0]).expand(2, 6, 4) + 0.1 * torch.randn(2, 6, 4)
+    episodes = toy_episodes(
+        state,
+        torch.randn(2, 6, 2),
+        next_state=state,
+        simulated_next=state + 0.1 * torch.randn_like(state),
+        goal=torch.zeros(2, 6, 2),
+    )
+    return Training(task, config, settings, episodes, grounding, None, seed, "cpu", folder, progress)
+
+
+def grounding() -> HistoryGrounding:
+    torch.manual_seed(0)
+    return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False))
+
+
+def test_the_learner_that_is_named_has_the_settings_ppo_by_default() -> None:
+    read: TypeAdapter[PpoTrainConfig | SacTrainConfig] = TypeAdapter(AnyTrainConfig)
+    assert type(read.validate_python({})) is PpoTrainConfig
+    assert type(read.validate_python({"learner": "ppo", "rollout_steps": 9})) is PpoTrainConfig
+    sac = read.validate_python({"learner": "sac", "burn_in": 3})
+    assert (type(sac), sac.num_envs) == (SacTrainConfig, 32)
+    assert read.validate_python(sac) is sac
+    with pytest.raises(ValidationError, match="burn_in"):
+        read.validate_python({"burn_in": 3})
+
+
+def test_each_learner_gets_its_policy_in_the_asked_sizes() -> None:
+    shape = PolicyShape(1, 1, 5, hidden_sizes=(8, 6))
+    given: dict[str, Any] = {"horizon": 7, "seed": 3}
+    ppo = learner_of(PPO, ToyWorld(4), shape, "cpu", **given)
+    assert type(ppo) is Ppo and type(ppo.policy) is ActorCritic
+    assert ppo.policy.shape == ActorCriticShape(1, 1, 5, hidden_sizes=(8, 6))
+    assert (ppo.total_steps, ppo.acting.horizon) == (48, 7)
+    sac = learner_of(SAC, ToyWorld(4), shape, "cpu", **given)
+    assert type(sac) is Sac and type(sac.policy) is SoftActor
+    assert sac.policy.shape == shape
+    assert sac.acting.horizon == 7
+
+
+@pytest.mark.parametrize("config", [PPO, SAC])
+def test_the_seed_decides_the_policy(config: PpoTrainConfig | SacTrainConfig, tmp_path: Path) -> None:
+    weights = []
+    for number, seed in enumerate((0, 0, 1)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        policy, curve = train_in(ToyWorld(4), config, 5, training(folder, seed=seed), 20)
+        weights.append(torch.cat([values.flatten() for values in policy.state_dict().values()]))
+        assert [point["steps"] for point in curve["points"]] == list(range(16, config.total_steps + 1, 16))
+        assert policy.shape.memory_size == 5
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+class Counting(Ppo):
+    """PPO that does nothing but count to ten, and notes the scale of penalties and its pace as it goes."""
+
+    def __init__(self, env: ToyWorld, figures: Callable[[int], dict[str, float]]) -> None:
+        self.env, self.figures, self.steps, self.total_steps = env, figures, 0, 10
+        self.share, self.pace = 0.0, 1.0
+        self.scales, self.paces = list[float](), list[float]()
+        self.acting: Any = self
+        self.world_seconds = 0.5
+
+    def iterate(self) -> dict[str, float]:
+        self.scales.append(self.env.penalty_scale)  # type: ignore[attr-defined]
+        self.paces.append(self.pace)
+        self.steps += 1
+        self.share = min(1.0, self.share + self.pace / self.total_steps)
+        return self.figures(self.steps)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"steps": torch.tensor(self.steps), "share": torch.tensor(self.share, dtype=torch.double)}
+
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor, *, goes_on: bool = True) -> None:
+        self.steps, self.share = int(state["steps"]), float(state["share"])
+        self.observation, self.goes_on = observation, goes_on
+
+
+def counted(
+    given: Training, figures: Callable[[int], dict[str, float]] = lambda step: {"success": 0.5}
+) -> tuple[Counting, dict[str, Any]]:
+    learner = Counting(ToyWorld(2), figures)
+    return learner, optimize(learner, learner.env, given)  # type: ignore[arg-type]
+
+
+WALKER = TASKS["humanoid-kinematics"]
+
+
+@pytest.mark.parametrize(
+    ("task", "is_plus", "success", "scales"),
+    [
+        # Mastered from the first point on: penalties grow over four tenths, and then it is thrice as fast.
+        (TASK, True, 1.0, [0.0, 0.25, 0.5, 0.75, 1.0, 1.0]),
+        (TASK, False, 1.0, [1.0] * 4),
+        (TASK, True, 0.9, [0.0] * 10),
+        (TASK, False, 0.9, [1.0] * 10),
+        # Success that is to last is unknown here: nothing grows, and nothing ends early.
+        (WALKER, True, 1.0, [1.0] * 10),
+    ],
+)
+def test_a_mastered_training_ends_early_and_only_its_penalties_grow(
+    task: Task, is_plus: bool, success: float, scales: list[float], tmp_path: Path
+) -> None:
+    notes: list[tuple[float, str]] = []
+    given = training(tmp_path, task=task, progress=lambda *note: notes.append(note))
+    figures = {"success": success, "episode_steps": 1000.0}
+    learner, curve = counted(replace(given, is_plus=is_plus), lambda step: figures)
+    assert learner.scales == pytest.approx(scales)
+    slow = {4: 1, 6: 4}.get(len(scales), 10)
+    assert learner.paces == [1.0] * slow + [3.0] * (len(scales) - slow)
+    shares = [point["share"] for point in curve["points"]]
+    tenths = [*range(1, slow + 1), *range(slow + 3, 11, 3)]
+    assert shares == pytest.approx([tenth / 10 for tenth in tenths])
+    assert [share for share, _ in notes] == shares
+    assert [point["steps"] for point in curve["points"]] == [*range(1, len(scales) + 1)]
+    told = f"success of training episodes {success:.2f}"
+    if task is WALKER:
+        told = "steps of training episodes 1,000"
+        assert {point["success"] for point in curve["points"]} == {None}
+    assert notes[-1][1].endswith(told)
+
+
+def test_with_sac_penalties_are_whole_and_it_ends_early_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A learner that is no PPO: its replay holds rewards of long ago."""
+    monkeypatch.setattr("astra_data.policies.train.Ppo", int)
+    learner, _ = counted(replace(training(tmp_path), is_plus=True), lambda step: {"success": 1.0})
+    assert learner.scales == [1.0] * 4
+
+
+@pytest.mark.parametrize(("success", "iterations"), [(1.0, 3), (0.0, 6)])
+def test_ppo_itself_takes_fewer_steps_once_episodes_succeed_and_completes_its_schedules(
+    success: float, iterations: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, rates = PPO.model_copy(update={"total_steps": 16 * 6}), list[float]()
+    figures = Acting.figures
+    monkeypatch.setattr(Acting, "figures", lambda acting: figures(acting) | {"success": success})
+    learn = Ppo._learn
+
+    def noted(ppo: Ppo, rollout: dict[str, Tensor]) -> None:
+        rates.append(ppo._optimizer.param_groups[0]["lr"] / config.learning_rate)
+        learn(ppo, rollout)
+
+    monkeypatch.setattr(Ppo, "_learn", noted)
+    _, curve = train_in(ToyWorld(4), config, 5, training(tmp_path, config), 20)
+    assert len(curve["points"]) == iterations and curve["points"][-1]["steps"] == 16 * iterations
+    done = [0, 1, 4] if success else range(6)
+    assert rates == pytest.approx([1 - sixths / 6 for sixths in done])
+    assert curve["points"][-1]["share"] == pytest.approx(1.0)
+
+
+def test_the_curve_has_every_iteration_and_null_for_what_is_undefined(tmp_path: Path) -> None:
+    notes: list[tuple[float, str]] = []
+    given = training(tmp_path, progress=lambda share, note: notes.append((share, note)))
+    _, curve = counted(given, lambda step: {"success": math.nan if step < 3 else step / 20})
+    assert [point["success"] for point in curve["points"]] == [
+        None,
+        None,
+        *[step / 20 for step in range(3, 11)],
+    ]
+    assert [point["steps"] for point in curve["points"]] == list(range(1, 11))
+    assert curve["simulator_steps_per_second"] == pytest.approx(10 / 0.5)
+    assert [share for share, _ in notes] == pytest.approx([step / 10 for step in range(1, 11)])
+    assert notes[0][1].endswith("success of training episodes unknown yet")
+    assert notes[-1][1].endswith("success of training episodes 0.33")  # the mean of 0.15 to 0.5
+
+
+def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+    given = training(tmp_path)
+    notes: list[float] = []
+
+    def interrupt(share: float, note: str) -> None:
+        notes.append(share)
+        if len(notes) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+        counted(replace(given, progress=interrupt))
+    again, curve = counted(given)
+    # The third was not written any more.
+    assert len(again.scales) == 8 and again.goes_on
+    assert [point["steps"] for point in curve["points"]] == [*range(1, 11)]
+    assert curve["simulator_steps_per_second"] == pytest.approx(8 / 0.5)
+    ended, curve = counted(given)
+    assert not ended.scales and len(curve["points"]) == 10 and curve["simulator_steps_per_second"] is None
+
+
+def test_the_episodes_of_robots_do_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ToyWorld, "state_dict", lambda world: {})
+    monkeypatch.setattr(ToyWorld, "load_state_dict", lambda world, state: world.observe())
+    given = training(tmp_path)
+    counted(given)
+    again, _ = counted(given)
+    assert again.steps == 10 and not again.goes_on
+
+
+@pytest.mark.parametrize("reward", ["abstract", "predicted"])
+def test_rows_and_their_plus_rows_differ_by_the_plus_settings_alone(
+    reward: RewardSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("astra_data.policies.train.command_limit", lambda task, episodes: 0.85)
+    given = training(tmp_path, PPO.model_copy(update={"data_start_share": 0.6}), grounding=grounding())
+    (plain, known), (plus, priced) = (
+        InSimulator(reward=reward).world(replace(given, is_plus=is_plus)) for is_plus in (False, True)
+    )
+    assert known.world == WorldConfig(reward=reward, data_start_share=0.6)
+    changes = {"reward": "priced", "change_penalty": 0.02, "command_limit": 0.85}
+    assert priced.world == known.world.model_copy(update=changes)
+    plainly = (str, float, int, bool)
+    switches, others = (
+        {name: value for name, value in vars(env).items() if isinstance(value, plainly)}
+        for env in (plain, plus)
+    )
+    assert switches["data_start_share"] == 0.6 and plain.num_envs == PPO.num_envs
+    assert others == switches | changes
+
+
+def test_parameters_vary_as_the_method_says_unless_its_settings_do(tmp_path: Path) -> None:
+    own = PlanarVariation(friction=(0.5, 0.6))
+    for ranges, settings, expected in (
+        (None, None, None),
+        ("randomized", None, TASK.varied.randomized),
+        ("wide", None, TASK.varied.wide),
+        ("wide", own, own),
+    ):
+        given = training(tmp_path, settings=settings)
+        env, simulation = InSimulator(ranges=ranges).world(given, shows_parameters=True)  # type: ignore[arg-type]
+        assert simulation.variation == expected
+        assert env.parameter_count == (0 if expected is None else len(own.names))
+
+
+def test_policies_that_observe_latents_have_no_memory(tmp_path: Path) -> None:
+    config = PPO.model_copy(update={"episode_steps": 3})
+    for name, used, memory_size, observed in (("raw", NO_GROUNDING, 5, 8), ("latents", grounding(), 0, 16)):
+        (tmp_path / name).mkdir()
+        trained, curve = InSimulator()(training(tmp_path / name, config, grounding=used))
+        shape = trained.policy.shape
+        assert (shape.memory_size, shape.observation_size, shape.hidden_sizes) == (
+            memory_size,
+            observed,
+            (8, 6),
+        )
+        assert trained.simulation is not None and (trained.dataset, trained.content_hash) == (
+            "toy@data-1.0.0",
+            "0",
+        )
+        assert max(point["episode_steps"] or 0 for point in curve["points"]) <= 3
+
+
+def test_simulated_episodes_last_as_long_as_the_tasks_unless_told_otherwise(tmp_path: Path) -> None:
+    given = training(tmp_path)
+    assert given.simulated_steps == TASK.objective.horizon
+    assert replace(given, config=PPO.model_copy(update={"episode_steps": 9})).simulated_steps == 9
+
+
+def test_what_is_told_on_the_way_is_of_the_last_ten_points() -> None:
+    points = [{"success": value} for value in (*[0.0] * 5, *[1.0] * 9, None)]
+    assert lately(points, "success").endswith("1.00")
+    assert lately(points[:-1], "success").endswith("0.90")

@@ -1,0 +1,197 @@
+"""The bodies under targets written by hand: delays, the ankles' reflex, waiting, falling."""
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from astra_data.core.arrays import Floats
+from astra_data.robots.nao.bodies import MOTORS, TICKS, BatchedBodies
+from astra_data.robots.nao.body import STIFFNESS_NM_PER_RAD, SUBSTEPS, nao_model
+from astra_data.robots.nao.kinematics import TO_MOTORS, leg_angles
+from astra_data.robots.nao.links import HIP_OFFSET_Z_M
+from astra_data.robots.nao.steps import Gait, StepPlanner, WalkLimits
+from astra_data.robots.nao.traits import IDENTICAL, Traits
+from astra_data.robots.nao.walk import Targets, WalkEngine, WalkStyle
+
+STYLE = WalkStyle(gyro_gain=(0.0, 0.0))
+STANDING = leg_angles(WalkEngine(StepPlanner(np.ones(1)), STYLE).feet(Gait.standing(1, WalkLimits()))).angles[
+    0
+]
+FIRST = 3  # the longest delay: so many angles are under way when a control step begins
+
+
+def bodies(
+    count: int = 1, *, height_m: float = 0.0, style: WalkStyle = STYLE, **traits: NDArray[Any]
+) -> BatchedBodies:
+    drawn = replace(Traits.draw(IDENTICAL, count, np.random.default_rng(0)), **traits)
+    made = BatchedBodies(nao_model(), drawn, longest_delay_ticks=FIRST, style=style, num_threads=1)
+    qpos = np.tile(made.model.qpos0, (count, 1))
+    qpos[:, 2] = STYLE.hip_height_m + HIP_OFFSET_Z_M + height_m
+    qpos[:, 7 : 7 + MOTORS] = STANDING[TO_MOTORS]
+    made.reset(np.arange(count), qpos, np.tile(STANDING[TO_MOTORS], (count, 1)))
+    return made
+
+
+def targets(count: int = 1, *, carries: tuple[bool, bool] = (False, False), lifts_off: int = 0) -> Targets:
+    """Return the standing posture for one control step, changing by 1 mrad per tick."""
+    ramp = 1e-3 * np.arange(1, TICKS + 1)[:, None]
+    return Targets(
+        angles=np.tile(STANDING + ramp, (count, 1, 1)),
+        supports=np.tile(np.array(carries), (count, TICKS, 1)),
+        lifts_off=np.full((count, TICKS), lifts_off),
+        gaits=[],
+    )
+
+
+def noise(count: int = 1) -> Floats:
+    return np.zeros((count, TICKS, 3))
+
+
+def test_angles_arrive_after_their_delay() -> None:
+    robots = bodies(3, delay_ticks=np.array([0, 2, 3]))
+    followed = robots.step(np.arange(3), targets(3), noise(3))
+    assert followed.tolist() == [TICKS] * 3
+    expected = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+    for row in range(3):
+        np.testing.assert_allclose(robots.sent[row, FIRST:], expected)
+        np.testing.assert_array_equal(robots.sent[row, :FIRST], np.tile(STANDING[TO_MOTORS], (FIRST, 1)))
+    # What the servos held in the last tick is the end of a saved state.
+    controls = robots.state[:, -MOTORS:]
+    for row, delay in enumerate((0, 2, 3)):
+        np.testing.assert_allclose(controls[row], expected[TICKS - 1 - delay])
+    # The last ticks of this control step are the first of the next.
+    robots.step(np.arange(3), targets(3), noise(3))
+    np.testing.assert_allclose(robots.sent[:, :FIRST], np.tile(expected[-FIRST:], (3, 1, 1)))
+
+
+def test_servos_turn_joints_that_are_off_by_their_offset() -> None:
+    offset = np.zeros((1, 11))
+    offset[0, 3] = 0.05
+    robots = bodies(joint_offset_rad=offset)
+    robots.step(np.array([0]), targets(), noise())
+    moved = robots.sent[0, -1] - (STANDING + 1e-3 * TICKS)[TO_MOTORS]
+    assert moved[3] == pytest.approx(0.05) and np.abs(np.delete(moved, 3)).max() < 1e-12
+    np.testing.assert_array_equal(robots.held[0], robots.sent[0, -1])
+
+
+def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> None:
+    robots = bodies(2, friction=np.array([0.3, 0.7]), stiffness=np.array([0.8, 1.0]), height_m=0.02)
+    before = robots.qpos.copy()
+    robots.step(np.arange(2), targets(2), noise(2))
+    for row, (friction, stiffness) in enumerate(((0.3, 0.8), (0.7, 1.0))):
+        model = nao_model()
+        model.geom("floor").friction[0] = friction
+        model.actuator_gainprm[:, 0] = stiffness * STIFFNESS_NM_PER_RAD
+        model.actuator_biasprm[:, 1] = -stiffness * STIFFNESS_NM_PER_RAD
+        data = mujoco.MjData(model)
+        data.qpos[:] = before[row]
+        mujoco.mj_forward(model, data)
+        angles = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+        for tick in range(TICKS):
+            data.ctrl[:] = angles[tick - 2] if tick >= 2 else STANDING[TO_MOTORS]
+            mujoco.mj_step(model, data, SUBSTEPS)
+        np.testing.assert_allclose(robots.qpos[row], data.qpos, atol=1e-9)
+        np.testing.assert_allclose(robots.pressure[row], data.sensordata, atol=1e-6)
+
+
+def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
+    """In the air nothing turns the torso; what the gyroscope measures there is its noise alone."""
+    style = replace(STYLE, gyro_gain=(0.1, 0.2), gyro_keep=0.5)
+    robots = bodies(height_m=1.0, style=style, delay_ticks=np.array([0]))
+    measured = noise()
+    measured[0, 0] = [0.4, 0.8, 0.0]  # roll and pitch rate in the first tick only
+    robots.step(np.array([0]), targets(carries=(True, False)), measured)
+    planned = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+    added = robots.sent[0, FIRST:] - planned
+    assert added[0, [4, 5]] == pytest.approx([0.1 * 0.4, 0.2 * 0.2], abs=2e-3)
+    # Half of a filtered rate lasts to the next tick.
+    assert added[1, [4, 5]] == pytest.approx([0.1 * 0.2, 0.2 * 0.1], abs=4e-3)
+    assert not added[:, [10, 11]].any() and not np.delete(added, [4, 5, 10, 11], axis=1).any()
+
+
+@pytest.mark.parametrize(
+    ("lifts_off", "lean_deg", "waits"),
+    [(1, -5, True), (1, 5, False), (-1, 5, True), (-1, -5, False), (0, -5, False)],
+)
+def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(
+    lifts_off: int, lean_deg: float, waits: bool
+) -> None:
+    robots = bodies()
+    half = np.radians(lean_deg) / 2
+    robots.qpos[0, 3:5] = np.cos(half), np.sin(half)  # positive rolls are to the right
+    planned = targets()
+    planned.lifts_off[:, 0] = lifts_off
+    followed = robots.step(np.array([0]), planned, noise())
+    assert (followed[0] < TICKS) == waits
+
+
+@pytest.mark.parametrize(("roll_rate", "waits"), [(-2.0, True), (2.0, False)])
+def test_a_foot_waits_as_soon_as_the_torso_turns_toward_it(roll_rate: float, waits: bool) -> None:
+    """An upright torso that is measured to roll to the left, over the left foot that is to be lifted."""
+    robots, measured, planned = bodies(height_m=1.0), noise(), targets()
+    measured[0, 0, 0] = roll_rate
+    planned.lifts_off[:, 0] = 1
+    followed = robots.step(np.array([0]), planned, measured)
+    assert (followed[0] < TICKS) == waits
+
+
+def test_a_robot_that_waits_stands_on_both_feet() -> None:
+    """Both ankles push against the rates that are measured then, whichever foot is planned to carry."""
+    style = replace(STYLE, gyro_gain=(0.1, 0.2), gyro_keep=0.0)
+    robots, measured, planned = bodies(height_m=1.0, style=style), noise(), targets(carries=(False, True))
+    measured[0, 0, :2] = [-2.0, 0.8]
+    planned.lifts_off[:, 0] = 1
+    followed = robots.step(np.array([0]), planned, measured)
+    assert followed[0] < TICKS
+    added = robots.sent[0, FIRST] - STANDING[TO_MOTORS]
+    assert added[[4, 5, 10, 11]] == pytest.approx([0.08, -0.4] * 2, abs=2e-3)
+
+
+def test_the_gyroscope_reads_the_last_rates_with_their_noise() -> None:
+    robots, measured = bodies(height_m=1.0), noise()
+    measured[0, :, 2] = 9.0
+    measured[0, -1] = [1.0, -2.0, 3.0]
+    robots.step(np.array([0]), targets(), measured)
+    assert robots.gyro[0] == pytest.approx([1.0, -2.0, 3.0], abs=0.2)
+
+
+def test_it_waits_only_so_long() -> None:
+    robots = bodies(height_m=1.0, style=replace(STYLE, longest_wait_ticks=5))
+    half = np.radians(-20) / 2
+    robots.qpos[0, 3:5] = np.cos(half), np.sin(half)
+    followed = robots.step(np.array([0]), targets(lifts_off=1), noise())
+    # Five ticks of waiting before each that is followed: in 16 ticks two are.
+    assert followed.tolist() == [2]
+    assert robots.waited.tolist() == [4]
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("degrees", "fallen"), [(44.5, False), (-44.5, False), (46.5, True), (-46.5, True)])
+def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(
+    axis: int, degrees: float, fallen: bool
+) -> None:
+    """In the air, where nothing turns it."""
+    robots, half = bodies(height_m=1.0), np.radians(degrees) / 2
+    robots.qpos[0, 3] = np.cos(half)
+    robots.qpos[0, 4 + axis] = np.sin(half)
+    robots.step(np.array([0]), targets(), noise())
+    assert bool(robots.fallen[0]) == fallen
+
+
+def test_who_falls_stays_as_it_is_until_it_is_reset() -> None:
+    robots = bodies(2)
+    half = np.radians(44.0) / 2
+    robots.qpos[1, 3:7] = [np.cos(half), 0.0, np.sin(half), 0.0]
+    robots.qvel[1, 4] = 5.0
+    robots.step(np.arange(2), targets(2), noise(2))
+    assert robots.fallen.tolist() == [False, True]
+    lying = robots.state[1].copy()
+    followed = robots.step(np.arange(2), targets(2), noise(2))
+    assert followed.tolist() == [TICKS, 0]
+    np.testing.assert_array_equal(robots.state[1], lying)
+    robots.reset(np.array([1]), robots.qpos[:1], np.tile(STANDING[TO_MOTORS], (1, 1)))
+    assert not robots.fallen.any() and not robots.pressure[1].any()

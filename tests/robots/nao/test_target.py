@@ -1,0 +1,231 @@
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nao_values import NO_ERRORS
+
+from astra_data.core.arrays import Floats
+from astra_data.robots.nao.target import NaoEnv
+from astra_data.robots.registry import TASKS
+
+
+def env(task: str = "nao-navigation", count: int = 3, **options: Any) -> NaoEnv:  # noqa: ANN401 - handed on
+    made = TASKS[task].target(count, seed=0, num_threads=1, **options)
+    assert isinstance(made, NaoEnv)
+    made.reset()
+    return made
+
+
+@pytest.mark.parametrize("task", ["nao-navigation", "nao-kick"])
+def test_states_have_their_columns_and_abstractions(task: str) -> None:
+    one = env(task)
+    columns = TASKS[task].state_columns
+    assert one.state.shape == (3, columns[0].size)
+    assert columns[0].names is not None
+    assert len(columns[0].names) == columns[0].size
+    assert one.reset().shape == (3, one.observation_size)
+    abstract = TASKS[task].abstraction(one.state)
+    assert abstract.shape == one.truth.shape == (3, TASKS[task].abstract_state.size)
+    assert TASKS[task].beyond(one.state).shape[1] == columns[0].size - abstract.shape[1]
+    # Beliefs are near the truth.
+    assert (abstract - one.truth).abs().max() < 0.5
+
+
+def test_robots_turn_to_where_they_are_to_go_and_go_there() -> None:
+    one = env(count=8, errors=NO_ERRORS)
+    start = one.position
+    for _ in range(25):
+        one.step(torch.tensor([[0.8, 0.0]]).expand(8, 2))
+    way = one.position - start
+    assert way[:, 0].min() > 0.3
+    assert (way[:, 1].abs() < 0.5 * way[:, 0]).all()
+    np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), 1.0, atol=0.1)
+
+
+def test_robots_with_a_ball_keep_facing_it() -> None:
+    one = env("nao-kick", 8, errors=NO_ERRORS)
+    away = torch.nn.functional.normalize(one.truth[:, :2] - one.truth[:, 4:6])
+    for _ in range(40):
+        one.step(torch.nn.functional.pad(0.5 * away, (0, 1)))
+    apart = one.robots.ball - one.robots.pose[:, :2]
+    assert np.linalg.norm(apart, axis=1).min() > 0.5
+    bearing = np.arctan2(apart[:, 1], apart[:, 0]) - one.robots.pose[:, 2]
+    np.testing.assert_allclose(np.cos(bearing), 1.0, atol=0.1)
+
+
+def test_robots_turn_to_their_ball_before_they_walk() -> None:
+    one = env("nao-kick", 4, errors=NO_ERRORS)
+    place, angle = np.zeros((4, 3)), np.array([0.0, np.pi / 4, np.pi / 2, -3.0])
+    one.robots.reset(np.arange(4), place, np.random.default_rng(0))
+    one.localisation.reset(np.arange(4), place, np.random.default_rng(0))
+    one.sight.reset(np.arange(4), np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    ahead = torch.tensor([[1.0, 0.0]]).expand(4, 2)
+    command = one._body_command(ahead, np.zeros(4, dtype=bool))
+    np.testing.assert_allclose(command[:, 0] / command[0, 0], [1.0, 0.5, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(np.sign(command[:, 2]), [0.0, 1.0, 1.0, -1.0])
+    kicking = one._body_command(0 * ahead, np.ones(4, dtype=bool))
+    assert (kicking[:, :2] == 0).all()
+    np.testing.assert_array_equal(kicking[:, 2], command[:, 2])
+
+
+def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
+    one = env("nao-kick", 2, errors=NO_ERRORS)
+    place, ball = np.zeros((2, 3)), np.array([[-0.8, 0.0], [0.8, 0.0]])
+    one.robots.reset(np.arange(2), place, np.random.default_rng(0), ball)
+    one.localisation.reset(np.arange(2), place, np.random.default_rng(0))
+    # Both believe that it lies in front of them.
+    one.sight.reset(np.arange(2), ball[[1, 1]])
+    one.sight.errors = replace(NO_ERRORS, ball_seen_rad=np.pi / 2)
+    heading = []
+    for _ in range(40):
+        one.step(torch.zeros(2, 3))
+        heading.append(one.robots.pose[:, 2])
+    assert np.abs(heading)[:, 0].max() > np.pi / 2
+    assert np.abs(heading)[:, 1].max() < 0.2
+    np.testing.assert_allclose(one.sight.position, ball, atol=0.1)
+
+
+def test_a_kick_reaches_a_foot_far_and_moves_no_robot() -> None:
+    one = env("nao-kick", 8, errors=NO_ERRORS)
+    place, angle = np.zeros((8, 3)), np.linspace(-np.pi, np.pi, 8)
+    place[:, 2] = angle
+    distance = np.array([0.17, 0.3] * 4)[:, None]
+    ball = distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    one.robots.reset(np.arange(8), place, np.random.default_rng(0), ball)
+    one.localisation.reset(np.arange(8), place, np.random.default_rng(0))
+    one.sight.reset(np.arange(8), ball)
+    fastest: Floats = np.zeros(8)
+    for _ in range(10):
+        one.step(torch.tensor([[1.0, 0.0, 1.0]]).expand(8, 3))
+        fastest = np.maximum(fastest, np.linalg.norm(one.robots.ball_velocity, axis=1))
+    assert fastest[::2].min() > 0.35
+    assert fastest[1::2].max() == pytest.approx(0.0, abs=0.02)
+    assert np.abs(one.robots.pose[:, :2]).max() < 0.1
+    assert not one.robots.fallen.any()
+
+
+def test_touching_a_wall_fails() -> None:
+    one = env(count=2)
+    for _ in range(60):
+        step = one.step(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
+        if step.terminated[0]:
+            break
+    assert one.failed.tolist() == [True, False]
+    assert one.wall_contact.tolist() == [True, False]
+    assert step.terminated.tolist() == [True, False]
+    assert float(step.reward[0]) == pytest.approx(one.objective.failure_reward, abs=0.3)
+
+
+def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
+    one = env("nao-kick", 2)
+    balls = np.array([[1.4, 0.0], [1.4, 1.2]])
+    one.robots.reset(
+        np.arange(2), np.column_stack([balls - [0.3, 0.0], [0.0, 0.0]]), np.random.default_rng(0), balls
+    )
+    one.localisation.reset(np.arange(2), one.robots.pose, np.random.default_rng(0))
+    ended = torch.zeros(2, dtype=torch.bool)
+    success = ended.clone()
+    for _ in range(40):
+        step = one.step(torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), ~ended)
+        success |= step.success & ~ended
+        ended |= step.terminated
+    assert ended.all()
+    assert success.tolist() == [True, False]
+
+
+def test_a_state_has_the_noise_that_comes_next() -> None:
+    one, action = env(), torch.tensor([[0.7, 0.2]] * 3)
+    one.step(action)
+    other = TASKS["nao-navigation"].target(3, seed=9, num_threads=1)
+    assert isinstance(other, NaoEnv)
+    other.reset()
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(one.step(action).observation, other.step(action).observation)
+
+
+def test_robots_can_be_stood_where_a_state_believes_them() -> None:
+    one = env("nao-kick", 2)
+    state = one.state.double().numpy()
+    one.step(torch.ones(2, 3))
+    one.reset_to(np.arange(2), state)
+    np.testing.assert_allclose(one.robots.pose[:, :2], state[:, :2], atol=1e-6)
+    np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), state[:, 2], atol=1e-6)
+    np.testing.assert_allclose(one.robots.ball, state[:, 29:31], atol=1e-6)
+
+
+def test_robots_turn_the_short_way_and_at_most_by_1_rad_a_second() -> None:
+    one = env(count=5, errors=NO_ERRORS)
+    heading = np.array([0.0, 0.0, 3.0, -3.0, 2.0])
+    one.localisation.pose[:, 2] = heading
+    angle = torch.tensor([0.25, np.pi / 2, -3.0, 3.0, 2.0])
+    command = one._body_command(torch.stack([angle.cos(), angle.sin()], dim=1), None)
+    short = 2 * np.pi - 6.0
+    np.testing.assert_allclose(command[:, 2], [0.5, 1.0, 2 * short, -2 * short, 0.0], atol=1e-6)
+    # A full command is 0.25 m/s, told along the heading and to its left.
+    ahead = 0.25 * np.exp(1j * (angle.double().numpy() - heading))
+    np.testing.assert_allclose(command[:, :2], np.column_stack([ahead.real, ahead.imag]), atol=1e-6)
+
+
+def test_commands_are_clipped_and_next_to_none_turns_nobody() -> None:
+    one = env(count=3, errors=NO_ERRORS)
+    one.localisation.pose[:, 2] = 1.0
+    commands = torch.tensor([[7.0, -3.0], [1.0, -1.0], [0.04, 0.0]])
+    wild, tame, standing = one._body_command(commands, None)
+    np.testing.assert_array_equal(wild, tame)
+    assert tame[2] < 0 and standing[2] == 0
+
+
+def test_states_tell_the_planned_velocity_in_the_world() -> None:
+    one = env(count=3, errors=NO_ERRORS)
+    heading = np.array([0.3, 2.0, -2.5])
+    one.localisation.pose[:, 2] = heading
+    gait = one.robots.gait
+    gait.before[:], gait.after[:], gait.duration_s[:] = [0.02, 0.01, 0.1], [0.04, -0.05, 0.1], 0.25
+    # Half of 6 cm forward and of 4 cm to the right in 0.25 s.
+    planned = (0.12 - 0.08j) * np.exp(1j * heading)
+    np.testing.assert_allclose(one.state[:, 4:6], np.column_stack([planned.real, planned.imag]), atol=1e-6)
+    np.testing.assert_allclose(one.state[:, 26:29], np.tile([0.12, -0.08, 0.4], (3, 1)), atol=1e-6)
+
+
+def test_loads_are_those_of_the_left_and_of_the_right_foot() -> None:
+    one = env(count=2)
+    one.robots.bodies.pressure[:] = [[1, 2, 3, 4, 10, 20, 30, 40], [0, 0, 0, 50, 0, 0, 25, 0]]
+    columns = TASKS["nao-navigation"].state_columns[0].names
+    assert columns is not None
+    left, right = columns.index("load_left"), columns.index("load_right")
+    np.testing.assert_allclose(one.state[:, [left, right]], [[0.2, 2.0], [1.0, 0.5]])
+
+
+def test_true_velocities_are_those_of_the_way() -> None:
+    one = env(count=4, errors=NO_ERRORS)
+    for _ in range(8):
+        one.step(torch.tensor([[0.5, 0.0]]).expand(4, 2))
+    start, velocities = one.truth[:, :2], []
+    for _ in range(20):
+        one.step(torch.tensor([[0.5, 0.0]]).expand(4, 2))
+        velocities.append(one.truth[:, 2:4])
+    way = (one.truth[:, :2] - start) / (20 * 0.192)
+    assert way[:, 0].min() > 0.05
+    np.testing.assert_allclose(torch.stack(velocities).mean(0), way, atol=0.04)
+
+
+def test_a_fall_ends_the_episode() -> None:
+    one, half = env(count=2), np.radians(60) / 2
+    one.robots.bodies.qpos[0, 3:7] = [np.cos(half), 0.0, np.sin(half), 0.0]
+    step = one.step(torch.zeros(2, 2))
+    assert one.failed.tolist() == step.terminated.tolist() == [True, False]
+    assert float(step.reward[0]) == pytest.approx(one.objective.failure_reward, abs=0.3)
+    one.reset(step.terminated)
+    assert not one.failed.any() and not one.robots.fallen.any()
+
+
+def test_a_seed_repeats_starts_traits_errors_and_noise() -> None:
+    one, seen = env(), []
+    for seed in (4, 4, 5):
+        one.reseed(seed)
+        first = one.reset()
+        seen.append(torch.cat([first, one.step(torch.full((3, 2), 0.5)).observation], dim=1))
+    assert torch.equal(seen[0], seen[1])
+    assert (seen[0] != seen[2]).any(dim=1).all()
