@@ -13,15 +13,8 @@ from typer.core import TyperArgument
 from typer.models import OptionInfo
 
 from astra_data.cli import (
-    augmenting,
     building,
-    checking,
-    comparing,
     deploying,
-    editing,
-    exporting,
-    importing,
-    inspecting,
     predicting,
     recipes,
     selecting,
@@ -32,6 +25,13 @@ from astra_data.cli import (
     tasks,
     viewing,
 )
+from astra_data.cli import building as augmenting
+from astra_data.cli import datasets as checking
+from astra_data.cli import datasets as comparing
+from astra_data.cli import datasets as editing
+from astra_data.cli import datasets as inspecting
+from astra_data.cli import sharing as exporting
+from astra_data.cli import sharing as importing
 from astra_data.core.disk import disk_error
 from astra_data.core.durable import NO_FSYNC
 from astra_data.core.errors import AstraDataError

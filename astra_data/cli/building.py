@@ -1,13 +1,22 @@
-"""`astra-data collect` and `astra-data pair`, for a recipe or on their own."""
+"""`astra-data collect`, `pair` and `augment`, for a recipe or on their own."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.arguments import Jobs, NewName, Out, Root, Seeds, Source, task_at
+from astra_data.cli.arguments import (
+    DatasetName,
+    Jobs,
+    NewName,
+    Out,
+    Root,
+    Seeds,
+    Source,
+    task_at,
+    with_settings,
+)
 from astra_data.cli.recipes import refuse, resumable, run_stage
-from astra_data.cli.settings import with_settings
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS
 
@@ -114,4 +123,34 @@ def pair(
     config = validated(settings, PairConfig, "pair")
     with shown("pair") as progress:
         folder = pair_dataset(simulator, config, dataset=source, name=name, out=out, progress=progress)
+    typer.echo(f"finished: {folder}")
+
+
+@with_settings("astra_data.pipeline.stages.augment:AugmentConfig")
+def augment(
+    dataset: DatasetName,
+    settings: dict[str, Any],
+    task: Annotated[
+        str | None,
+        typer.Option(
+            help="Task that computes the rewards and endings of the copies.",
+            show_default="the dataset's own task",
+        ),
+    ] = None,
+    name: NewName = None,
+    out: Out = None,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+) -> None:
+    """Add rotated and shifted copies of episodes; the dataset must not be paired yet."""
+    from astra_data.dataset.versions import locate
+
+    root = locate(dataset)
+    from astra_data.core.config import validated
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.stages.augment import AugmentConfig
+    from astra_data.pipeline.stages.augment import augment as augment_dataset
+
+    config = validated(settings, AugmentConfig, "augment")
+    with shown("augment") as progress:
+        folder = augment_dataset(task, config, dataset=root, seed=seed, name=name, out=out, progress=progress)
     typer.echo(f"finished: {folder}")

@@ -58,7 +58,7 @@ def check(
     """Check recipes without running them, and list which artifacts are finished, damaged or stale."""
     for recipe in recipes:
         recipe_at(recipe)
-    from astra_data.pipeline.recipe_file import is_gap_recipe
+    from astra_data.pipeline.recipe import is_gap_recipe
     from astra_data.pipeline.run import check as check_recipe
 
     faults: list[str] = []

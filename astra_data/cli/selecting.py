@@ -55,8 +55,8 @@ def select(
     if trials is None and (field is not None or percent is not None):
         raise BadInputError("--field and --percent need --trials: add --trials, or leave them out")
     from astra_data.pipeline.display import shown
+    from astra_data.pipeline.selecting import choose_by_trials
     from astra_data.pipeline.selecting import select as rank
-    from astra_data.pipeline.trials import choose_by_trials
     from astra_data.reports.choice import FOLDER
 
     given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.showing import show_table
+from astra_data.cli.arguments import show_table
 
 app = typer.Typer(no_args_is_help=True)
 

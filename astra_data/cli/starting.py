@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from astra_data.cli.showing import show_table
+from astra_data.cli.arguments import show_table
 
 _NAMED = 5
 """Files that are named in a line."""

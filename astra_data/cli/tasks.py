@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from astra_data.cli.arguments import DatasetName, NewName, Out, task_at
-from astra_data.cli.showing import show_table
+from astra_data.cli.arguments import DatasetName, NewName, Out, show_table, task_at
 from astra_data.core.wording import first_few
 
 if TYPE_CHECKING:

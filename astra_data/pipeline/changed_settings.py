@@ -10,9 +10,9 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import RECORD
 from astra_data.core.wording import first_few, shortened
 from astra_data.dataset.description import changed_values
-from astra_data.pipeline.own_methods import OwnMethod
 from astra_data.pipeline.recipe import WHOLE, Recipe
 from astra_data.pipeline.staleness import SIMULATOR
+from astra_data.pipeline.user_code import OwnMethod
 from astra_data.robots.registry import task_named
 
 _MOST_KEYS = 3

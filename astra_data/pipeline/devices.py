@@ -9,7 +9,7 @@ import torch
 
 from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
-from astra_data.pipeline.execution import Item
+from astra_data.pipeline.executors import Item
 from astra_data.pipeline.plan import stage_of
 
 CUDA_JOBS = 2

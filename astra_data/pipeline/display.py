@@ -14,7 +14,7 @@ from rich.text import Text
 
 from astra_data.core.naming import stage_of_key
 from astra_data.core.progress import Progress as Notes
-from astra_data.pipeline.execution import Watcher
+from astra_data.pipeline.executors import Watcher
 
 SLOW_STAGES = ("ground", "train", "align")
 """Stages that take most of a run: until it is known how long their items take, no time left is shown."""

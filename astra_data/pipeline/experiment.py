@@ -19,11 +19,10 @@ from astra_data.core.errors import RecipeError
 from astra_data.core.naming import RECORD, base_method, reference_of, stage_of_key
 from astra_data.methods import method_named
 from astra_data.pipeline.changed_settings import differences, restated, share_target
-from astra_data.pipeline.own_files import changed_code
-from astra_data.pipeline.recipe import Recipe
-from astra_data.pipeline.recipe_file import read_tables, recorded_settings
+from astra_data.pipeline.recipe import Recipe, read_tables, recorded_settings
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.staleness import ROWS_TABLES, reads, stale_stages
+from astra_data.pipeline.user_code import changed_code
 from astra_data.reports.results import read_results
 
 ALWAYS_NEW = {"report"}

@@ -22,7 +22,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key, base_method, reference_of, stage_of_key
 from astra_data.methods import grounded_as, method_named
 from astra_data.methods.method import Method
-from astra_data.pipeline.execution import Item
+from astra_data.pipeline.executors import Item
 from astra_data.pipeline.points import Selection
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES, Stage

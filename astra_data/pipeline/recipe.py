@@ -1,22 +1,151 @@
-"""The model of recipes: task, rows, seeds and sizes, and a table of settings per stage and method."""
+"""The model of recipes, and their files: task, rows, seeds, sizes, a table of settings a stage and method."""
 
+import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from pydantic import Field, JsonValue, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ValidationInfo,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
-from astra_data.core.config import Config, Seed, did_you_mean
-from astra_data.core.errors import BadInputError
-from astra_data.core.naming import PLUS, base_method, is_plus
+from astra_data.core.config import Config, Seed, did_you_mean, load_tables, read_written
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.naming import PLUS, RECORD, base_method, is_plus
 from astra_data.dataset.edit import share
+from astra_data.dataset.format import INFO_PATH
+from astra_data.io.mapping import refuse_mapping
 from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
-from astra_data.pipeline.own_methods import OwnMethod, add_all, with_offered
-from astra_data.pipeline.recipe_tables import method_field, stage_field
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import judge_of
+from astra_data.pipeline.user_code import OwnMethod, add_all, looked_up, with_offered
 from astra_data.robots.registry import task_named
+from astra_data.worlds.own_code import place_beside
 from astra_data.worlds.score import Score
+
+_FILLED: Any = Field(default_factory=dict, validate_default=True)
+"""A table that a recipe leaves out is read as an empty one."""
+
+
+def stage_field(stage: Stage) -> tuple[Any, Any]:
+    """Return the type and the default of a stage's table."""
+    if stage.name == "collect":
+        return stage.config | None, _FILLED
+    if stage.name == "align":
+        # It would be judged on what grounding trained on.
+        return Annotated[stage.config, _agreeing("ground", "held_out_share")], _FILLED
+    if stage.name == "select":
+        return stage.config | None, Field(default=None, exclude_if=lambda table: table is None)
+    return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
+
+
+def method_field(table: Table) -> tuple[Any, Any]:
+    """Return the type and the default of a method's table."""
+    return Annotated[table.model, BeforeValidator(table.over_usual)], table.usual
+
+
+def _agreeing(table: str, key: str) -> BeforeValidator:
+    """Return what takes `key` from `table`, and refuses another value of it."""
+
+    def read(overrides: object, info: ValidationInfo) -> object:
+        other = info.data.get(table)
+        if other is None or not isinstance(overrides, dict):
+            return overrides
+        expected = getattr(other, key)
+        if (asked := overrides.get(key, expected)) != expected:
+            raise ValueError(f"{key}: expected that of [{table}], {expected!r}, got {asked!r}")
+        return {key: expected} | overrides
+
+    return BeforeValidator(read)
+
+
+class _OwnMethod(BaseModel):
+    model_config = ConfigDict(extra="allow")
+
+    method: str
+
+
+class _Record(BaseModel):
+    """What is read of a record before it is known to be a recipe of today."""
+
+    model_config = ConfigDict(extra="allow")
+
+    task: str
+    own_methods: dict[str, _OwnMethod] = {}
+    sweep: dict[str, JsonValue] = {}
+
+
+def recorded_settings(folder: Path) -> dict[str, Any]:
+    """Return the settings that the run in `folder` was made with.
+
+    Raises:
+        BadInputError: their file is damaged.
+    """
+    advice = "restore it from a copy, or move the folder away and run the recipe again"
+    return read_written(_Record, folder / RECORD, by="a run", advice=advice).model_dump(exclude_unset=True)
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it.
+
+    Raises:
+        RecipeError: it cannot be read, or is a recipe of `gap`.
+    """
+    tables = tables_of(path)
+    if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
+        raise RecipeError(
+            f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
+        )
+    task, data = tables.get("task"), tables.get("data")
+    if isinstance(task, str):
+        tables["task"] = place_beside(task, path.parent)
+    if isinstance(own := tables.get("own_methods"), dict):
+        tables["own_methods"] = looked_up(own, path.parent)
+    if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
+        tables["data"] = str(path.parent / data)
+    return tables
+
+
+def is_gap_recipe(path: Path) -> bool:
+    """Return whether the file at `path` has the keys of a recipe for `astra-data gap`.
+
+    Raises:
+        RecipeError: as `tables_of`.
+    """
+    return {"mapping", "models"} <= tables_of(path).keys()
+
+
+def tables_of(path: Path) -> dict[str, Any]:
+    """Return the tables of the file of a recipe as they are.
+
+    Raises:
+        RecipeError: it cannot be read; of a run, a dataset or a mapping in its place, it says so.
+    """
+    if os.path.isdir(path):  # of a name that is too long, too, `load_tables` tells
+        _refuse_folder(path)
+    tables = load_tables(path)
+    refuse_mapping(tables, path)
+    return tables
+
+
+def _refuse_folder(path: Path) -> None:
+    """Refuse a run or a dataset; name the recipe that made it, if that is known."""
+    whole = path.absolute()
+    run = next((folder for folder in (whole, *whole.parents) if (folder / RECORD).is_file()), None)
+    kind = "a run" if run == whole else "a dataset" if (path / INFO_PATH).is_file() else ""
+    if kind:
+        made_by = f", {run.name}.toml" if run else ""
+        raise RecipeError(f"{path} is {kind}: expected the recipe that made it{made_by}")
+
 
 WHOLE = 100
 """Per cent: the size of a dataset that is not swept over."""

@@ -19,17 +19,14 @@ from astra_data.pipeline.condition import Condition, can_be_made_again, conditio
 from astra_data.pipeline.data_check import data_condition
 from astra_data.pipeline.devices import check_device, default_jobs, share_cores, with_threads
 from astra_data.pipeline.display import display
-from astra_data.pipeline.execution import Item, Watcher
+from astra_data.pipeline.executors import Item, Watcher, execute, execute_on_cluster
 from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.pipeline.held_out import write_errors
-from astra_data.pipeline.local_executor import execute
-from astra_data.pipeline.own_files import record_code
-from astra_data.pipeline.own_methods import OwnMethod, add_all
 from astra_data.pipeline.plan import check_stage, plan, stage_of, stages_until
 from astra_data.pipeline.points import Selection
-from astra_data.pipeline.ray_executor import execute_on_cluster
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.stages.report import is_current
+from astra_data.pipeline.user_code import OwnMethod, add_all, record_code
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
 

@@ -18,7 +18,7 @@ from astra_data.core.durable import write_file
 from astra_data.core.naming import RUNS, stage_of_key
 from astra_data.core.optional import optional
 from astra_data.pipeline.display import display
-from astra_data.pipeline.execution import Item, Watcher
+from astra_data.pipeline.executors import Item, Watcher
 from astra_data.pipeline.experiment import Experiment, load_experiment
 from astra_data.pipeline.held_out import write_errors
 from astra_data.pipeline.plan import plan, stage_of, stages_until

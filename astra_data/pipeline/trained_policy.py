@@ -15,10 +15,9 @@ from astra_data.dataset.columns import STATE
 from astra_data.dataset.reader import Dataset
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.methods import grounded_as, method_named
-from astra_data.pipeline.own_files import check_unchanged
-from astra_data.pipeline.own_methods import add_all
 from astra_data.pipeline.points import refuse_unmade
-from astra_data.pipeline.recipe_file import recorded_settings
+from astra_data.pipeline.recipe import recorded_settings
+from astra_data.pipeline.user_code import add_all, check_unchanged
 from astra_data.policies.policy_file import POLICY, PolicyFile, running
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.robots.registry import task_named

@@ -12,7 +12,7 @@ from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import RUNS
 from astra_data.pipeline.display import shown
-from astra_data.pipeline.recipe_file import is_gap_recipe, tables_of
+from astra_data.pipeline.recipe import is_gap_recipe, tables_of
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import place_name, read_recordings
 from astra_data.studies.study import run_study

@@ -6,7 +6,7 @@ import pytest
 from typer.main import get_command
 
 from astra_data.cli.app import app
-from astra_data.cli.settings import settings_of
+from astra_data.cli.arguments import settings_of
 from astra_data.core.config import Config
 from astra_data.core.naming import STAGE_NAMES
 from astra_data.pipeline.stages.augment import AugmentConfig

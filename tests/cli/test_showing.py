@@ -1,7 +1,7 @@
 import pytest
 from rich.table import Table
 
-from astra_data.cli.showing import show_table
+from astra_data.cli.arguments import show_table
 
 
 def test_cells_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,12 +17,11 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
-from astra_data.deployment.folder import deploy, describe
+from astra_data.deployment.folder import deploy, describe, page
 from astra_data.deployment.graph import load_onnx
-from astra_data.deployment.page import page
 from astra_data.grounding.networks.alignment import TargetEncoder
 from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.pipeline.recipe_file import recorded_settings
+from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.selecting import select
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.ground import ground

@@ -18,9 +18,9 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.methods import METHODS, add_method, method_named
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.own_methods import OwnMethod
 from astra_data.pipeline.plan import plan
 from astra_data.pipeline.trained_policy import load_policy
+from astra_data.pipeline.user_code import OwnMethod
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.own_code import own_object
 from astra_data.worlds.task import Task

@@ -15,7 +15,7 @@ from astra_data.core.errors import AstraDataError, BadInputError, MissingStageEr
 from astra_data.core.manifest import MANIFEST, read_manifest
 from astra_data.core.progress import silent
 from astra_data.pipeline.condition import LOADERS, condition
-from astra_data.pipeline.execution import Item
+from astra_data.pipeline.executors import Item
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.plan import plan
 from astra_data.pipeline.run import check, run, run_stage

@@ -6,7 +6,7 @@ import torch
 from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
 from astra_data.pipeline.devices import check_device, default_jobs, share_cores
-from astra_data.pipeline.execution import Item
+from astra_data.pipeline.executors import Item
 
 OTHERS = ("mps", "meta", "xpu:0")
 """Devices that torch knows, and trainings do not."""

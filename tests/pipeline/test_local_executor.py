@@ -12,9 +12,8 @@ from fake_items import Record, crash, fail, hang, kill_itself, leave, rendezvous
 
 from astra_data.core.errors import AstraDataError, MissingStageError
 from astra_data.core.lock import held
-from astra_data.pipeline import local_executor
-from astra_data.pipeline.execution import Item
-from astra_data.pipeline.local_executor import execute
+from astra_data.pipeline import executors as local_executor
+from astra_data.pipeline.executors import Item, execute
 
 PATIENCE_S = 120
 """Enough for a process to start on a machine that is busy with other work."""
@@ -128,8 +127,8 @@ def _hanging_run(folder: Path, handler: str = "default_int_handler") -> subproce
         "import signal\nimport sys\nfrom functools import partial\nfrom pathlib import Path\n"
         f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "from fake_items import Record, hang\n"
-        "from astra_data.pipeline.execution import Item\n"
-        "from astra_data.pipeline.local_executor import execute\n"
+        "from astra_data.pipeline.executors import Item\n"
+        "from astra_data.pipeline.executors import execute\n"
         "if __name__ == '__main__':\n"
         f"    signal.signal(signal.SIGINT, signal.{handler})\n"
         f"    here = Path({str(folder)!r})\n"

@@ -10,8 +10,7 @@ import pytest
 from fake_items import Record, crash, fail, hang, kill_itself, rendezvous, touch
 
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
-from astra_data.pipeline.execution import Item
-from astra_data.pipeline.ray_executor import SETTINGS, execute_on_cluster
+from astra_data.pipeline.executors import SETTINGS, Item, execute_on_cluster
 from astra_data.pipeline.sweep import sweep
 
 # Ray looks when it is imported.
@@ -107,7 +106,7 @@ def test_a_worker_that_does_not_share_the_folder_is_told(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = SimpleNamespace(cwd=lambda: tmp_path / "elsewhere")
-    monkeypatch.setattr("astra_data.pipeline.ray_executor.Path", own)
+    monkeypatch.setattr("astra_data.pipeline.executors.Path", own)
     record = Record()
     items = [Item("a", (), partial(touch, tmp_path / "a", ()))]
     with pytest.raises(

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.pipeline.recipe_file import is_gap_recipe, read_tables, recorded_settings
+from astra_data.pipeline.recipe import is_gap_recipe, read_tables, recorded_settings
 from astra_data.studies.run import load_gap_recipe
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from astra_data.core.config import validated
 from astra_data.methods import METHODS
-from astra_data.pipeline.execution import Item
+from astra_data.pipeline.executors import Item
 from astra_data.pipeline.plan import plan, stage_of
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.staleness import reads, stale_stages

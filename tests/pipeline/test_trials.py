@@ -14,11 +14,10 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.core.manifest import read_manifest
 from astra_data.core.seeding import derive
-from astra_data.pipeline import trials as module
-from astra_data.pipeline.recipe_file import recorded_settings
-from astra_data.pipeline.selecting import select
+from astra_data.pipeline import selecting as module
+from astra_data.pipeline.recipe import recorded_settings
+from astra_data.pipeline.selecting import choose_by_trials, select
 from astra_data.pipeline.trained_policy import TrainedPolicy, trained_policy
-from astra_data.pipeline.trials import choose_by_trials
 from astra_data.policies.judging import Judge
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.reports.trials import TrialsFile, halve

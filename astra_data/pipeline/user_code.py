@@ -1,5 +1,6 @@
-"""Methods of one's own as recipes name them: by a place, or by a table of the place and settings."""
+"""The code of the user's that a recipe names: methods, by a place or a table of the place and settings."""
 
+import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -7,9 +8,13 @@ from typing import Any
 from pydantic import ConfigDict, model_validator
 
 from astra_data.core.config import Config, validated
+from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import base_method
+from astra_data.core.naming import CODE, base_method
 from astra_data.methods import METHODS, add_method, is_of_package, offered_methods
+from astra_data.reports.runs import recorded_code
+from astra_data.robots.registry import place_of
+from astra_data.worlds.code_digest import code_digest
 from astra_data.worlds.own_code import place_beside
 
 
@@ -93,3 +98,61 @@ def with_offered(tables: Mapping[str, Any], keys: Collection[str]) -> dict[str, 
     taken = {name: table | {"method": found[name]} for name, table in given.items()}
     rest = {key: value for key, value in tables.items() if key not in taken}
     return rest | {"own_methods": {**own, **taken}} if taken else rest
+
+
+_SETTINGS = ".settings"
+
+
+def changed_code(recipe: Any, folder: Path) -> dict[str, str]:  # noqa: ANN401 - a Recipe
+    """Return what was recorded in `folder` and is another now.
+
+    Returns:
+        "task" and names of methods, each to what of it changed: its file, or its settings.
+
+    Raises:
+        BadInputError: the record is damaged.
+    """
+    before = recorded_code(folder)
+    now = _digests(recipe)
+    changed = [name for name, digest in before.items() if now.get(name, digest) != digest]
+    return {
+        name.removesuffix(_SETTINGS): f"the settings of {name.removesuffix(_SETTINGS)}"
+        if name.endswith(_SETTINGS)
+        else Path(_places(recipe)[name].rpartition(":")[0]).name
+        for name in changed
+    }
+
+
+def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
+    """Refuse code at a `place` that is not what the folder of a run has recorded of its task, or of a method.
+
+    That of an installed task may be its name.
+
+    Raises:
+        BadInputError: it is another, or the record is damaged.
+    """
+    place = place_of(place) if name == "task" else place
+    now = code_digest(place)
+    if now and now != recorded_code(run).get(name, now):
+        raise BadInputError(
+            f"{place.rpartition(':')[0]} changed since {run} was made: "
+            "restore that version, or run the recipe under another name"
+        )
+
+
+def record_code(recipe: Any, folder: Path) -> None:  # noqa: ANN401 - a Recipe
+    """Write down in `folder` what the code is now, if there is any; that of other methods stays written."""
+    if digests := _digests(recipe):
+        write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
+
+
+def _places(recipe: Any) -> dict[str, str]:  # noqa: ANN401
+    return {"task": place_of(recipe.task)} | {name: own.method for name, own in recipe.own_methods.items()}
+
+
+def _digests(recipe: Any) -> dict[str, str]:  # noqa: ANN401
+    found = {name: code_digest(place) for name, place in _places(recipe).items()}
+    for name, own in recipe.own_methods.items():
+        if settings := own.settings(name):
+            found[f"{name}{_SETTINGS}"] = settings.model_dump_json()
+    return {name: digest for name, digest in found.items() if digest}

@@ -11,7 +11,7 @@ import torch
 from fake_items import crash, fail, fill_the_disk, touch
 
 from astra_data.core.errors import DiskError, MissingStageError
-from astra_data.pipeline.execution import Item, Reporter, pickled, run_in_order, run_item
+from astra_data.pipeline.executors import Item, Reporter, pickled, run_in_order, run_item
 from astra_data.worlds.own_code import own_object
 
 
@@ -140,7 +140,7 @@ def test_an_item_leaves_no_file_open(tmp_path: Path) -> None:
 
 def test_at_most_ten_notes_a_second_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 5.0
-    monkeypatch.setattr("astra_data.pipeline.execution.time.monotonic", lambda: now)
+    monkeypatch.setattr("astra_data.pipeline.executors.time.monotonic", lambda: now)
     sent: list[tuple[float, str]] = []
     report = Reporter(sent.append)
     for step in range(12):

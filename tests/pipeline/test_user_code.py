@@ -14,9 +14,9 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import CODE
 from astra_data.pipeline.experiment import Experiment, load_experiment
 from astra_data.pipeline.grounded_env import training_of
-from astra_data.pipeline.own_files import check_unchanged, record_code
 from astra_data.pipeline.plan import plan
 from astra_data.pipeline.trained_policy import load_policy, task_of
+from astra_data.pipeline.user_code import check_unchanged, record_code
 from astra_data.robots import registry
 
 ROOT = Path(__file__).parents[2]

@@ -1,0 +1,394 @@
+"""Commands that edit datasets, show them, check them and compare them."""
+
+from json import dumps
+from pathlib import Path
+from shlex import quote
+from typing import Annotated
+
+import typer
+
+from astra_data.cli.arguments import DatasetName, Jobs, NewName, Out, Root, Source, show_table
+from astra_data.cli.recipes import refuse, run_stage
+from astra_data.core.durable import write_file
+from astra_data.core.errors import BadInputError
+from astra_data.core.naming import RUNS
+from astra_data.core.wording import first_few, printable
+
+
+def subset(
+    dataset: Source,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Number of episodes to keep.", show_default=False)
+    ] = None,
+    percent: Annotated[
+        int | None,
+        typer.Option(min=1, help="The same as a percentage of --of; may exceed 100.", show_default=False),
+    ] = None,
+    of: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of episodes that counts as 100 percent.",
+            show_default="all episodes of DATASET",
+        ),
+    ] = None,
+    seeds: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--seed",
+            help="Seed of the random choice; with a recipe, run only this of its seeds (may be repeated).",
+            show_default="the one stored in DATASET; all seeds of a recipe",
+        ),
+    ] = None,
+    stratify: Annotated[
+        str | None,
+        typer.Option(
+            help="Key of the episodes' metadata, such as success, whose values keep their proportions.",
+            show_default=False,
+        ),
+    ] = None,
+    name: NewName = None,
+    out: Out = None,
+    jobs: Jobs = None,
+    root: Root = RUNS,
+) -> None:
+    """Write a random subset; with the same seed, smaller subsets are contained in larger ones."""
+    if dataset.endswith(".toml"):
+        options = {"episodes": episodes, "percent": percent, "of": of, "stratify": stratify}
+        refuse(options | {"name": name, "out": out}, "subset", "sweep")
+        run_stage(Path(dataset), "subset", seeds=seeds or (), jobs=jobs, root=root)
+        return
+    if len(seeds or ()) > 1 or jobs is not None:
+        raise BadInputError(
+            "subset: with a dataset, give at most one --seed and no --jobs (these are for recipes)"
+        )
+    from astra_data.dataset.edit import subset as write
+    from astra_data.dataset.versions import open_dataset
+
+    source = open_dataset(dataset)
+    _report(
+        write(
+            source,
+            episodes=episodes,
+            percent=percent,
+            of=of,
+            seed=seeds[0] if seeds else None,
+            stratify=stratify,
+            name=name,
+            out=out,
+        )
+    )
+
+
+def merge(
+    datasets: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DATASET",
+            help="Two or more datasets with the same columns, fps, task, environment and simulator.",
+        ),
+    ],
+    new_uids: Annotated[
+        bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is already taken.")
+    ] = False,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Merge the episodes of several datasets into one."""
+    from astra_data.dataset.edit import merge as write
+    from astra_data.dataset.versions import open_dataset
+
+    _report(write([open_dataset(dataset) for dataset in datasets], new_uids=new_uids, name=name, out=out))
+
+
+def delete(
+    dataset: DatasetName,
+    uids: Annotated[
+        list[int],
+        typer.Option(
+            "--episode", metavar="UID", help="Uid of an episode; may be repeated.", show_default=False
+        ),
+    ],
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Write a dataset without some of its episodes."""
+    from astra_data.dataset.edit import delete as write
+    from astra_data.dataset.versions import open_dataset
+
+    _report(write(open_dataset(dataset), uids, name=name, out=out))
+
+
+def filter_(
+    dataset: DatasetName,
+    success: Annotated[
+        bool | None,
+        typer.Option(
+            "--success/--no-success", help="Keep only successes, or only failures.", show_default=False
+        ),
+    ] = None,
+    min_return: Annotated[float | None, typer.Option(help="Minimum return.", show_default=False)] = None,
+    max_return: Annotated[float | None, typer.Option(help="Maximum return.", show_default=False)] = None,
+    min_length: Annotated[int | None, typer.Option(help="Minimum steps.", show_default=False)] = None,
+    max_length: Annotated[int | None, typer.Option(help="Maximum steps.", show_default=False)] = None,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Write a dataset of the episodes that meet every given condition."""
+    from astra_data.dataset.edit import filter_episodes
+    from astra_data.dataset.versions import open_dataset
+
+    _report(
+        filter_episodes(
+            open_dataset(dataset),
+            success=success,
+            min_return=min_return,
+            max_return=max_return,
+            min_length=min_length,
+            max_length=max_length,
+            name=name,
+            out=out,
+        )
+    )
+
+
+def _report(folder: Path) -> None:
+    from astra_data.dataset.reader import Dataset
+    from astra_data.dataset.versions import home_of, versions_at_home
+
+    written = Dataset.open(folder)
+    typer.echo(
+        f"finished: {folder} ({written.reference}, {len(written)} episodes, {written.lengths.sum()} steps)"
+    )
+    name, version = written.description["name"], written.description["version"]
+    versions = [str(known) for known in versions_at_home(name)]
+    if folder == home_of(written.description) and versions[-1] == version and len(versions) > 1:
+        typer.echo(
+            f"note: {name} now means this version, no longer data-{versions[-2]}; --name keeps both apart"
+        )
+
+
+def inspect(
+    dataset: DatasetName,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures"),
+    ] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(
+            help="File for the check-up's findings, each with all its episodes.", show_default="no file"
+        ),
+    ] = None,
+) -> None:
+    """Show a dataset's values, episodes, a map of visited positions, and what looks wrong."""
+    from rich.console import Console
+
+    from astra_data.cli.inspection_page import inspection_page
+    from astra_data.dataset.checkup.checkup import check_up
+    from astra_data.dataset.inspection import inspect_dataset
+    from astra_data.dataset.versions import open_dataset
+
+    found = open_dataset(dataset)
+    inspection, checkup = inspect_dataset(found), check_up(found, quote(dataset))
+    Console(soft_wrap=True).print(inspection_page(inspection, checkup))
+    if json is not None:
+        write_file(json, dumps(checkup.record(), indent=1, ensure_ascii=False) + "\n")
+        typer.echo(f"written: {json}")
+    if plot is None:
+        return
+    from astra_data.reports.figures.catalog import coverage, png
+
+    maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
+    drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]
+    if not drawn:
+        raise BadInputError(
+            f"{inspection.reference}: expected a state with the role position or vector, found none: "
+            "give its columns a role in the mapping, or leave out --plot"
+        )
+    for planar, label, unit in drawn:
+        path = plot / f"{label}_coverage.png"
+        write_file(path, png(coverage(planar.counts, planar.extent, label, unit)))
+        typer.echo(f"written: {path}")
+
+
+def list_(
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="FOLDER", help="More folders for --clean, such as runs.", show_default=False),
+    ] = None,
+    clean: Annotated[
+        bool,
+        typer.Option(
+            "--clean", help="Instead, remove leftovers of killed commands from the home folder and FOLDER."
+        ),
+    ] = False,
+) -> None:
+    """List the datasets in the home folder, and their versions."""
+    if clean:
+        _clean(folders or [])
+        return
+    if folders:
+        raise BadInputError(
+            "list: folders are for --clean; without it, list shows the datasets in the home folder"
+        )
+    from rich.table import Table
+
+    from astra_data.core.errors import AstraDataError, CorruptDatasetError
+    from astra_data.core.wording import printable
+    from astra_data.dataset.description import full_name
+    from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
+
+    faults: list[str] = []
+    table = Table("dataset", "stage", "episodes", "steps", "content", title=printable(str(home())))
+    for name in names_at_home():
+        for version in versions_at_home(name):
+            reference = full_name({"name": name, "version": version})
+            try:
+                found = open_dataset(reference)
+            except AstraDataError as error:
+                table.add_row(reference, "damaged", "", "", "")
+                faults.append(str(error))
+                continue
+            steps = int(found.lengths.sum())
+            facts = (
+                printable(found.description["stage"]),
+                f"{len(found):,}",
+                f"{steps:,}",
+                found.content_hash[:12],
+            )
+            table.add_row(found.reference, *facts)
+    show_table(table)
+    if faults:
+        raise CorruptDatasetError("\n".join(faults))
+
+
+def _clean(folders: list[Path]) -> None:
+    from astra_data.core.durable import clean
+    from astra_data.core.wording import printable
+    from astra_data.dataset.versions import home
+
+    notes = {
+        "removed": "",
+        "in use": ": another command is writing it",
+        "kept": ": the interrupted command can continue from it; otherwise delete it",
+    }
+    if home().exists():
+        folders = [home(), *folders]
+    if missing := [str(folder) for folder in folders if not folder.is_dir()]:
+        raise BadInputError(f"list --clean: expected folders, got {', '.join(missing)}")
+    found = dict(item for folder in folders for item in clean(folder))
+    for path, state in found.items():
+        typer.echo(f"{state}: {printable(str(path))}{notes[state]}")
+    if not found:
+        typer.echo("found no leftovers of killed commands")
+
+
+def validate(
+    dataset: DatasetName,
+    with_lerobot: Annotated[
+        bool, typer.Option("--with-lerobot", help="Also compare with what lerobot's own loader reads (slow).")
+    ] = False,
+) -> None:
+    """Check every file and value of a LeRobot dataset and list all errors."""
+    from astra_data.core.errors import BadInputError, CorruptDatasetError
+    from astra_data.dataset.columns import TERMINATED
+    from astra_data.dataset.doctor.check import check
+    from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
+    from astra_data.dataset.endings import endings_of
+    from astra_data.dataset.opening import can_be_repaired
+    from astra_data.dataset.reader import Dataset
+    from astra_data.dataset.versions import locate
+
+    root = locate(dataset)
+    report = check(root)
+    if with_lerobot and not report.faults:
+        compare_with_lerobot(root, report)
+    for note in report.notes:
+        typer.echo(f"note: {printable(note)}")
+    if report.faults:
+        count = "1 error" if report.fault_count == 1 else f"{report.fault_count} errors"
+        message = "\n  ".join([f"{root} has {count}:", *report.faults])
+        if can_be_repaired(root):
+            message += f"\nTo recover its intact episodes: astra-data repair {root} --out DIR"
+        raise CorruptDatasetError(message)
+    typer.echo(f"{printable(str(root))} is intact: {report.episodes} episodes, {report.frames} steps")
+    try:
+        whole = Dataset.open(root)
+    except BadInputError as error:  # intact, but no robot's trajectories
+        typer.echo(f"note: {printable(str(error))}")
+        return
+    if TERMINATED in whole.features:
+        typer.echo(f"episodes end: {endings_of(whole)}")
+
+
+def repair(
+    dataset: DatasetName,
+    out: Annotated[Path, typer.Option(help="Folder of the new dataset.", show_default=False)],
+    like: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ORIGINAL",
+            help="The dataset that LeRobot's tools made DATASET from. Its origin and its episodes' metadata "
+            "are copied to episodes with the same uid and values. After a merge, give each dataset merged.",
+            show_default=False,
+        ),
+    ] = None,
+    new_uids: Annotated[
+        bool, typer.Option("--new-uids", help="Keep episodes whose uid is already taken, under new uids.")
+    ] = False,
+) -> None:
+    """Recover the intact episodes of a damaged dataset, of astra-data or LeRobot, into a new one."""
+    from astra_data.dataset.doctor.repair import repair as save
+    from astra_data.dataset.versions import locate, open_dataset
+
+    sources = [open_dataset(original) for original in like or ()]
+    repaired = save(locate(dataset), out=out, like=sources, new_uids=new_uids)
+    for note in repaired.notes:
+        typer.echo(f"note: {printable(note)}")
+    typer.echo(f"finished: {printable(str(out))} ({repaired.episodes} episodes, {repaired.frames} steps)")
+
+
+_SHOWN = 5
+"""Uids of episodes whose metadata differ."""
+
+
+def log(dataset: DatasetName) -> None:
+    """Show what a dataset was made from: a tree of datasets with versions, hashes, stages and settings."""
+    from astra_data.dataset.lineage import lineage, tree_lines
+    from astra_data.dataset.versions import open_dataset
+
+    for line in tree_lines(lineage(open_dataset(dataset))):
+        typer.echo(line)
+
+
+def diff(
+    a: DatasetName,
+    b: Annotated[str, typer.Argument(metavar="DATASET", help="The other one.", show_default=False)],
+) -> None:
+    """Show how two datasets differ: columns, episodes by uid, origin."""
+    from astra_data.dataset.compare import differences
+    from astra_data.dataset.versions import open_dataset
+
+    first, second = open_dataset(a), open_dataset(b)
+    found = differences(first, second)
+    for dataset in (first, second):
+        typer.echo(f"{dataset.reference}: {len(dataset)} episodes, {dataset.lengths.sum()} steps")
+    listed = {
+        f"only in {first.reference}": found.only_in_a,
+        f"only in {second.reference}": found.only_in_b,
+        "differ in values": found.values,
+    }
+    for title, uids in listed.items():
+        if uids:
+            typer.echo(f"{len(uids)} episodes {title}: {', '.join(map(str, uids))}")
+    if found.metadata:
+        if not found.values:
+            typer.echo("0 episodes differ in values")
+        keys = ", ".join(
+            f"{printable(key)} ({first_few(uids, _SHOWN)})" for key, uids in found.metadata.items()
+        )
+        different = set().union(*found.metadata.values())
+        typer.echo(f"{len(different)} episodes differ in metadata: {keys}")
+    for sentence in (*found.schema, *found.description):
+        typer.echo(printable(sentence))
