@@ -2,8 +2,8 @@
 
 import torch
 
-from astra_data.grounding.networks.failure import FailureModel, FailureShape
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.failures import FailureModel, FailureShape
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]

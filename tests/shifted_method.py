@@ -9,8 +9,7 @@ from torch import Tensor
 
 from astra_data.grounding.fit import Fitting
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import FittedGrounding
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
 from astra_data.methods.method import Method
 from astra_data.worlds.protocols import PlacedSimulator
 

@@ -8,7 +8,7 @@ import torch
 from gpu import needs_cuda
 from quick_runs import fit_failures_quickly, run_here
 
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.running_policy import PolicyFile
 
 pytestmark = needs_cuda
 

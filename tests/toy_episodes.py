@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from astra_data.grounding.networks.paired_windows import PairedWindows
-from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
 
 def toy_episodes(

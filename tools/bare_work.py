@@ -8,8 +8,8 @@ import torch
 from timing import Stretch
 from torch import Tensor
 
-from astra_data.grounding.networks.history import mlp
-from astra_data.policies.networks.actor_critic import ActorCritic
+from astra_data.grounding.encoder import mlp
+from astra_data.policies.networks import ActorCritic
 from astra_data.policies.ppo import EPOCHS, MINIBATCHES, PpoConfig
 from astra_data.policies.simulator_env import SimulatorEnv
 

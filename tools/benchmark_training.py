@@ -35,15 +35,12 @@ from astra_data.core.errors import AstraDataError
 from astra_data.core.progress import silent
 from astra_data.grounding.fit import Fitting, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.pipeline.recipe import Recipe
 from astra_data.policies.iql import Experience, Iql, IqlConfig
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.policy import PolicyShape
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.sac import Sac, SacConfig
 from astra_data.policies.simulator_env import SimulatorEnv

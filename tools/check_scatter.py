@@ -19,7 +19,7 @@ from torch import Tensor
 
 from astra_data.grounding.files import GROUNDING, load_grounding
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.moments import Moments
+from astra_data.grounding.open_loop import Moments
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as
 from astra_data.robots.registry import task_named

@@ -24,7 +24,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.methods import method_named
 from astra_data.pipeline.grounded_env import training_of
-from astra_data.policies.own_world import reached_in_own_world
+from astra_data.policies.episodes import reached_in_own_world
 
 
 class Trained(NamedTuple):

@@ -6,7 +6,7 @@ import torch
 from timing import Stretch
 
 from astra_data.grounding.fit import GroundConfig
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape, LossWeights
+from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
 from astra_data.grounding.paired_episodes import PairedEpisodes
 
 

@@ -18,8 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors.numpy import save_file
 from torch import nn
 
-from astra_data.policies.networks.policy import PolicyShape
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.networks import PolicyShape, SoftActor
 from astra_data.policies.sac import Sac, SacConfig
 from astra_data.robots.ant.body import VelocityController
 

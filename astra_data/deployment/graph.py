@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.policies.own_policy import OwnPolicy
-from astra_data.policies.running_policy import Memory, RunningPolicy
+from astra_data.policies.running_policy import Memory, RunningPolicy, UserPolicy
 
 ONNX = "policy.onnx"
 INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")
@@ -81,7 +80,7 @@ def write_graph(deployed: RunningPolicy, folder: Path) -> Written:
         BadInputError: code of the task cannot be traced, or the graph gives other commands than the policy.
     """
     optional("onnxscript")
-    if isinstance(deployed.policy, OwnPolicy):
+    if isinstance(deployed.policy, UserPolicy):
         raise BadInputError(
             f"{deployed.policy.name} is a policy of another learner, which cannot be traced: export it with "
             "its own library, or act with astra_data.load_policy"

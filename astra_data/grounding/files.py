@@ -1,17 +1,21 @@
 """Groundings and target encoders on disk: safetensors files with metadata."""
 
+import json
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
+
+import torch
 
 from astra_data.core.checkpoint import loaded, save_tensors, understood
 from astra_data.core.errors import BadInputError
+from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.alignment import TargetEncoder
-from astra_data.grounding.networks.grounding import GroundingModel
+from astra_data.grounding.model import GroundingModel
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import FittedGrounding, Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import NO_GROUNDING, FittedGrounding, Grounding
+from astra_data.worlds.own_code import explained
 from astra_data.worlds.own_saving import parts_of, restored
+from astra_data.worlds.task import Task
 
 KINDS: dict[str, type[FittedGrounding]] = {HistoryGrounding.kind: HistoryGrounding}
 """The groundings that can be read, by what their files call them."""
@@ -75,3 +79,85 @@ def load_target_encoder(path: Path | str) -> TargetEncoder:
     """
     with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), "cpu") as (tensors, metadata):
         return loaded(TargetEncoder(**metadata["sizes"]), tensors)
+
+
+_WRITTEN = ("kind", "to_file", "from_file")
+"""The parts that a grounding does not inherit."""
+_ROUNDING = 1e-6
+"""Between states that are the same, relative to their size and absolute."""
+
+
+def missing_parts(grounding: type) -> list[str]:
+    """Return the parts of a `FittedGrounding` that a class has not, and does not inherit."""
+    inherited = [name for name in vars(Grounding) if not name.startswith("_")]
+    has = {name for one in grounding.__mro__ if one not in FittedGrounding.__mro__ for name in vars(one)}
+    if FittedGrounding in grounding.__mro__:
+        has |= {*inherited} - {*_WRITTEN}
+    return [name for name in dict.fromkeys((*_WRITTEN, *inherited)) if name not in has]
+
+
+def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
+    """Return the grounding and the figures that a fit `returned`.
+
+    Raises:
+        BadInputError: they are no such pair, no class of groundings that is known, or no JSON values by name.
+    """
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        raise BadInputError(
+            f"fit returned a {type(returned).__name__}: expected a pair, the grounding and a dict of figures"
+        )
+    grounding, figures = returned
+    name = type(grounding).__name__
+    if KINDS.get(getattr(grounding, "kind", "")) is not type(grounding):
+        raise BadInputError(
+            f"fit returned a {name}, which cannot be read again: expected grounding={name} of the Method"
+        )
+    if not isinstance(figures, dict):
+        raise BadInputError(f"fit returned a {type(figures).__name__} of figures: expected a dict")
+    if unnamed := [f"{key!r}" for key in figures if not isinstance(key, str)]:
+        raise BadInputError(f"the figures of fit are named {', '.join(unnamed)}: expected texts")
+    if faults := [f"{key!r} {fault}" for key, value in figures.items() if (fault := _fault(value))]:
+        raise BadInputError(
+            f"the figures of fit: {', '.join(faults)}: expected numbers, texts, lists or dicts, such as "
+            "those of value.tolist(), or None for what is not known"
+        )
+    return grounding, figures
+
+
+@torch.no_grad()
+def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
+    """Step the corrected simulator of `task` once, from where the first of `episodes` begin.
+
+    Raises:
+        BadInputError: it fails, it returns something else than states (B, X), or its simulator is not there.
+    """
+    windows = episodes.windows
+    state, goal, action = (values[:2, 0] for values in (windows.state, windows.goal, windows.action))
+    with explained(f"a step of {task.name} as corrected by {type(grounding).__name__}"):
+        simulator = grounding.simulator(task, len(state), str(state.device))
+        simulator.start(state, torch.arange(len(state), device=state.device), goal)
+        landed: object = simulator.step(action)
+        reached = simulator.state
+    got = tuple(landed.shape) if isinstance(landed, torch.Tensor) else f"a {type(landed).__name__}"
+    if not isinstance(landed, torch.Tensor) or landed.shape != state.shape:
+        raise BadInputError(
+            f"{type(simulator).__name__}.step: expected states of shape {tuple(state.shape)}, got {got}"
+        )
+    if not torch.allclose(reached, landed, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True):
+        apart = f"{(reached - landed).abs().max():.3g}"
+        raise BadInputError(
+            f"{type(simulator).__name__}.step: returned states up to {apart} from its simulator's, which "
+            "would go on uncorrected: expected `return self._settle(before, corrected)`, which moves the "
+            "simulator to the corrected states, as far as walls allow"
+        )
+
+
+def _fault(value: object) -> str:
+    """Return why a figure cannot be written as JSON; nothing if it can."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except TypeError:
+        return f"is a {type(value).__name__}"
+    except ValueError:
+        return "is not finite"
+    return ""

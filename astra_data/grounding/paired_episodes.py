@@ -1,4 +1,4 @@
-"""Paired episodes as tensors: whole episodes side by side, and windows cut from them."""
+"""Windows of paired episodes, which the grounding model learns from."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -29,10 +29,112 @@ from astra_data.dataset.endings import stands_still
 from astra_data.dataset.lineage import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
-from astra_data.grounding.networks.paired_windows import RISK_STEPS, PairedWindows, before_failures
-from astra_data.grounding.recorded import draw_steps
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.task import Task
+
+RISK_STEPS = 20
+"""Steps before each failure that `PairedWindows.fails_soon` marks."""
+
+
+@dataclass(frozen=True)
+class PairedWindows:
+    """B windows of T steps each from paired episodes; the mask marks real steps, not padding.
+
+    Attributes:
+        state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
+        goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
+        next_state: φ(s_{i+1}), (B, T, X).
+        fails_soon: (B, T), 1 where the episode fails within `RISK_STEPS`; see also `failing`.
+        reward: r_i, (B, T).
+        goes_on: (B, T), 1 where R_pred learns the reward: where the step ends nothing, as simulators detect
+            and pay what ends an episode; without a failure model, also where it fails.
+        failed: (B, T), 1 where the step ends in a failure that no abstract state shows, whatever it pays.
+        mask: (B, T), 1 on real steps.
+        own_reward: the task's own reward of the step on abstract states, (B, T); None where R_pred predicts
+            no residual reward, `reward` less this.
+    """
+
+    state: Tensor
+    action: Tensor
+    previous_action: Tensor
+    goal: Tensor
+    simulated_next: Tensor
+    next_state: Tensor
+    reward: Tensor
+    goes_on: Tensor
+    failed: Tensor
+    fails_soon: Tensor
+    mask: Tensor
+    own_reward: Tensor | None = None
+
+
+def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:
+    """Return 1 at the last `steps` real steps of each episode that fails (E,), by the mask (E, T), else 0."""
+    left = mask.flip(1).cumsum(1).flip(1)
+    return (fails[:, None] & mask.bool() & (left <= steps)).float()
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """E recorded episodes of up to T steps, padded at the end.
+
+    Attributes:
+        observation: (E, T, O). previous_action: (E, T, A), zero at the start. action: (E, T, A).
+        lengths: the number of real steps of each episode, (E,).
+    """
+
+    observation: Tensor
+    previous_action: Tensor
+    action: Tensor
+    lengths: Tensor
+
+    def draw(self, count: int, length: int, burn_in: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Draw windows of `length` steps from torch's global generator.
+
+        Returns:
+            their places in the columns, episodes (count, 1) and steps (count, length), and which steps to
+            learn from, (count, length) bool: all but the first `burn_in` of a window that begins within its
+            episode.
+        """
+        episodes, steps, learned = draw_steps(self.lengths, count, length)
+        learned &= steps < self.lengths[episodes]
+        learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
+        return (episodes, steps), learned
+
+    def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
+        """Draw windows as `draw` does.
+
+        Returns:
+            the columns by name, (count, length, ...), and which steps to learn from, (count, length) bool.
+        """
+        places, learned = self.draw(count, length, burn_in)
+        names = ("observation", "previous_action", "action")
+        return {name: getattr(self, name)[places] for name in names}, learned
+
+
+def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw windows of `length` steps, each step equally likely; from torch's global generator.
+
+    A window that is drawn across an end of its episode is shifted inside. Otherwise the last steps, where
+    robots fall, would hardly be seen.
+
+    Args:
+        lengths: of the episodes, (E,).
+        count: of windows.
+        length: of each window; at most the longest episode's.
+
+    Returns:
+        episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn before the
+        shift, (count, length) bool. In episodes shorter than `length` some lie beyond the end.
+    """
+    length = min(length, int(lengths.max()))
+    beginnings = lengths + length - 1
+    episodes = torch.multinomial(beginnings.float(), count, replacement=True)
+    drawn = (torch.rand(count, device=episodes.device) * beginnings[episodes]).long() - (length - 1)
+    first = drawn.clamp_min(0).minimum((lengths[episodes] - length).clamp_min(0))
+    steps = first[:, None] + torch.arange(length, device=first.device)
+    return episodes[:, None], steps, (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
+
 
 _COLUMNS = (
     *(STATE, ACTION, TERMINATED),

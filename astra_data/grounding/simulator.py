@@ -1,7 +1,13 @@
 """The abstract simulator that episodes are run in: raw or varied; groundings correct its steps."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, Self
+
 from torch import Tensor
 
+from astra_data.grounding.encoder import LatentEncoder
+from astra_data.grounding.paired_episodes import PairedWindows
 from astra_data.worlds.protocols import PlacedSimulator, RememberingSimulator
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation, VariedSimulator
@@ -14,13 +20,14 @@ class EpisodeSimulator:
         simulator: the abstract simulator that is stepped; the parameters of a `VariedSimulator` are redrawn
             for each episode.
         latent_size: Z, of the latents that policies observe; 0 where there are none.
+        landed: where the simulator landed in the last step, before any correction, (B, X).
     """
 
     latent_size: int = 0
 
     def __init__(self, simulator: PlacedSimulator) -> None:
         """Wrap `simulator`."""
-        self.simulator = simulator
+        self.simulator, self.landed = simulator, simulator.state
         self._varied = simulator if isinstance(simulator, VariedSimulator) else None
         self._remembering = _remembering_within(simulator)
 
@@ -70,7 +77,8 @@ class EpisodeSimulator:
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the new states (B, X)."""
-        return self.simulator.step(action)
+        self.landed = self.simulator.step(action)
+        return self.landed
 
     def _settle(self, before: Tensor, corrected: Tensor) -> Tensor:
         """Move from `before` to `corrected` (B, X), as far as walls allow; return where that is."""
@@ -120,3 +128,77 @@ def abstract_simulator(
     if variation is None:
         return task.simulator(num_envs, device)
     return task.varied_simulator(num_envs, variation, device)
+
+
+class Grounding(Protocol):
+    """How an abstract simulator is corrected, if it is.
+
+    Attributes:
+        start_stride: recorded steps between those that episodes may start from.
+    """
+
+    start_stride: ClassVar[int] = 1
+
+    @property
+    def encoder(self) -> LatentEncoder | None:
+        """The source encoder ψ^s, whose latents policies observe; None where there are none."""
+        return None
+
+    def corrected(self, simulator: PlacedSimulator) -> EpisodeSimulator:
+        """Wrap `simulator` in the correction."""
+        return EpisodeSimulator(simulator)
+
+    def simulator(
+        self, task: Task, num_envs: int, device: str = "cpu", *, variation: Variation | None = None
+    ) -> EpisodeSimulator:
+        """Build `num_envs` abstract simulators of `task`, corrected.
+
+        Args:
+            task: the task.
+            num_envs: B.
+            device: torch device.
+            variation: ranges of the simulator's parameters, unless the grounding has its own.
+        """
+        return self.corrected(abstract_simulator(task, num_envs, device, variation))
+
+    def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor | None:
+        """Return its memory before each `every`-th step, (E, ceil(T / every), H); None if it has none.
+
+        Histories begin where `windows` (E, T, ...) do.
+        """
+        return None
+
+    def for_replay(self) -> "Grounding":
+        """Return the grounding to replay recorded actions with: without noise of sensors and actions."""
+        return self
+
+
+class FittedGrounding(Grounding, Protocol):
+    """A grounding that was fitted to pairs, and can be saved.
+
+    Attributes:
+        kind: names the class in files; see `files.KINDS`.
+    """
+
+    kind: ClassVar[str]
+
+    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
+        ...
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
+        """Rebuild it on `device`, with frozen parameters.
+
+        Raises:
+            KeyError, TypeError, ValueError, RuntimeError: something is missing or of another shape.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class NoGrounding(Grounding):
+    """Leave the simulator as it is, except for varied parameters if given."""
+
+
+NO_GROUNDING = NoGrounding()

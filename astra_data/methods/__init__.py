@@ -8,8 +8,7 @@ from pathlib import Path
 from astra_data.core.config import Config
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
-from astra_data.grounding.files import KINDS
-from astra_data.grounding.own_grounding import missing_parts
+from astra_data.grounding.files import KINDS, missing_parts
 from astra_data.methods.astra import (
     ASTRA,
     ASTRA_PRINTED,
@@ -18,19 +17,15 @@ from astra_data.methods.astra import (
     ASTRA_WITHOUT_LATENT,
     ASTRA_WITHOUT_REWARD,
     ASTRA_WITHOUT_SCATTER,
+    NAS,
 )
-from astra_data.methods.compass import COMPASS
-from astra_data.methods.direct_transfer import DIRECT_TRANSFER
-from astra_data.methods.domain_randomization import DOMAIN_RANDOMIZATION
+from astra_data.methods.baselines import COMPASS, DIRECT_TRANSFER, DOMAIN_RANDOMIZATION, FULL_OBS, TARGET
 from astra_data.methods.follower import FOLLOWER
 from astra_data.methods.iql import BEHAVIOR_CLONING, DIRECT_TRANSFER_IQL, IQL
 from astra_data.methods.method import Method, Table
-from astra_data.methods.nas import NAS
 from astra_data.methods.rma import RMA
-from astra_data.methods.target import FULL_OBS, TARGET
-from astra_data.policies.own_learner import OwnLearner
-from astra_data.policies.policy_file import add_policy_kind
-from astra_data.policies.train import InSimulator
+from astra_data.policies.running_policy import add_policy_kind
+from astra_data.policies.train import InSimulator, UserLearner
 from astra_data.worlds.own_code import offered, own_object
 from astra_data.worlds.variation import Variation
 
@@ -103,7 +98,7 @@ def add_method(name: str, place: str) -> None:
                 f"{place}: groundings of kind '{kind.kind}' are those of {owner.__name__} in "
                 f"{owner.__module__}: rename its kind"
             )
-    if isinstance(method.learn, OwnLearner):
+    if isinstance(method.learn, UserLearner):
         add_policy_kind(method.learn.policy)
     METHODS[name] = replace(method, name=name)
     _PLACES[name] = found
@@ -112,7 +107,7 @@ def add_method(name: str, place: str) -> None:
 def _faults(method: Method) -> Iterator[str]:
     """Yield what a method of the user's lacks to be a row."""
     if method.learn is None:
-        yield "learns no policy: expected learn, an OwnLearner that returns one"
+        yield "learns no policy: expected learn, an UserLearner that returns one"
     if method.grounding is not None and (missing := missing_parts(method.grounding)):
         yield f"has a grounding, {method.grounding.__name__}, without {', '.join(missing)}"
     if (table := method.table) is None:

@@ -72,3 +72,6 @@ ASTRA_PRINTED = replace(
 )
 """The paper's losses and nothing else: R_pred learns the whole reward, no failure model, no scatter, and
 corrections as close to walls as the simulator goes."""
+
+
+NAS = Method(name="nas", title="NAS", color="#56B4E9", fit=HistoryFit(latent=False, reward=False))

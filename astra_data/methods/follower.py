@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from astra_data.methods.method import Method
-from astra_data.policies.simulator_episodes import Act
+from astra_data.policies.episodes import Act
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 

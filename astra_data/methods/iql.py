@@ -18,13 +18,12 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
-from astra_data.grounding.networks.history import PositionFeatures
+from astra_data.grounding.encoder import PositionFeatures
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods.method import Method, Table
 from astra_data.policies.iql import Experience, Iql, IqlConfig
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.policy import Policy
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy
+from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.simulator_env import policy_observation
 from astra_data.policies.train import Training
 from astra_data.worlds.task import Task

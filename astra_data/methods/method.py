@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from astra_data.core.config import Config
 from astra_data.grounding.fit import Fit
-from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.simulator import FittedGrounding
 from astra_data.policies.train import InSimulator, Learn
 
 IN_RAW_SIMULATOR = InSimulator()

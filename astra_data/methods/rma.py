@@ -15,10 +15,10 @@ from astra_data.core.progress import part
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import CLOCKS
 from astra_data.methods.method import Method, Table
-from astra_data.policies.networks.adaptation import AdaptiveShape, Teacher
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.networks import AdaptiveShape, Teacher
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.rma import Adaptation, RmaConfig
+from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.train import InSimulator, PpoTrainConfig, Training, optimize
 
 

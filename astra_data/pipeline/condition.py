@@ -23,7 +23,7 @@ from astra_data.pipeline.executors import Item
 from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment
 from astra_data.pipeline.plan import stage_of
 from astra_data.pipeline.stages.registry import STAGES, Stage
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.running_policy import PolicyFile
 from astra_data.reports.artifacts import Evaluation, read_json
 from astra_data.reports.choice import Judged
 

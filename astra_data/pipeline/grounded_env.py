@@ -21,11 +21,9 @@ from astra_data.pipeline.points import Selection
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.trained_policy import settings_of
 from astra_data.pipeline.user_code import add_all
-from astra_data.policies.build_env import Simulation
 from astra_data.policies.gymnasium import BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
-from astra_data.policies.own_policy import ActingPolicy, OwnPolicy
-from astra_data.policies.policy_file import PolicyFile
-from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.running_policy import ActingPolicy, PolicyFile, UserPolicy
+from astra_data.policies.simulator_env import Simulation, SimulatorEnv
 from astra_data.policies.train import InSimulator, Training
 from astra_data.robots.registry import task_named
 
@@ -105,7 +103,7 @@ def evaluate_policy(
     """
     settings = settings_of(run)
     env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)
-    own = OwnPolicy(policy, env.observation_size, env.action_size)
+    own = UserPolicy(policy, env.observation_size, env.action_size)
     episodes = training.episodes
     rows = list(dict.fromkeys([*settings.get("methods", []), row]))
     tested = {"seeds": [seed]} | settings | {"methods": rows}

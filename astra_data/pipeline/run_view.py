@@ -17,10 +17,9 @@ from astra_data.dataset.columns import ABSTRACT_NEXT_STATE, ABSTRACT_STATE, ACTI
 from astra_data.dataset.edit import check_uids
 from astra_data.dataset.reader import Dataset
 from astra_data.grounding.files import load_grounding
-from astra_data.grounding.open_loop_replay import replay_open_loop
+from astra_data.grounding.open_loop import replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.pipeline.plan import plan, stage_of
 from astra_data.pipeline.points import Selection
 from astra_data.pipeline.recipe import Recipe

@@ -20,8 +20,7 @@ from astra_data.pipeline.stages.select import SelectConfig, benches, digests, ju
 from astra_data.pipeline.stages.select import select as judge_all
 from astra_data.pipeline.trained_policy import settings_of, task_of, trained_policy
 from astra_data.pipeline.user_code import add_all
-from astra_data.policies.simulator_episodes import started
-from astra_data.policies.target_episodes import in_target
+from astra_data.policies.episodes import in_target, started
 from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, read_judged, select_page
 from astra_data.reports.runs import Reported
 from astra_data.reports.trials import (

@@ -18,8 +18,7 @@ from astra_data.methods import grounded_as, method_named
 from astra_data.pipeline.points import refuse_unmade
 from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.user_code import add_all, check_unchanged
-from astra_data.policies.policy_file import POLICY, PolicyFile, running
-from astra_data.policies.running_policy import RunningPolicy
+from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
 from astra_data.robots.registry import task_named
 from astra_data.worlds.own_code import found_near
 

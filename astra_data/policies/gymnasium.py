@@ -18,9 +18,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.progress import Progress
 from astra_data.core.seeding import fresh_seed
-from astra_data.grounding.generators import seeded
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.descent import seeded
+from astra_data.grounding.simulator import NO_GROUNDING
+from astra_data.policies.learner import lately, penalty_scale
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import task_named
 from astra_data.worlds.batched import BatchedEnv, Step
@@ -215,3 +217,70 @@ def point_maze_vector(num_envs: int, task: str, max_episode_steps: int) -> Batch
 def _abstract(task: str, num_envs: int) -> SeededSimulatorEnv:
     found = task_named(task)
     return SeededSimulatorEnv(SimulatorEnv(found.objective, NO_GROUNDING.simulator(found, num_envs)))
+
+
+_POINTS = 50
+"""Of a learning curve."""
+
+
+class WatchedEnv(BatchedVectorEnv):
+    """The environment that a row is trained in, which keeps the learning curve of who learns there.
+
+    Attributes:
+        points: of the curve so far.
+    """
+
+    def __init__(
+        self,
+        env: SimulatorEnv,
+        *,
+        seed: int,
+        max_episode_steps: int,
+        total_steps: int,
+        ramps: bool,
+        is_lasting: bool,
+        progress: Progress,
+    ) -> None:
+        """Show `env`, whose randomness comes from `seed`; with `ramps`, penalties grow with success."""
+        seeded = SeededSimulatorEnv(env)
+        seeded.reseed(seed)
+        super().__init__(seeded, max_episode_steps)
+        self.points: list[dict[str, Any]] = []
+        self._simulated, self._total, self._progress = env, total_steps, progress
+        self._ramps, self._is_lasting = ramps, is_lasting
+        self._steps = self._ended = self._succeeded = self._lasted = 0
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Apply actions (B, A) for one control step."""
+        self._simulated.penalty_scale = penalty_scale(self.points) if self._ramps else 1.0
+        ages = self._age.numpy() + 1
+        stepped = super().step(actions)
+        infos = stepped[-1]
+        self._steps += self.num_envs
+        if "final_info" in infos:
+            ended = infos["_final_info"]
+            self._ended += int(ended.sum())
+            self._lasted += int(ages[ended].sum())
+            self._succeeded += int(infos["final_info"]["success"].sum())
+        if self._steps * _POINTS >= (len(self.points) + 1) * self._total:
+            self._note()
+        return stepped
+
+    def finish(self) -> None:
+        """End the curve with the last step, if it does not yet."""
+        if not self.points or self.points[-1]["steps"] != self._steps:
+            self._note()
+
+    def _note(self) -> None:
+        """Add a point to the curve, of the episodes that ended since the last one."""
+        ended, is_lasting = self._ended, self._is_lasting
+        point = {
+            "steps": self._steps,
+            "share": min(1.0, self._steps / self._total),
+            "success": None if is_lasting or not ended else self._succeeded / ended,
+            "episode_steps": self._lasted / ended if ended else None,
+        }
+        self.points.append(point)
+        self._ended = self._succeeded = self._lasted = 0
+        note = lately([point], "episode_steps" if is_lasting else "success")
+        self._progress(min(1.0, self._steps / self._total), note)

@@ -22,11 +22,10 @@ from torch import Tensor, nn
 from astra_data.core.config import AtOnce, Config, Count, CountFromZero, NotNegative, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
-from astra_data.grounding.divergence import refuse_divergence
-from astra_data.grounding.generators import seed_generators
-from astra_data.grounding.networks.history import mlp
-from astra_data.grounding.recorded import Recorded
-from astra_data.policies.networks.policy import Policy
+from astra_data.grounding.descent import refuse_divergence, seed_generators
+from astra_data.grounding.encoder import mlp
+from astra_data.grounding.paired_episodes import Recorded
+from astra_data.policies.networks import Policy
 
 _LARGEST_WEIGHT = 100.0
 _CRITIC_BATCH = 256

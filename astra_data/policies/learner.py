@@ -1,17 +1,125 @@
 """The base of learners that act in an environment: seeded iterations, and checkpoints."""
 
+import math
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from astra_data.core.seeding import derive
-from astra_data.policies.acting import Acting
+from astra_data.worlds.batched import BatchedEnv, Step
 
 _ROUNDING = 1e-9
 """Of a sum of shares."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """The outcome of one step of all rows.
+
+    Attributes:
+        step: its outcome.
+        action: as applied, (B, A) in ±1.
+        expired: episodes that reached the horizon, (B,) bool.
+        done: episodes that ended, expired or terminated, (B,) bool.
+    """
+
+    step: Step
+    action: Tensor
+    expired: Tensor
+    done: Tensor
+
+
+class Acting:
+    """B rows of an environment in which a policy acts.
+
+    Attributes:
+        observation: (B, O), to act on next.
+        previous_action: (B, A) in ±1. hidden: the policy's memory, (B, H). Both are zero at the start.
+        first: whether an episode begins with it, (B,) bool.
+        world_seconds: the time that the environment's steps took, since the start or since resuming.
+    """
+
+    def __init__(self, env: BatchedEnv, hidden: Tensor, *, horizon: int, is_staggered: bool) -> None:
+        """Start all rows.
+
+        Args:
+            env: the environment.
+            hidden: the policy's memory at the start, (B, H).
+            horizon: steps after which an episode is truncated and its row restarted.
+            is_staggered: begin at random ages, so that rows do not all reach the horizon at once.
+        """
+        self.env, self.horizon = env, horizon
+        self.world_seconds = 0.0
+        self.observation = env.reset()
+        device = self.observation.device
+        self.previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
+        self.hidden = hidden
+        self.first = torch.ones(env.num_envs, dtype=torch.bool, device=device)
+        self._lasted = torch.zeros(env.num_envs, dtype=torch.int64, device=device)
+        self._age = torch.randint_like(self._lasted, horizon) if is_staggered else self._lasted
+        self._forget()
+
+    def _forget(self) -> None:
+        self._steps = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
+
+    def take(self, action: Tensor, hidden: Tensor) -> Taken:
+        """Apply `action` (B, A), clipped to ±1, keep `hidden` (B, H), and reset the rows that are done."""
+        began = time.perf_counter()
+        step = self.env.step(action)
+        self.world_seconds += time.perf_counter() - began
+        self._age, self._lasted = self._age + 1, self._lasted + 1
+        expired = (self._age >= self.horizon) & ~step.terminated
+        done = step.terminated | expired
+        self._steps += 1
+        self._finished += float(done.sum())
+        self._succeeded += float(step.success.sum())
+        self._survived += float(self._lasted[done].sum())
+        self._rewarded += float(step.reward.mean())
+        self._age, self._lasted = (torch.where(done, 0, steps) for steps in (self._age, self._lasted))
+        self.observation = self.env.reset(done) if bool(done.any()) else step.observation
+        executed, going = action.clamp(-1.0, 1.0), (~done).float().unsqueeze(-1)
+        self.previous_action, self.hidden, self.first = executed * going, hidden * going, done
+        return Taken(step, executed, expired, done)
+
+    def figures(self) -> dict[str, float]:
+        """Return figures on the steps since the last call.
+
+        Returns:
+            the share of "success" among the "episodes" that ended, wherever in the task they began, and their
+            mean "episode_steps", NaN if none ended; the mean "reward" of a step.
+        """
+        figures = {
+            "success": self._succeeded / self._finished if self._finished else math.nan,
+            "episode_steps": self._survived / self._finished if self._finished else math.nan,
+            "episodes": self._finished,
+            "reward": self._rewarded / self._steps,
+        }
+        self._forget()
+        return figures
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything but the environment's own state, after `figures`; see `load_state_dict`."""
+        return {
+            "previous_action": self.previous_action,
+            "hidden": self.hidden,
+            "first": self.first,
+            "age": self._age,
+            "lasted": self._lasted,
+        }
+
+    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
+        """Continue from `state`, once the environment is restored and returned `observation` (B, O)."""
+        device = observation.device
+        self.observation = observation
+        self.previous_action, self.hidden = state["previous_action"].to(device), state["hidden"].to(device)
+        self.first = state["first"].to(device)
+        self._age, self._lasted = state["age"].to(device), state["lasted"].to(device)
 
 
 class Resumable(Protocol):
@@ -120,3 +228,44 @@ class Learner(ABC):
 
     def _cut(self) -> None:  # noqa: B027 - most keep nothing
         """Let what comes next follow no step that was kept."""
+
+
+Points = Sequence[Mapping[str, float | None]]
+
+_RECENT = 5
+"""Points of the learning curve over which success is averaged."""
+MASTERED = 0.95
+"""Success of training episodes from which on a simulator counts as mastered."""
+FAST = 3.0
+"""Pace of a training that has mastered its simulator, of one that has not."""
+_GROWTH_SHARE = 0.4
+"""Share of the training over which penalties grow from 0 to full size."""
+
+
+def is_mastered(points: Points) -> bool:
+    """Return whether the last training episodes succeed as often as `MASTERED`."""
+    recent = [success for point in points[-_RECENT:] if (success := point.get("success")) is not None]
+    return bool(recent) and fmean(recent) >= MASTERED
+
+
+def penalty_scale(points: Points) -> float:
+    """Return the factor on penalties, from 0 to 1, after the `points` of a learning curve.
+
+    It grows while the simulator is mastered and falls as fast while not, so that caution does not cost
+    success; at full size from the start, penalties teach the robot to stand still.
+    """
+    scale, before = 0.0, 0.0
+    for number, point in enumerate(points, 1):
+        now = float(point["share"] or 0.0)
+        change = (now - before) / _GROWTH_SHARE
+        scale += change if is_mastered(points[max(0, number - _RECENT) : number]) else -change
+        scale, before = min(1.0, max(0.0, scale)), now
+    return scale
+
+
+def lately(points: Points, figure: str) -> str:
+    """Return a note of the mean of a `figure`, "success" or "episode_steps", over the last `points`."""
+    recent = [value for point in points[-10:] if (value := point.get(figure)) is not None]
+    if figure == "success":
+        return f"success of training episodes {f'{fmean(recent):.2f}' if recent else 'unknown yet'}"
+    return f"steps of training episodes {f'{fmean(recent):,.0f}' if recent else 'unknown yet'}"

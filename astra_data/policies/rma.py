@@ -14,10 +14,9 @@ from torch.nn import functional
 
 from astra_data.core.config import Config, Count, Positive
 from astra_data.core.seeding import derive
-from astra_data.grounding.divergence import refuse_divergence
-from astra_data.policies.acting import Acting
-from astra_data.policies.learner import Learner
-from astra_data.policies.networks.adaptation import SHORTEST_HISTORY, Student, Teacher
+from astra_data.grounding.descent import refuse_divergence
+from astra_data.policies.learner import Acting, Learner
+from astra_data.policies.networks import SHORTEST_HISTORY, Student, Teacher
 from astra_data.worlds.batched import BatchedEnv
 
 

@@ -1,19 +1,113 @@
-"""Run a policy step by step, in the target or a simulator, with its encoder and memory."""
+"""Policies of other learners, which act on the observations of a row's environment."""
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.checkpoint import as_part, part_of, save_tensors, understood
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.networks.history import LatentEncoder
-from astra_data.policies.networks.policy import Policy
-from astra_data.policies.simulator_env import policy_observation
+from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.encoder import LatentEncoder
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
+from astra_data.policies.networks import (
+    ActorCritic,
+    ActorCriticShape,
+    AdaptiveShape,
+    Policy,
+    PolicyShape,
+    SoftActor,
+    Student,
+)
+from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.worlds.objective import NO_LIMIT
+from astra_data.worlds.own_code import explained
+from astra_data.worlds.own_saving import parts_of, restored
 from astra_data.worlds.task import Task
+from astra_data.worlds.variation import Variation
+
+Array = NDArray[Any]
+
+
+class ActingPolicy(Protocol):
+    """What a policy of another learner has to have."""
+
+    def act(self, observation: Array) -> Array:
+        """Return actions (B, A) within ±1 for observations (B, O) float32."""
+        ...
+
+
+class SavedPolicy(ActingPolicy, Protocol):
+    """What a policy has to have that a learner of the user's makes for a row.
+
+    Attributes:
+        kind: names the class in files; see `KINDS`.
+    """
+
+    kind: ClassVar[str]
+
+    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
+        ...
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any]) -> Self:
+        """Rebuild it."""
+        ...
+
+
+KINDS: dict[str, type[SavedPolicy]] = {}
+"""The classes of such policies by their kinds, as methods of the user's add them."""
+
+
+class UserPolicy(Policy):
+    """A policy of another learner, in the place of one that was trained here; it has no memory."""
+
+    def __init__(self, acting: ActingPolicy, observation_size: int, action_size: int) -> None:
+        """Let `acting` act on observations (B, O).
+
+        Raises:
+            BadInputError: it has no `act`.
+        """
+        super().__init__(PolicyShape(observation_size, action_size))
+        if not callable(getattr(acting, "act", None)):
+            raise BadInputError(f"{type(acting).__name__} is no policy: expected act(observation) -> action")
+        self.acting = acting
+
+    @property
+    def name(self) -> str:
+        """The name of its class."""
+        return type(self.acting).__name__
+
+    def initial_hidden(self, count: int) -> Tensor:
+        """Return no memory, (count, 0)."""
+        return torch.zeros(count, 0)
+
+    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the actions (B, A) for observations (B, O), and a scale of 0."""
+        action = self.act(features)
+        return action, torch.zeros_like(action)
+
+    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the actions (B, A), clipped to ±1, for observations (B, O); `generator` has no effect.
+
+        Raises:
+            BadInputError: the policy fails, or returns something of another shape, or that is not finite.
+        """
+        with explained(f"{self.name}.act"):
+            action = np.asarray(self.acting.act(features.numpy()), dtype=np.float32)
+        expected = (len(features), self.shape.action_size)
+        if action.shape != expected:
+            raise BadInputError(f"{self.name}.act: expected actions of shape {expected}, got {action.shape}")
+        if not np.isfinite(action).all():
+            raise BadInputError(f"{self.name}.act: expected finite actions, got NaN or infinity")
+        return torch.from_numpy(action).clamp(-1.0, 1.0)
+
 
 Given = Tensor | NDArray[np.float32] | NDArray[np.float64]
 """What measures and goals come in."""
@@ -142,3 +236,145 @@ class RunningPolicy:
         action = self.task.objective.limit_command(output, self.command_limit)
         self.memory = Memory(output, action, hidden, before.encoder)
         return action
+
+
+POLICY = "policy.safetensors"
+"""Name of the file of its artifact."""
+_KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
+    "actor_critic": (ActorCritic, ActorCriticShape),
+    "adaptive": (Student, AdaptiveShape),
+    "soft_actor": (SoftActor, PolicyShape),
+}
+_PART = "policy"
+"""Of the tensors of a file: the policy's networks."""
+
+
+def add_policy_kind(made: type[SavedPolicy]) -> None:
+    """Let files hold policies of another learner.
+
+    Raises:
+        BadInputError: the package, or another learner, has policies of this kind.
+    """
+    if made.kind in _KINDS or KINDS.setdefault(made.kind, made) is not made:
+        raise BadInputError(
+            f"policies of kind '{made.kind}' are the package's or another learner's: rename that of "
+            f"{made.__name__}"
+        )
+
+
+@dataclass(frozen=True)
+class PolicyFile:
+    """A trained policy.
+
+    Attributes:
+        policy: the networks.
+        simulation: the simulator that it was trained in; None if it was trained in the target, or on data.
+        dataset, content_hash: the dataset that everything was learned from; None for a policy that was
+            trained to collect one.
+        observed: which part of the target's state it observes.
+    """
+
+    policy: Policy
+    simulation: Simulation | None
+    dataset: str | None
+    content_hash: str | None
+    observed: Observed = "abstract"
+
+    def save(self, path: Path) -> None:
+        """Write the policy to `path`.
+
+        Raises:
+            BadInputError: it is of a class that `load` does not know, or its `to_file` returns something else
+                than tensors and JSON values.
+        """
+        kind, networks, own = _taken_apart(self.policy)
+        tensors = as_part(networks, _PART)
+        metadata: dict[str, Any] = own | {
+            "kind": kind,
+            "shape": asdict(self.policy.shape),
+            "dataset": self.dataset,
+            "hash": self.content_hash,
+            "observed": self.observed,
+        }
+        if self.simulation:
+            variation = self.simulation.variation
+            metadata["simulation"] = {
+                "world": self.simulation.world.model_dump(mode="json"),
+                "variation": variation.model_dump() if variation else None,
+            }
+        save_tensors(path, tensors, metadata)
+
+    @classmethod
+    def load(cls, path: Path | str, device: str = "cpu") -> "PolicyFile":
+        """Read a policy; its parameters are frozen.
+
+        Raises:
+            BadInputError: the file is missing, holds something else, or is from an older version.
+        """
+        with understood(Path(path), "a policy", {**_KINDS, **KINDS}, device) as (tensors, metadata):
+            policy = _put_together(part_of(tensors, _PART), metadata)
+            simulation = None
+            if recorded := metadata.get("simulation"):
+                variation = recorded["variation"]
+                simulation = Simulation(
+                    WorldConfig(**recorded["world"]),
+                    Variation.of_json(variation) if variation else None,
+                )
+            read = cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
+        policy.to(device).requires_grad_(False)
+        return read
+
+
+def _taken_apart(policy: Policy) -> tuple[str, Mapping[str, Tensor], dict[str, Any]]:
+    """Return the kind of a policy, its tensors, and metadata if it is of another learner."""
+    if not isinstance(policy, UserPolicy):
+        kinds = {made: kind for kind, (made, _) in _KINDS.items()}
+        if type(policy) not in kinds:
+            known = ", ".join(made.__name__ for made in kinds)
+            raise BadInputError(
+                f"a {type(policy).__name__} cannot be read again: expected a {known}, or what an "
+                "UserLearner learns"
+            )
+        return kinds[type(policy)], policy.state_dict(), {}
+    saved: Any = policy.acting
+    tensors, metadata = parts_of(saved)
+    return saved.kind, tensors, {"own": metadata}
+
+
+def _put_together(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> Policy:
+    shape = metadata["shape"] | {"hidden_sizes": tuple(metadata["shape"]["hidden_sizes"])}
+    if "own" in metadata:
+        acting = restored(KINDS[metadata["kind"]], tensors, metadata["own"])
+        return UserPolicy(acting, shape["observation_size"], shape["action_size"])
+    made, shaped = _KINDS[metadata["kind"]]
+    policy = made(shaped(**shape))
+    policy.load_state_dict(tensors)
+    return policy
+
+
+def running(
+    task: Task,
+    trained: PolicyFile,
+    grounding: Grounding = NO_GROUNDING,
+    target_encoder: TargetEncoder | None = None,
+) -> RunningPolicy:
+    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s.
+
+    Raises:
+        BadInputError: it is of another task, or of another grounding.
+    """
+    world = trained.simulation.world if trained.simulation else WorldConfig()
+    made = RunningPolicy(
+        task,
+        trained.policy,
+        grounding.encoder,
+        target_encoder,
+        command_limit=world.command_limit,
+        observed=trained.observed,
+    )
+    if made.observation_size != (taken := trained.policy.shape.observation_size):
+        raise BadInputError(
+            f"the policy takes {taken} values, {task.name} gives {made.observation_size}: expected a "
+            "policy of this task and, if it was trained in a grounded simulator, its grounding"
+        )
+    return made

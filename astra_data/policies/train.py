@@ -5,11 +5,11 @@ Most train by PPO, or by SAC, in the abstract simulator: raw, varied, or correct
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from statistics import fmean
-from typing import Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import torch
 from pydantic import Discriminator, Tag
@@ -17,28 +17,30 @@ from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import AtOnce, Config, Count, CountFromZero, Share, choice
+from astra_data.core.errors import BadInputError
 from astra_data.core.logbook import Logbook
-from astra_data.core.progress import Progress
+from astra_data.core.progress import Progress, part
 from astra_data.core.seeding import derive
+from astra_data.core.stopwatch import CLOCKS
+from astra_data.grounding.files import grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import Grounding
-from astra_data.policies.build_env import (
+from astra_data.grounding.simulator import Grounding
+from astra_data.policies.episodes import ObservedTargetEnv, Reached, TargetStarts, reached_in_own_world
+from astra_data.policies.learner import FAST, Learner, is_mastered, lately, penalty_scale
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, PolicyShape, SoftActor
+from astra_data.policies.ppo import Ppo, PpoConfig
+from astra_data.policies.running_policy import POLICY, Observed, PolicyFile, SavedPolicy, UserPolicy
+from astra_data.policies.sac import Sac, SacConfig
+from astra_data.policies.simulator_env import (
+    RewardSource,
     Simulation,
+    SimulatorEnv,
     WorldConfig,
+    command_limit,
     data_starts,
     plus,
     training_env,
 )
-from astra_data.policies.command_limit import command_limit
-from astra_data.policies.learner import Learner
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.policy import Policy, PolicyShape
-from astra_data.policies.networks.soft_actor import SoftActor
-from astra_data.policies.policy_file import PolicyFile
-from astra_data.policies.ppo import Ppo, PpoConfig
-from astra_data.policies.ramp import FAST, is_mastered, penalty_scale
-from astra_data.policies.sac import Sac, SacConfig
-from astra_data.policies.simulator_env import RewardSource, SimulatorEnv
 from astra_data.worlds.batched import BatchedEnv
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
@@ -276,9 +278,157 @@ def optimize(
     }
 
 
-def lately(points: Sequence[Mapping[str, float | None]], figure: str) -> str:
-    """Return a note of the mean of a `figure`, "success" or "episode_steps", over the last `points`."""
-    recent = [value for point in points[-10:] if (value := point.get(figure)) is not None]
-    if figure == "success":
-        return f"success of training episodes {f'{fmean(recent):.2f}' if recent else 'unknown yet'}"
-    return f"steps of training episodes {f'{fmean(recent):,.0f}' if recent else 'unknown yet'}"
+class TargetConfig(Config):
+    """Settings that may differ from `[train]` in the target, whose steps are slow; not in the paper."""
+
+    total_steps: Count | None = None
+    """Number of environment steps; by default as in `[train]`."""
+    num_envs: AtOnce | None = None
+    """Target environments stepped in parallel; by default as in `[train]`."""
+    memory_size: CountFromZero | None = None
+    """Size of the policy's own GRU; by default as in `[train]`. A policy that observes the full state needs
+    none."""
+
+
+@dataclass(frozen=True)
+class InTarget:
+    """Train in the target, from its own rewards.
+
+    Attributes:
+        observed: whether the policy observes φ of the state or the full state.
+    """
+
+    observed: Observed
+
+    def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        """Return the policy and its learning curve."""
+        settings, episodes = training.settings, training.episodes
+        config = training.config.model_copy(update=settings.model_dump(exclude_none=True) if settings else {})
+        env = ObservedTargetEnv(
+            training.task,
+            config.num_envs,
+            observed=self.observed,
+            starts=TargetStarts.of(episodes),
+            data_start_share=config.data_start_share,
+            device=training.device,
+            num_threads=training.num_threads,
+        )
+        policy, curve = train_in(env, config, config.memory_size, training, training.task.objective.horizon)
+        return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve
+
+
+def with_restarts(
+    learn: Learn, training: Training, grounding_file: Path | None
+) -> tuple[PolicyFile, dict[str, Any]]:
+    """Train until a policy masters its own simulator, `tries` times at most, each from another seed.
+
+    Args:
+        learn: trains once.
+        training: what it is given.
+        grounding_file: of its grounding, which is read again where that is not on the CPU: policies are
+            tested there.
+
+    Returns:
+        the policy that does, or else the one with the most success there; and its learning curve, with the
+        time that all tries took, and with them as "tries": their seeds, what they reached, and their points.
+    """
+    config = training.config
+    if config.tries == 1:
+        return learn(training)
+    grounding = training.grounding if training.device == "cpu" else grounding_at(grounding_file)
+    made: list[tuple[Reached, PolicyFile, dict[str, Any]]] = []
+    seeds = [training.seed, *(derive(training.seed, f"try {number}") for number in range(1, config.tries))]
+    for number, seed in enumerate(seeds):
+        attempt = _attempt(training, seed, number)
+        policy, curve = learn(attempt)
+        policy.save(attempt.folder / POLICY)
+        reached = reached_in_own_world(
+            training.task, PolicyFile.load(attempt.folder / POLICY), grounding, training.seed
+        )
+        made.append((reached, policy, curve))
+        if _masters(reached, training):
+            break
+    _, policy, curve = max(made, key=lambda one: (_masters(one[0], training), one[0].success))
+    tries = [
+        {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": of_try["points"]}
+        for seed, (one, _, of_try) in zip(seeds, made, strict=False)
+    ]
+    spent = {clock: sum(of_try[clock] for _, _, of_try in made) for clock in CLOCKS if clock in curve}
+    for number in range(1, len(made)):
+        shutil.rmtree(_folder(training, number))
+    return policy, curve | spent | {"tries": tries}
+
+
+def _attempt(training: Training, seed: int, number: int) -> Training:
+    """Return the training of a try; the first is the one that there would be without tries."""
+    tries, folder = training.config.tries, _folder(training, number)
+    folder.mkdir(exist_ok=True)
+    share = part(training.progress, number / tries, (number + 1) / tries)
+
+    def progress(fraction: float, note: str) -> None:
+        share(fraction, f"try {number + 1} of {tries}  {note}")
+
+    return replace(training, seed=seed, folder=folder, progress=progress)
+
+
+def _folder(training: Training, number: int) -> Path:
+    return training.folder / f"try_{number}" if number else training.folder
+
+
+def _masters(reached: Reached, training: Training) -> bool:
+    return reached.success >= training.config.least_success
+
+
+if TYPE_CHECKING:
+    from astra_data.policies.gymnasium import WatchedEnv
+
+
+@dataclass(frozen=True, kw_only=True)
+class UserLearner(InSimulator):
+    """Train in the abstract simulator by a function of the user's.
+
+    Attributes:
+        learn: given the environment, a vector environment of Gymnasium, and the training, which has the
+            recipe's settings (`training.config.total_steps`) and the seed, returns the policy. A hand-written
+            one needs no step.
+        policy: the class of what it returns.
+    """
+
+    learn: Callable[["WatchedEnv", Training], SavedPolicy]
+    policy: type[SavedPolicy]
+
+    def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        """Return the policy and its learning curve.
+
+        Raises:
+            BadInputError: what it returns is no such policy, or the device is no CPU.
+        """
+        if training.device != "cpu":
+            raise BadInputError(
+                f"--device {training.device}: a learner of your own gets an environment of numpy arrays, "
+                "expected --device cpu; run the recipe again with it, finished artifacts are kept"
+            )
+        from astra_data.policies.gymnasium import WatchedEnv
+
+        env, simulation = self.world(training)
+        is_lasting = training.task.objective.is_lasting
+        watched = WatchedEnv(
+            env,
+            seed=derive(training.seed, "own learner"),
+            max_episode_steps=training.simulated_steps,
+            total_steps=training.config.total_steps,
+            ramps=training.is_plus and not is_lasting,
+            is_lasting=is_lasting,
+            progress=training.progress,
+        )
+        torch.manual_seed(derive(training.seed, "policy"))
+        learned = self.learn(watched, training)
+        if not isinstance(learned, self.policy):
+            raise BadInputError(
+                f"learn returned a {type(learned).__name__}, expected a {self.policy.__name__}"
+            )
+        watched.finish()
+        own = UserPolicy(learned, env.observation_size, env.action_size)
+        episodes = training.episodes
+        curve = {"points": watched.points}
+        return PolicyFile(own, simulation, episodes.reference, episodes.content_hash), curve

@@ -5,8 +5,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape, LossWeights
-from astra_data.grounding.networks.paired_windows import PairedWindows
+from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
+from astra_data.grounding.paired_episodes import PairedWindows
 from astra_data.studies.body import Body
 from astra_data.studies.predictors import LEAST_DEVIATION, Predictor
 from astra_data.studies.sequences import Stretch

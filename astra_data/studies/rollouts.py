@@ -12,7 +12,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import Descent, DescentConfig
-from astra_data.grounding.networks.grounding import LossWeights
+from astra_data.grounding.model import LossWeights
 from astra_data.studies.histories import HistoryModel
 from astra_data.studies.joints import Joints
 from astra_data.studies.predictors import Gains, Predictor, Response

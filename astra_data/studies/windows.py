@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from astra_data.grounding.networks.history import mlp
+from astra_data.grounding.encoder import mlp
 from astra_data.studies.body import Body
 from astra_data.studies.predictors import LEAST_DEVIATION, Predictor
 from astra_data.studies.sequences import Stretch

@@ -19,8 +19,8 @@ from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
 from astra_data.deployment.folder import deploy, describe, page
 from astra_data.deployment.graph import load_onnx
-from astra_data.grounding.networks.alignment import TargetEncoder
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.selecting import select
 from astra_data.pipeline.stages.collect import CollectConfig, collect
@@ -28,11 +28,8 @@ from astra_data.pipeline.stages.ground import ground
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.pipeline.stages.train import train
 from astra_data.pipeline.trained_policy import load_policy
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.policy import PolicyShape
-from astra_data.policies.networks.soft_actor import SoftActor
-from astra_data.policies.policy_file import PolicyFile
-from astra_data.policies.running_policy import RunningPolicy
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
+from astra_data.policies.running_policy import PolicyFile, RunningPolicy
 from astra_data.robots.registry import TASKS
 
 

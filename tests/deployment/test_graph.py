@@ -18,12 +18,16 @@ from astra_data.deployment.graph import (
     load_onnx,
     write_graph,
 )
-from astra_data.grounding.networks.alignment import TargetEncoder
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.adaptation import AdaptiveShape, Student
-from astra_data.policies.networks.policy import PolicyShape
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.policies.networks import (
+    ActorCritic,
+    ActorCriticShape,
+    AdaptiveShape,
+    PolicyShape,
+    SoftActor,
+    Student,
+)
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task

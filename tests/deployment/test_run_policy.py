@@ -13,7 +13,7 @@ from astra_data.core.manifest import write_manifest
 from astra_data.deployment.folder import describe
 from astra_data.deployment.graph import write_graph
 from astra_data.deployment.run_policy import RobotPolicy, refuse_far, run
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.running_policy import RunningPolicy
 
 

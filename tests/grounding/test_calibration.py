@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from astra_data.grounding.calibration import calibration, folds
+from astra_data.grounding.failures import calibration, folds
 
 
 def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:

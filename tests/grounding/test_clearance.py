@@ -8,13 +8,12 @@ import torch
 from toy_episodes import no_episodes, toy_episodes
 
 from astra_data.core.progress import silent
-from astra_data.grounding.clearance import recorded_clearance_m
 from astra_data.grounding.files import load_grounding, save_grounding
-from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
+from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded_clearance_m
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.scatter import ScatterModel, ScatterShape
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 

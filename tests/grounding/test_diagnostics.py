@@ -5,10 +5,8 @@ import torch
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.diagnostics import correction_r2, telemetry
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape, LossWeights
-from astra_data.grounding.networks.paired_windows import PairedWindows
-from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, correction_r2, telemetry
+from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
 WEIGHTS = LossWeights()
 

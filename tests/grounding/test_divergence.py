@@ -1,7 +1,7 @@
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.divergence import refuse_divergence
+from astra_data.grounding.descent import refuse_divergence
 
 
 def test_figures_that_are_not_finite_are_named() -> None:

@@ -11,21 +11,21 @@ from torch import Tensor
 from toy_episodes import toy_episodes
 
 from astra_data.grounding import failures as module
-from astra_data.grounding.calibration import folds
 from astra_data.grounding.descent import DescentConfig
 from astra_data.grounding.failures import (
+    FailureModel,
+    FailureShape,
     averages_before,
     failing,
     failure_figures,
     failure_skill,
     fit_failures,
+    folds,
     has_failures,
     replayed_inputs,
 )
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.failure import FailureModel, FailureShape
-from astra_data.grounding.networks.paired_windows import RISK_STEPS
-from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes
 from astra_data.robots.registry import TASKS
 
 HERE = torch.tensor([0.0, 4.0, 0.0, 0.0])

@@ -7,6 +7,7 @@ from toy_episodes import no_episodes
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.errors import BadInputError
+from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.files import (
     KINDS,
     load_grounding,
@@ -16,10 +17,9 @@ from astra_data.grounding.files import (
     save_target_encoder,
 )
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.alignment import TargetEncoder
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.running_policy import PolicyFile
 
 
 def small() -> HistoryGrounding:

@@ -11,7 +11,7 @@ from astra_data.grounding import fit as fit_module
 from astra_data.grounding.descent import DescentConfig
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, with_own_rewards
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel, LossWeights
+from astra_data.grounding.model import GroundingModel, LossWeights
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.robots.registry import TASKS
 
@@ -190,7 +190,7 @@ def test_the_held_out_error_is_of_correction_and_reward(tmp_path: Path) -> None:
 
 
 def test_the_slow_encoder_follows_in_each_update(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("astra_data.grounding.networks.grounding._EMA_RATE", 1.0)
+    monkeypatch.setattr("astra_data.grounding.model._EMA_RATE", 1.0)
     model = fit(tmp_path)[0].model
     assert torch.equal(model.target_encoder.embedding.weight, model.encoder.embedding.weight)
 

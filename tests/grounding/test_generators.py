@@ -4,7 +4,7 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from astra_data.grounding.generators import seed_generators, seeded
+from astra_data.grounding.descent import seed_generators, seeded
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda:1")
 

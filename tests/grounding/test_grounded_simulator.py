@@ -3,9 +3,9 @@ import torch
 from grounding_models import GOAL, HERE, failure_model, model
 from torch import Tensor
 
-from astra_data.grounding.grounded_simulator import GroundedSimulator
-from astra_data.grounding.networks.failure import FailureModel
-from astra_data.grounding.networks.grounding import GroundingModel
+from astra_data.grounding.failures import FailureModel
+from astra_data.grounding.history import GroundedSimulator
+from astra_data.grounding.model import GroundingModel
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
 

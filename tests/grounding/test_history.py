@@ -4,8 +4,7 @@ import pytest
 import torch
 from grounding_models import TASK, failure_model, model
 
-from astra_data.grounding.grounded_simulator import GroundedSimulator
-from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 
 
 def test_simulators_are_corrected_by_the_model_and_replays_by_it_alone() -> None:

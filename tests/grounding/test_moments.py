@@ -3,7 +3,7 @@ from typing import Any
 import torch
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.moments import Moments
+from astra_data.grounding.open_loop import Moments
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.robots.registry import TASKS
 

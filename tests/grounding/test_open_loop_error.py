@@ -8,10 +8,10 @@ from toy_episodes import toy_episodes
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.grounding.open_loop_error import _interval, _starts, distances, gap_report
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.grounding.open_loop import _interval, _starts, distances, gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.point_mass import PointMass
 

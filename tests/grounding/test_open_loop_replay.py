@@ -4,9 +4,8 @@ from grounding_models import HERE, TASK, failure_model, model
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.open_loop_replay import replay_open_loop
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.open_loop import replay_open_loop
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 
 STEPS = 6
 

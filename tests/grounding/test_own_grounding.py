@@ -10,10 +10,9 @@ import torch
 from shifted_method import Lossy, Shifted, ShiftedSimulator
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.files import KINDS
+from astra_data.grounding.files import KINDS, check_step, fitted, missing_parts
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.own_grounding import check_step, fitted, missing_parts
-from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.simulator import FittedGrounding
 from astra_data.robots.registry import task_named
 
 SHIFTED = Shifted(torch.tensor([0.01]))

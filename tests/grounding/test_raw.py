@@ -1,9 +1,7 @@
 import torch
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.point_mass import PointMass
 from astra_data.worlds.variation import VariedSimulator

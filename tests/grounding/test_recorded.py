@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from astra_data.grounding.recorded import Recorded, draw_steps
+from astra_data.grounding.paired_episodes import Recorded, draw_steps
 
 LENGTHS = torch.tensor([3, 10, 25])
 

@@ -11,15 +11,13 @@ from toy_episodes import no_episodes, toy_episodes
 from astra_data.core.progress import silent
 from astra_data.grounding import scatter
 from astra_data.grounding.descent import DescentConfig
-from astra_data.grounding.failures import averages_before, replayed_inputs
+from astra_data.grounding.failures import FailureModel, FailureShape, averages_before, replayed_inputs
 from astra_data.grounding.files import load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.failure import FailureModel, FailureShape
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.scatter import fit_scatter
+from astra_data.grounding.scatter import ScatterModel, ScatterShape, fit_scatter
 from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]

@@ -1,5 +1,5 @@
 from astra_data.grounding.fit import GroundConfig, HistoryFit
-from astra_data.grounding.networks.grounding import LossWeights
+from astra_data.grounding.model import LossWeights
 from astra_data.methods import METHODS
 from astra_data.policies.train import InSimulator
 

@@ -13,12 +13,12 @@ from astra_data.core.checkpoint import save_state
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.methods import METHODS, iql
 from astra_data.methods.iql import clone_behavior, experience_of, learn_from_episodes
 from astra_data.policies.iql import Iql, IqlConfig
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.policy_file import PolicyFile, running
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.policies.train import PpoTrainConfig, Training
 from astra_data.robots.registry import TASKS
 

@@ -1,7 +1,6 @@
 from astra_data.core.config import Config
 from astra_data.methods.method import Method, Table
-from astra_data.policies.train import InSimulator
-from astra_data.policies.train_in_target import InTarget
+from astra_data.policies.train import InSimulator, InTarget
 
 PLAIN = Method(name="mine", title="Mine")
 

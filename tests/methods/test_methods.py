@@ -4,10 +4,9 @@ import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.fit import GroundConfig, HistoryFit
-from astra_data.grounding.networks.grounding import LossWeights
+from astra_data.grounding.model import LossWeights
 from astra_data.methods import METHODS, method_named, method_role, method_title, tables
-from astra_data.policies.train import InSimulator
-from astra_data.policies.train_in_target import InTarget
+from astra_data.policies.train import InSimulator, InTarget
 from astra_data.reports.figures.catalog import method_color
 from astra_data.reports.figures.style import SPARE_COLORS
 

@@ -291,9 +291,9 @@ def test_what_learns_no_policy_is_no_row_of_the_users(tmp_path: Path) -> None:
 HEAD = """
 from pydantic import BaseModel
 from astra_data.core.config import Config
-from astra_data.methods.direct_transfer import DIRECT_TRANSFER
+from astra_data.methods.baselines import DIRECT_TRANSFER
 from astra_data.methods.method import Method, Table
-from astra_data.grounding.protocols import FittedGrounding
+from astra_data.grounding.simulator import FittedGrounding
 class Ours(Config):
     memory: int = 4
 class Theirs(BaseModel):

@@ -27,7 +27,7 @@ from astra_data.pipeline.plan import plan, stage_of
 from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.trained_policy import load_policy, settings_of
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SingleEnv
-from astra_data.policies.own_policy import OwnPolicy
+from astra_data.policies.running_policy import UserPolicy
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import InSimulator
 from astra_data.worlds.own_code import own_object
@@ -318,7 +318,7 @@ def test_the_example_learns_and_is_tested_by_the_command_line(
     assert tested["policy"] == "Linear" and len(tested["grounded"]["success"]) == 3
     observation = torch.ones(1, 2 + 4)
     by_hand = np.tanh(np.ones((1, 2 + 4)) @ np.load("linear.npy"))
-    acted = OwnPolicy(own_object("learned.py:POLICY"), 6, 2).act(observation)
+    acted = UserPolicy(own_object("learned.py:POLICY"), 6, 2).act(observation)
     np.testing.assert_allclose(acted, by_hand, atol=1e-6)
 
 

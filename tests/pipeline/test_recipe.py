@@ -9,8 +9,7 @@ from astra_data.methods.method import Table
 from astra_data.pipeline.recipe import Recipe, with_tables
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.policies.iql import IqlConfig
-from astra_data.policies.train import PpoTrainConfig, SacTrainConfig
-from astra_data.policies.train_in_target import TargetConfig
+from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, TargetConfig
 
 BASE = {
     "task": "humanoid-walker2d",

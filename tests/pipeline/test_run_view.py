@@ -17,7 +17,7 @@ from astra_data.dataset import Dataset
 from astra_data.grounding.descent import DescentConfig
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel
+from astra_data.grounding.model import GroundingModel
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.plan import plan, stage_of
 from astra_data.pipeline.run_view import view_run

@@ -12,7 +12,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.lock import held
 from astra_data.methods import grounded_as
 from astra_data.pipeline.selecting import select
-from astra_data.policies.judging import Judge
+from astra_data.policies.episodes import Judge
 
 pytestmark = pytest.mark.usefixtures("quick_failures")
 

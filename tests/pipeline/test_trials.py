@@ -18,7 +18,7 @@ from astra_data.pipeline import selecting as module
 from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.selecting import choose_by_trials, select
 from astra_data.pipeline.trained_policy import TrainedPolicy, trained_policy
-from astra_data.policies.judging import Judge
+from astra_data.policies.episodes import Judge
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.reports.trials import TrialsFile, halve
 

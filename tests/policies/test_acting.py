@@ -4,7 +4,7 @@ import pytest
 import torch
 from toy_worlds import ConstantReward, GoToZero
 
-from astra_data.policies.acting import Acting
+from astra_data.policies.learner import Acting
 from astra_data.worlds.batched import BatchedEnv
 
 
@@ -62,7 +62,9 @@ def test_going_on_is_as_never_having_stopped() -> None:
 
 def test_the_time_of_the_environments_steps_is_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = acting(ConstantReward(2, 9.0), 9)
-    monkeypatch.setattr("astra_data.policies.acting.time.perf_counter", iter([1.0, 4.0, 10.0, 15.0]).__next__)
+    monkeypatch.setattr(
+        "astra_data.policies.learner.time.perf_counter", iter([1.0, 4.0, 10.0, 15.0]).__next__
+    )
     take(rows)
     take(rows)
     assert rows.world_seconds == 8.0

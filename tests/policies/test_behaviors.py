@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.policies.behaviors import (
+from astra_data.policies.collecting import (
     MixedBehavior,
     RandomCommands,
     StressCommands,

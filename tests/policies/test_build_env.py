@@ -5,17 +5,19 @@ import pytest
 import torch
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.failures import averages_before
-from astra_data.grounding.grounded_simulator import GroundedSimulator
-from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.failure import FailureModel, FailureShape
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.failures import FailureModel, FailureShape, averages_before
+from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.policies.build_env import Simulation, WorldConfig, data_starts, plus, training_env
-from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
+from astra_data.policies.simulator_env import (
+    Simulation,
+    SimulatorEnv,
+    WorldConfig,
+    data_starts,
+    plus,
+    training_env,
+)
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.point_mass import PointMass
 

@@ -7,7 +7,7 @@ import torch
 from toy_episodes import toy_episodes
 
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.policies.command_limit import command_limit
+from astra_data.policies.simulator_env import command_limit
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.objective import NO_LIMIT
 

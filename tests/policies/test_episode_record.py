@@ -3,7 +3,7 @@ import math
 import torch
 from torch import Tensor
 
-from astra_data.policies.episode_record import EpisodeRecord
+from astra_data.policies.episodes import EpisodeRecord
 
 
 def flags(*values: int) -> Tensor:

@@ -11,9 +11,9 @@ from gymnasium.vector import AutoresetMode
 
 import astra_data.envs
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.grounding.scatter import ScatterModel, ScatterShape
+from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import TASKS

@@ -12,9 +12,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.policies import iql as module
 from astra_data.policies.iql import Experience, Iql, IqlConfig, transitions
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.policy import Policy, PolicyShape
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, PolicyShape, SoftActor
 
 QUICK = IqlConfig(
     critic_updates=300,

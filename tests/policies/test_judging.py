@@ -7,11 +7,10 @@ from rail_run import make_rail_run
 from small_cart import TASK
 
 from astra_data.grounding.files import load_grounding
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.policies import judging
-from astra_data.policies.judging import Judge
-from astra_data.policies.policy_file import PolicyFile, running
-from astra_data.policies.running_policy import RunningPolicy
+from astra_data.grounding.simulator import NO_GROUNDING
+from astra_data.policies import episodes as judging
+from astra_data.policies.episodes import Judge
+from astra_data.policies.running_policy import PolicyFile, RunningPolicy, running
 from astra_data.policies.simulator_env import SimulatorEnv
 
 pytestmark = pytest.mark.usefixtures("quick_failures")

@@ -7,8 +7,7 @@ from torch import nn
 from toy_worlds import ConstantReward, GoToZero
 
 from astra_data.core.seeding import derive
-from astra_data.policies.acting import Acting
-from astra_data.policies.learner import Learner
+from astra_data.policies.learner import Acting, Learner
 
 
 class Noisy(Learner):

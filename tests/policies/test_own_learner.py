@@ -13,12 +13,10 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
 from astra_data.deployment.graph import write_graph
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.policies.own_learner import OwnLearner
-from astra_data.policies.own_policy import KINDS, Array
-from astra_data.policies.policy_file import PolicyFile, add_policy_kind, running
-from astra_data.policies.train import PpoTrainConfig, Training
-from astra_data.policies.watched_env import WatchedEnv
+from astra_data.grounding.simulator import NO_GROUNDING
+from astra_data.policies.gymnasium import WatchedEnv
+from astra_data.policies.running_policy import KINDS, Array, PolicyFile, add_policy_kind, running
+from astra_data.policies.train import PpoTrainConfig, Training, UserLearner
 from astra_data.worlds.task import Task
 
 
@@ -43,7 +41,7 @@ def training(folder: Path, progress: Callable[[float, str], None] = lambda share
     )
 
 
-def driving(command: float, steps: int, seen: list[Array] | None = None) -> OwnLearner:
+def driving(command: float, steps: int, seen: list[Array] | None = None) -> UserLearner:
     def learn(env: WatchedEnv, training: Training) -> Constant:
         env.reset()
         for _ in range(steps // env.num_envs):
@@ -52,7 +50,7 @@ def driving(command: float, steps: int, seen: list[Array] | None = None) -> OwnL
                 seen.append(observation)
         return Constant(command)
 
-    return OwnLearner(learn=learn, policy=Constant)
+    return UserLearner(learn=learn, policy=Constant)
 
 
 @pytest.mark.parametrize(("command", "success"), [(1.0, 1.0), (-1.0, 0.0)])
@@ -96,7 +94,7 @@ def test_prices_grow_as_in_other_trainings(
             scales.append(env.env.env.penalty_scale)  # type: ignore[attr-defined]
         return Constant(command)
 
-    OwnLearner(learn=learn, policy=Constant)(given)
+    UserLearner(learn=learn, policy=Constant)(given)
     assert scales == pytest.approx(expected)
 
 
@@ -115,7 +113,7 @@ def test_its_randomness_is_that_of_the_seed(tmp_path: Path) -> None:
     for seed in (7, 7, 8):
         given = training(tmp_path)
         object.__setattr__(given, "seed", seed)
-        OwnLearner(learn=learn, policy=Constant)(given)
+        UserLearner(learn=learn, policy=Constant)(given)
     assert drawn[0] == drawn[1] != drawn[2]
 
 
@@ -157,7 +155,7 @@ def test_a_hand_written_policy_takes_no_step(tmp_path: Path) -> None:
 
 def test_what_is_not_learned_is_told(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="learn returned a float, expected a Constant"):
-        OwnLearner(learn=lambda env, training: 1.0, policy=Constant)(training(tmp_path))  # type: ignore[arg-type, return-value]
+        UserLearner(learn=lambda env, training: 1.0, policy=Constant)(training(tmp_path))  # type: ignore[arg-type, return-value]
 
 
 def test_a_kind_of_the_package_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

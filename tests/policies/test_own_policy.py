@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.policies.own_policy import Array, OwnPolicy
+from astra_data.policies.running_policy import Array, UserPolicy
 
 
 class Doubling:
@@ -15,7 +15,7 @@ class Doubling:
 
 
 def test_it_acts_in_batches_within_the_bounds_and_remembers_nothing() -> None:
-    policy = OwnPolicy(Doubling(), observation_size=3, action_size=2)
+    policy = UserPolicy(Doubling(), observation_size=3, action_size=2)
     observation = torch.tensor([[0.1, -0.2, 9.0], [0.3, 4.0, 9.0]])
     hidden = policy.initial_hidden(2)
     features, after = policy.remember(observation, torch.zeros(2, 2), hidden)
@@ -44,4 +44,4 @@ def test_what_is_no_policy_is_answered_by_a_line(act: Any, message: str) -> None
             self.act = act
 
     with pytest.raises(BadInputError, match=message):
-        OwnPolicy(Mine(), 3, 2).act(torch.ones(2, 3))
+        UserPolicy(Mine(), 3, 2).act(torch.ones(2, 3))

@@ -7,17 +7,16 @@ from constant_policy import Constant
 from small_cart import TASK
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.policies.build_env import Simulation, WorldConfig
-from astra_data.policies.own_policy import OwnPolicy
-from astra_data.policies.own_world import own_world, reached_in_own_world
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.grounding.simulator import NO_GROUNDING
+from astra_data.policies.episodes import own_world, reached_in_own_world
+from astra_data.policies.running_policy import PolicyFile, UserPolicy
+from astra_data.policies.simulator_env import Simulation, WorldConfig
 
 SIMULATION = Simulation(WorldConfig())
 
 
 def constant(command: float, simulation: Simulation = SIMULATION) -> PolicyFile:
-    return PolicyFile(OwnPolicy(Constant(command), 2, 1), simulation, None, None)
+    return PolicyFile(UserPolicy(Constant(command), 2, 1), simulation, None, None)
 
 
 def test_what_it_reaches_is_what_the_simulator_s_rule_says() -> None:
@@ -34,7 +33,7 @@ def test_what_it_reaches_is_what_the_simulator_s_rule_says() -> None:
 
 
 def test_a_policy_that_knows_no_simulator_cannot_be_tried() -> None:
-    trained = PolicyFile(OwnPolicy(Constant(1.0), 2, 1), None, None, None)
+    trained = PolicyFile(UserPolicy(Constant(1.0), 2, 1), None, None, None)
     with pytest.raises(BadInputError, match=r"tries: expected a policy that knows its simulator"):
         reached_in_own_world(TASK, trained, NO_GROUNDING, seed=0)
 

@@ -8,15 +8,13 @@ from toy_episodes import no_episodes
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.errors import BadInputError
+from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.files import save_grounding
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.alignment import TargetEncoder
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.policies.build_env import Simulation, WorldConfig
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.adaptation import AdaptiveShape, Student
-from astra_data.policies.own_policy import KINDS, OwnPolicy
-from astra_data.policies.policy_file import PolicyFile, running
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, Student
+from astra_data.policies.running_policy import KINDS, PolicyFile, UserPolicy, running
+from astra_data.policies.simulator_env import Simulation, WorldConfig
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
 
@@ -103,7 +101,10 @@ def test_networks_that_could_not_be_read_again_are_not_written(tmp_path: Path) -
 def test_what_a_policy_of_another_learner_saves_and_asks_for_is_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, made = tmp_path / "policy.safetensors", PolicyFile(OwnPolicy(Constant(0.5), 3, 1), None, None, None)
+    path, made = (
+        tmp_path / "policy.safetensors",
+        PolicyFile(UserPolicy(Constant(0.5), 3, 1), None, None, None),
+    )
     monkeypatch.setitem(KINDS, Constant.kind, Constant)
     monkeypatch.setattr(Constant, "to_file", lambda self: ({"command": np.ones(1)}, {"unit": "none"}))
     with pytest.raises(BadInputError, match=r"^Constant.to_file: 'command' is a ndarray, expected a torch"):

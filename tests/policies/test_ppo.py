@@ -11,7 +11,7 @@ from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, train, whol
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies import ppo as module
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo, PpoConfig, generalized_advantages
 from astra_data.worlds.batched import BatchedEnv
 

@@ -1,6 +1,6 @@
 import pytest
 
-from astra_data.policies.ramp import is_mastered, penalty_scale
+from astra_data.policies.learner import is_mastered, penalty_scale
 
 
 def curve(*successes: float | None) -> list[dict[str, float | None]]:

@@ -5,7 +5,7 @@ import torch
 from fake_dataset import writer
 
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
-from astra_data.policies.recorded_range import RecordedRange
+from astra_data.policies.episodes import RecordedRange
 from astra_data.worlds.commands import Commands
 
 LIMITS = Commands({"v": (-1.0, 3.0), "w": (-2.0, 2.0)})

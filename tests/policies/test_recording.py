@@ -8,7 +8,7 @@ from small_cart import TASK, Last
 
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, DONE, SUCCESS, TERMINATED, TRUNCATED, Episode
-from astra_data.policies.recording import _step, record
+from astra_data.policies.collecting import _step, record
 
 
 def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:

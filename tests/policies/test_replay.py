@@ -1,7 +1,7 @@
 import torch
 from toy_worlds import GoToZero
 
-from astra_data.policies.replay import Replay
+from astra_data.policies.sac import Replay
 
 ROWS = 3
 

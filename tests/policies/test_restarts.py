@@ -14,13 +14,10 @@ from toy_episodes import toy_episodes
 
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.policies.own_learner import OwnLearner
-from astra_data.policies.own_policy import KINDS, OwnPolicy
-from astra_data.policies.own_world import Reached
-from astra_data.policies.policy_file import PolicyFile
-from astra_data.policies.restarts import _masters, with_restarts
-from astra_data.policies.train import PpoTrainConfig, Training
+from astra_data.grounding.simulator import NO_GROUNDING
+from astra_data.policies.episodes import Reached
+from astra_data.policies.running_policy import KINDS, PolicyFile, UserPolicy
+from astra_data.policies.train import PpoTrainConfig, Training, UserLearner, _masters, with_restarts
 
 SEEDS = [7, derive(7, "try 1"), derive(7, "try 2")]
 
@@ -61,14 +58,14 @@ def restarted(
         folder=folder,
         progress=progress,
     )
-    learner = OwnLearner(learn=learn, policy=Constant)
+    learner = UserLearner(learn=learn, policy=Constant)
 
     def timed(given: Training) -> tuple[PolicyFile, dict[str, Any]]:
         kept, curve = learner(given)
         return kept, curve | ({"wall_seconds": 2.0 * len(seeds), "cpu_seconds": len(seeds)} if clocks else {})
 
     kept, curve = with_restarts(timed, training, None)
-    assert isinstance(kept, PolicyFile) and isinstance(kept.policy, OwnPolicy)
+    assert isinstance(kept, PolicyFile) and isinstance(kept.policy, UserPolicy)
     return kept.policy.acting.command, curve, seeds  # type: ignore[attr-defined]
 
 
@@ -122,13 +119,13 @@ def test_a_grounding_is_read_again_only_to_test_on_the_cpu_what_is_trained_elsew
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, tries: int, read: int
 ) -> None:
     grounding_at, given = Mock(), list[object]()
-    monkeypatch.setattr("astra_data.policies.restarts.grounding_at", grounding_at)
+    monkeypatch.setattr("astra_data.policies.train.grounding_at", grounding_at)
 
     def tested(task: Any, policy: Any, grounding: object, seed: int) -> Reached:  # noqa: ANN401
         given.append(grounding)
         return Reached(1.0, 1.0)
 
-    monkeypatch.setattr("astra_data.policies.restarts.reached_in_own_world", tested)
+    monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", tested)
     kept: Any = Mock()
     monkeypatch.setattr(PolicyFile, "load", Mock())
     training: Any = Training(
@@ -155,7 +152,7 @@ def test_all_tries_meet_the_same_starts_and_goals(tmp_path: Path, monkeypatch: p
         seeds.append(seed)
         return Reached(0.0, 40.0)
 
-    monkeypatch.setattr("astra_data.policies.restarts.reached_in_own_world", tested)
+    monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", tested)
     restarted(tmp_path, [-1.0, -0.9], tries=2)
     assert seeds == [7, 7]
 

@@ -3,7 +3,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from astra_data.policies.return_scale import ReturnScale
+from astra_data.policies.ppo import ReturnScale
 
 
 def test_rewards_are_scaled_as_by_stable_baselines() -> None:

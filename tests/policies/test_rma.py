@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from toy_worlds import Slope, train, whole_and_resumed
 
 from astra_data.core.errors import BadInputError
-from astra_data.policies.networks.adaptation import AdaptiveShape, Student, Teacher
+from astra_data.policies.networks import AdaptiveShape, Student, Teacher
 from astra_data.policies.rma import Adaptation, RmaConfig
 
 HISTORY = 40

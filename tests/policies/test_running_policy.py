@@ -8,9 +8,9 @@ from small_cart import Reach
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.networks.alignment import TargetEncoder
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.policies.simulator_env import policy_observation
 from astra_data.robots.registry import TASKS

@@ -9,8 +9,7 @@ from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, train, whol
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies import sac as module
-from astra_data.policies.networks.policy import PolicyShape, features_of
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.networks import PolicyShape, SoftActor, features_of
 from astra_data.policies.sac import Sac, SacConfig
 from astra_data.worlds.batched import BatchedEnv
 

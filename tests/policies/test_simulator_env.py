@@ -3,11 +3,10 @@ from typing import Any
 import pytest
 import torch
 
-from astra_data.grounding.grounded_simulator import GroundedSimulator
-from astra_data.grounding.networks.failure import FailureModel, FailureShape
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.failures import FailureModel, FailureShape
+from astra_data.grounding.history import GroundedSimulator
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator
 from astra_data.policies.simulator_env import DataStarts, SimulatorEnv, policy_observation
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE

@@ -8,17 +8,14 @@ import torch
 from constant_policy import Constant
 from small_cart import TASK, Last
 
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.policies.build_env import Simulation, WorldConfig
-from astra_data.policies.own_policy import OwnPolicy
-from astra_data.policies.own_world import own_world
-from astra_data.policies.policy_file import PolicyFile, running
-from astra_data.policies.recorded_range import RecordedRange
-from astra_data.policies.simulator_episodes import in_simulator, started
+from astra_data.grounding.simulator import NO_GROUNDING
+from astra_data.policies.episodes import RecordedRange, in_simulator, own_world, started
+from astra_data.policies.running_policy import PolicyFile, UserPolicy, running
+from astra_data.policies.simulator_env import Simulation, WorldConfig
 
 SIMULATION = Simulation(WorldConfig())
 SPEED = 4.0
-FORWARD = PolicyFile(OwnPolicy(Constant(1.0), 2, 1), SIMULATION, None, None)
+FORWARD = PolicyFile(UserPolicy(Constant(1.0), 2, 1), SIMULATION, None, None)
 
 
 def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:

@@ -12,12 +12,11 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
-from astra_data.policies import suboptimal
-from astra_data.policies.networks.actor_critic import ActorCritic
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies import collecting as suboptimal
+from astra_data.policies.collecting import suboptimal_by_ppo, suboptimal_by_sac
+from astra_data.policies.networks import ActorCritic, SoftActor
 from astra_data.policies.ppo import PpoConfig
 from astra_data.policies.sac import SacConfig
-from astra_data.policies.suboptimal import suboptimal_by_ppo, suboptimal_by_sac
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 

@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
+from astra_data.policies.episodes import ObservedTargetEnv, TargetStarts
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.running_policy import Observed, RunningPolicy
-from astra_data.policies.target_env import ObservedTargetEnv, TargetStarts
 from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]

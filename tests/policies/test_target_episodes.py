@@ -6,9 +6,7 @@ from small_cart import TASK, Cart, Last
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.policies.recorded_range import RecordedRange
-from astra_data.policies.simulator_episodes import Act
-from astra_data.policies.target_episodes import in_target
+from astra_data.policies.episodes import Act, RecordedRange, in_target
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 

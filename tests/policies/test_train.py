@@ -13,24 +13,19 @@ from toy_worlds import GoToZero
 
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.policies.acting import Acting
-from astra_data.policies.build_env import WorldConfig
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.policy import PolicyShape
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
+from astra_data.policies.learner import Acting, lately
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.sac import Sac
-from astra_data.policies.simulator_env import RewardSource
+from astra_data.policies.simulator_env import RewardSource, WorldConfig
 from astra_data.policies.train import (
     AnyTrainConfig,
     InSimulator,
     PpoTrainConfig,
     SacTrainConfig,
     Training,
-    lately,
     learner_of,
     optimize,
     train_in,

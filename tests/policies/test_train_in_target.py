@@ -6,10 +6,9 @@ import torch
 from toy_episodes import toy_episodes
 
 from astra_data.core.progress import silent
-from astra_data.grounding.raw import NO_GROUNDING
-from astra_data.policies import train_in_target
-from astra_data.policies.train import PpoTrainConfig, Training
-from astra_data.policies.train_in_target import InTarget, TargetConfig
+from astra_data.grounding.simulator import NO_GROUNDING
+from astra_data.policies import train as train_in_target
+from astra_data.policies.train import InTarget, PpoTrainConfig, TargetConfig, Training
 from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from toy_walks import FPS, piece
 
-from astra_data.grounding.networks.grounding import LossWeights
+from astra_data.grounding.model import LossWeights
 from astra_data.studies.histories import HistoryModel
 from astra_data.studies.rollouts import rollout
 from astra_data.studies.sequences import Sequences, StepsConfig, Stretch

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from small_cart import TASK, Cart, Reach
 
 from astra_data.core.errors import BadInputError
-from astra_data.policies.target_episodes import in_target
+from astra_data.policies.episodes import in_target
 from astra_data.worlds.robot import RobotEnv
 
 

@@ -19,9 +19,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from astra_data.core.config import load_recipe
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.pipeline.recipe import Recipe
 from astra_data.policies import ppo
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SeededSimulatorEnv, SingleEnv

@@ -12,7 +12,7 @@ import torch
 import typer
 from stable_baselines3 import SAC
 
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.gymnasium import BatchedVectorEnv, SeededSimulatorEnv
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.stable_baselines import StableBaselinesEnv

@@ -14,12 +14,11 @@ from astra_data.core.digest import file_digest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
+from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
 from astra_data.grounding.descent import Descent, WindowedConfig
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, load_history_model, save_target_encoder
-from astra_data.grounding.networks.alignment import TargetEncoder, gaussian_mmd
-from astra_data.grounding.networks.grounding import GroundingModel
-from astra_data.grounding.networks.paired_windows import PairedWindows
-from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.model import GroundingModel
+from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 from astra_data.reports.artifacts import METRICS
 
 _MEASURED_EVERY = 100

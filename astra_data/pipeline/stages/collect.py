@@ -18,7 +18,7 @@ from astra_data.dataset.columns import OUTCOME_COLUMNS
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import home_of
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
-from astra_data.policies.behaviors import (
+from astra_data.policies.collecting import (
     Behavior,
     HoldTimes,
     MixedBehavior,
@@ -27,9 +27,9 @@ from astra_data.policies.behaviors import (
     StressCommands,
     WallWatch,
     held_steps,
+    record,
 )
-from astra_data.policies.policy_file import POLICY, PolicyFile, running
-from astra_data.policies.recording import record
+from astra_data.policies.running_policy import POLICY, PolicyFile, running
 from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
 
@@ -249,7 +249,7 @@ def _behavior(
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):
         return _random(task, config, commands), {}
     if config.behavior.startswith("suboptimal"):
-        from astra_data.policies.suboptimal import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - slow to import
+        from astra_data.policies.collecting import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - slow to import
 
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)

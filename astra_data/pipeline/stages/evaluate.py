@@ -32,18 +32,20 @@ from astra_data.grounding.files import (
     load_grounding,
     load_target_encoder,
 )
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.policies.own_policy import OwnPolicy
-from astra_data.policies.own_world import own_world
-from astra_data.policies.policy_file import POLICY, PolicyFile, running
-from astra_data.policies.recorded_range import RecordedRange
-from astra_data.policies.running_policy import EncoderKind
+from astra_data.policies.episodes import (
+    Act,
+    Begin,
+    RecordedRange,
+    in_simulator,
+    in_target,
+    own_world,
+    started,
+)
+from astra_data.policies.running_policy import POLICY, EncoderKind, PolicyFile, UserPolicy, running
 from astra_data.policies.simulator_env import SimulatorEnv
-from astra_data.policies.simulator_episodes import Act, Begin, in_simulator, started
-from astra_data.policies.target_episodes import in_target
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES
 from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
@@ -209,7 +211,7 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
         aligned = replace(source, target_encoder=encoder)
         robots["target"] = partial(started, aligned, aligned.act)
         headline = config.encoder or ("target" if encoder.is_deployed else "source")
-    facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, OwnPolicy) else {}
+    facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, UserPolicy) else {}
     facts |= {
         "encoder": headline,
         "dataset_version": trained.dataset,

@@ -14,10 +14,9 @@ from astra_data.core.naming import base_method
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.grounding.files import GROUNDING, load_grounding, save_grounding
+from astra_data.grounding.files import GROUNDING, check_step, fitted, load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
-from astra_data.grounding.open_loop_error import gap_report
-from astra_data.grounding.own_grounding import check_step, fitted
+from astra_data.grounding.open_loop import gap_report
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import is_of_package, method_named
 from astra_data.reports.artifacts import GAP, METRICS, Metrics

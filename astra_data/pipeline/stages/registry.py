@@ -17,7 +17,7 @@ from astra_data.pipeline.stages.report import ReportConfig, report
 from astra_data.pipeline.stages.select import SelectConfig, select
 from astra_data.pipeline.stages.subset import subset
 from astra_data.pipeline.stages.train import train
-from astra_data.policies.policy_file import POLICY
+from astra_data.policies.running_policy import POLICY
 from astra_data.policies.train import AnyTrainConfig
 from astra_data.reports.artifacts import EVALUATION
 from astra_data.reports.choice import SELECTED

@@ -25,9 +25,8 @@ from astra_data.dataset.meta_files import read_description
 from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as, method_named
-from astra_data.policies.judging import Judge
-from astra_data.policies.policy_file import POLICY, PolicyFile, running
-from astra_data.policies.running_policy import RunningPolicy
+from astra_data.policies.episodes import Judge
+from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
 from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, select_page
 from astra_data.reports.runs import Reported
 from astra_data.robots.registry import task_named

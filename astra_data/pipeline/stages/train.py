@@ -16,9 +16,8 @@ from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
-from astra_data.policies.policy_file import POLICY, PolicyFile
-from astra_data.policies.restarts import with_restarts
-from astra_data.policies.train import Learn, PpoTrainConfig, SacTrainConfig, Training
+from astra_data.policies.running_policy import POLICY, PolicyFile
+from astra_data.policies.train import Learn, PpoTrainConfig, SacTrainConfig, Training, with_restarts
 from astra_data.reports.artifacts import CURVE
 from astra_data.robots.registry import task_named
 
@@ -140,5 +139,5 @@ def _learned(learn: Learn, training: Training) -> tuple[PolicyFile, dict[str, An
     raise BadInputError(
         f"learn returned {' and '.join(type(part).__name__ for part in parts) or 'nothing'}: expected a "
         "PolicyFile and a dict of the learning curve; one that returns a policy of another learner is given "
-        "to an OwnLearner"
+        "to an UserLearner"
     )

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from astra_data.methods.method import Method
-from astra_data.policies.own_learner import OwnLearner
+from astra_data.policies.train import UserLearner
 
 REACH_M = 0.045  # from the gripper's axis to the puck's
 
@@ -38,5 +38,5 @@ METHOD = Method(
     title="Script",
     role="ceiling",
     color="#555555",
-    learn=OwnLearner(learn=lambda env, training: Script(), policy=Script),
+    learn=UserLearner(learn=lambda env, training: Script(), policy=Script),
 )

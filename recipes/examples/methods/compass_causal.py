@@ -13,8 +13,8 @@ from torch.nn.functional import elu
 from astra_data.core.config import AtOnce, Config, Count
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
-from astra_data.grounding.open_loop_error import distances
-from astra_data.grounding.raw import NoGrounding
+from astra_data.grounding.open_loop import distances
+from astra_data.grounding.simulator import NoGrounding
 from astra_data.methods.method import Method, Table
 from astra_data.worlds.variation import Variation
 

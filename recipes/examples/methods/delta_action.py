@@ -10,8 +10,7 @@ import torch
 from torch.nn import GRU, Linear
 
 from astra_data.core.config import AtOnce, Config
-from astra_data.grounding.protocols import FittedGrounding
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
 from astra_data.methods.method import Method, Table
 
 NUDGE = 0.05

@@ -12,8 +12,7 @@ from torch.nn.functional import leaky_relu
 from astra_data.core.config import AtOnce, Config, Count
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive, generator
-from astra_data.grounding.protocols import FittedGrounding
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
 from astra_data.methods.method import Method, Table
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from astra_data.grounding.protocols import FittedGrounding
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
 from astra_data.methods.method import Method
 
 MEMBERS, HIDDEN = 5, 64

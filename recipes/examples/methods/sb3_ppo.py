@@ -5,10 +5,10 @@ from gymnasium.spaces import Box
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from astra_data.methods.astra import NAS
 from astra_data.methods.method import Method
-from astra_data.methods.nas import NAS
-from astra_data.policies.own_learner import OwnLearner
 from astra_data.policies.stable_baselines import StableBaselinesEnv
+from astra_data.policies.train import UserLearner
 
 
 class Sb3Policy:
@@ -52,5 +52,5 @@ METHOD = Method(
     color="#7F7F7F",
     fit=NAS.fit,
     grounded_as="nas",
-    learn=OwnLearner(learn=learn, policy=Sb3Policy),
+    learn=UserLearner(learn=learn, policy=Sb3Policy),
 )

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from astra_data.deployment.folder import deploy
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.running_policy import PolicyFile
 
 TASK = f"{Path(__file__).parents[2] / 'small_cart.py'}:TASK"
 

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.grounding.networks.alignment import TargetEncoder, gaussian_mmd
-from astra_data.grounding.networks.history import PositionFeatures
+from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
+from astra_data.grounding.encoder import PositionFeatures
 from astra_data.pipeline.stages.align import _BANDWIDTHS
 
 

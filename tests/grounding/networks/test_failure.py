@@ -5,14 +5,14 @@ import torch
 from torch import Tensor
 from toy_episodes import toy_episodes
 
-from astra_data.grounding.networks.failure import (
+from astra_data.grounding.failures import (
     AHEAD_S,
     AVERAGED_S,
     FAILURE_STEPS,
     FailureModel,
     FailureShape,
 )
-from astra_data.grounding.networks.paired_windows import PairedWindows
+from astra_data.grounding.paired_episodes import PairedWindows
 from astra_data.worlds.plane.mazes import U_MAZE
 
 TIMESTEP_S = 0.05

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape, LossWeights
-from astra_data.grounding.networks.paired_windows import PairedWindows
+from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
+from astra_data.grounding.paired_episodes import PairedWindows
 
 NAS = LossWeights(latent=0.0, reward=0.0, state=1.0)
 LATENT_ALONE = LossWeights(latent=1.0, reward=0.0, state=0.0)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape, LossWeights
-from astra_data.grounding.networks.paired_windows import PairedWindows
+from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
+from astra_data.grounding.paired_episodes import PairedWindows
 
 NOTHING = LossWeights(latent=0.0, reward=0.0, state=0.0)
 EPISODES, STEPS = 3, 7

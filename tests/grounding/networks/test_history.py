@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from astra_data.grounding.networks.history import HistoryEncoder, PositionFeatures, mlp
+from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, mlp
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 import torch
 from torch import nn
 
-from astra_data.grounding.networks.scales import add_scales, take_scales
+from astra_data.grounding.encoder import add_scales, take_scales
 
 
 def test_scales_are_those_of_the_values_and_plain_without_any() -> None:

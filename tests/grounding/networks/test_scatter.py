@@ -3,7 +3,7 @@ import math
 import torch
 from torch.distributions import Normal
 
-from astra_data.grounding.networks.scatter import ScatterModel, ScatterShape
+from astra_data.grounding.scatter import ScatterModel, ScatterShape
 
 INPUTS = torch.tensor([[0.3, -1.2], [2.0, 0.5], [-0.4, 0.1]])
 

@@ -13,10 +13,10 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
+from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
 from astra_data.grounding.files import load_history_model, load_target_encoder, save_grounding
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.networks.alignment import TargetEncoder, gaussian_mmd
-from astra_data.grounding.networks.grounding import GroundingModel, GroundingShape
+from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.pipeline.stages.align import align
 

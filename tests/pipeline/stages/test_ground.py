@@ -12,10 +12,9 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
 from astra_data.grounding import fit as stage
-from astra_data.grounding.diagnostics import telemetry
 from astra_data.grounding.files import load_history_model
-from astra_data.grounding.networks.grounding import LossWeights
-from astra_data.grounding.open_loop_error import _starts
+from astra_data.grounding.model import LossWeights, telemetry
+from astra_data.grounding.open_loop import _starts
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import add_method
 from astra_data.pipeline.stages.ground import ground

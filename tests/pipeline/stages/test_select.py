@@ -11,7 +11,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.pipeline.stages.select import SelectConfig, benches, judge_of, select
-from astra_data.policies.judging import Judge
+from astra_data.policies.episodes import Judge
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
 

@@ -14,13 +14,10 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import METHODS
 from astra_data.pipeline.stages.train import train
-from astra_data.policies.build_env import Simulation, WorldConfig, plus
-from astra_data.policies.command_limit import command_limit
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.adaptation import Student
-from astra_data.policies.networks.soft_actor import SoftActor
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, SoftActor, Student
 from astra_data.policies.rma import RmaConfig
+from astra_data.policies.running_policy import PolicyFile
+from astra_data.policies.simulator_env import Simulation, WorldConfig, command_limit, plus
 from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, Training
 from astra_data.robots.registry import TASKS
 

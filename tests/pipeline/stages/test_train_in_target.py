@@ -8,8 +8,8 @@ from stopping import Stopped, stop_past
 from astra_data.core.progress import Progress, silent
 from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.stages.train import train
-from astra_data.policies.policy_file import PolicyFile
-from astra_data.policies.train_in_target import TargetConfig
+from astra_data.policies.running_policy import PolicyFile
+from astra_data.policies.train import TargetConfig
 
 CONFIG = TRAIN.model_copy(update={"data_start_share": 0.5, "episode_steps": 1})
 MEMORY = {"target": None, "full_obs": 0}

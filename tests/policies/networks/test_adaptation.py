@@ -2,8 +2,14 @@ from dataclasses import asdict
 
 import torch
 
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape
-from astra_data.policies.networks.adaptation import SHORTEST_HISTORY, AdaptiveShape, Student, Teacher
+from astra_data.policies.networks import (
+    SHORTEST_HISTORY,
+    ActorCritic,
+    ActorCriticShape,
+    AdaptiveShape,
+    Student,
+    Teacher,
+)
 
 SHAPE = AdaptiveShape(3, 2, memory_size=8, hidden_sizes=(16,), extrinsics_size=4, history_length=45)
 

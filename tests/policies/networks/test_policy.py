@@ -2,9 +2,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.policies.networks.actor_critic import ActorCritic, ActorCriticShape, bounded
-from astra_data.policies.networks.policy import Policy, PolicyShape, features_of
-from astra_data.policies.networks.soft_actor import SoftActor
+from astra_data.policies.networks import (
+    ActorCritic,
+    ActorCriticShape,
+    Policy,
+    PolicyShape,
+    SoftActor,
+    bounded,
+    features_of,
+)
 
 OBSERVATION, ACTION = torch.randn(3, 5, 4), torch.randn(3, 5, 2)
 

@@ -24,8 +24,8 @@ from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.pipeline.stages.train import train
-from astra_data.policies.networks.soft_actor import SoftActor
-from astra_data.policies.policy_file import PolicyFile
+from astra_data.policies.networks import SoftActor
+from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.humanoid.model import STANDING
 from astra_data.robots.humanoid.tasks import HUMANOID_TASKS

@@ -14,8 +14,8 @@ from astra_data.core.progress import Progress, silent
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.pipeline.stages.train import train
-from astra_data.policies.policy_file import PolicyFile
 from astra_data.policies.rma import RmaConfig
+from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.humanoid.tasks import HUMANOID_TASKS, RANDOMIZED_ACTIONS, WIDE_RANGES
 from astra_data.robots.registry import TASKS

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from astra_data.core.numbers import normalized
-from astra_data.grounding.networks.history import HistoryEncoder, PositionFeatures
-from astra_data.grounding.networks.scales import add_scales, take_scales
+from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, add_scales, take_scales
 
 LEAST_LATENT_R2 = 0.9
 """Of a target encoder on held-out episodes, to be deployed in place of the source encoder."""

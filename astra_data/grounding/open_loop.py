@@ -1,5 +1,6 @@
 """Open-loop error: how far the raw and the grounded simulator drift from the target under its own actions."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,8 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive, generator
-from astra_data.grounding.moments import Moments
-from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.protocols import Grounding
-from astra_data.grounding.raw import NO_GROUNDING
+from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
+from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
 from astra_data.worlds.task import Task
 
 HORIZONS = (1, 10, 50, 200)
@@ -105,3 +104,68 @@ def _interval(
     means = sums[drawn].sum(1) / counts[drawn].sum(1)
     low, high = np.quantile(means, [0.025, 0.975])
     return mean, float(low), float(high)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """N moments of the episodes in `windows` (E, T, ...): step `first` (N,) of `episode` (N,)."""
+
+    windows: PairedWindows
+    episode: Tensor
+    first: Tensor
+
+    @classmethod
+    def every(cls, windows: PairedWindows, steps: int) -> "Moments":
+        """Return every so many `steps` of whole episodes."""
+        episode, number = windows.mask[:, ::steps].nonzero(as_tuple=True)
+        return cls(windows, episode, number * steps)
+
+    def __len__(self) -> int:
+        """Return their number N."""
+        return len(self.first)
+
+    @property
+    def state(self) -> Tensor:
+        """φ(s_i), (N, X)."""
+        return self.windows.state[self.episode, self.first]
+
+    @property
+    def previous_action(self) -> Tensor:
+        """a_{i-1}, (N, A)."""
+        return self.windows.previous_action[self.episode, self.first]
+
+    def start(self, simulator: EpisodeSimulator, hidden: Tensor | None) -> None:
+        """Start a row of `simulator` at each, with what a grounding remembers of the history, (N, H)."""
+        simulator.start(
+            self.state,
+            torch.arange(len(self), device=self.first.device),
+            self.windows.goal[self.episode, self.first],
+            hidden=hidden,
+            previous_action=self.previous_action,
+        )
+
+    def action(self, count: int) -> Tensor:
+        """Return the commands (N, A) of the steps that come `count` later."""
+        return self.windows.action[self.episode, self.after(count)]
+
+    def after(self, count: int) -> Tensor:
+        """Return the steps (N,) that come `count` later; the last of T where there is none."""
+        return (self.first + count).clamp_max(self.windows.mask.shape[1] - 1)
+
+
+@torch.no_grad()
+def replay_open_loop(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> Tensor:
+    """Replay whole `episodes` in the simulator of `task` as `grounding` corrects it, without scatter.
+
+    Returns:
+        φ(s_0) and where each of T steps ended, (E, T + 1, X); what comes after an episode is void.
+    """
+    windows, device = episodes.windows, str(episodes.windows.state.device)
+    torch.manual_seed(derive(seed, "open-loop replay"))
+    episode = torch.arange(len(episodes), device=device)
+    moments = Moments(windows, episode, torch.zeros_like(episode))
+    simulator = grounding.for_replay().simulator(task, len(moments), device)
+    moments.start(simulator, None)
+    states = [moments.state]
+    states += [simulator.step(moments.action(step)) for step in range(windows.mask.shape[1])]
+    return torch.stack(states, dim=1)

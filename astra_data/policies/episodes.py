@@ -1,0 +1,403 @@
+"""Outcomes of N episodes that are run side by side."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.progress import Progress, silent
+from astra_data.core.seeding import derive
+from astra_data.dataset.columns import ACTION
+from astra_data.dataset.reader import Dataset
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.simulator import Grounding
+from astra_data.policies.running_policy import (
+    Observed,
+    PolicyFile,
+    RunningPolicy,
+    running,
+    target_observation,
+)
+from astra_data.policies.simulator_env import Simulation, SimulatorEnv, training_env
+from astra_data.worlds.batched import Step
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.task import Task
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcomes of N episodes: a list per quantity, and every path.
+
+    Attributes:
+        success: 1 or 0.
+        failed: 1 or 0.
+        wall_contact: share of the steps.
+        steps: until the end.
+        returns: sum of rewards.
+        position: of what moves, (N, T + 1, 2 K) in m, from the start on, NaN after the end.
+    """
+
+    success: list[float]
+    failed: list[float]
+    wall_contact: list[float]
+    steps: list[int]
+    returns: list[float]
+    position: Tensor
+
+    def to_json(self) -> dict[str, list[float]]:
+        """Return the lists by name."""
+        return {
+            "success": self.success,
+            "failed": self.failed,
+            "wall_contact": self.wall_contact,
+            "steps": [float(steps) for steps in self.steps],
+            "return": self.returns,
+        }
+
+
+class EpisodeRecord:
+    """Record N episodes until each has ended, in success or failure.
+
+    Attributes:
+        active: (N,) bool, not ended yet. total_steps: of all episodes together so far.
+    """
+
+    def __init__(self, position: Tensor) -> None:
+        """Start at `position` (N, 2 K)."""
+        count = len(position)
+        self.active = torch.ones(count, dtype=torch.bool)
+        self.total_steps = 0
+        self._success, self._failed, self._contact, self._steps, self._return = torch.zeros(5, count)
+        self._positions = [position.clone()]
+
+    def add(self, position: Tensor, reward: Tensor, success: Tensor, failed: Tensor, contact: Tensor) -> None:
+        """Add one step; rows of ended episodes are ignored."""
+        active = self.active
+        self._success += success & active
+        self._failed += failed & active
+        self._contact += contact & active
+        self._steps += active
+        self._return += torch.where(active, reward, 0.0)
+        self._positions.append(torch.where(active.unsqueeze(-1), position, torch.nan))
+        self.total_steps += int(active.sum())
+        self.active = active & ~success & ~failed
+
+    def outcome(self) -> Outcome:
+        """Return the outcomes so far."""
+        return Outcome(
+            success=self._success.tolist(),
+            failed=self._failed.tolist(),
+            wall_contact=(self._contact / self._steps).tolist(),
+            steps=self._steps.long().tolist(),
+            returns=self._return.tolist(),
+            position=torch.stack(self._positions, dim=1),
+        )
+
+
+TOLERANCE = 0.01
+"""Share of the recorded range by which a command may be beyond it."""
+
+
+class RecordedRange:
+    """Counts the steps in which any of A commands lies beyond what was recorded."""
+
+    def __init__(self, least: Tensor, largest: Tensor, limits: Commands) -> None:
+        """Take the range `least` to `largest`, both (A,), in the units of `limits`."""
+        margin = TOLERANCE * (largest - least)
+        self._least, self._largest, self._limits = least - margin, largest + margin, limits
+        self._steps = self._beyond = 0
+
+    @classmethod
+    def of(cls, dataset: Path, limits: Commands) -> Self | None:
+        """Return the range in a dataset; None if it cannot be read any more."""
+        try:
+            statistics = Dataset.open(dataset).statistics()
+        except AstraDataError:
+            return None
+        if isinstance(statistics, str):
+            return None
+        least, largest = (
+            torch.from_numpy(np.asarray(statistics[ACTION][end], np.float32)) for end in ("min", "max")
+        )
+        return cls(least, largest, limits)
+
+    def count(self, action: Tensor, active: Tensor) -> None:
+        """Count a step with actions of ±1 (B, A), of the robots in `active` (B,)."""
+        command = self._limits.in_units(action)
+        beyond = ((command < self._least) | (command > self._largest)).any(dim=-1)
+        self._steps += int(active.sum())
+        self._beyond += int((beyond & active).sum())
+
+    @property
+    def share(self) -> float:
+        """The share of the steps so far that were beyond."""
+        return self._beyond / self._steps
+
+
+Act = Callable[[Tensor, Tensor], Tensor]
+Begin = Callable[[Tensor], Act]
+"""Given the goals (N, G) of new episodes, returns the function that acts in them."""
+
+
+def started(policy: RunningPolicy, act: Act, goal: Tensor) -> Act:
+    """Start a policy in as many episodes as there are goals (N, G), and return its `act`."""
+    policy.start(len(goal))
+    return act
+
+
+@torch.no_grad()
+def in_simulator(
+    world: SimulatorEnv, begin: Begin, horizon: int, seed: int, asked: RecordedRange | None = None
+) -> tuple[Outcome, dict[str, Tensor]]:
+    """Run an episode in each row of `world`; `asked` counts commands beyond what was recorded.
+
+    Returns:
+        the outcome, and the starts and goals, which are the same in every simulator.
+    """
+    torch.manual_seed(seed)
+    world.reset()
+    act = begin(world.goal)
+    record = EpisodeRecord(world.objective.places(world.simulator.state))
+    start_goal = {"start": world.objective.places(world.simulator.state).clone(), "goal": world.goal.clone()}
+    for number in range(horizon):
+        action = act(world.simulator.state, world.goal)
+        if asked is not None:
+            asked.count(action, record.active)
+        step = world.step(action)
+        success = world.objective.succeeded(step.success, world.failed, number + 1)
+        blocked = world.simulator.blocked
+        places = world.objective.places(world.simulator.state)
+        record.add(places, step.reward, success, world.failed, blocked)
+        if not record.active.any():
+            break
+    return record.outcome(), start_goal
+
+
+@dataclass(frozen=True)
+class TargetStarts:
+    """Moments of recorded episodes to start from.
+
+    Attributes:
+        state: s_i, (N, S). goal: (N, G).
+    """
+
+    state: Tensor
+    goal: Tensor
+
+    @classmethod
+    def of(cls, episodes: PairedEpisodes) -> "TargetStarts":
+        """Return every step of `episodes`."""
+        state, goal = episodes.target_state, episodes.windows.goal
+        return cls(episodes.steps(state).cpu(), episodes.steps(goal).cpu())
+
+
+class ObservedTargetEnv:
+    """B target environments whose observation (B, O) is made of their state and the goal.
+
+    The physics runs on the CPU, whatever the device of observations and actions. All randomness comes from
+    torch's global generator.
+
+    Attributes:
+        penalty_scale: without effect, as there are no penalties here.
+    """
+
+    penalty_scale = 1.0
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        *,
+        observed: Observed = "abstract",
+        starts: TargetStarts | None = None,
+        data_start_share: float = 0.0,
+        device: str = "cpu",
+        num_threads: int | None = None,
+    ) -> None:
+        """Build B environments.
+
+        Args:
+            task: the task.
+            num_envs: B.
+            observed: whether φ of the state is observed, or the full state.
+            starts: recorded moments to start from.
+            data_start_share: share of the episodes that start from `starts`.
+            device: torch device of observations and actions.
+            num_threads: of the physics, by default one per core.
+        """
+        self.num_envs = num_envs
+        self.action_size = task.objective.action_size
+        self._task, self._observed, self._device = task, observed, device
+        self._starts, self._data_start_share = starts, data_start_share
+        self._env = task.target(num_envs, seed=0, num_threads=num_threads)
+        self.observation_size = self._observe().shape[1]
+
+    def reset(self, mask: Tensor | None = None) -> Tensor:
+        """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""
+        anew = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask.cpu()
+        from_data = anew & (torch.rand(self.num_envs) < self._data_start_share)
+        self._env.reseed(int(torch.randint(2**62, ())))
+        self._env.reset(anew & ~from_data)
+        rows = from_data.nonzero().squeeze(1)
+        if self._starts is not None and len(rows):
+            moments = torch.randint(len(self._starts.state), (len(rows),))
+            self._env.goal[rows] = self._starts.goal[moments]
+            self._env.reset_to(rows.numpy(), self._starts.state[moments].numpy().astype(np.float64))
+        return self._observe()
+
+    def step(self, action: Tensor) -> Step:
+        """Apply `action` (B, A), clipped to ±1."""
+        step = self._env.step(action.cpu())
+        reward, terminated, success = (
+            values.to(self._device) for values in (step.reward, step.terminated, step.success)
+        )
+        return Step(self._observe(), reward, terminated, success)
+
+    def _observe(self) -> Tensor:
+        env = self._env
+        return target_observation(self._task, env.state, env.goal, None, self._observed).to(self._device)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all that `load_state_dict` needs to continue from here."""
+        return self._env.state_dict()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
+        """Continue from `state`; return the observations (B, O)."""
+        self._env.load_state_dict({name: values.cpu() for name, values in state.items()})
+        return self._observe()
+
+
+class TargetEpisodes(NamedTuple):
+    """Episodes in the target.
+
+    Attributes:
+        outcome: theirs. filmed: the states (T + 1, S) of the first. rate: target steps/s.
+        start_goal: where they began, "start" (B, 2) or with balls (B, 4), and "goal" (B, G).
+    """
+
+    outcome: Outcome
+    filmed: Tensor
+    rate: float
+    start_goal: dict[str, Tensor]
+
+
+def in_target(
+    task: Task,
+    begin: Begin,
+    episodes: int,
+    seed: int,
+    *,
+    leg_scale: float = 1.0,
+    num_threads: int | None = None,
+    progress: Progress = silent,
+    asked: RecordedRange | None = None,
+) -> TargetEpisodes:
+    """Run so many episodes side by side; starts and goals depend on the seed alone.
+
+    Args:
+        task: with a target.
+        begin: starts the policy.
+        episodes: their number.
+        seed: of the target.
+        leg_scale: factor on the legs' length, of tasks with the fact `leg_scale`: the ant's.
+        num_threads: of the physics, by default one per core; the outcome is the same with any number.
+        progress: called with the fraction done and the speed.
+        asked: counts commands beyond what was recorded.
+
+    Raises:
+        BadInputError: the robot has no legs of another length.
+    """
+    if leg_scale != 1.0 and "leg_scale" not in task.facts:
+        raise BadInputError(
+            f"leg_scale: the robot of {task.name} has one length of legs: expected 1, got {leg_scale:g}"
+        )
+    legs = {} if leg_scale == 1.0 else {"leg_scale": leg_scale}
+    env = task.target(episodes, seed=seed, num_threads=num_threads, **legs)
+    env.reset()
+    start_goal = {"start": env.position.clone(), "goal": env.goal.clone()}
+    act = begin(env.goal)
+    record = EpisodeRecord(env.position)
+    filmed = [env.state[0]]
+    began = time.perf_counter()
+    for step in range(task.objective.horizon):
+        is_filmed = bool(record.active[0])
+        action = act(env.state, env.goal)
+        if asked is not None:
+            asked.count(action, record.active)
+        outcome = env.step(action, record.active)
+        success = task.objective.succeeded(outcome.success, env.failed, step + 1)
+        record.add(env.position, outcome.reward, success, env.failed, env.wall_contact)
+        if is_filmed:
+            filmed.append(env.state[0])
+        rate = record.total_steps / (time.perf_counter() - began)
+        progress((step + 1) / task.objective.horizon * 0.99, f"{rate:,.0f} target steps/s")
+        if not record.active.any():
+            break
+    return TargetEpisodes(record.outcome(), torch.stack(filmed), rate, start_goal)
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A grounding of other episodes, in whose simulator its failure model, if it has one, ends episodes."""
+
+    task: Task
+    grounding: Grounding
+
+    def simulator(self, episodes: int) -> SimulatorEnv:
+        """Return its simulator."""
+        simulator = self.grounding.simulator(self.task, episodes)
+        return SimulatorEnv(self.task.objective, simulator, draws_failures=True)
+
+    def success(self, policy: RunningPolicy, episodes: int, seed: int) -> float:
+        """Return the share of so many episodes in which a policy succeeds; starts and goals are of `seed`."""
+        begin = partial(started, policy, policy.act_in_simulator)
+        outcome, _ = in_simulator(self.simulator(episodes), begin, self.task.objective.horizon, seed)
+        return fmean(outcome.success)
+
+
+_EPISODES = 100
+
+
+def own_world(task: Task, simulation: Simulation, grounding: Grounding, num_envs: int) -> SimulatorEnv:
+    """Build the simulator that a policy was trained in; episodes start where the task does."""
+    return training_env(task, simulation, grounding, num_envs=num_envs, device="cpu")
+
+
+@dataclass(frozen=True)
+class Reached:
+    """What a policy reaches in its own simulator.
+
+    Attributes:
+        success: share of the episodes. steps: mean of those that succeed; the horizon without any.
+    """
+
+    success: float
+    steps: float
+
+
+def reached_in_own_world(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
+    """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions.
+
+    Raises:
+        BadInputError: it does not know that simulator.
+    """
+    if trained.simulation is None:
+        raise BadInputError(
+            "tries: expected a policy that knows its simulator, got one without: give PolicyFile its "
+            "simulation, or set tries = 1"
+        )
+    policy = running(task, trained, grounding)
+    world = own_world(task, trained.simulation, grounding, _EPISODES)
+    begin = partial(started, policy, policy.act_in_simulator)
+    horizon = task.objective.horizon
+    outcome, _ = in_simulator(world, begin, horizon, derive(seed, "trial in its own simulator"))
+    steps = [steps for steps, success in zip(outcome.steps, outcome.success, strict=True) if success]
+    return Reached(fmean(outcome.success), fmean(steps) if steps else float(horizon))

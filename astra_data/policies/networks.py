@@ -1,0 +1,330 @@
+"""The base of all policies: a recurrent memory where observations hold no latent, and a head that acts."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from astra_data.grounding.encoder import HistoryEncoder, mlp
+
+_SMALLEST_SQUASHED = 1e-6 - 1.0
+"""Actions beyond it are taken for it, since the tanh of no number is -1."""
+
+
+@dataclass(frozen=True)
+class PolicyShape:
+    """Sizes of a policy.
+
+    Attributes:
+        observation_size: O. action_size: A. memory_size: M, of the GRU that encodes (observation, previous
+            action); 0 for none, where the observation already holds a latent.
+    """
+
+    observation_size: int
+    action_size: int
+    memory_size: int = 0
+    embedding_size: int = 64
+    hidden_sizes: tuple[int, ...] = (64, 64)
+
+    @property
+    def feature_size(self) -> int:
+        """F, size of the input of the heads: the observation and the memory."""
+        return self.observation_size + self.memory_size
+
+    def new_memory(self) -> HistoryEncoder | None:
+        """Build an untrained memory; None where there is none."""
+        if not self.memory_size:
+            return None
+        return HistoryEncoder(
+            self.observation_size + self.action_size,
+            embedding_size=self.embedding_size,
+            latent_size=self.memory_size,
+        )
+
+
+def features_of(
+    memory: HistoryEncoder | None, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
+) -> Tensor:
+    """Return the features (B, T, F) of `observation` (B, T, O), (B, T, A), from `hidden` (B, M).
+
+    `start` (B, T) is 1 where a new episode begins: there the memory is set to zero.
+    """
+    if memory is None:
+        return observation
+    inputs = torch.cat([observation, previous_action], dim=-1)
+    return torch.cat([observation, memory.latent(memory.through_episodes(inputs, hidden, start))], dim=-1)
+
+
+def gaussian_log_prob(mean: Tensor, std: Tensor, value: Tensor) -> Tensor:
+    """Return the log-density (...) of `value` (..., A) under independent Gaussians (..., A)."""
+    return (((value - mean) / std).square() / -2 - std.log() - math.log(2 * math.pi) / 2).sum(-1)
+
+
+class Policy(nn.Module, ABC):
+    """Acts on observations and its memory of them.
+
+    The memory is an argument and a result, `hidden` (B, M), never kept; without memory M = 0.
+
+    Attributes:
+        squashes: whether actions are the tanh of draws from the Gaussian that `policy` returns.
+    """
+
+    squashes: ClassVar[bool] = False
+
+    def __init__(self, shape: PolicyShape) -> None:
+        super().__init__()
+        self.shape = shape
+        self.memory = shape.new_memory()
+
+    def initial_hidden(self, count: int) -> Tensor:
+        """Return the memory (count, M) at the start of an episode."""
+        return torch.zeros(count, self.shape.memory_size, device=next(self.parameters()).device)
+
+    def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Process one step; return the features (B, F), and the next hidden (B, M)."""
+        if self.memory is None:
+            return observation, hidden
+        hidden = self.memory.step(torch.cat([observation, previous_action], dim=-1), hidden)
+        return torch.cat([observation, self.memory.latent(hidden)], dim=-1), hidden
+
+    def remember_sequence(
+        self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
+    ) -> Tensor:
+        """Return the features (B, T, F) of T steps; see `features_of`."""
+        return features_of(self.memory, observation, previous_action, hidden, start)
+
+    @abstractmethod
+    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return location and scale (..., A) of a Gaussian for `features` (..., F)."""
+
+    def log_prob(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return the log-density (...) of `action` (..., A) for `features` (..., F)."""
+        if not self.squashes:
+            return gaussian_log_prob(*self.policy(features), action)
+        inside = action.clamp(_SMALLEST_SQUASHED, -_SMALLEST_SQUASHED)
+        drawn = gaussian_log_prob(*self.policy(features), inside.atanh())
+        return drawn - torch.log1p(-inside.square()).sum(-1)
+
+    @abstractmethod
+    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the action (..., A), within ±1: the mode, or with `generator` a sample."""
+
+
+@dataclass(frozen=True)
+class ActorCriticShape(PolicyShape):
+    """Sizes of actor and critic, and their actions.
+
+    Attributes:
+        initial_log_std: logarithm of the initial standard deviation.
+    """
+
+    initial_log_std: float = -0.5
+
+
+def bounded(output: Tensor) -> Tensor:
+    """Return the mean actions (..., A) of an actor's `output`, clipped to ±1 with the gradient of the output.
+
+    A tanh is flat far out: once a policy pushes against a wall at full speed, it hardly learns to turn.
+    """
+    return output + (output.clamp(-1.0, 1.0) - output).detach()
+
+
+class ActorCritic(Policy):
+    """Bounded Gaussian mean with a state-independent deviation, and a value."""
+
+    shape: ActorCriticShape
+
+    def __init__(self, shape: ActorCriticShape) -> None:
+        super().__init__(shape)
+        self.actor = mlp((shape.feature_size, *shape.hidden_sizes, shape.action_size), inplace=True)
+        self.critic = mlp((shape.feature_size, *shape.hidden_sizes, 1), inplace=True)
+        self.log_std = nn.Parameter(torch.full((shape.action_size,), shape.initial_log_std))
+        for network, gain in ((self.actor, 0.01), (self.critic, 1.0)):
+            layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+            for layer in layers:
+                nn.init.orthogonal_(layer.weight, 2**0.5)
+                nn.init.zeros_(layer.bias)
+            nn.init.orthogonal_(layers[-1].weight, gain)
+
+    @property
+    def value_layer(self) -> nn.Linear:
+        """The critic's last layer."""
+        layer = self.critic[-1]
+        assert isinstance(layer, nn.Linear)
+        return layer
+
+    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation (..., A) of the action for `features` (..., F)."""
+        return self.gaussian(self.actor(features))
+
+    def gaussian(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation (..., A) of the action for the actor's `output` (..., A)."""
+        mean = bounded(output)
+        return mean, self.log_std.exp().expand_as(mean)
+
+    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the mean action (..., A), or with `generator` a sample that is clipped to ±1."""
+        mean, std = self.policy(features)
+        return mean if generator is None else torch.normal(mean, std, generator=generator).clamp(-1.0, 1.0)
+
+    def value(self, features: Tensor) -> Tensor:
+        """Return the value (...) of `features` (..., F)."""
+        return torch.as_tensor(self.critic(features).squeeze(-1))
+
+
+_SMALLEST_SCALE = 1e-3
+_UNIT_SCALE = math.log(math.e - 1.0)
+"""Its softplus is 1."""
+
+
+class SoftActor(Policy):
+    """A Gaussian whose location and scale both depend on the features; actions are the tanh of samples."""
+
+    squashes = True
+
+    def __init__(self, shape: PolicyShape) -> None:
+        super().__init__(shape)
+        self.actor = mlp((shape.feature_size, *shape.hidden_sizes, 2 * shape.action_size), nn.ReLU)
+
+    def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return location and scale (..., A) of the Gaussian, before the tanh, for `features` (..., F)."""
+        loc, width = self.actor(features).chunk(2, dim=-1)
+        return loc, functional.softplus(width + _UNIT_SCALE) + _SMALLEST_SCALE
+
+    def sample(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw actions (..., A), through which gradients flow; return them and their log-density (...)."""
+        loc, scale = self.policy(features)
+        drawn = loc + scale * torch.randn_like(loc)
+        # log(1 - tanh²), without loss of precision far out.
+        narrowed = 2.0 * (math.log(2.0) - drawn - functional.softplus(-2.0 * drawn))
+        return torch.tanh(drawn), gaussian_log_prob(loc, scale, drawn) - narrowed.sum(-1)
+
+    def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the tanh of the location, (..., A), or with `generator` that of a sample."""
+        loc, scale = self.policy(features)
+        return torch.tanh(loc if generator is None else torch.normal(loc, scale, generator=generator))
+
+
+SHORTEST_HISTORY = 40
+"""Steps that the student's convolutions span."""
+
+
+@dataclass(frozen=True)
+class AdaptiveShape(ActorCriticShape):
+    """Sizes of teacher and student.
+
+    Attributes:
+        extrinsics_size: E. history_length: H, steps that the student's estimate is made from.
+    """
+
+    extrinsics_size: int = 8
+    history_length: int = 50
+
+    @property
+    def feature_size(self) -> int:
+        """F, size of the input of actor and critic: observation, memory and extrinsics."""
+        return super().feature_size + self.extrinsics_size
+
+
+class Teacher(ActorCritic):
+    """Actor and critic that observe the environment's parameters, as the last P values of observations."""
+
+    shape: AdaptiveShape
+
+    def __init__(self, shape: AdaptiveShape, parameter_count: int) -> None:
+        super().__init__(shape)
+        sizes = (parameter_count, *shape.hidden_sizes, shape.extrinsics_size)
+        self.encoder = nn.Sequential(*mlp(sizes), nn.Tanh())
+
+    def extrinsics(self, observation: Tensor) -> Tensor:
+        """Encode the parameters in `observation` (..., O + P); return extrinsics (..., E) in [-1, 1]."""
+        return torch.as_tensor(self.encoder(observation[..., self.shape.observation_size :]))
+
+    def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Process one step `observation` (B, O + P); return features (B, F) and the next hidden (B, M)."""
+        seen = observation[:, : self.shape.observation_size]
+        features, hidden = super().remember(seen, previous_action, hidden)
+        return torch.cat([features, self.extrinsics(observation)], dim=-1), hidden
+
+    def remember_sequence(
+        self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
+    ) -> Tensor:
+        """Return the features (B, T, F) of `observation` (B, T, O + P); see `Policy`."""
+        seen = observation[..., : self.shape.observation_size]
+        features = super().remember_sequence(seen, previous_action, hidden, start)
+        return torch.cat([features, self.extrinsics(observation)], dim=-1)
+
+
+class HistoryEstimate(nn.Module):
+    """Estimate extrinsics from H rows of I values each, with the convolutions of Kumar et al. 2021."""
+
+    def __init__(self, row_size: int, length: int, extrinsics_size: int) -> None:
+        super().__init__()
+        self.length = length
+        self.embedding = nn.Linear(row_size, 32)
+        self.convolutions = nn.Sequential(
+            nn.Conv1d(32, 32, 8, stride=4), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(), nn.Conv1d(32, 32, 5)
+        )
+        moments = (length - SHORTEST_HISTORY) // 4 + 1
+        self.head = nn.Linear(32 * moments, extrinsics_size)
+
+    def forward(self, history: Tensor) -> Tensor:
+        """Return extrinsics (B, E), in [-1, 1], for `history` (B, H * I), the newest row last."""
+        embedded = functional.elu(self.embedding(history.unflatten(-1, (self.length, -1))))
+        seen = functional.elu(self.convolutions(embedded.transpose(1, 2)))
+        return torch.tanh(self.head(seen.flatten(1)))
+
+
+class Student(ActorCritic):
+    """Actor and critic with extrinsics that are estimated from the last H observations and actions.
+
+    The hidden state is the memory (B, M) followed by the history (B, H * (O + A)): each row holds an
+    observation and the action before it, the newest last; rows from before the start are zero.
+    """
+
+    shape: AdaptiveShape
+
+    def __init__(self, shape: AdaptiveShape) -> None:
+        super().__init__(shape)
+        row_size = shape.observation_size + shape.action_size
+        self.adaptation = HistoryEstimate(row_size, shape.history_length, shape.extrinsics_size)
+
+    @classmethod
+    def of_teacher(cls, teacher: Teacher) -> "Student":
+        """Return a student with the teacher's frozen memory, actor and critic, and an untrained estimate."""
+        student = cls(teacher.shape).to(teacher.log_std.device)
+        shared = student.state_dict().keys() & teacher.state_dict().keys()
+        student.load_state_dict({name: teacher.state_dict()[name] for name in shared}, strict=False)
+        student.requires_grad_(False)
+        student.adaptation.requires_grad_(True)
+        return student
+
+    def initial_hidden(self, count: int) -> Tensor:
+        """Return memory and history (count, M + H * (O + A)) at the start of an episode: zeros."""
+        shape = self.shape
+        history = shape.history_length * (shape.observation_size + shape.action_size)
+        return torch.zeros(count, shape.memory_size + history, device=self.log_std.device)
+
+    def remember(self, observation: Tensor, previous_action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Process one step; return the features (B, F), the estimate last, and the next hidden."""
+        memory, history = hidden.tensor_split([self.shape.memory_size], dim=-1)
+        features, memory = super().remember(observation, previous_action, memory)
+        newest = torch.cat([observation, previous_action], dim=-1)
+        history = torch.cat([history[:, newest.shape[1] :], newest], dim=-1)
+        features = torch.cat([features, self.adaptation(history)], dim=-1)
+        return features, torch.cat([memory, history], dim=-1)
+
+    def remember_sequence(
+        self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
+    ) -> Tensor:
+        """Return the features (B, T, F) of T steps, from `hidden`; `start` (B, T) is 1 at new episodes."""
+        features = []
+        for step in range(observation.shape[1]):
+            hidden = hidden * (1.0 - start[:, step, None])
+            seen, hidden = self.remember(observation[:, step], previous_action[:, step], hidden)
+            features.append(seen)
+        return torch.stack(features, dim=1)

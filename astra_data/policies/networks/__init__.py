@@ -1,1 +1,0 @@
-"""Networks. They know no environment and no dataset."""
