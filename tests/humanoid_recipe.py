@@ -24,7 +24,7 @@ rollout_steps = 16
 total_steps = 256
 hidden_sizes = [8]
 memory_size = 8
-data_start_share = 0.5
+tries = 1
 
 [align]
 updates = 10

@@ -69,10 +69,3 @@ def test_logs_become_a_dataset(installed: Path, tmp_path: Path) -> None:
     output_of(program, "inspect", "walks", folder=tmp_path)
     read = "from astra_data import Dataset; print(Dataset.open('datasets/walks/data-1.0.0').lengths)"
     assert output_of(installed / "python", "-c", read, folder=tmp_path).strip() == "[39]"
-
-
-def test_reports_take_no_version_of_pandas_with_which_their_statistics_fail(tmp_path: Path) -> None:
-    if UV is None:
-        pytest.skip("uv looks up what would be installed, and is not on the path")
-    newest = output_of(UV, "pip", "compile", "--extra", "report", ROOT / "pyproject.toml", folder=tmp_path)
-    assert "\npandas==2." in newest and "\narch==7." in newest

@@ -24,7 +24,6 @@ _SURE = 0.1
 _FITS = {
     "r2_state": "state",
     "r2_reward": "reward of steps that go on",
-    "r2_final_reward": "reward of failures",
     "r2_latent": "latent",
 }
 """R² of a grounding's heads, and their titles."""

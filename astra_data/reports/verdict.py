@@ -151,15 +151,12 @@ def _learned(results: Results, row: str) -> str:
 def _causes(results: Results, row: str) -> Iterator[str]:
     """Yield why a method did not learn its own simulator, and what helps."""
     title, grounding = method_title(row), grounded_as(row)
-    names = {"r2_reward": "of steps that go on", "r2_final_reward": "of failures"}
-    found = {name: results.summary(grounding, name, "ground") for name in names}
-    poor = {name: one.mean for name, one in found.items() if one and one.mean < EXPLAINED}
-    if poor:
-        values = listed([f"{value:.2f} {names[name]}" for name, value in poor.items()])
+    explained = results.summary(grounding, "r2_reward", "ground")
+    if explained and explained.mean < EXPLAINED:
         yield (
-            f"{title}: its rewards are predicted poorly on held-out episodes (R² {values}; 1 is perfect, 0 "
-            "is no better than the mean). Record more episodes, above all such as succeed and fail "
-            "(`episodes` of `[collect]`, or more logs)."
+            f"{title}: its rewards are predicted poorly on held-out episodes (R² {explained.mean:.2f}; 1 is "
+            "perfect, 0 is no better than the mean). Record more episodes (`episodes` of `[collect]`, or more "
+            "logs)."
         )
         return
     yield (

@@ -77,7 +77,7 @@ def test_ppo_stops_after_its_steps(tmp_path: Path) -> None:
     assert metadata["learner"]["num_envs"] == 2
     assert metadata["learner"]["hidden_sizes"] == [64, 64]
     assert metadata["learner"]["total_steps"] == 250
-    assert metadata["spent"].keys() == {"wall_seconds", "cpu_seconds"}
+    assert metadata["spent"].keys() == {"wall_seconds", "cpu_seconds", "finished_at"}
 
 
 @pytest.mark.parametrize(("task", "episodes_go_on"), [(MAZE, True), (CART, False)])

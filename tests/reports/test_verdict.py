@@ -33,7 +33,7 @@ def results(
         for seed, one in enumerate(scores)
     ]
     lines += [
-        Line(row=row, seed=0, where="ground", values={"r2_final_reward": value})
+        Line(row=row, seed=0, where="ground", values={"r2_reward": value})
         for row, value in (r2 or {}).items()
     ]
     given = {"recipe": "r", "task": "t", "command": "c", "rows": tuple(target), "episodes": 120}

@@ -80,8 +80,8 @@ def test_the_reward_is_how_much_nearer_the_ball_comes(stretch: Stretch) -> None:
     model = model_of(stretch).grounding
     distance = bounded(stretch.past_seen).norm(dim=-1)
     nearer = (distance[:, :-1] - distance[:, 1:]).flatten()
-    torch.testing.assert_close(model.reward_mean, nearer.mean())
-    torch.testing.assert_close(model.reward_std, nearer.std(correction=0).clamp_min(1e-3))
+    torch.testing.assert_close(model.reward_mean, nearer.mean()[None])
+    torch.testing.assert_close(model.reward_std, nearer.std(correction=0).clamp_min(1e-3)[None])
 
 
 def test_steps_that_are_not_walking_are_not_learned_from(stretch: Stretch) -> None:

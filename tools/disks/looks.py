@@ -19,7 +19,7 @@ Look = Callable[[Path], str | None]
 """Describes what is at a path: None if there is nothing, and "damaged: ..." if it is not whole."""
 
 _OF_THE_MOMENT = re.compile(
-    r"\w*(seconds|per_second|cost)|created|git_commit|packages|machine|meta/astra/dataset.json|\w+\.json"
+    r"\w*(seconds|per_second|cost)|finished_at|created|git_commit|packages|machine|meta/astra/dataset.json|\w+\.json"
 )
 """Keys of JSON files whose values differ from run to run; the last two have the sums of such files."""
 

@@ -21,9 +21,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.core.stopwatch import Stopwatch
-from astra_data.dataset.meta_files import read_description
 from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
-from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import grounded_as, method_named
 from astra_data.policies.episodes import Judge
 from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
@@ -71,18 +69,18 @@ class Bench:
 
     Attributes:
         percent: the size, if there are several. entries: the policies.
-        judges: the seed of each judge → the keys of its grounding and of the dataset it was fitted to.
+        judges: the seed of each judge → the key of its grounding.
     """
 
     percent: int | None
     entries: tuple[Entry, ...]
-    judges: dict[int, tuple[str, str]]
+    judges: dict[int, str]
 
     @property
     def keys(self) -> tuple[str, ...]:
         """The artifacts that are read, each once."""
         read = [key for one in self.entries for key in (one.policy, one.grounding) if key]
-        return tuple(dict.fromkeys([*read, *(key for judge in self.judges.values() for key in judge)]))
+        return tuple(dict.fromkeys([*read, *self.judges.values()]))
 
     def finished(self, root: Path) -> "Bench":
         """Return those whose artifacts are in a run's folder."""
@@ -92,7 +90,7 @@ class Bench:
             if (root / one.policy / POLICY).is_file()
             and (one.grounding is None or (root / one.grounding / GROUNDING).is_file())
         ]
-        judges = {seed: of for seed, of in self.judges.items() if (root / of[0] / GROUNDING).is_file()}
+        judges = {seed: key for seed, key in self.judges.items() if (root / key / GROUNDING).is_file()}
         return Bench(self.percent, tuple(entries), judges)
 
 
@@ -173,7 +171,7 @@ def select(
                 for other in bench.judges:
                     if other == entry.seed:
                         continue
-                    read = f"{made_from[entry.policy]}/{made_from[bench.judges[other][0]]}"
+                    read = f"{made_from[entry.policy]}/{made_from[bench.judges[other]]}"
                     if read not in known:
                         drawn = derive(other, f"judged: {entry.seed}")
                         known[read] = judge_of_seed(other).success(policy, config.episodes, drawn)
@@ -199,7 +197,6 @@ def select(
 
 
 def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -> Bench:
-    dataset = "pair" if percent is None else "subset"
     entries = [
         Entry(
             row,
@@ -211,10 +208,7 @@ def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -
         for row in rows
         for seed in recipe.seeds
     ]
-    judges = {
-        seed: (artifact_key("ground", judge, seed, percent), artifact_key(dataset, "", seed, percent))
-        for seed in recipe.seeds
-    }
+    judges = {seed: artifact_key("ground", judge, seed, percent) for seed in recipe.seeds}
     return Bench(percent, tuple(entries), judges)
 
 
@@ -231,13 +225,9 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
 
 
 def _judge(bench: Bench, task: str, root: Path, seed: int) -> Judge:
-    grounding, dataset = bench.judges[seed]
-    made, episodes = load_grounding(root / grounding / GROUNDING), PairedEpisodes.load(root / dataset)
-    check_made_from(root / grounding / GROUNDING, {"dataset": episodes.content_hash})
-    return Judge(task_named(task), made)
+    return Judge(task_named(task), load_grounding(root / bench.judges[seed] / GROUNDING))
 
 
 def _digest(folder: Path) -> str:
-    files = [folder / name for name in (POLICY, GROUNDING)]
-    file = next((file for file in files if file.is_file()), None)
-    return file_digest(file) if file else str(read_description(folder)["content_hash"])
+    policy = folder / POLICY
+    return file_digest(policy if policy.is_file() else folder / GROUNDING)

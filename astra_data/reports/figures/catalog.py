@@ -124,7 +124,7 @@ FIGURES = {
         "seeds, dashed with the plus settings. Bands: from the worst seed to the best. Many episodes "
         "may start in the middle of a recording or be cut off early, so these are not results on the task; "
         "those are in the table. High here and low there means that the policy learned what does not work "
-        "in the target.",
+        "{where}.",
         "training",
     ),
 }

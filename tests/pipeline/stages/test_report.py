@@ -137,7 +137,7 @@ def test_intervals_and_probabilities_of_improvement_need_three_seeds(root: Path,
 
 def test_r2_of_rewards_stands_on_the_page(root: Path) -> None:
     for seed in SEEDS:
-        epochs = [{"r2_final_reward": 0.9}, {"step": 2, "r2_reward": 0.5, "r2_final_reward": -2.7}]
+        epochs = [{"r2_reward": 0.9}, {"step": 2, "r2_state": 0.5, "r2_reward": -2.7}]
         edit_json(root / f"ground/astra/seed_{seed}/metrics.json", epochs=epochs)
     make(root)
     page = read_page((root / "report/results.html").read_text())
