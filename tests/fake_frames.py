@@ -3,7 +3,7 @@
 import torch
 
 from astra_data.dataset.columns import ACTION, INDEX, REWARD, STATE, TERMINATED
-from astra_data.dataset.samples import Batch, Samples
+from astra_data.dataset.frames import Batch, Samples
 
 NAMES = (STATE, ACTION, REWARD, TERMINATED, "mode", INDEX)
 

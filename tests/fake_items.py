@@ -6,8 +6,8 @@ import signal
 import time
 from pathlib import Path
 
+from astra_data.core.durable import held
 from astra_data.core.errors import MissingStageError
-from astra_data.core.lock import held
 from astra_data.core.progress import Progress
 
 

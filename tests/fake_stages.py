@@ -12,10 +12,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from astra_data.core.artifact import write_manifest
 from astra_data.core.config import Config
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import Progress
 
 

@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.table import Table
 from timing import Candidates, Stretch, measure
 
-from astra_data.core.cores import cores
+from astra_data.core.provenance import cores
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
 from astra_data.dataset.frames import Frames

@@ -30,9 +30,9 @@ from step_by_step import step_by_step
 from timing import OURS, Candidates, Rate, Stretch, complain, measure, peer, print_rates
 
 from astra_data.core.config import load_recipe
-from astra_data.core.cores import cores
 from astra_data.core.errors import AstraDataError
 from astra_data.core.progress import silent
+from astra_data.core.provenance import cores
 from astra_data.grounding.fit import Fitting, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape

@@ -22,7 +22,7 @@ from rich.table import Table
 from timing import Candidates, Stretch, measure
 
 from astra_data.core.arrays import Floats
-from astra_data.core.cores import cores
+from astra_data.core.provenance import cores
 from astra_data.robots.ant.body import CONTROL_SUBSTEPS, VelocityController, ant_model
 from astra_data.robots.ant.target import AntMazeEnv
 from astra_data.robots.registry import TASKS

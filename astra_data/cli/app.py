@@ -32,11 +32,10 @@ from astra_data.cli import datasets as editing
 from astra_data.cli import datasets as inspecting
 from astra_data.cli import sharing as exporting
 from astra_data.cli import sharing as importing
-from astra_data.core.disk import disk_error
-from astra_data.core.durable import NO_FSYNC
+from astra_data.core.durable import NO_FSYNC, disk_error
 from astra_data.core.errors import AstraDataError
+from astra_data.core.naming import in_lines
 from astra_data.core.optional import missing_extra
-from astra_data.core.wording import in_lines
 
 app = typer.Typer(
     help="Turn robot logs into datasets, and datasets into policies trained in a simplified simulator.",

@@ -11,8 +11,7 @@ from astra_data.cli.arguments import DatasetName, Jobs, NewName, Out, Root, Sour
 from astra_data.cli.recipes import refuse, run_stage
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import RUNS
-from astra_data.core.wording import first_few, printable
+from astra_data.core.naming import RUNS, first_few, printable
 
 
 def subset(
@@ -235,7 +234,7 @@ def list_(
     from rich.table import Table
 
     from astra_data.core.errors import AstraDataError, CorruptDatasetError
-    from astra_data.core.wording import printable
+    from astra_data.core.naming import printable
     from astra_data.dataset.description import full_name
     from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
 
@@ -265,7 +264,7 @@ def list_(
 
 def _clean(folders: list[Path]) -> None:
     from astra_data.core.durable import clean
-    from astra_data.core.wording import printable
+    from astra_data.core.naming import printable
     from astra_data.dataset.versions import home
 
     notes = {
@@ -295,9 +294,8 @@ def validate(
     from astra_data.dataset.columns import TERMINATED
     from astra_data.dataset.doctor.check import check
     from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
-    from astra_data.dataset.endings import endings_of
-    from astra_data.dataset.opening import can_be_repaired
-    from astra_data.dataset.reader import Dataset
+    from astra_data.dataset.inspection import endings_of
+    from astra_data.dataset.reader import Dataset, can_be_repaired
     from astra_data.dataset.versions import locate
 
     root = locate(dataset)
@@ -355,7 +353,7 @@ _SHOWN = 5
 
 def log(dataset: DatasetName) -> None:
     """Show what a dataset was made from: a tree of datasets with versions, hashes, stages and settings."""
-    from astra_data.dataset.lineage import lineage, tree_lines
+    from astra_data.dataset.compare import lineage, tree_lines
     from astra_data.dataset.versions import open_dataset
 
     for line in tree_lines(lineage(open_dataset(dataset))):

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from astra_data.core.arrays import Ints
-from astra_data.core.wording import printable
+from astra_data.core.naming import printable
 from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
 

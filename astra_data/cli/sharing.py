@@ -62,7 +62,7 @@ def import_(
     skip_bad: SkipBad = False,
 ) -> None:
     """Convert logs (CSV, NPZ, HDF5, Parquet, Minari, MCAP, JSON, PyTorch) to a dataset."""
-    from astra_data.core.wording import printable
+    from astra_data.core.naming import printable
     from astra_data.io.importing import import_dataset
 
     report = import_dataset(

@@ -35,7 +35,7 @@ def new(
     from rich.table import Table
 
     from astra_data.core.errors import BadInputError
-    from astra_data.core.wording import first_few
+    from astra_data.core.naming import first_few
     from astra_data.pipeline.first_simulator import CLEARLY, JUDGED_STEPS
     from astra_data.pipeline.new_robot import write_robot
 

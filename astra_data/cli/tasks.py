@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName, NewName, Out, show_table, task_at
-from astra_data.core.wording import first_few
+from astra_data.core.naming import first_few
 
 if TYPE_CHECKING:
     from astra_data.worlds.task import Task

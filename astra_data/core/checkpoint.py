@@ -1,7 +1,7 @@
 """Weights and training states on disk, as safetensors and JSON: written atomically, never pickled."""
 
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from astra_data.core.artifact import check_intact
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import check_intact
+from astra_data.core.progress import Alarm, Stopwatch
 
 type Nested = (
     Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
 )
 """A training state, such as an optimizer's `state_dict()`."""
+CHECKPOINT_SECONDS = 60.0
+"""Time between checkpoints."""
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
@@ -194,3 +197,42 @@ def _put_together(state: Any, tensors: Mapping[str, Tensor]) -> Any:  # noqa: AN
         case list():
             return [_put_together(item, tensors) for item in state]
     return state
+
+
+class Logbook:
+    """The log of a training run that can be interrupted.
+
+    Attributes:
+        points: measurements, of JSON values.
+        stopwatch: measures from the start, including the time before an interruption.
+    """
+
+    def __init__(self, checkpoint: Path | None, go_on: Callable[[dict[str, Any]], object]) -> None:
+        """Start, or resume from `checkpoint` if it exists.
+
+        Args:
+            checkpoint: the file that `keep` writes; None to write none.
+            go_on: restores a state that was passed to `keep`.
+
+        Raises:
+            BadInputError: the checkpoint cannot be read, or lacks something that `go_on` needs.
+        """
+        self._checkpoint = checkpoint
+        self.points, spent = list[dict[str, Any]](), None
+        if checkpoint and checkpoint.exists():
+            with resumed(checkpoint) as (state, metadata):
+                go_on(state)
+                self.points, spent = metadata["points"], metadata["spent"]
+        self.stopwatch, self._alarm = Stopwatch(spent), Alarm(CHECKPOINT_SECONDS)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the next checkpoint is due."""
+        return self._alarm.rings
+
+    def keep(self, state: Mapping[str, Any]) -> None:
+        """Write a checkpoint: `state` (see `save_state`), the points and the time spent."""
+        if self._checkpoint is not None:
+            metadata = {"points": self.points, "spent": self.stopwatch.spent()}
+            save_state(self._checkpoint, state, metadata)
+        self._alarm.reset()

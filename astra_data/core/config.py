@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, Tag, TypeAdapter, ValidationE
 from pydantic_core import ErrorDetails, to_jsonable_python
 
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.wording import shortened
+from astra_data.core.naming import shortened
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
 AtOnce = Annotated[int, Field(ge=1, le=10**6)]

@@ -4,8 +4,11 @@ While one is written, it is in a hidden folder beside its place, `.<name>.tmp-<p
 holds by a lock. What killed processes left is removed by the next one with the same target, or by `clean`.
 """
 
+import errno
+import fcntl
 import fnmatch
 import glob
+import hashlib
 import itertools
 import os
 import re
@@ -14,17 +17,34 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from astra_data.core.disk import writing
-from astra_data.core.errors import BadInputError
-from astra_data.core.lock import held
+from astra_data.core.errors import AstraDataError, BadInputError, DiskError
 
 NO_FSYNC = "ASTRA_DATA_NO_FSYNC"
 """Environment variable; unless it is empty, files survive a kill but perhaps not a power failure."""
-
 _HIDDEN = re.compile(r"\..+\.tmp-\d+(-\d+)?")
 """Names of what is being written."""
 _RESUMABLE = re.compile(r"\..+\.(staged|partial|pull-\d+\.\d+\.\d+)")
 """Names of folders with which a command goes on."""
+_OF_THE_DISK = {
+    errno.ENOSPC: ("the disk is full", "free space"),
+    errno.EDQUOT: ("the quota is exceeded", "free space"),
+    errno.EFBIG: ("a file would be larger than is allowed", "raise the limit (ulimit -f)"),
+    errno.EROFS: ("the disk is read-only", "make it writable or choose another folder"),
+    errno.EIO: ("the disk reports an error", "check it"),
+    errno.ENODEV: ("the disk is gone", "connect it again"),
+    errno.ENXIO: ("the disk is gone", "connect it again"),
+    errno.ESTALE: ("the disk is gone", "connect it again"),
+}
+"""Faults that are the disk's whatever was written: why, and what to do."""
+_OF_THE_PLACE = {
+    errno.EACCES: ("permission is denied", "change the permissions or choose another folder"),
+    errno.EPERM: ("permission is denied", "change the permissions or choose another folder"),
+    errno.ENOENT: ("its folder is gone", "check that its disk is there"),
+    errno.ENOTDIR: ("a file is where its folder would be", "choose another folder"),
+    errno.EEXIST: ("a file is where its folder would be", "choose another folder"),
+    errno.EISDIR: ("a folder has its name", "choose another name"),
+    errno.ENAMETOOLONG: ("its name is too long", "choose a shorter one"),
+}
 
 
 def sync(path: Path) -> None:
@@ -216,3 +236,122 @@ def _own_folder(target: Path) -> Iterator[Path]:
             if ours and folder.exists():
                 yield folder
                 return
+
+
+@contextmanager
+def writing(target: Path, *, place: bool = True) -> Iterator[None]:
+    """Report that `target` cannot be written, if the block fails because of the disk or of its place.
+
+    Args:
+        target: what is written.
+        place: also report what is wrong with its place, such as permissions, not the disk's faults alone.
+
+    Raises:
+        DiskError: says why, and what to do.
+    """
+    try:
+        yield
+    except Exception as error:
+        code = _code(error)
+        if code not in _OF_THE_DISK and not (place and code and _is_about(error, target)):
+            raise
+        raise DiskError(_report(f"{target} cannot be written", code)) from error
+
+
+def disk_error(error: Exception) -> DiskError | None:
+    """Return what to report of an error that nobody expected; None if it does not come from a disk."""
+    code = _code(error)
+    name = getattr(error, "filename", None)
+    if code is None or not (name or code in _OF_THE_DISK):
+        return None
+    subject = os.fsdecode(name) if isinstance(name, str | bytes) else "a file"
+    return DiskError(_report(f"{subject} cannot be read or written", code))
+
+
+def _report(fault: str, code: int) -> str:
+    known = _OF_THE_DISK | _OF_THE_PLACE
+    why, advice = known.get(code, (os.strerror(code).lower(), "choose another place"))
+    return f"{fault}: {why}. What was finished before is safe: {advice}, then run the same command again."
+
+
+def _code(error: Exception) -> int | None:
+    """Return the system's number of a fault; HDF5 has it in the text of errors of any type.
+
+    None where there is no number, or the error is one of ours, which says all there is to say.
+    """
+    if isinstance(error, AstraDataError):
+        return None
+    if isinstance(error, OSError) and error.errno:
+        return error.errno
+    found = re.search(r"\berrno = (\d+)", str(error))
+    return int(found[1]) if found else None
+
+
+def _is_about(error: Exception, target: Path) -> bool:
+    """Return whether `error` names `target`, a folder that it is in, or a hidden file or folder of it."""
+    name = getattr(error, "filename", None)
+    if not isinstance(name, str | bytes):
+        return False
+    path = Path(os.fsdecode(name))
+    hidden = str(target.parent / f".{target.name}.")
+    return path in (target, *target.parents) or target in path.parents or str(path).startswith(hidden)
+
+
+@contextmanager
+def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
+    """Hold the lock of `folder`, which the system releases when the process ends; yield whether it is held.
+
+    Args:
+        folder: an existing folder.
+        wait: wait while another process holds the lock, instead of yielding False.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would wait for a writer
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        yield False
+    else:
+        yield True
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Hold the lock of a run's folder.
+
+    Raises:
+        BadInputError: another process holds it.
+    """
+    with held(folder) as ours:
+        if not ours:
+            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+        yield
+
+
+def files_below(folder: Path) -> list[Path]:
+    """Return the files in `folder` and below, sorted, and those in folders elsewhere that links lead to.
+
+    Each is there once: by its own path if it lies below `folder`, else by the first link. Links to a folder
+    that holds `folder` are not followed.
+    """
+    root, seen, found, todo = folder.resolve(), set[Path](), list[Path](), [folder]
+    while todo:
+        links: list[Path] = []
+        for here, folders, names in todo.pop(0).walk():
+            if here.resolve() in seen:
+                folders.clear()
+                continue
+            seen.add(here.resolve())
+            paths = [here / name for name in names]
+            links += [path for path in paths if path.is_dir()]
+            found += [path for path in paths if path.is_file()]
+        links = [link for link in links if not root.is_relative_to(link.resolve())]
+        todo += sorted(links, key=lambda link: (link.name.startswith("."), link))
+    return sorted(found)
+
+
+def file_digest(path: Path) -> str:
+    """Return the sha256 of the file at `path` in hex; it is read in pieces."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -9,7 +9,7 @@ AstraDataError          all expected errors; the command line prints one line an
 └── DiskError           a disk is full, read-only, failing or gone
 """
 
-from astra_data.core.wording import printable, shortened
+from astra_data.core.naming import printable, shortened
 
 
 class AstraDataError(Exception):

@@ -8,15 +8,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.cores import cores
-
 MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """Memory limit of a container in bytes, or "max"; absent outside of one."""
-
 ROOT = Path(__file__).parents[2]
 CODE = ("astra_data", "pyproject.toml", "uv.lock")
 """Changes of these make a checkout dirty; changes of notes and recipes do not."""
-
 PACKAGES = (
     *("astra-data", "gymnasium", "gymnasium-robotics", "lerobot", "mujoco"),
     *("numpy", "pandas", "scipy", "torch"),
@@ -93,3 +89,10 @@ def _gpu_name(device: str) -> str:
     import torch  # slow; only needed on GPUs
 
     return torch.cuda.get_device_name(device)
+
+
+def cores() -> int:
+    """Return the number of processor cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

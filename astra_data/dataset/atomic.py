@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from astra_data.core.disk import writing
-from astra_data.core.durable import hidden_folder, move, sync, sync_tree
+from astra_data.core.durable import hidden_folder, move, sync, sync_tree, writing
 from astra_data.core.errors import BadInputError
 
 

@@ -6,15 +6,16 @@ X abstract state, A action, G goal, O observation, Z latent.
 A column with one value per step has shape (T,), all others (T, size): never (T, 1), never more dimensions.
 """
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import as_column
 from astra_data.core.errors import BadInputError
-from astra_data.core.numbers import as_column
 
 STATE = "observation.state"
 """(T, S) float32: the full target state s_t."""
@@ -40,20 +41,17 @@ ABSTRACT_NEXT_STATE = "abstract.next_state"
 """(T, X) float32: the abstract state of s_{t+1}."""
 ABSTRACT_SIMULATED_NEXT_STATE = "abstract.simulated_next_state"
 """(T, X) float32: the abstract simulator's next state, from the abstract state of s_t under a_t."""
-
 EPISODE_UID = "episode_uid"
 """(T,) int64: identifies the episode through all later edits; filled in by the writer."""
 TIMESTAMP, FRAME_INDEX = "timestamp", "frame_index"
 EPISODE_INDEX, INDEX, TASK_INDEX = "episode_index", "index", "task_index"
 RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)
 """Columns filled in by the writer; all but the first are LeRobot's own."""
-
 DTYPES = ("float32", "int64", "bool")
 MOST_VALUES, MOST_NAME_BYTES = 2**20, 200
 """Upper bounds of a column: its values per step, and the bytes of its name, which also names files."""
 ROLES = {"position": 2, "vector": 2, "heading": 1, "quaternion": 4, "invariant": 1}
 """How a change of the planar frame acts on values (see `Column.astra`), and on how many of them at once."""
-
 Array = NDArray[Any]
 Scalar = float | int | bool | str
 
@@ -265,3 +263,35 @@ def _column_faults(name: str, values: Array) -> list[str]:
         where = f"frame {bad[0][0]}" + (f" index {bad[0][1]}" if values.ndim == 2 else "")
         faults.append(f"{name}: {len(bad)} values are not finite, the first in {where}")
     return faults
+
+
+def in_blocks(episodes: Iterable[Episode], rows: int) -> Iterator[list[Episode]]:
+    """Yield successive episodes in lists: each ends when it has `rows` steps, or with the last episode."""
+    block: list[Episode] = []
+    steps = 0
+    for episode in episodes:
+        block.append(episode)
+        steps += len(episode)
+        if steps >= rows:
+            yield block
+            block, steps = [], 0
+    if block:
+        yield block
+
+
+def new_uid(uid: int, origin: bytes, known: Collection[int]) -> int:
+    """Return a uid that is not among those `known`, always the same for `uid` of this `origin`."""
+    while uid in known:
+        uid = int.from_bytes(hashlib.sha256(origin + str(uid).encode()).digest()[:8]) >> 1
+    return uid
+
+
+def renamed_metadata(uid: int, metadata: Mapping[str, Scalar], names: Mapping[int, int]) -> dict[str, Any]:
+    """Return the metadata of the episode `uid` whose data's uids are replaced by `names`: old to new."""
+    renamed = dict(metadata)
+    source = metadata.get("source_episode")
+    if isinstance(source, int):
+        renamed["source_episode"] = names.get(source, source)
+    if names[uid] != uid:
+        renamed["merged_uid"] = uid
+    return renamed

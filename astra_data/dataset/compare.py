@@ -1,17 +1,29 @@
 """Differences between two datasets: columns, episodes, provenance."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.core.naming import RECORD, printable, shortened
 from astra_data.dataset.columns import Column
-from astra_data.dataset.description import changed_values
+from astra_data.dataset.description import changed_values, full_name, identity_of, read_description
+from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import home_of
 
 _DESCRIBED = ("name", "version", "stage", "config", "seeds", "environment", "simulator", "parents")
 _SHOWN = 5
 """Entries of a list in the provenance; those of longer ones are counted."""
+_Described = tuple[Path, Mapping[str, Any]]
+"""Folder and description."""
+_Key = tuple[str, str, str]
+"""Name, version and content hash."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +64,7 @@ def differences(a: Dataset, b: Dataset) -> Differences:
         only_in_b=sorted(prints_b.keys() - prints_a.keys()),
         values=values,
         metadata=metadata,
-        description=list(_value_differences(_described(a), _described(b), most=_SHOWN)),
+        description=list(_value_differences(_provenance(a), _provenance(b), most=_SHOWN)),
     )
 
 
@@ -78,7 +90,7 @@ def _facts(column: Column) -> dict[str, Any]:
     return {**vars(column), "astra": column.astra or {}}
 
 
-def _described(dataset: Dataset) -> dict[str, Any]:
+def _provenance(dataset: Dataset) -> dict[str, Any]:
     return {key: dataset.description[key] for key in _DESCRIBED}
 
 
@@ -117,3 +129,176 @@ def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, bytes]:
             print_.update(f"{name} {values.dtype} {values.shape}".encode() + values.tobytes())
         prints[episode.uid] = print_.digest()
     return prints
+
+
+@dataclass(frozen=True, eq=False)
+class Ancestor:
+    """A dataset in the tree; one that several were made from is one object.
+
+    Attributes:
+        reference: name and version.
+        content_hash: its hash.
+        stage: the stage that wrote it, "" if its folder was not found.
+        config: the stage's settings, empty if its folder was not found.
+        parents: the datasets that it was made from.
+        folder: its folder; None if it was not found.
+    """
+
+    reference: str
+    content_hash: str
+    stage: str
+    config: Mapping[str, Any]
+    parents: tuple["Ancestor", ...]
+    folder: Path | None
+
+
+def lineage(dataset: Dataset) -> Ancestor:
+    """Return `dataset` with all its ancestors, looked up in `versions.home()`, beside it, and in its run.
+
+    An ancestor is found where name, version and content hash are those that its descendant lists.
+
+    Raises:
+        CorruptDatasetError: a dataset is named among its own ancestors.
+    """
+    places = _Places(dataset.root.resolve().parent)
+    described: dict[_Key, _Described | None] = {_key(dataset.identity): (dataset.root, dataset.description)}
+    known: dict[_Key, Ancestor] = {}
+    begun: set[_Key] = set()
+    steps = [(_key(dataset.identity), False)]
+    while steps:  # without recursion: there may be thousands of versions
+        key, is_complete = steps.pop()
+        reference = full_name({"name": key[0], "version": key[1]})
+        if key in known:
+            continue
+        if not is_complete and key in begun:
+            raise CorruptDatasetError(
+                f"{reference} is among its own ancestors: a {DATASET_PATH} was altered; restore it from "
+                "a copy."
+            )
+        if not is_complete and key not in described:
+            described[key] = places.find(key)
+        folder, description = described[key] or (None, {})
+        parents = [_key(parent) for parent in description.get("parents", [])]
+        if not is_complete:
+            begun.add(key)
+            steps += [(key, True), *((parent, False) for parent in parents)]
+            continue
+        begun.remove(key)
+        known[key] = Ancestor(
+            reference=reference,
+            content_hash=key[2],
+            stage=description.get("stage", ""),
+            config=description.get("config", {}),
+            parents=tuple(known[parent] for parent in parents),
+            folder=folder,
+        )
+    return known[_key(dataset.identity)]
+
+
+def hashes(ancestor: Ancestor) -> set[str]:
+    """Return the content hashes of a dataset and of all its ancestors."""
+    return {one.content_hash for one, _, _ in _walked(ancestor)}
+
+
+def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
+    """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
+    sources = dataset.metadata.get("source_episode", [None] * len(dataset))
+    numbers: dict[int, int] = {}
+    recorded = [uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True)]
+    return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
+
+
+def tree_lines(ancestor: Ancestor) -> Iterator[str]:
+    """Yield the tree, a dataset per line, parents indented below their child, those of each dataset once."""
+    for one, margin, is_repeated in _walked(ancestor):
+        yield margin + _line(one) + ("  (its parents: see above)" if is_repeated and one.parents else "")
+
+
+def _walked(ancestor: Ancestor) -> Iterator[tuple[Ancestor, str, bool]]:
+    """Yield each dataset of a tree, what stands before it in its line, and whether it came before."""
+    seen: set[Ancestor] = set()
+    steps = [(ancestor, "", "")]
+    while steps:
+        one, margin, below = steps.pop()
+        yield one, margin, one in seen
+        if one in seen:
+            continue
+        seen.add(one)
+        for parent in reversed(one.parents):
+            is_last = parent is one.parents[-1]
+            branch, deeper = ("└── ", "    ") if is_last else ("├── ", "│   ")
+            steps.append((parent, below + branch, below + deeper))
+
+
+class _Places:
+    """Where datasets are looked for, each place once."""
+
+    def __init__(self, beside: Path) -> None:
+        """Look at home, in the folder `beside` the first dataset, and in the run that it is in."""
+        self._beside = beside
+        self._neighbors: dict[_Key, _Described] | None = None
+
+    def find(self, key: _Key) -> _Described | None:
+        """Return the dataset that has this name, version and hash."""
+        found = _described(home_of({"name": key[0], "version": key[1]})).get(key)
+        if found is None and self._neighbors is None:
+            places = [self._beside.glob(f"*/{DATASET_PATH}")]
+            for folder in self._beside.parents[:2]:
+                if (folder / RECORD).exists():
+                    places += [folder.glob(f"{depth}/{DATASET_PATH}") for depth in ("*/*", "*/*/*")]
+            listed = [_described(path.parents[2]) for place in places for path in sorted(place)]
+            self._neighbors = {key: found for one in reversed(listed) for key, found in one.items()}
+        return found or (self._neighbors or {}).get(key)
+
+
+def _described(folder: Path) -> dict[_Key, _Described]:
+    try:
+        found = read_description(folder)
+    except CorruptDatasetError:
+        return {}
+    # A dataset may hold the same values under another name or version.
+    return {_key(identity_of(found)): (folder, found)}
+
+
+def _key(identity: Mapping[str, str]) -> _Key:
+    return identity["name"], identity["version"], identity["hash"]
+
+
+def _line(ancestor: Ancestor) -> str:
+    if ancestor.folder is None:
+        return f"{ancestor.reference}  {ancestor.content_hash[:8]}  (not found here)"
+    settings = ", ".join(
+        f"{key} {shortened(str(value), 40)}" for key, value in ancestor.config.items() if value is not None
+    )
+    line = f"{ancestor.reference}  {ancestor.content_hash[:8]}  {ancestor.stage}"
+    return printable(f"{line}: {settings}" if settings else line)
+
+
+def column_faults(source: Dataset, expected: Column, task: str) -> list[str]:
+    """List how a column of a dataset is of another size, in another order or in other units than a task's."""
+    if expected.name not in source.features:
+        return [f"has no column {expected.name}"]
+    recorded = Column.from_feature(expected.name, source.features[expected.name])
+    if recorded.size != expected.size:
+        return [f"{expected.name} has {recorded.size} values, expected those of {task}: {expected.size}"]
+    faults, names = [], recorded.names or ()
+    if any(name in names and names.index(name) != place for place, name in enumerate(expected.names or ())):
+        order = ", ".join(expected.labels)
+        faults.append(f"has the values {', '.join(names)} in {expected.name}, expected the order {order}")
+    for name, own, other in zip(recorded.labels, recorded.units, expected.units, strict=True):
+        if own and other and own != other:
+            faults.append(f"has {name} of {expected.name} in {own}, expected {other}: scale it on import")
+    return faults
+
+
+def names_apart(source: Dataset, expected: Iterable[Column], task: str) -> str:
+    """Say which columns of a dataset, where they fit, have no name that the task has; empty if none."""
+    apart = []
+    for column in expected:
+        recorded = Column.from_feature(column.name, source.features[column.name])
+        if column.names and not {*(recorded.names or ())} & {*column.names}:
+            given = ", ".join(recorded.names or ["values without names"])
+            apart.append(f"{given} of {column.name} as {', '.join(column.names)}")
+    if not apart:
+        return ""
+    return f"{source.reference}: takes {' and '.join(apart)} of {task}: check that they are, in this order"

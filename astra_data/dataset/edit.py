@@ -12,12 +12,11 @@ from typing import Any
 
 from astra_data.core.config import did_you_mean, only_given
 from astra_data.core.errors import BadInputError
-from astra_data.core.wording import first_few
-from astra_data.dataset.columns import Scalar
+from astra_data.core.naming import first_few
+from astra_data.dataset.columns import Scalar, new_uid, renamed_metadata
 from astra_data.dataset.compare import schema_differences, world_differences
 from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
-from astra_data.dataset.uids import new_uid, renamed_metadata
 from astra_data.dataset.versions import next_version
 
 MOST_UIDS = 8

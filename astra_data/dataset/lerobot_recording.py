@@ -14,15 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.core.wording import first_few
+from astra_data.core.naming import first_few
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
-from astra_data.dataset.declared import declared_columns, name_of, robot_of
 from astra_data.dataset.description import ContentHash, complete_description, permutation
-from astra_data.dataset.digests import Digests, digests_of
-from astra_data.dataset.lerobot_rows import ENDS, RecordedFiles, Rows, lacking, our_columns
+from astra_data.dataset.integrity import Digests, digests_of
+from astra_data.dataset.lerobot_rows import (
+    ENDS,
+    RecordedFiles,
+    Rows,
+    declared_columns,
+    lacking,
+    name_of,
+    our_columns,
+    robot_of,
+)
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.plain import (
     Run,

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
-from astra_data.core.wording import shortened
+from astra_data.core.naming import shortened
 from astra_data.dataset.columns import Column
 from astra_data.dataset.description import NAME, VERSION, identity_of
 from astra_data.dataset.format import DATASET_PATH

@@ -7,8 +7,8 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.digest import file_digest
-from astra_data.core.manifest import write_manifest
+from astra_data.core.artifact import write_manifest
+from astra_data.core.durable import file_digest
 from astra_data.core.provenance import origin
 from astra_data.dataset.atomic import atomic_folder, refuse_existing
 from astra_data.dataset.columns import Column

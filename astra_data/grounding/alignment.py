@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from astra_data.core.numbers import normalized
+from astra_data.core.arrays import normalized
 from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, add_scales, take_scales
 
 LEAST_LATENT_R2 = 0.9

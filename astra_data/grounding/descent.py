@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import AtOnce, Config, Count, Positive
 from astra_data.core.errors import BadInputError
-from astra_data.core.logbook import Logbook
 
 
 def seed_generators(seed: int, device: torch.device) -> None:

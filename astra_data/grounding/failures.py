@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from astra_data.core.numbers import normalized
+from astra_data.core.arrays import normalized
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import Descent, DescentConfig, seeded
 from astra_data.grounding.encoder import add_scales, take_scales

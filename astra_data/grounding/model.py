@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
-from astra_data.core.numbers import normalized
 from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, add_scales, mlp, take_scales
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 

@@ -25,8 +25,8 @@ from astra_data.dataset.columns import (
     TERMINATED,
     Array,
 )
-from astra_data.dataset.endings import stands_still
-from astra_data.dataset.lineage import recordings_of
+from astra_data.dataset.compare import recordings_of
+from astra_data.dataset.inspection import stands_still
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.worlds.commands import Commands

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import as_column
 from astra_data.core.errors import BadInputError
-from astra_data.core.numbers import as_column
 from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, TERMINATED, Array, Column
 from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
 from astra_data.io.mapping import MAPPED_FLAGS, ColumnMapping, ImportMapping

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from astra_data.core.arrays import as_rows
 from astra_data.core.errors import BadInputError
-from astra_data.core.numbers import as_rows
-from astra_data.core.wording import first_few
+from astra_data.core.naming import first_few
 from astra_data.dataset.checkup.clock import Clock
-from astra_data.dataset.checkup.jumps import full_turns, shortest
+from astra_data.dataset.checkup.findings import full_turns, shortest
 from astra_data.dataset.columns import (
     DONE,
     NEXT_STATE,
@@ -27,7 +27,7 @@ from astra_data.dataset.columns import (
     Column,
     Scalar,
 )
-from astra_data.dataset.endings import is_terminated
+from astra_data.dataset.inspection import is_terminated
 from astra_data.io.conversion import Converter, Mask
 from astra_data.io.import_report import Tally
 from astra_data.io.mapping import ImportMapping

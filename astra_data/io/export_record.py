@@ -16,8 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 from astra_data.core.config import Config, Count, CountFromZero, faults_of
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Array, Column, Episode
-from astra_data.dataset.description import ContentHash, full_name, identity_of
-from astra_data.dataset.meta_files import NameText, VersionText
+from astra_data.dataset.description import ContentHash, NameText, VersionText, full_name, identity_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter

@@ -11,7 +11,7 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.checkup.angles import ANGLE, LARGEST
+from astra_data.dataset.checkup.findings import ANGLE, LARGEST
 from astra_data.io.cutting import RATE_TOLERANCE
 from astra_data.io.importers.csv import torn_bytes
 from astra_data.io.logs import (

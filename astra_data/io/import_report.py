@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.core.wording import first_few
-from astra_data.dataset.endings import Endings
+from astra_data.core.naming import first_few
+from astra_data.dataset.inspection import Endings
 from astra_data.io.recording import Block
 
 Mask = NDArray[np.bool_]

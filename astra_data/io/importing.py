@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.config import did_you_mean, only_given, validated
+from astra_data.core.durable import files_below
 from astra_data.core.errors import AstraDataError, BadInputError, in_short
-from astra_data.core.files import files_below
-from astra_data.core.wording import first_few
-from astra_data.dataset.admission import is_text
+from astra_data.core.naming import first_few
 from astra_data.dataset.columns import TRUNCATED, Episode
 from astra_data.dataset.versions import home_of
-from astra_data.dataset.writer import DatasetWriter
+from astra_data.dataset.writer import DatasetWriter, is_text
 from astra_data.io.cutting import Cut, Cutter
 from astra_data.io.export_record import ExportRecord, read_record, restored, write_restored
 from astra_data.io.import_report import ImportReport, Tally, losses

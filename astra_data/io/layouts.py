@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from astra_data.core.numbers import as_rows
+from astra_data.core.arrays import as_rows
 from astra_data.dataset.columns import (
     ACTION,
     GOAL,

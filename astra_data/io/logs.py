@@ -13,10 +13,9 @@ from pyarrow import csv
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.checkup.angles import LARGEST, is_angle
+from astra_data.dataset.checkup.findings import LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP
-from astra_data.dataset.opening import refuse_run, refuse_versions
-from astra_data.dataset.reader import Dataset
+from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.io.importers.csv import (
     SUFFIXES,
     check_header,

@@ -11,9 +11,8 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import IO, Any
 
 from astra_data.core.config import did_you_mean
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest, files_below
 from astra_data.core.errors import BadInputError, in_short
-from astra_data.core.files import files_below
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.plain import read_object

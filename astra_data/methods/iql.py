@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT
+from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
-from astra_data.core.logbook import Logbook
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.encoder import PositionFeatures

@@ -11,9 +11,8 @@ import torch
 from astra_data.core.artifact import CHECKPOINT
 from astra_data.core.config import own_settings
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import part
+from astra_data.core.progress import CLOCKS, part
 from astra_data.core.seeding import derive
-from astra_data.core.stopwatch import CLOCKS
 from astra_data.methods.method import Method, Table
 from astra_data.policies.networks import AdaptiveShape, Teacher
 from astra_data.policies.ppo import Ppo

@@ -7,8 +7,7 @@ from typing import Any
 
 from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import RECORD
-from astra_data.core.wording import first_few, shortened
+from astra_data.core.naming import RECORD, first_few, shortened
 from astra_data.dataset.description import changed_values
 from astra_data.pipeline.recipe import WHOLE, Recipe
 from astra_data.pipeline.staleness import SIMULATOR

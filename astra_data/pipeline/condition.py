@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from astra_data.core.artifact import MANIFEST, Manifest, read_manifest
 from astra_data.core.errors import AstraDataError
-from astra_data.core.manifest import MANIFEST, Manifest, read_manifest
 from astra_data.core.naming import stage_of_key
-from astra_data.dataset.lineage import hashes, lineage
-from astra_data.dataset.meta_files import read_description
+from astra_data.dataset.compare import hashes, lineage
+from astra_data.dataset.description import read_description
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.grounding.files import load_grounding, load_target_encoder

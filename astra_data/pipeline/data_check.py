@@ -4,8 +4,8 @@ import numpy as np
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
+from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.edit import share
-from astra_data.dataset.lineage import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.grounding.paired_episodes import divided

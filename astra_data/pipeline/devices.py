@@ -7,8 +7,8 @@ from functools import partial
 
 import torch
 
-from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
+from astra_data.core.provenance import cores
 from astra_data.pipeline.executors import Item
 from astra_data.pipeline.plan import stage_of
 

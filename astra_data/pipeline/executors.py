@@ -20,10 +20,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from astra_data.core.cores import cores
-from astra_data.core.disk import disk_error
+from astra_data.core.durable import disk_error
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.optional import optional
+from astra_data.core.provenance import cores
 from astra_data.core.seeding import derive
 
 SECONDS_BETWEEN_NOTES = 0.1

@@ -10,9 +10,8 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from astra_data.core.durable import clean, folder_for, make_folder, move, write_file
+from astra_data.core.durable import alone_in, clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.lock import alone_in
 from astra_data.core.naming import RECORD, RUNS, row_of_key, stage_of_key
 from astra_data.methods import grounded_as
 from astra_data.pipeline.condition import Condition, can_be_made_again, condition, spoilt, to_make_again

@@ -7,11 +7,10 @@ from pathlib import Path
 from shutil import copy2
 from typing import Any
 
-from astra_data.core.artifact import finished_folder
+from astra_data.core.artifact import finished_folder, read_manifest
 from astra_data.core.config import only_given, validated
+from astra_data.core.durable import alone_in
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import alone_in
-from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, part, silent
 from astra_data.core.seeding import derive
 from astra_data.pipeline.run import set_aside

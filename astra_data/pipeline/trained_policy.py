@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.digest import file_digest
+from astra_data.core.artifact import check_made_from
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import check_made_from
 from astra_data.core.naming import RECORD, artifact_key
-from astra_data.dataset.column_statistics import ranges
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.statistics import ranges
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.methods import grounded_as, method_named
 from astra_data.pipeline.points import refuse_unmade

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator
 from torch import Tensor
 
+from astra_data.core.arrays import as_column
+from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import Config, NotNegative, in_order
 from astra_data.core.errors import BadInputError
-from astra_data.core.logbook import Logbook
-from astra_data.core.numbers import as_column
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import (
@@ -30,7 +30,7 @@ from astra_data.dataset.columns import (
     Array,
     Episode,
 )
-from astra_data.dataset.endings import outcome_of
+from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.staging import StagedWriter
 from astra_data.policies.episodes import ObservedTargetEnv
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, PolicyShape, SoftActor

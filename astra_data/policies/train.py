@@ -16,12 +16,11 @@ from pydantic import Discriminator, Tag
 from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT
+from astra_data.core.checkpoint import Logbook
 from astra_data.core.config import AtOnce, Config, Count, CountFromZero, Share, choice
 from astra_data.core.errors import BadInputError
-from astra_data.core.logbook import Logbook
-from astra_data.core.progress import Progress, part
+from astra_data.core.progress import CLOCKS, Progress, part
 from astra_data.core.seeding import derive
-from astra_data.core.stopwatch import CLOCKS
 from astra_data.grounding.files import grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import Grounding

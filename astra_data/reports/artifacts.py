@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
+from astra_data.core.artifact import check_intact
 from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import check_intact
 
 EVALUATION = "evaluation.json"
 TRAJECTORIES = "trajectories.safetensors"

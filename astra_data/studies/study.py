@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.checkpoint import load_tensors, save_tensors
-from astra_data.core.durable import write_file
+from astra_data.core.durable import alone_in, write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import alone_in
-from astra_data.core.progress import Progress, part
+from astra_data.core.progress import Progress, Stopwatch, part
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import generator
-from astra_data.core.stopwatch import Stopwatch
 from astra_data.studies.errors import Starts, summary
 from astra_data.studies.gap_recipe import GapRecipe
 from astra_data.studies.recordings import Piece, Recording

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
-from astra_data.core.cores import cores
+from astra_data.core.provenance import cores
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from importlib.machinery import PathFinder
 from pathlib import Path
 
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 
 _NOT_READ = (".log", ".py", ".pyc")

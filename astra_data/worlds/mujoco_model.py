@@ -10,8 +10,8 @@ from mujoco.rollout import Rollout
 from torch import Tensor
 
 from astra_data.core.arrays import Floats
-from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
+from astra_data.core.provenance import cores
 from astra_data.worlds.free_states import FreeStates
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.worlds.code_digest import with_neighbors
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import first_few
 from astra_data.core.seeding import derive, generator
-from astra_data.core.wording import first_few
 from astra_data.dataset.columns import Column
 from astra_data.worlds.batched import Step
 from astra_data.worlds.commands import Commands

@@ -7,10 +7,9 @@ from rich.console import Console
 
 from astra_data.cli.inspection_page import inspection_page, shaded, sparkline
 from astra_data.dataset.checkup.checkup import Checkup
-from astra_data.dataset.checkup.finding import Finding
+from astra_data.dataset.checkup.findings import Finding
 from astra_data.dataset.columns import Column
-from astra_data.dataset.endings import Endings
-from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
+from astra_data.dataset.inspection import BINS, Endings, Inspection, Map, Spread
 
 
 def plane(counts: list[list[int]]) -> Map:

@@ -9,10 +9,9 @@ import pytest
 import torch
 from failing_disk import failing
 
-from astra_data.core.artifact import CHECKPOINT, finished_folder
+from astra_data.core.artifact import CHECKPOINT, MANIFEST, finished_folder, read_manifest
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.errors import BadInputError, DiskError
-from astra_data.core.manifest import MANIFEST, read_manifest
 
 
 def test_a_folder_appears_when_it_is_finished(tmp_path: Path) -> None:

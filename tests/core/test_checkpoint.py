@@ -8,6 +8,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from astra_data.core.artifact import write_manifest
 from astra_data.core.checkpoint import (
     load_tensors,
     resumed,
@@ -16,7 +17,6 @@ from astra_data.core.checkpoint import (
     understood,
 )
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import write_manifest
 
 
 def assert_same(actual: object, expected: object) -> None:

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 
 
 def test_a_file_is_read_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from astra_data.core.disk import disk_error, writing
+from astra_data.core.durable import disk_error, writing
 from astra_data.core.errors import BadInputError, DiskError
 
 

@@ -11,6 +11,7 @@ from astra_data.core.durable import (
     begun_beside,
     clean,
     discard,
+    held,
     hidden_folder,
     made_in,
     make_folder,
@@ -18,7 +19,6 @@ from astra_data.core.durable import (
     write_file,
 )
 from astra_data.core.errors import DiskError
-from astra_data.core.lock import held
 
 pytestmark = pytest.mark.usefixtures("fsync")
 MUTATING = "mkdir rename replace unlink rmdir fsync"

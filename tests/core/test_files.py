@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from astra_data.core.files import files_below
+from astra_data.core.durable import files_below
 
 
 def _file(path: Path) -> Path:

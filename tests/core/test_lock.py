@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from astra_data.core.durable import alone_in, held
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import alone_in, held
 
 
 def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 import torch
 
+from astra_data.core.checkpoint import CHECKPOINT_SECONDS, Logbook
 from astra_data.core.errors import BadInputError
-from astra_data.core.logbook import CHECKPOINT_SECONDS, Logbook
 
 
 def never(state: dict[str, Any]) -> None:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from astra_data.core.artifact import MANIFEST, Manifest, read_manifest, write_manifest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import MANIFEST, Manifest, read_manifest, write_manifest
 
 
 @pytest.fixture

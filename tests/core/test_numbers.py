@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from astra_data.core.numbers import as_column, as_rows, normalized
+from astra_data.core.arrays import as_column, as_rows, normalized
 
 
 def test_states_are_in_standard_deviations_and_clipped() -> None:

@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from astra_data.core.stopwatch import Alarm, Stopwatch
+from astra_data.core.progress import Alarm, Stopwatch
 
 
 def test_waiting_takes_wall_time_and_computing_both(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 """Lists in sentences."""
 
-from astra_data.core.wording import first_few, in_code, in_lines, in_markdown, printable, shortened
+from astra_data.core.naming import first_few, in_code, in_lines, in_markdown, printable, shortened
 
 
 def test_as_many_as_are_shown_are_all_named() -> None:

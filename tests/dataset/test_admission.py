@@ -7,8 +7,8 @@ from fake_dataset import COLUMNS, fake_columns, fake_episode, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset import Dataset
-from astra_data.dataset.admission import Admission
 from astra_data.dataset.columns import ACTION, DONE, REWARD, TERMINATED, TRUNCATED, Episode, Scalar
+from astra_data.dataset.writer import Admission
 
 
 def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ import pytest
 from failing_disk import failing
 from racing import ROUNDS, race
 
+from astra_data.core.durable import held
 from astra_data.core.errors import BadInputError, DiskError
-from astra_data.core.lock import held
 from astra_data.dataset.atomic import atomic_file, atomic_folder, refuse_existing
 
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from astra_data.dataset.blocks import in_blocks
-from astra_data.dataset.columns import Episode
+from astra_data.dataset.columns import Episode, in_blocks
 
 
 def _episodes(*lengths: int) -> list[Episode]:

@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import concatenated, fake_episodes, write_fake
 
-from astra_data.dataset import column_statistics as statistics
+from astra_data.dataset import statistics as statistics
 from astra_data.dataset.columns import ACTION, REWARD, STATE, SUCCESS, Array
 from astra_data.dataset.format import QUANTILES, STATISTICS
 

@@ -5,8 +5,8 @@ import pytest
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import STATE, Column
-from astra_data.dataset.declared import declared_columns, name_of
 from astra_data.dataset.format import DEFAULT_COLUMNS
+from astra_data.dataset.lerobot_rows import declared_columns, name_of
 
 WHOLE = "expected a whole number of frames per second"
 LACKING = (

@@ -5,10 +5,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from astra_data.dataset import episode_rows
-from astra_data.dataset.column_statistics import episode_statistics
+from astra_data.dataset import statistics as episode_rows
 from astra_data.dataset.columns import Column
-from astra_data.dataset.episode_rows import EpisodeRows
+from astra_data.dataset.statistics import EpisodeRows, episode_statistics
 
 COLUMNS = [Column("state", size=2), Column("flag", "bool")]
 LENGTHS = (4, 1, 7)

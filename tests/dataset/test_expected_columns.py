@@ -5,7 +5,7 @@ import pytest
 
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
-from astra_data.dataset.expected_columns import column_faults, names_apart
+from astra_data.dataset.compare import column_faults, names_apart
 
 
 def recorded(folder: Path, names: tuple[str, ...] | None, units: list[str] | None = None) -> Dataset:

@@ -9,13 +9,13 @@ from nested import places
 
 from astra_data.core.errors import AstraDataError, CorruptDatasetError
 from astra_data.dataset import Dataset
+from astra_data.dataset.compare import lineage, tree_lines
+from astra_data.dataset.description import read_description
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.edit import subset
 from astra_data.dataset.format import DATA_PATH, DATASET_PATH, INFO_PATH, STATS_PATH, SUBSETS_PATH
 from astra_data.dataset.inspection import inspect_dataset
-from astra_data.dataset.lineage import lineage, tree_lines
-from astra_data.dataset.meta_files import read_description
 from astra_data.dataset.plain import is_data_path
 
 VALUES: tuple[object, ...] = (

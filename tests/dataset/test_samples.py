@@ -5,8 +5,7 @@ from fake_frames import assert_equal, everything
 from torch.utils.data import DataLoader
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.frames import Frames, Padding
-from astra_data.dataset.samples import Order, take
+from astra_data.dataset.frames import Frames, Order, Padding, take
 
 
 def test_samples_come_one_by_one_too(frames: Frames) -> None:

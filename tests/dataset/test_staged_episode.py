@@ -7,7 +7,7 @@ import pytest
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import Column, Episode
 from astra_data.dataset.format import data_schema
-from astra_data.dataset.staged_episode import load_staged, write_staged
+from astra_data.dataset.staging import load_staged, write_staged
 
 COLUMNS = [Column("observation.state", size=3), Column("next.reward"), Column("next.done", "bool")]
 EPISODE = Episode(

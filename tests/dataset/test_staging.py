@@ -381,7 +381,7 @@ def test_metadata_that_cannot_be_stored_is_refused_and_the_recording_goes_on(tmp
 
 def test_an_episode_that_an_older_version_staged_with_such_metadata_is_named(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("astra_data.dataset.admission._metadata_faults", lambda key, value: [])
+        patch.setattr("astra_data.dataset.writer._metadata_faults", lambda key, value: [])
         interrupted(tmp_path / "set", [Episode(1, fake_columns(4, 1), {"serial": 2**64})])
     again = staged_writer(tmp_path / "set", resume=True)
     with (

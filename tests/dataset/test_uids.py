@@ -1,6 +1,6 @@
 """Uids of episodes that meet others of the same uid."""
 
-from astra_data.dataset.uids import new_uid, renamed_metadata
+from astra_data.dataset.columns import new_uid, renamed_metadata
 
 
 def test_a_uid_that_nobody_has_is_kept() -> None:

@@ -7,8 +7,8 @@ from fake_dataset import LENGTHS, concatenated, write_fake
 
 from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import ACTION, STATE
-from astra_data.dataset.digests import digests_of
-from astra_data.dataset.values import alterations, measure, read_values
+from astra_data.dataset.contents import alterations, measure, read_values
+from astra_data.dataset.integrity import digests_of
 
 
 @pytest.mark.parametrize("block_rows", [1, 20, 2**16])

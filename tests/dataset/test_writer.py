@@ -15,7 +15,8 @@ from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, fake_episodes, stag
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset, DatasetWriter, episode_rows, parquet
+from astra_data.dataset import Dataset, DatasetWriter, parquet
+from astra_data.dataset import statistics as episode_rows
 from astra_data.dataset.columns import STATE, Column
 from astra_data.dataset.format import DATASET_PATH
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from rail_run import make_rail_run
 from small_run import GROUND, TASK, TRAIN, short_task
 
-from astra_data.core.digest import file_digest
+from astra_data.core.artifact import read_manifest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import silent
 from astra_data.dataset import Dataset
 from astra_data.deployment.folder import deploy, describe, page

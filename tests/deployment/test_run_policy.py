@@ -9,7 +9,7 @@ import pytest
 import torch
 from small_cart import TASK
 
-from astra_data.core.manifest import write_manifest
+from astra_data.core.artifact import write_manifest
 from astra_data.deployment.folder import describe
 from astra_data.deployment.graph import write_graph
 from astra_data.deployment.run_policy import RobotPolicy, refuse_far, run

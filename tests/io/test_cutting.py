@@ -24,7 +24,7 @@ from astra_data.dataset.columns import (
     TRUNCATED,
     Array,
 )
-from astra_data.dataset.endings import Endings
+from astra_data.dataset.inspection import Endings
 from astra_data.io.cutting import Cutter
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block

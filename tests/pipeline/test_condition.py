@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
+from astra_data.core.artifact import MANIFEST, read_manifest
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
-from astra_data.core.manifest import MANIFEST, read_manifest
 from astra_data.core.progress import silent
 from astra_data.pipeline.condition import LOADERS, condition
 from astra_data.pipeline.executors import Item

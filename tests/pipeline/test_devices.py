@@ -3,8 +3,8 @@ import re
 import pytest
 import torch
 
-from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
+from astra_data.core.provenance import cores
 from astra_data.pipeline.devices import check_device, default_jobs, share_cores
 from astra_data.pipeline.executors import Item
 

@@ -15,8 +15,8 @@ from gymnasium.utils.env_checker import check_env
 
 import astra_data.envs
 from astra_data.cli.app import app
+from astra_data.core.artifact import read_manifest, write_manifest
 from astra_data.core.errors import AstraDataError, BadInputError
-from astra_data.core.manifest import read_manifest, write_manifest
 from astra_data.core.progress import silent
 from astra_data.grounding.files import load_target_encoder, save_target_encoder
 from astra_data.io.importing import import_dataset

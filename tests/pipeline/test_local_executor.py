@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from fake_items import Record, crash, fail, hang, kill_itself, leave, rendezvous, touch
 
+from astra_data.core.durable import held
 from astra_data.core.errors import AstraDataError, MissingStageError
-from astra_data.core.lock import held
 from astra_data.pipeline import executors as local_executor
 from astra_data.pipeline.executors import Item, execute
 

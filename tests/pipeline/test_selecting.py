@@ -8,8 +8,8 @@ from rail_run import make_rail_run
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
+from astra_data.core.durable import held
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import held
 from astra_data.methods import grounded_as
 from astra_data.pipeline.selecting import select
 from astra_data.policies.episodes import Judge

@@ -10,9 +10,9 @@ from rail_run import ROOT, make_rail_run
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
+from astra_data.core.artifact import read_manifest
+from astra_data.core.durable import held
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import held
-from astra_data.core.manifest import read_manifest
 from astra_data.core.seeding import derive
 from astra_data.pipeline import selecting as module
 from astra_data.pipeline.recipe import recorded_settings

@@ -84,7 +84,7 @@ def test_ppo_stops_after_its_steps(tmp_path: Path) -> None:
 def test_it_goes_on_from_its_checkpoint(
     task: Task, episodes_go_on: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
 
     given: dict[str, Any] = {"steps": 250, "seed": 7, "folder": tmp_path, "num_threads": 1}
     with pytest.raises(Stopped):

@@ -244,7 +244,7 @@ def test_a_training_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+        patch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
         counted(replace(given, progress=interrupt))
     again, curve = counted(given)
     # The third was not written any more.

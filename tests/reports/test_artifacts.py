@@ -6,8 +6,8 @@ import pytest
 from fake_runs import band, edit_json, outcomes, write_evaluation, write_json
 from safetensors.numpy import save_file
 
+from astra_data.core.artifact import write_manifest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import write_manifest
 from astra_data.reports.artifacts import (
     CurveFile,
     Evaluation,

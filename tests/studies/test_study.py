@@ -6,8 +6,8 @@ import pytest
 from pydantic import ValidationError
 from toy_walks import FPS, piece
 
+from astra_data.core.durable import held
 from astra_data.core.errors import BadInputError
-from astra_data.core.lock import held
 from astra_data.core.progress import silent
 from astra_data.studies.errors import Starts
 from astra_data.studies.gap_recipe import GapRecipe

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.dataset.checkup.finding import Finding, deletion
+from astra_data.dataset.checkup.findings import Finding, deletion
 from astra_data.dataset.columns import RESERVED, Column, Episode
 
 GAP = 1.5

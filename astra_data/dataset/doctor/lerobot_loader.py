@@ -12,7 +12,7 @@ import numpy as np
 
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import ACTION, EPISODE_INDEX, Array
-from astra_data.dataset.doctor.findings import Report
+from astra_data.dataset.doctor.check import Report
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.plain import PlainColumn, data_files, plain_columns, runs

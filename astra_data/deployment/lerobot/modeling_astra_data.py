@@ -8,8 +8,8 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
+from astra_data.core.artifact import check_intact
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import check_intact
 from astra_data.dataset.columns import GOAL, STATE
 from astra_data.deployment.folder import DESCRIPTION
 from astra_data.deployment.graph import ONNX, load_onnx

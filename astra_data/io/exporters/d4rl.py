@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.dataset.blocks import in_blocks
-from astra_data.dataset.columns import REWARD, TERMINATED, TRUNCATED, Array, Episode
+from astra_data.dataset.columns import REWARD, TERMINATED, TRUNCATED, Array, Episode, in_blocks
 from astra_data.dataset.reader import Dataset
 from astra_data.io.export_record import Export
 from astra_data.io.hdf5_file import hdf5_file

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.dataset.columns import GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
-from astra_data.dataset.lineage import recordings_of
+from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.reader import Dataset
 from astra_data.io.export_record import Export
 from astra_data.io.hdf5_file import hdf5_file

@@ -10,7 +10,7 @@ import numpy as np
 
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.wording import in_code, in_markdown
+from astra_data.core.naming import in_code, in_markdown
 from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import RESERVED, Column

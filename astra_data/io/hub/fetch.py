@@ -3,8 +3,7 @@
 import os
 from pathlib import Path
 
-from astra_data.core.digest import file_digest
-from astra_data.core.disk import writing
+from astra_data.core.durable import file_digest, writing
 from astra_data.core.errors import AstraDataError, SharingError
 from astra_data.io.hub.store import RemoteFolder
 from astra_data.io.hub.sums import Listed, altered

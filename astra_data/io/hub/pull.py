@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.durable import folder_for
+from astra_data.core.durable import folder_for, held
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, SharingError
-from astra_data.core.lock import held
 from astra_data.core.progress import Progress, silent
 from astra_data.dataset import Dataset
 from astra_data.dataset.atomic import publish

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import SharingError
 from astra_data.core.progress import Progress
 from astra_data.dataset import Dataset

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import SharingError
 
 SUMS_PATH = "SHA256SUMS"

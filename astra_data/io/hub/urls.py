@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from astra_data.core.disk import writing
-from astra_data.core.durable import hidden_folder, move, sync
+from astra_data.core.durable import hidden_folder, move, sync, writing
 from astra_data.core.errors import AstraDataError, BadInputError, SharingError
 from astra_data.core.optional import how_to_install
 from astra_data.core.progress import Progress

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from astra_data.core.errors import BadInputError, in_short
-from astra_data.core.wording import shortened
+from astra_data.core.naming import shortened
 from astra_data.dataset.columns import Array
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block, Part, Source, row_count

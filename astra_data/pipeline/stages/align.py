@@ -10,7 +10,7 @@ from torch import Tensor
 
 from astra_data.core.artifact import CHECKPOINT, finished_folder
 from astra_data.core.config import NotNegative, as_json
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive

@@ -34,7 +34,7 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
-from astra_data.dataset.endings import outcome_of
+from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
 from astra_data.robots.registry import TASKS, task_named

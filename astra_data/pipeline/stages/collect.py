@@ -9,11 +9,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from astra_data.core.config import Config, Count, NotNegative, Share
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.progress import Progress, part, silent
+from astra_data.core.progress import Progress, Stopwatch, part, silent
 from astra_data.core.seeding import derive
-from astra_data.core.stopwatch import Stopwatch
 from astra_data.dataset.columns import OUTCOME_COLUMNS
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import home_of

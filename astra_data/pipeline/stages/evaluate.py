@@ -15,16 +15,14 @@ from typing import Any
 
 from torch import Tensor
 
-from astra_data.core.artifact import finished_folder, refuse_finished
+from astra_data.core.artifact import check_made_from, finished_folder, refuse_finished
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.config import AtOnce, Config, Positive
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import check_made_from
-from astra_data.core.progress import Progress, silent
+from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
-from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import (
     GROUNDING,
     TARGET_ENCODER,

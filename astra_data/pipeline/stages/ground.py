@@ -11,9 +11,8 @@ from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, as_json, faults_of
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import base_method
-from astra_data.core.progress import Progress, silent
+from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.core.provenance import origin
-from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import GROUNDING, check_step, fitted, load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
 from astra_data.grounding.open_loop import gap_report

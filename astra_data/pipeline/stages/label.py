@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.durable import make_folder
 from astra_data.core.errors import BadInputError
-from astra_data.core.numbers import as_column, as_rows
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
 from astra_data.dataset.atomic import refuse_existing
-from astra_data.dataset.checkup.continuity import Continuity
+from astra_data.dataset.checkup.findings import Continuity
 from astra_data.dataset.columns import (
     DONE,
     GOAL,
@@ -27,8 +27,8 @@ from astra_data.dataset.columns import (
     Array,
     Episode,
 )
-from astra_data.dataset.endings import is_terminated, outcome_of
-from astra_data.dataset.expected_columns import column_faults, names_apart
+from astra_data.dataset.compare import column_faults, names_apart
+from astra_data.dataset.inspection import is_terminated, outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 from astra_data.io.hub.pull import opened

@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.config import Config, NotNegative
 from astra_data.core.errors import BadInputError
-from astra_data.core.numbers import as_column, as_rows
-from astra_data.core.progress import Progress, silent
-from astra_data.core.stopwatch import Stopwatch
-from astra_data.dataset.blocks import in_blocks
-from astra_data.dataset.checkup.angles import LARGEST, TURNS, is_angle
+from astra_data.core.progress import Progress, Stopwatch, silent
+from astra_data.dataset.checkup.findings import LARGEST, TURNS, is_angle
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -24,8 +22,9 @@ from astra_data.dataset.columns import (
     STATE,
     Array,
     Episode,
+    in_blocks,
 )
-from astra_data.dataset.expected_columns import column_faults, names_apart
+from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
 from astra_data.robots.registry import TASKS

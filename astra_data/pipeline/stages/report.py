@@ -9,12 +9,10 @@ from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from astra_data.core.artifact import finished_folder
+from astra_data.core.artifact import finished_folder, read_manifest
 from astra_data.core.config import Config, Share
-from astra_data.core.digest import file_digest
-from astra_data.core.durable import write_file
+from astra_data.core.durable import file_digest, write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import read_manifest
 from astra_data.core.naming import artifact_key
 from astra_data.core.progress import Progress, silent
 from astra_data.core.provenance import origin

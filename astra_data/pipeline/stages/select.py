@@ -10,17 +10,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.artifact import finished_folder
+from astra_data.core.artifact import check_made_from, finished_folder
 from astra_data.core.config import AtOnce, Config
-from astra_data.core.digest import file_digest
-from astra_data.core.durable import write_file
+from astra_data.core.durable import file_digest, write_file
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import check_made_from
 from astra_data.core.naming import artifact_key, reference_of
-from astra_data.core.progress import Progress, silent
+from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
-from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
 from astra_data.methods import grounded_as, method_named
 from astra_data.policies.episodes import Judge

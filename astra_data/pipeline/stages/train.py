@@ -7,12 +7,11 @@ from typing import Any
 
 from astra_data.core.artifact import finished_folder
 from astra_data.core.config import Config, as_json
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import is_plus
-from astra_data.core.progress import Progress, silent
+from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.core.provenance import origin
-from astra_data.core.stopwatch import Stopwatch
 from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named

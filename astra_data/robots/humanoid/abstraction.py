@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.core.numbers import normalized
+from astra_data.core.arrays import normalized
 from astra_data.robots.humanoid.model import COMMANDED, CONTACT_M, FOOT_RADIUS_M, JOINTS, POSITIONS
 from astra_data.robots.humanoid.skeleton import mass_and_feet, mass_velocity
 from astra_data.robots.humanoid.spread import VELOCITY_M_S, in_spreads

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.core.numbers import normalized
+from astra_data.core.arrays import normalized
 from astra_data.robots.humanoid.abstraction import (
     humanoid_to_extended_kinematics,
     humanoid_to_kinematics,

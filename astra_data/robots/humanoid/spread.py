@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from astra_data.core.numbers import normalized
+from astra_data.core.arrays import normalized
 from astra_data.robots.humanoid.model import COMMANDED, JOINTS, STANDING
 
 JOINTS_RAD = tuple(0.3 if joint in COMMANDED else 0.025 for joint in range(len(JOINTS)))

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
-from astra_data.core.cores import cores
 from astra_data.core.errors import BadInputError
+from astra_data.core.provenance import cores
 from astra_data.robots.nao.bodies import MOTORS, TICKS, BatchedBodies
 from astra_data.robots.nao.body import TICK_S, nao_model
 from astra_data.robots.nao.kinematics import TO_MOTORS, leg_angles

@@ -5,12 +5,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_logs import CLOCK, COLUMNS, FPS, Columns, toy_columns, write_logs
+from toy_logs import Columns, toy_columns, write_logs
 
-from astra_data.dataset import Dataset, DatasetWriter
-from astra_data.dataset.checkup.checkup import Checkup, check_up
-from astra_data.dataset.checkup.finding import Finding
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Episode
+from astra_data.dataset.checkup.checkup import (
+    Checkup,
+    DeadChannels,
+    Duplicates,
+    EpisodeEnds,
+    GivenCommands,
+    Repeats,
+    check_up,
+    held_steps,
+    longest_rests,
+)
+from astra_data.dataset.checkup.findings import (
+    Angles,
+    Continuity,
+    Finding,
+    channels,
+    deletion,
+    is_angle,
+    labels,
+    listed,
+)
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED, Array, Column, Episode
 
 
 def test_good_logs_have_no_findings(tmp_path: Path) -> None:
@@ -24,12 +42,6 @@ def test_good_logs_have_no_findings(tmp_path: Path) -> None:
         ),
         (),
     )
-
-
-def carried(uid: int, columns: Columns) -> None:
-    if uid == 7:
-        columns[STATE][50:, 0] += 1.0
-        columns[NEXT_STATE][49:, 0] += 1.0
 
 
 def missed(uid: int, columns: Columns) -> None:
@@ -68,24 +80,9 @@ def copied(uid: int, columns: Columns) -> Columns | None:
     return toy_columns(2) if uid in (11, 12) else None
 
 
-def short(uid: int, columns: Columns) -> Columns | None:
-    return toy_columns(uid, 12) if uid == 6 else None
-
-
 def torn(uid: int, columns: Columns) -> None:
     if uid == 2:
         columns[NEXT_STATE][60, 0] += 0.001
-
-
-def rewarded(uid: int, columns: Columns) -> None:
-    if uid == 8:
-        columns["next.reward"] += 5.0
-
-
-def far(uid: int, columns: Columns) -> None:
-    if uid == 1:
-        for name in (STATE, NEXT_STATE):
-            columns[name][:, 1] -= 40.0
 
 
 def saturated(uid: int, columns: Columns) -> None:
@@ -104,13 +101,6 @@ def failing(uid: int, columns: Columns) -> None:
 
 
 FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...], str, str]] = [
-    (
-        carried,
-        "warning",
-        (7,),
-        "1 single-step jump in x of observation.state; the largest is 1",
-        "[split.jump]",
-    ),
     (missed, "warning", (3, 4), "steps of over 1.5 periods: 2, the longest 0.15 s", "gap_s = 0.075"),
     (slow, "warning", (), "time runs at 10 Hz, but 20 Hz is declared", "correct `fps`"),
     (jittery, "note", (), "5 % of the steps are off by 24 %", "resample the recording to 20 Hz"),
@@ -119,10 +109,7 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
     (stuck, "warning", (5,), "others move: yaw of observation.state", "delete walks --episode 5"),
     (unused, "note", (), "constant in all steps: w of action", "its effect cannot be learned"),
     (copied, "warning", (11, 12), "11 has the states and actions of 2", "--episode 11 --episode 12"),
-    (short, "note", (6,), "6 by length 12 steps, median 100", "delete walks --episode 6"),
     (torn, "warning", (2,), "not the state of the next row: 1 of 2970", "rows are missing"),
-    (rewarded, "note", (8,), "8 by return 59", "delete walks --episode 8"),
-    (far, "note", (1,), "1 by y of observation.state, which reaches -4", "delete walks --episode 1"),
     (in_degrees, "warning", (), "yaw of observation.state: up to", "degrees, set `scale` to 0.0174533"),
     (saturated, "note", (), "at the edge of their range in up to", "record gentler commands"),
     (failing, "note", tuple(range(9)), "9 failures, which is little", "--behavior stress"),
@@ -143,43 +130,307 @@ def test_a_planted_fault_is_the_one_finding(
 
 
 def test_warnings_come_first_and_findings_are_recorded(tmp_path: Path) -> None:
-    def both(uid: int, columns: Columns) -> Columns | None:
-        rewarded(uid, columns)
-        return copied(uid, columns)
+    def two(uid: int, columns: Columns) -> None:
+        saturated(uid, columns)
+        missed(uid, columns)
 
-    checkup = check_up(write_logs(tmp_path / "logs", both))
+    checkup = check_up(write_logs(tmp_path / "logs", two))
     assert [finding.severity for finding in checkup.findings] == ["warning", "note"]
     record = checkup.record()
     assert record["dataset"] == "logs@data-1.0.0"
-    assert record["findings"][0]["episodes"] == [11, 12]
-    assert "logs@data-1.0.0 --episode 11" in record["findings"][0]["advice"]
+    assert record["findings"][0]["episodes"] == [3, 4]
     assert set(record["findings"][1]) == set(Finding.__dataclass_fields__)
 
 
+def test_five_episodes_are_named_and_the_others_counted() -> None:
+    assert listed([7]) == "episode 7"
+    assert listed(range(7)) == "episodes 0, 1, 2, 3, 4 and 2 more"
+    assert deletion("walks", [3, 9]) == "astra-data delete walks --episode 3 --episode 9"
+    assert deletion("walks", range(6)).endswith("--episode 3 --episode 4 ...")
+    pose = Column("pose", size=2, names=("x", "y"))
+    assert (labels(pose), channels(pose, [1])) == (["x", "y"], "y of pose")
+    assert (labels(Column("charge")), channels(Column("charge"), [0])) == (["charge"], "charge")
+
+
+ANGLES = Column(
+    STATE, size=4, names=("x", "heading", "rate", "arm"), astra={"unit": ["m", "rad", "rad/s", "rad"]}
+)
+
+
 @pytest.mark.parametrize(
-    ("sources", "format_", "is_mcap"),
+    ("largest", "what"),
     [
-        (["a.mcap", "b.MCAP"], None, True),
-        (["a.csv", "b.csv"], None, False),
-        (["a.csv", "b.mcap"], None, None),
-        (["a.mcap"], None, None),
-        ([], None, None),
-        (["a", "b"], "mcap", True),
+        (
+            (500.0, 179.9, 500.0, 3.0),
+            "heading of observation.state: up to 179.9 rad",
+        ),
+        (
+            (0.0, 179.9, 0.0, 90.0),
+            "heading, arm of observation.state: up to 179.9 rad",
+        ),
+        ((500.0, 12.5, 500.0, 3.0), None),
     ],
 )
-def test_whether_a_dataset_is_of_mcap_is_seen_by_its_files(
-    tmp_path: Path, sources: list[str], format_: str | None, is_mcap: bool | None
-) -> None:
-    """Also where it is a part of one; two episodes, of which some tell no file."""
-    description = {"name": "logs", "stage": "import", "config": {"format": format_} if format_ else {}}
-    with DatasetWriter(
-        tmp_path / "logs", [*COLUMNS, CLOCK], fps=FPS, task="drive", description=description
-    ) as writer:
-        for uid in range(2):
-            columns = toy_columns(uid)
-            missed(3, columns)
-            writer.add(Episode(uid, columns, {"source": sources[uid]} if uid < len(sources) else {}))
-    findings = check_up(Dataset.open(tmp_path / "logs"), "walks").findings
-    (advice,) = [finding.advice for finding in findings if "steps of over" in finding.what]
-    assert ("`time`" in advice) is (is_mcap is not True)
-    assert ("[columns." in advice) is (is_mcap is not False)
+def test_an_angle_of_many_turns_is_taken_for_degrees(largest: tuple[float, ...], what: str | None) -> None:
+    angles = Angles(ANGLES)
+    for uid, share in enumerate((0.5, -1.0, 0.25)):
+        angles.add(Episode(uid, {STATE: np.outer([0.0, share], largest).astype(np.float32)}))
+    assert [finding.what.rpartition(", which")[0] for finding in angles.findings()] == (
+        [what] if what else []
+    )
+
+
+def test_angles_are_known_by_their_names() -> None:
+    assert all(map(is_angle, ("theta", "Base.Yaw", "heading_deg", "joint1.pos")))
+    assert not any(map(is_angle, ("y", "theta.vel", "yaw_rate", "cos_yaw_dot")))
+
+
+@pytest.mark.parametrize("shape", [(6,), (6, 2)])
+def test_a_step_leads_to_the_row_after_it(shape: tuple[int, ...]) -> None:
+    walk = np.random.default_rng(0).normal(size=(7, *shape[1:])).astype(np.float32)
+    state, arrived = walk[:-1], walk[1:].copy()
+    arrived[-1] = 9.0  # whatever is after the last row
+    continuity = Continuity()
+    continuity.add(Episode(0, {STATE: state, NEXT_STATE: arrived}))
+    continuity.add(Episode(1, {STATE: state[:1], NEXT_STATE: arrived[:1]}))
+    continuity.add(Episode(2, {STATE: state}))
+    assert not continuity.findings()
+    off = arrived.copy()
+    off[1] = np.nextafter(off[1], np.float32(100))
+    continuity.add(Episode(4, {STATE: state, NEXT_STATE: off}))
+    (found,) = continuity.findings()
+    assert found.severity == "warning" and found.episodes == (4,)
+    assert found.what == "steps whose next.observation.state is not the state of the next row: 1 of 10"
+
+
+def test_the_same_states_and_actions_are_a_copy() -> None:
+    state, action = np.arange(12, dtype=np.float32).reshape(6, 2), np.ones(6, np.float32)
+    other = state.copy()
+    other[5, 1] = np.nextafter(other[5, 1], 100, dtype=np.float32)
+    pairs = [(state, action), (other, action), (state, 2 * action), (state[:5], action[:5]), (other, action)]
+    duplicates = Duplicates()
+    for uid, (states, actions) in enumerate(pairs):
+        assert not duplicates.findings("walks")
+        duplicates.add(Episode(uid, {STATE: states, ACTION: actions}))
+    (found,) = duplicates.findings("walks")
+    assert found.episodes == (4,)
+
+
+WALK = np.cumsum(np.random.default_rng(0).normal(size=(400, 2)), axis=0)
+
+
+@pytest.mark.parametrize(
+    ("state", "found"),
+    [
+        (np.repeat(WALK, 2, axis=0), True),
+        (WALK, False),
+        (np.repeat(WALK, np.where(np.arange(400) % 50, 1, 60), axis=0), False),  # rests
+        (np.zeros((400, 2)), False),
+    ],
+)
+def test_rows_that_were_written_twice_are_found(state: Array, found: bool) -> None:
+    repeats = Repeats()
+    repeats.add(Episode(0, {STATE: state[:200].astype(np.float32)}))
+    repeats.add(Episode(1, {STATE: state[200:].astype(np.float32)}))
+    assert bool(repeats.findings()) is found
+
+
+def counted(ends: list[tuple[int, bool | None]], successes: list[bool | None] | None) -> EpisodeEnds:
+    outcomes = EpisodeEnds(successes)
+    for uid, (steps, terminated) in enumerate(ends):
+        columns: Columns = {"x": np.zeros(steps, np.float32)}
+        if terminated is not None:
+            columns[TERMINATED] = (np.arange(steps) == steps - 1) & terminated
+        outcomes.add(Episode(uid, columns))
+    return outcomes
+
+
+def test_every_way_to_end_is_counted() -> None:
+    ends: list[tuple[int, bool | None]] = [
+        (9, True),
+        (8, True),
+        (50, False),
+        (50, False),
+        (30, False),
+        (7, True),
+    ]
+    outcomes = counted(ends, [True, False, False, None, False, None])
+    assert str(outcomes) == (
+        "1 in success, 1 in failure, 1 terminated, success unknown, "
+        "2 after 50 steps, the longest (a time limit), 1 cut"
+    )
+    assert outcomes.failures == [1]
+    assert str(counted([(9, False), (12, False)], None)) == "2 cut"
+    unknown = counted([(9, None), (9, None)], None)
+    assert str(unknown).startswith("unknown") and not unknown.findings()
+
+
+@pytest.mark.parametrize(("longest", "found"), [(1, True), (2, False)])
+def test_episodes_that_all_end_in_their_first_step_are_told(longest: int, found: bool) -> None:
+    assert bool(counted([(1, False), (longest, False)], [None, None]).findings()) is found
+
+
+@pytest.mark.parametrize(("failures", "found"), [(0, False), (1, True), (9, True), (10, False)])
+def test_few_failures_are_told(failures: int, found: bool) -> None:
+    ends: list[tuple[int, bool | None]] = [(9, uid < failures) for uid in range(30)]
+    findings = counted(ends, [False] * len(ends)).findings()
+    assert [finding.episodes for finding in findings] == ([tuple(range(failures))] if found else [])
+    assert not counted(ends, None).findings()  # where success is unknown, failure is
+
+
+def given(*actions: Array, size: int = 1) -> GivenCommands:
+    commands = GivenCommands(Column(ACTION, size=size, names=("v", "w")[:size]), fps=10)
+    for uid, action in enumerate(actions):
+        commands.add(Episode(uid, {ACTION: action.astype(np.float32)}))
+    return commands
+
+
+def test_commands_are_held_as_long_as_all_of_them_stay() -> None:
+    actions = np.array([[0, 0], [0, 0], [0, 0], [0, 1], [2, 1], [2, 1], [3, 3]], np.float32)
+    assert held_steps(actions).tolist() == [3, 1, 2]  # the end cuts the last
+    assert held_steps(np.ones((4, 2), np.float32)).tolist() == [4]
+    assert held_steps(np.ones((1, 2), np.float32)).tolist() == [1]
+
+
+def test_quantiles_are_over_commands_not_over_steps() -> None:
+    values = np.arange(101).repeat([1] * 60 + [2] * 30 + [9] * 10 + [1])
+    commands = given(values)
+    assert commands.held_s(0.5) == pytest.approx(0.1)
+    assert commands.held_s(0.8) == pytest.approx(0.2)
+    assert commands.held_s(0.95) == pytest.approx(0.9)
+
+
+def test_steps_at_either_edge_of_the_range_of_all_episodes_are_counted() -> None:
+    first = np.linspace(-0.5, 0.5, 10)  # its edges are none of the whole
+    second = np.concatenate([np.linspace(-0.8, 0.8, 8), [-1, 1]])
+    third = np.array([1.0] * 5 + [-1.0] * 2 + [0.0] * 3)
+    for order in ((first, second, third), (third, first, second)):
+        np.testing.assert_allclose(given(*order).edge_shares, [9 / 30])
+
+
+@pytest.mark.parametrize(("at_edge", "found"), [(20, False), (21, True)])
+def test_a_command_is_saturated_above_a_fifth_of_steps(at_edge: int, found: bool) -> None:
+    inside = np.linspace(-0.9, 0.9, 100 - at_edge)
+    edge = np.where(np.arange(at_edge) % 2, 1.0, -1.0)
+    (action,) = [np.concatenate([inside, edge])]
+    both = np.column_stack([action, np.linspace(-1, 1, 100)])
+    findings = given(both, size=2).findings()
+    assert len(findings) == found
+    if found:
+        assert "up to 21 % of steps, v of action" in findings[0].what
+
+
+@pytest.mark.parametrize(("values", "found"), [(8, False), (9, True)])
+def test_a_choice_of_a_few_commands_has_no_edge(values: int, found: bool) -> None:
+    action = np.tile(np.arange(values), 10)
+    assert bool(given(action[:40], action[40:]).findings()) == found
+
+
+def test_a_line_sums_them_up() -> None:
+    action = np.column_stack([np.linspace(-1, 1, 20), np.linspace(-1, 1, 20).clip(-0.5, 0.5)])
+    shown = str(given(action, size=2))
+    assert shown.startswith("held 0.1 s (median), 0.1 s (95 %)")
+    assert shown.endswith("v 10.0 %, w 50.0 %")
+
+
+DEAD_COLUMNS = [Column(STATE, size=3, names=("x", "y", "z")), Column(ACTION), Column("next.reward")]
+
+
+def moving(seed: int, steps: int = 41) -> Array:
+    return np.random.default_rng(seed).normal(size=(steps, 3)).astype(np.float32)
+
+
+def findings(states: list[Array], actions: list[Array] | None = None) -> list[Finding]:
+    dead = DeadChannels(DEAD_COLUMNS)
+    for uid, state in enumerate(states):
+        action = moving(uid, len(state))[:, 0] if actions is None else actions[uid]
+        dead.add(
+            Episode(uid, {STATE: state, ACTION: action, "next.reward": np.zeros(len(state), np.float32)})
+        )
+    return dead.findings("walks")
+
+
+def held(state: Array, first: int, last: int, index: int = 1) -> Array:
+    """Let steps first to last change nothing."""
+    out = state.copy()
+    out[first : last + 1, index] = out[first, index]
+    return out
+
+
+def test_the_longest_rest_is_counted_in_each_column() -> None:
+    changes = np.array([[1, 0, 0], [0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 0, 1]], bool)
+    assert longest_rests(changes).tolist() == [2, 5, 2]
+
+
+def test_a_value_is_constant_only_if_it_is_in_all_episodes() -> None:
+    states = [held(moving(uid), 0, 40) for uid in range(3)]
+    for state in states:
+        state[:, 1] = 2.0
+    (found,) = findings(states)
+    assert found.what == "constant in all steps: y of observation.state"
+    states[2][:, 1] = 2.5  # constant in each episode, but another value
+    assert not findings(states)
+
+
+def test_where_episodes_begin_alike_and_none_goes_on_no_sensor_is_dead() -> None:
+    states = [held(moving(0), 0, 40) for _ in range(3)]
+    assert not findings([state[:1] for state in states])
+    (found,) = findings([states[0][:1], states[1][:2]])  # y in a second step is that of the first
+    assert found.what == "constant in all steps: y of observation.state"
+
+
+def test_a_command_that_was_never_given_is_told() -> None:
+    states = [moving(uid) for uid in range(3)]
+    (found,) = findings(states, [np.full(41, 0.5, np.float32)] * 3)
+    assert (found.severity, found.what) == ("note", "constant in all steps: action")
+
+
+@pytest.mark.parametrize(("last", "found"), [(20, False), (21, True)])
+def test_a_value_is_stuck_above_half_of_an_episode(last: int, found: bool) -> None:
+    states = [moving(uid) for uid in range(5)]
+    states[3] = held(states[3], 0, last)
+    assert [finding.episodes for finding in findings(states)] == [(3,)] * found
+
+
+@pytest.mark.parametrize(("rests", "found"), [(3, True), (4, False)])
+def test_what_often_rests_is_not_stuck(rests: int, found: bool) -> None:
+    # Of 40 steps of an episode, 3 are less than a tenth and 4 are not.
+    states = [held(moving(uid), 5, 5 + rests) for uid in range(5)]
+    states[3] = held(states[3], 0, 30)
+    assert bool(findings(states)) is found
+
+
+@pytest.mark.parametrize(("others", "found"), [(1, True), (2, False)])
+def test_most_episodes_must_move(others: int, found: bool) -> None:
+    # A puck rests once it was pushed, and before it trembles by the simulator's noise.
+    states = [moving(uid) for uid in range(5)]
+    states[3] = held(states[3], 0, 30)
+    for uid in range(others):
+        states[uid] = held(states[uid], 5, 15) if uid else states[uid] * np.array([1, 1e-6, 1], np.float32)
+    assert bool(findings(states)) is found
+
+
+@pytest.mark.parametrize(("far", "found"), [(90.0, True), (110.0, False)])
+def test_what_hardly_moves_in_most_episodes_is_not_stuck(far: float, found: bool) -> None:
+    # In an episode y spans 1, in one it is also elsewhere.
+    states = [moving(uid) for uid in range(5)]
+    for uid, state in enumerate(states):
+        state[:, 1] = np.linspace(0, 1, 41)
+        state[0, 1] += far * (uid == 4)
+    states[3] = held(states[3], 0, 30)
+    assert bool(findings(states)) is found
+
+
+@pytest.mark.parametrize(("last", "found"), [(19, True), (20, False)])
+def test_a_robot_that_rests_as_a_whole_is_not_stuck(last: int, found: bool) -> None:
+    states = [moving(uid) for uid in range(5)]
+    states[3] = held(states[3], 0, 30)
+    states[3][: last + 1] = states[3][0]
+    assert bool(findings(states)) is found
+
+
+@pytest.mark.parametrize(("steps", "found"), [(9, False), (10, True)])
+def test_short_episodes_tell_nothing(steps: int, found: bool) -> None:
+    states = [moving(uid) for uid in range(5)]
+    states[3] = held(moving(3, steps), 0, steps - 1)
+    assert bool(findings(states)) is found

@@ -14,8 +14,7 @@ from fake_dataset import fake_columns, write_fake, writer
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import Episode
-from astra_data.dataset.doctor.check import check
-from astra_data.dataset.doctor.findings import MOST
+from astra_data.dataset.doctor.check import MOST, check
 from astra_data.dataset.format import POLICY_PATH
 
 

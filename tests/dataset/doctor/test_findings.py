@@ -1,4 +1,4 @@
-from astra_data.dataset.doctor.findings import MOST, Report
+from astra_data.dataset.doctor.check import MOST, Report
 
 
 def test_only_the_first_findings_of_a_kind_are_kept_and_all_are_counted() -> None:

@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset.doctor.footerless import rebuilt_metadata
+from astra_data.dataset.doctor.salvage import rebuilt_metadata
 
 
 @pytest.mark.parametrize("compression", ["snappy", "zstd"])

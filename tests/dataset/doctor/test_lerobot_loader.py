@@ -8,7 +8,7 @@ from fake_dataset import COLUMNS, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column, Episode
-from astra_data.dataset.doctor.findings import Report
+from astra_data.dataset.doctor.check import Report
 from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")

@@ -9,10 +9,10 @@ from fake_dataset import LENGTHS, fake_episodes, write_fake
 
 from astra_data.dataset import parquet
 from astra_data.dataset.columns import STATE
-from astra_data.dataset.digests import Digests
+from astra_data.dataset.contents import measure
 from astra_data.dataset.doctor.salvage import whole_runs
+from astra_data.dataset.integrity import Digests
 from astra_data.dataset.plain import plain_columns, read_object
-from astra_data.dataset.values import measure
 
 UIDS = [episode.uid for episode in fake_episodes()]
 

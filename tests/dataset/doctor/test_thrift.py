@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from astra_data.dataset.doctor.thrift import (
+from astra_data.dataset.doctor.salvage import (
     BINARY,
     BYTE,
     DOUBLE,

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import fsspec
 import pytest
 
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import DiskError, SharingError
 from astra_data.io.hub import fetch as module
 from astra_data.io.hub import store

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
 
+from astra_data.core.artifact import write_manifest
 from astra_data.core.checkpoint import load_tensors, save_tensors
-from astra_data.core.manifest import write_manifest
 from astra_data.core.progress import silent
 from astra_data.pipeline.stages.align import align
 from astra_data.pipeline.stages.collect import collect

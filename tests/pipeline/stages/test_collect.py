@@ -164,7 +164,7 @@ def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"_SAC": sac, "_SAC_SIZES": (8,), "_SAC_ENVS": 4, "_PPO_ENVS": 4, "_TEST_EPISODES": 2}
     for name, value in small.items():
         monkeypatch.setattr(suboptimal, name, value)
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(stage, "_SAC_STEPS", 3 * 8 * 4)
     monkeypatch.setattr(stage, "_SAC_EPISODE_STEPS", 71)
 

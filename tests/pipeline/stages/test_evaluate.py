@@ -12,10 +12,10 @@ from fake_dataset import writer
 from small_run import TRAIN
 from torch import Tensor
 
+from astra_data.core.artifact import read_manifest, write_manifest
 from astra_data.core.checkpoint import load_tensors
-from astra_data.core.digest import file_digest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import read_manifest, write_manifest
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.grounding.files import load_target_encoder, save_target_encoder

@@ -27,9 +27,9 @@ from fake_runs import (
 from html_pages import read_page
 from matplotlib.figure import Figure
 
-from astra_data.core.digest import file_digest
+from astra_data.core.artifact import read_manifest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.manifest import read_manifest
 from astra_data.core.naming import seed_folder
 from astra_data.pipeline.stages import report as stage
 from astra_data.pipeline.stages.report import is_current, report

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from rail_run import make_rail_run
 
-from astra_data.core.digest import file_digest
+from astra_data.core.artifact import read_manifest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.pipeline.stages.select import SelectConfig, benches, judge_of, select
 from astra_data.policies.episodes import Judge

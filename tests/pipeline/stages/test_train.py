@@ -7,9 +7,9 @@ import pytest
 from small_run import TRAIN
 from stopping import Stopped, stop_past
 
-from astra_data.core.digest import file_digest
+from astra_data.core.artifact import read_manifest
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.core.manifest import read_manifest
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import METHODS
@@ -85,7 +85,7 @@ def test_after_an_interruption_it_goes_on(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     grounding = grounded if method == "astra_plus" else None
     expected = make(task, method, paired, grounding, tmp_path / "whole")
     out = tmp_path / "interrupted"
@@ -105,7 +105,7 @@ def test_after_an_interruption_it_goes_on(
 def test_sac_goes_on_after_an_interruption(
     method: str, task: str, paired: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     grounding = grounded if method == "astra" else None
     config = SacTrainConfig(
         learner="sac",
@@ -138,7 +138,7 @@ def test_what_was_begun_with_other_settings_is_left_alone(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     out = tmp_path / "out"
     with pytest.raises(Stopped):
         make(task, "nas", paired, grounded, out, TRAIN, stop_past(0.7))
@@ -179,7 +179,7 @@ def test_rma_deploys_a_student_that_is_told_no_parameters(task: str, paired: Pat
 def test_rma_goes_on_after_an_interruption_in_either_phase(
     share: float, task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     expected = make(task, "rma", paired, None, tmp_path / "whole")
     out = tmp_path / "interrupted"
     with pytest.raises(Stopped):

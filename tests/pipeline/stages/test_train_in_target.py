@@ -43,7 +43,7 @@ def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
     observed: str,
     size: int,
 ) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     expected = make(task, row, paired, whole)
     with pytest.raises(Stopped):

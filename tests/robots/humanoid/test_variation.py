@@ -76,7 +76,7 @@ def short() -> Iterator[None]:
 def test_training_goes_on_after_an_interruption(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("astra_data.core.logbook.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     config = CollectConfig(episodes=3, max_steps=9, start="task", hold_s=(0.03, 0.2))
     collected = collect(TASK, config, seed=0, out=tmp_path / "raw", progress=silent, num_threads=1)
     paired = pair(TASK, PairConfig(), dataset=collected, out=tmp_path / "paired", progress=silent)

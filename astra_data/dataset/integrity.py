@@ -3,9 +3,13 @@
 They stand in meta/astra/digests.parquet: a row per episode, in the dataset's order, and a column per column.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+import hashlib
+import json
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,15 +17,26 @@ import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 from xxhash import xxh3_64_intdigest
 
+from astra_data.core.durable import file_digest
 from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import DIGESTS_PATH
 from astra_data.dataset.parquet import to_numpy
-from astra_data.dataset.plain import Run, read_small_table
-from astra_data.dataset.seal import is_sealed
+from astra_data.dataset.plain import Run, episodes_files, read_small_table
 
 Digests = Mapping[str, NDArray[np.uint64]]
 """Column to the digest of each episode, (E,)."""
+_EPISODES = re.compile(r"meta/episodes/[\w-]+/[\w-]+\.parquet")
+SEALED = (
+    layout.INFO_PATH,
+    layout.STATS_PATH,
+    layout.TASKS_PATH,
+    layout.METADATA_PATH,
+    layout.SUBSETS_PATH,
+    layout.DIGESTS_PATH,
+)
+"""The files with a sum, beside the description and those of meta/episodes."""
 
 
 def digest_of(values: Array) -> int:
@@ -94,3 +109,40 @@ def read_digests(
     if others or len(table) != (len(table) if episodes is None else episodes):
         raise CorruptDatasetError(f"{DIGESTS_PATH} has other columns or episodes than the data")
     return {name: to_numpy(table.column(name), 1, "uint64") for name in columns}
+
+
+def sealed(root: Path, description: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `description`, as JSON gives it back, with the sums of the files in folder `root`."""
+    sums = {path: file_digest(root / path) for path in (*SEALED, *_episodes(root))}
+    full: dict[str, Any] = json.loads(json.dumps({**description, "sums": sums}))
+    full["sums"][layout.DATASET_PATH] = _own_sum(full)
+    return full
+
+
+def is_description_sealed(description: Mapping[str, Any]) -> bool:
+    """Return whether `description` is as it was sealed."""
+    return bool(description["sums"].get(layout.DATASET_PATH) == _own_sum(description))
+
+
+def is_sealed(path: Path, expected: str | None) -> bool:
+    """Return whether the file at `path` has the sum `expected`."""
+    return path.is_file() and file_digest(path) == expected
+
+
+def altered_files(root: Path, description: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the sealed files in folder `root` that were altered or are missing, and those added to them."""
+    sums = description.get("sums", {})
+    listed = [path for path in sums if _EPISODES.fullmatch(path)]
+    for path in (*(path for path in SEALED if path in sums), *sorted({*listed, *_episodes(root)})):
+        if sums and not is_sealed(root / path, sums.get(path)):
+            yield path
+
+
+def _episodes(root: Path) -> list[str]:
+    return [path.relative_to(root).as_posix() for path in episodes_files(root)]
+
+
+def _own_sum(description: Mapping[str, Any]) -> str:
+    sums = {path: value for path, value in description["sums"].items() if path != layout.DATASET_PATH}
+    text = json.dumps({**description, "sums": sums}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
