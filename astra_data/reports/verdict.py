@@ -155,8 +155,8 @@ def _causes(results: Results, row: str) -> Iterator[str]:
     if explained and explained.mean < EXPLAINED:
         yield (
             f"{title}: its rewards are predicted poorly on held-out episodes (R² {explained.mean:.2f}; 1 is "
-            "perfect, 0 is no better than the mean). Record more episodes (`episodes` of `[collect]`, or more "
-            "logs)."
+            "perfect, 0 is no better than the mean). Record more episodes (`episodes` of `[collect]`, or "
+            "more logs)."
         )
         return
     yield (
