@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.dataset import Dataset, DatasetWriter, StagedWriter, atomic
+from astra_data.dataset import atomic
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -23,6 +23,9 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.staging import StagedWriter
+from astra_data.dataset.writer import DatasetWriter
 
 COLUMNS = (
     Column(

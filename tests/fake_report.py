@@ -9,8 +9,8 @@ from fake_runs import FakeRecipe
 from astra_data.pipeline.stages.report import ReportConfig, report
 from astra_data.reports.command_replay import CommandReplay
 from astra_data.reports.results import Results, read_results
+from astra_data.worlds.objective import SUCCESS
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.score import SUCCESS
 
 REPLAY = CommandReplay(
     np.arange(4, dtype=np.float64), np.zeros((4, 2)), np.zeros((4, 4)), np.zeros((2, 4, 4))

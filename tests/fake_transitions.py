@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from fake_dataset import COLUMNS, fake_episodes, writer
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import GOAL, NEXT_STATE, STATE, Array, Column, Episode
+from astra_data.dataset.reader import Dataset
 
 NEXT = Column(NEXT_STATE, size=3)
 

@@ -14,7 +14,7 @@ import fsspec.implementations.local  # noqa: F401 - here, so that no child spend
 from forks import forked
 from shared_files import contents
 
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub import store
 from astra_data.io.hub.pull import pull
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.dataset.frames import mapped_columns
+from astra_data.dataset.reader import Dataset
 
 if __name__ == "__main__":
     dataset, caches = Dataset.open(Path(sys.argv[1])), Path(sys.argv[2])

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Array
+from astra_data.dataset.reader import Dataset
 from astra_data.io.import_report import ImportReport
 from astra_data.io.importing import import_dataset
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ACTION,
     NEXT_STATE,
@@ -15,6 +14,8 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 
 FPS, EPISODES, STEPS = 20, 30, 100
 _POSE = {"unit": ["m", "m", "rad"], "role": ["position", "position", "heading"]}

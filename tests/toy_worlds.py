@@ -8,7 +8,7 @@ from kept_states import came_back
 from torch import Tensor
 
 from astra_data.policies.learner import Learner
-from astra_data.worlds.batched import Step
+from astra_data.worlds.protocols import Step
 
 
 class _World:

@@ -17,9 +17,9 @@ from astra_data.robots.ant.body import (
     torques_to_body,
     up_cosine,
 )
-from astra_data.worlds.batched import Step
 from astra_data.worlds.batched_mujoco import BatchedPhysics
-from astra_data.worlds.rotation import rotation_matrix
+from astra_data.worlds.geometry import rotation_matrix
+from astra_data.worlds.protocols import Step
 
 
 @dataclass(frozen=True)

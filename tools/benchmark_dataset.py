@@ -32,16 +32,16 @@ from rich.table import Table
 from timing import Candidates, Stretch, measure
 
 from astra_data.core.provenance import cores
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
 from astra_data.dataset.frames import Frames
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.pipeline.stages.pair import pair_steps
 from astra_data.policies.gymnasium import SeededSimulatorEnv, SingleEnv
 from astra_data.policies.simulator_env import SimulatorEnv
-from astra_data.robots.registry import TASKS
-from astra_data.robots.simulator_loader import Pairing, pairing_named
-from astra_data.worlds.mujoco_model import MujocoModel
+from astra_data.robots.registry import TASKS, Pairing, pairing_named
+from astra_data.worlds.simulators import MujocoModel
 
 PAIRED = 32_768
 BATCH_OF_PAIRS = 4096

@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.table import Table
 
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ACTION,
     GOAL,
@@ -33,6 +32,8 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.doctor.check import check
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 from astra_data.pipeline.stages.augment import AugmentConfig, augment
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.robots.registry import TASKS

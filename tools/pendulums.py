@@ -9,7 +9,7 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
-from astra_data.worlds.batched import Step
+from astra_data.worlds.protocols import Step
 
 ENV = "Pendulum-v1"
 HORIZON = 200

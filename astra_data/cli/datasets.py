@@ -196,7 +196,8 @@ def inspect(
         typer.echo(f"written: {json}")
     if plot is None:
         return
-    from astra_data.reports.figures.catalog import coverage, png
+    from astra_data.reports.figures.coverage import coverage
+    from astra_data.reports.figures.style import png
 
     maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
     drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]

@@ -150,11 +150,11 @@ def evaluate(
         )
     from astra_data.pipeline.display import shown
     from astra_data.pipeline.grounded_env import evaluate_policy
-    from astra_data.worlds.own_code import own_object
+    from astra_data.worlds.user_code import user_object
 
     with shown("evaluate") as progress:
         evaluate_policy(
-            root / recipe.stem, methods[0], own_object(policy), out=out, seed=seeds[0], progress=progress
+            root / recipe.stem, methods[0], user_object(policy), out=out, seed=seeds[0], progress=progress
         )
     typer.echo(f"finished: {out}")
 

@@ -17,7 +17,7 @@ from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.pipeline.trained_policy import trained_policy
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.reports.formatting import table
-from astra_data.worlds.own_code import file_of
+from astra_data.worlds.user_code import file_of
 
 _PAGE = """\
 # {task}: {row}, seed {seed}

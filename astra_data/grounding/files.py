@@ -13,9 +13,8 @@ from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, FittedGrounding, Grounding
-from astra_data.worlds.own_code import explained
-from astra_data.worlds.own_saving import parts_of, restored
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import explained, parts_of, restored
 
 KINDS: dict[str, type[FittedGrounding]] = {HistoryGrounding.kind: HistoryGrounding}
 """The groundings that can be read, by what their files call them."""

@@ -26,7 +26,7 @@ from astra_data.methods.method import Method, Table
 from astra_data.methods.rma import RMA
 from astra_data.policies.running_policy import add_policy_kind
 from astra_data.policies.train import InSimulator, UserLearner
-from astra_data.worlds.own_code import offered, own_object
+from astra_data.worlds.user_code import offered, user_object
 from astra_data.worlds.variation import Variation
 
 METHODS: dict[str, Method] = {
@@ -86,7 +86,7 @@ def add_method(name: str, place: str) -> None:
         )
     if is_of_package(name):
         raise BadInputError(f"method '{name}' is one of the package: give {place} another name")
-    method = own_object(place)
+    method = user_object(place)
     if not isinstance(method, Method):
         raise BadInputError(f"{place} is a {type(method).__name__}, expected a Method")
     if faults := [*_faults(method)]:

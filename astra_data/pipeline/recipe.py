@@ -29,8 +29,8 @@ from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import judge_of
 from astra_data.pipeline.user_code import OwnMethod, add_all, looked_up, with_offered
 from astra_data.robots.registry import task_named
-from astra_data.worlds.own_code import place_beside
-from astra_data.worlds.score import Score
+from astra_data.worlds.objective import Score
+from astra_data.worlds.user_code import place_beside
 
 _FILLED: Any = Field(default_factory=dict, validate_default=True)
 """A table that a recipe leaves out is read as an empty one."""

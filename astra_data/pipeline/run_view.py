@@ -25,7 +25,7 @@ from astra_data.pipeline.points import Selection
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.trained_policy import settings_of
-from astra_data.reports.figures.catalog import method_color
+from astra_data.reports.figures.style import method_color
 from astra_data.robots.registry import task_named
 
 

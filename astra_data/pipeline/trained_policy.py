@@ -20,7 +20,7 @@ from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.user_code import add_all, check_unchanged
 from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
 from astra_data.robots.registry import task_named
-from astra_data.worlds.own_code import found_near
+from astra_data.worlds.user_code import found_near
 
 
 @dataclass(frozen=True)

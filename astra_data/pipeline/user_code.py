@@ -14,8 +14,7 @@ from astra_data.core.naming import CODE, base_method
 from astra_data.methods import METHODS, add_method, is_of_package, offered_methods
 from astra_data.reports.runs import recorded_code
 from astra_data.robots.registry import place_of
-from astra_data.worlds.code_digest import code_digest
-from astra_data.worlds.own_code import place_beside
+from astra_data.worlds.user_code import code_digest, place_beside
 
 
 class OwnMethod(Config):

@@ -37,7 +37,7 @@ from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, 
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import Observed, PolicyFile, RunningPolicy
 from astra_data.policies.sac import Sac, SacConfig
-from astra_data.worlds.batched import TargetEnv
+from astra_data.worlds.protocols import TargetEnv
 from astra_data.worlds.task import Task
 
 _FORESIGHT_S = 1.0

@@ -27,8 +27,8 @@ from astra_data.policies.running_policy import (
     target_observation,
 )
 from astra_data.policies.simulator_env import Simulation, SimulatorEnv, training_env
-from astra_data.worlds.batched import Step
 from astra_data.worlds.commands import Commands
+from astra_data.worlds.protocols import Step
 from astra_data.worlds.task import Task
 
 

@@ -25,7 +25,7 @@ from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.learner import lately, penalty_scale
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import task_named
-from astra_data.worlds.batched import BatchedEnv, Step
+from astra_data.worlds.protocols import BatchedEnv, Step
 
 Array = NDArray[Any]
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from astra_data.core.seeding import derive
-from astra_data.worlds.batched import BatchedEnv, Step
+from astra_data.worlds.protocols import BatchedEnv, Step
 
 _ROUNDING = 1e-9
 """Of a sum of shares."""

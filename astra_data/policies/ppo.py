@@ -15,7 +15,7 @@ from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
 from astra_data.policies.learner import Acting, Learner, Resumable
 from astra_data.policies.networks import ActorCritic, gaussian_log_prob
-from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.protocols import BatchedEnv
 
 EPOCHS, MINIBATCHES = 5, 16
 """Passes over a rollout, and updates per pass, each on the complete rollouts of some environments."""

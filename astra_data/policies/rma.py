@@ -17,7 +17,7 @@ from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
 from astra_data.policies.learner import Acting, Learner
 from astra_data.policies.networks import SHORTEST_HISTORY, Student, Teacher
-from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.protocols import BatchedEnv
 
 
 class RmaConfig(Config):

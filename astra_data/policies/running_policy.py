@@ -26,9 +26,8 @@ from astra_data.policies.networks import (
 )
 from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.worlds.objective import NO_LIMIT
-from astra_data.worlds.own_code import explained
-from astra_data.worlds.own_saving import parts_of, restored
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import explained, parts_of, restored
 from astra_data.worlds.variation import Variation
 
 Array = NDArray[Any]

@@ -21,7 +21,7 @@ from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
 from astra_data.policies.learner import Acting, Learner
 from astra_data.policies.networks import PolicyShape, SoftActor, features_of
-from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.protocols import BatchedEnv
 
 _REWARD_SCALE = 0.1
 """Factor on the reward that the critics learn from."""

@@ -13,8 +13,8 @@ from astra_data.grounding.failures import averages_before, failing
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes
 from astra_data.grounding.simulator import EpisodeSimulator, Grounding
-from astra_data.worlds.batched import Step
 from astra_data.worlds.objective import NO_LIMIT, Objective
+from astra_data.worlds.protocols import Step
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 

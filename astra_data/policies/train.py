@@ -40,7 +40,7 @@ from astra_data.policies.simulator_env import (
     plus,
     training_env,
 )
-from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.protocols import BatchedEnv
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import Variation
 

@@ -82,7 +82,9 @@ def write_held_out(
     ]
     figures = {}
     if rates := failure_rates(results):
-        from astra_data.reports.figures.catalog import pictures, png, reliability
+        from astra_data.reports.figures.catalog import pictures
+        from astra_data.reports.figures.reliability import reliability
+        from astra_data.reports.figures.style import png
 
         write_file(root / RELIABILITY, png(reliability(rates)))
         blocks += pictures(results, "failures")

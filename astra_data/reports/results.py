@@ -22,7 +22,7 @@ from astra_data.methods import grounded_as, method_role, method_title
 from astra_data.reports.artifacts import Machine
 from astra_data.reports.choice import Candidate, Choice, Judged, choice_of
 from astra_data.reports.statistics import Estimate, Summary, paired_difference, summarize
-from astra_data.worlds.score import SUCCESS, Score
+from astra_data.worlds.objective import SUCCESS, Score
 
 if TYPE_CHECKING:
     import pandas as pd

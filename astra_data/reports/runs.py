@@ -43,7 +43,7 @@ from astra_data.reports.results import (
     merged_origins,
     without_nan,
 )
-from astra_data.worlds.score import SUCCESS, Score
+from astra_data.worlds.objective import SUCCESS, Score
 
 DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")
 """Stages that write a dataset of each seed, in their order."""

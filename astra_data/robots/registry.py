@@ -3,24 +3,34 @@
 A task of a file or of a package is code, which is run when the task is named.
 """
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ABSTRACT_STATE, Array, Column
 from astra_data.robots.ant.tasks import ANTMAZE_TASKS
 from astra_data.robots.humanoid.tasks import HUMANOID_TASKS
 from astra_data.robots.nao.tasks import NAO_TASKS
-from astra_data.worlds.own_code import is_own_code, offered, own_object
+from astra_data.worlds.commands import Commands
+from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import expect_tensor, explained, file_of, is_user_code, offered, user_object
 
 TASKS: dict[str, Task] = {task.name: task for task in (*ANTMAZE_TASKS, *NAO_TASKS, *HUMANOID_TASKS)}
 """The tasks of the package."""
 
-ENTRY_POINTS = "astra_data.tasks"
+TASK_GROUP = "astra_data.tasks"
 """The group of entry points under which installed packages offer tasks."""
 
 
 def known_names() -> tuple[str, ...]:
     """Return the names of the tasks of this package and of installed ones, without running these."""
-    return (*TASKS, *(name for name in offered(ENTRY_POINTS) if name not in TASKS))
+    return (*TASKS, *(name for name in offered(TASK_GROUP) if name not in TASKS))
 
 
 def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
@@ -33,11 +43,11 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
     """
     if name in TASKS:
         return TASKS[name]
-    if is_own_code(name):
-        return _a_task(name, own_object(name))
-    installed = offered(ENTRY_POINTS)
+    if is_user_code(name):
+        return _a_task(name, user_object(name))
+    installed = offered(TASK_GROUP)
     if name in installed:
-        return _a_task(name, own_object(installed[name]))
+        return _a_task(name, user_object(installed[name]))
     known = (*known_names(), *besides)
     raise BadInputError(
         f"unknown task '{name}'{did_you_mean(name, known)}; name your own task like cart.py:TASK"
@@ -46,7 +56,7 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
 
 def place_of(name: str) -> str:
     """Return the place of the code of a task: of one that an installed package offers, where it is there."""
-    return name if name in TASKS or is_own_code(name) else offered(ENTRY_POINTS).get(name, name)
+    return name if name in TASKS or is_user_code(name) else offered(TASK_GROUP).get(name, name)
 
 
 def known_tasks() -> dict[str, Task]:
@@ -62,3 +72,122 @@ def _a_task(name: str, found: object) -> Task:
     if not isinstance(found, Task):
         raise BadInputError(f"{name} is a {type(found).__name__}, expected a Task")
     return found
+
+
+SIMULATOR_GROUP = "astra_data.simulators"
+"""The group of entry points under which installed packages offer abstract simulators."""
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """An abstract simulator, and the map φ to its states.
+
+    Attributes:
+        id: the simulator's name in the dataset.
+        origin: the task that it belongs to, the sha256 of its file, or its place in a package.
+        maze: that of the task; None where there is none.
+        abstract_state: the column of abstract states, with names, units, frames and roles.
+        abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
+        simulator: builds B simulators.
+        commands: the bounds of the task's commands; None where they are ±1, and without a task.
+        fps: the task's steps per second; None for a simulator without a task.
+        columns: the states and commands of the task's robot; none for a simulator without a task.
+    """
+
+    id: str
+    origin: Mapping[str, str]
+    maze: Maze | None
+    abstract_state: Column
+    abstraction: Callable[[Array], Array]
+    simulator: Callable[[int], AbstractSimulator]
+    commands: Commands | None = None
+    fps: int | None = None
+    columns: tuple[Column, ...] = ()
+
+
+def pairing_named(name: str) -> Pairing:
+    """Return the simulator of the task `name`, of an installed package, or of a file as `path.py:MySim`.
+
+    A simulator is a class as `Simulator` of `astra_data.worlds.protocols`; its file or package is run. A task
+    comes before a simulator of the same name.
+
+    Raises:
+        BadInputError: there is no such task, file or class, or the class lacks an attribute.
+    """
+    if name not in TASKS and name.endswith(".py"):
+        raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
+    made = _made_by(name)
+    if isinstance(made, Task):
+        maze = None if made.plane is None else made.maze
+        origin = {"task": made.name, **file_of(name)}
+        return Pairing(
+            id=made.simulator_id,
+            origin=origin,
+            maze=maze,
+            abstract_state=made.abstract_state,
+            abstraction=made.abstraction,
+            simulator=made.own_simulator,
+            commands=None if made.limits.are_normal else made.limits,
+            fps=made.fps,
+            columns=(made.state, made.action),
+        )
+    needed = ("abstract_state", "abstraction", "parameters", "reset_to", "step")
+    missing = [attribute for attribute in needed if not hasattr(made, attribute)]
+    if missing:
+        raise BadInputError(
+            f"{name} has no {', '.join(missing)}: expected what a Simulator has, see "
+            "astra_data.worlds.protocols"
+        )
+    column = made.abstract_state
+    if not isinstance(column, Column):
+        raise BadInputError(f"{name}.abstract_state is a {type(column).__name__}, expected a Column")
+    kind = name.rpartition(":")[2]
+    column = replace(column, name=ABSTRACT_STATE)
+    origin = file_of(name) if is_user_code(name) else {"package": offered(SIMULATOR_GROUP)[name]}
+    return Pairing(kind, origin, None, column, made.abstraction, made)
+
+
+def _made_by(name: str) -> Any:  # noqa: ANN401 - a task or a class of the user's
+    if is_user_code(name):
+        return user_object(name)
+    installed = offered(SIMULATOR_GROUP)
+    if name in installed and name not in known_names():
+        return user_object(installed[name])
+    return task_named(name, besides=tuple(installed))
+
+
+def built(pairing: Pairing, count: int) -> AbstractSimulator:
+    """Build `count` simulators.
+
+    Raises:
+        BadInputError: building them fails, or their states or parameters are of the wrong kind.
+    """
+    with explained(f"{pairing.id}({count})"):
+        batch = pairing.simulator(count)
+        parameters, state = dict(batch.parameters), batch.state
+        shape = tuple(state.shape)
+    expect_tensor(f"{pairing.id}({count}).state", state)
+    expected = (count, pairing.abstract_state.size)
+    if shape != expected:
+        raise BadInputError(f"{pairing.id}({count}).state has shape {shape}, expected {expected}")
+    faults = [key for key, value in parameters.items() if not isinstance(value, int | float | str)]
+    if faults:
+        raise BadInputError(f"{pairing.id}.parameters: expected numbers or texts for {', '.join(faults)}")
+    return batch
+
+
+def checked_abstraction(pairing: Pairing, state: Array) -> Array:
+    """Return φ(state), (B, X) float32, for `state` (B, S).
+
+    Raises:
+        BadInputError: φ fails on such states, or returns another shape.
+    """
+    expected = (len(state), pairing.abstract_state.size)
+    with explained(f"the abstraction of {pairing.id}, given states {state.shape},"):
+        abstract = np.ascontiguousarray(pairing.abstraction(state), dtype=np.float32)
+    if abstract.shape != expected:
+        raise BadInputError(
+            f"the abstraction of {pairing.id} makes {abstract.shape} of states {state.shape}, "
+            f"expected {expected}"
+        )
+    return abstract

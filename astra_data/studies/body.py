@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.arrays import Floats
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from torch import Tensor
 from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, NotNegative, Positive
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.studies.body import Body
 
 ALL = "all_joints"

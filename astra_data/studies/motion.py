@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from astra_data.worlds.plane.geometry import turned, wrapped
+from astra_data.worlds.geometry import turned, wrapped
 
 MIRROR = (1.0, -1.0, -1.0)
 """Signs of forward, left and turn in the mirror image."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from astra_data.reports.figures.catalog import walk_prediction
+from astra_data.reports.figures.walks import walk_prediction
 from astra_data.reports.formatting import fill
 from astra_data.studies.joints import ALL
 from astra_data.studies.models import MODELS, MODELS_OF_JOINTS, Model

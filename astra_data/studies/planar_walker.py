@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from astra_data.dataset.columns import Column
-from astra_data.worlds.free_states import FreeStates
-from astra_data.worlds.plane.geometry import turned
+from astra_data.worlds.geometry import turned
+from astra_data.worlds.simulators import FreeStates
 
 FORWARD_M_S = 0.25
 BACKWARD_M_S = 0.15

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import Floats, as_rows
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.inspection import is_terminated, stands_still
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version, locate
 from astra_data.io.importing import import_dataset, log_suffixes
 from astra_data.io.mapping import read_mapping

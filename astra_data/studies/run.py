@@ -62,7 +62,7 @@ def measure_gap(
         RecipeError: the recipe has faults.
         BadInputError: there are no usable recordings, or the folder holds results of other settings.
     """
-    from astra_data.reports.figures.catalog import png
+    from astra_data.reports.figures.style import png
     from astra_data.studies.page import figure, render
 
     recipe = load_gap_recipe(recipe_path)

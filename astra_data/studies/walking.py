@@ -10,12 +10,12 @@ from torch import Tensor
 from astra_data.core.arrays import Floats
 from astra_data.core.config import Config, Positive
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.studies.body import Body
 from astra_data.studies.motion import MIRROR, between, chained, composed, seen_after
 from astra_data.studies.planar_walker import PlanarWalker
-from astra_data.worlds.plane.geometry import turned, wrapped
+from astra_data.worlds.geometry import turned, wrapped
 
 STATE_NAMES = ("x", "y", "yaw", "ball_x", "ball_y")
 ACTION_NAMES = ("turn", "forward", "left", "kick")

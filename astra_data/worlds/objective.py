@@ -1,4 +1,4 @@
-"""Objectives of tasks, on abstract states: the same in target and simulator, so that rewards compare."""
+"""Measures by which methods are compared on a task."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -10,7 +10,37 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS, Score
+
+
+@dataclass(frozen=True)
+class Score:
+    """A measure of episodes; the larger, the better.
+
+    Attributes:
+        measure: its name in evaluation.json, which has one number per episode.
+        title: of a table's column.
+        quantity: name of its mean over episodes, within a sentence.
+        digits: shown behind the decimal point.
+        limit: the largest possible value, at which axes end; None where there is none.
+    """
+
+    measure: str
+    title: str
+    quantity: str
+    digits: int
+    limit: float | None = None
+
+    def text(self, value: float) -> str:
+        """Return a value with its digits."""
+        return f"{value:.{self.digits}f}"
+
+
+SUCCESS = Score("success", "success", "success rate", 2, limit=1.0)
+
+SURVIVED_STEPS = Score("steps", "survived steps", "number of survived steps", 0)
+
+RETURN = Score("return", "return", "return", 1)
+
 
 NO_LIMIT = 2.0
 """Of the length of velocity commands: longer than any of ±1 on two axes."""
@@ -102,37 +132,3 @@ class Objective(ABC):
     @abstractmethod
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
         """Return the reward (B,) of a step between states (B, X), a failure where `failed` (B,)."""
-
-
-@dataclass(frozen=True)
-class PlanarObjective(Objective):
-    """An objective in a maze; states begin with x and y of the robot in m, actions with its velocity.
-
-    Attributes:
-        maze: where it happens.
-    """
-
-    action_size = 2
-    goal_size = 2
-
-    maze: Maze
-
-    @property
-    def layout(self) -> Maze:
-        """The maze that it happens in."""
-        return self.maze
-
-    @abstractmethod
-    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
-
-    def limit_command(self, action: Tensor, limit: float) -> Tensor:
-        """Shorten the velocities that actions (..., A) begin with, ±1 per axis, to at most `limit`."""
-        command, rest = super().limit_command(action, limit).tensor_split([2], dim=-1)
-        speed = command.norm(dim=-1, keepdim=True)
-        shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)
-        return torch.cat([command * shorten, rest], dim=-1)
-
-    def places(self, state: Tensor) -> Tensor:
-        """Return x and y in m of the bodies in states (..., X); by default of the robot alone, (..., 2)."""
-        return state[..., :2]

@@ -13,10 +13,10 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import Column
-from astra_data.worlds.batched import Step
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.objective import Objective
-from astra_data.worlds.own_code import explained
+from astra_data.worlds.protocols import Step
+from astra_data.worlds.user_code import explained
 
 _SHOWN = 4
 """Entries of a state that a line names."""

@@ -1,12 +1,13 @@
-"""A task: target environment, abstract simulator, the map between their states, and the objective."""
+"""The entries of a task's columns, one row each."""
 
 import inspect
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from numbers import Integral
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -16,15 +17,77 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, NEXT_STATE, STATE, Column
 from astra_data.dataset.description import NAME
-from astra_data.worlds.batched import TargetEnv
-from astra_data.worlds.column_entries import names_with_units, repeated_names
-from astra_data.worlds.commands import Commands
-from astra_data.worlds.driven import DrivenSimulator, VariedCommands
+from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.protocols import AbstractSimulator, TaskSimulator, VariableSimulator
+from astra_data.worlds.protocols import AbstractSimulator, TargetEnv, TaskSimulator, VariableSimulator
 from astra_data.worlds.robot import Robot, RobotEnv
 from astra_data.worlds.variation import RANDOMIZED_COMMANDS, Variation, VariedSimulator
+
+
+class ColumnEntry(NamedTuple):
+    """One value of a column, in the words of `Column.astra`."""
+
+    name: str
+    unit: str
+    frame: str
+    role: str
+
+
+PLANAR_STATE = (
+    ColumnEntry("x", "m", "world", "position"),
+    ColumnEntry("y", "m", "world", "position"),
+    ColumnEntry("vx", "m/s", "world", "vector"),
+    ColumnEntry("vy", "m/s", "world", "vector"),
+)
+"""Abstract states of a robot in the plane."""
+
+PLANAR_GOAL = (
+    ColumnEntry("goal_x", "m", "world", "position"),
+    ColumnEntry("goal_y", "m", "world", "position"),
+)
+
+
+def column(name: str, entries: Sequence[ColumnEntry], meaning: str) -> Column:
+    """Return the column `name` with `entries`."""
+    names, units, frames, roles = zip(*entries, strict=True)
+    astra = {"unit": [*units], "frame": [*frames], "role": [*roles]}
+    return Column(name, size=len(entries), names=names, meaning=meaning, astra=astra)
+
+
+def names_with_units(column: Column) -> list[str]:
+    """Return the names of a column's values, with units where these are known: "speed_m_s"."""
+    words = [
+        "_".join(re.findall("[a-z0-9]+", unit.replace("²", "2").replace("°", "deg"))) for unit in column.units
+    ]
+    return [
+        name if word in ("", "1") or name.endswith(f"_{word}") else f"{name}_{word}"
+        for name, word in zip(column.labels, words, strict=True)
+    ]
+
+
+def repeated_names(column: Column | None) -> list[str]:
+    """Return the names that several values of a column have, each once; none of no column."""
+    names = (column.names if column else None) or ()
+    return sorted({name for name in names if names.count(name) > 1})
+
+
+def free_body(joints: Sequence[str]) -> list[ColumnEntry]:
+    """Return the entries of MuJoCo's qpos, then qvel, of a free body with hinge `joints`, in their order."""
+    return [
+        ColumnEntry("x", "m", "world", "position"),
+        ColumnEntry("y", "m", "world", "position"),
+        ColumnEntry("z", "m", "world", "invariant"),
+        *(ColumnEntry(name, "1", "world", "quaternion") for name in ("qw", "qx", "qy", "qz")),
+        *(ColumnEntry(joint, "rad", "joint", "invariant") for joint in joints),
+        ColumnEntry("vx", "m/s", "world", "vector"),
+        ColumnEntry("vy", "m/s", "world", "vector"),
+        ColumnEntry("vz", "m/s", "world", "invariant"),
+        ColumnEntry("wx", "rad/s", "body", "invariant"),
+        ColumnEntry("wy", "rad/s", "body", "invariant"),
+        ColumnEntry("wz", "rad/s", "body", "invariant"),
+        *(ColumnEntry(f"{joint}_rate", "rad/s", "joint", "invariant") for joint in joints),
+    ]
 
 
 def whole(state: Tensor) -> Tensor:

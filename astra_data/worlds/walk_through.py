@@ -10,11 +10,10 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
-from astra_data.worlds.expecting import expect, expect_same, expect_tensor, judged, paid, stepped
-from astra_data.worlds.own_code import explained
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.robot import RobotEnv
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import expect, expect_same, expect_tensor, explained, judged, paid, stepped
 
 _COUNT = 3
 _EVEN = 0.005

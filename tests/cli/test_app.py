@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 
 HEAVY = {"torch", "numpy", "pydantic", "lerobot", "mujoco", "matplotlib"}
 

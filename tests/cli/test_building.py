@@ -4,8 +4,9 @@ import pytest
 from command_line import call
 
 from astra_data.core.errors import AstraDataError
-from astra_data.dataset import Dataset, StagedWriter
 from astra_data.dataset.columns import Episode
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import open_dataset
 
 pytestmark = pytest.mark.usefixtures("home")

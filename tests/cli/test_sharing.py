@@ -6,8 +6,8 @@ from fake_dataset import write_fake
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError, SharingError
-from astra_data.dataset import Dataset
 from astra_data.dataset.edit import subset
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.fixture

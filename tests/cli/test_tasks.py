@@ -12,14 +12,14 @@ from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, 
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
 from astra_data.robots import registry
-from astra_data.worlds import own_code
+from astra_data.worlds import user_code
 
 CART = Path(__file__).parents[1] / "small_cart.py"
 
 
 def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    offered = EntryPoint("rail-cart", "small_cart:LOGS_ALONE", registry.ENTRY_POINTS)
-    monkeypatch.setattr(own_code, "entry_points", lambda group: [offered])
+    offered = EntryPoint("rail-cart", "small_cart:LOGS_ALONE", registry.TASK_GROUP)
+    monkeypatch.setattr(user_code, "entry_points", lambda group: [offered])
     result = CliRunner().invoke(app, ["tasks"], env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
     lines = {line.split()[1]: line for line in result.output.splitlines() if line.startswith("│")}

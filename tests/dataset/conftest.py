@@ -7,8 +7,8 @@ import pytest
 from fake_dataset import write_fake
 from fake_frames import NAMES
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.frames import Frames
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.fixture(scope="session")

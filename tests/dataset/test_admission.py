@@ -6,8 +6,8 @@ import pytest
 from fake_dataset import COLUMNS, fake_columns, fake_episode, writer
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, DONE, REWARD, TERMINATED, TRUNCATED, Episode, Scalar
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import Admission
 
 

@@ -10,9 +10,9 @@ from failing_disk import small_files
 from fake_frames import NAMES, assert_equal, everything
 
 from astra_data.core.errors import CorruptDatasetError, DiskError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
 from astra_data.dataset.frames import Frames
+from astra_data.dataset.reader import Dataset
 
 
 def test_mapped_columns_equal_loaded_ones(

@@ -2,9 +2,9 @@ from pathlib import Path
 
 from fake_dataset import COLUMNS, DESCRIPTION, fake_columns, fake_episode, write_fake, writer
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE, Column, Episode
 from astra_data.dataset.compare import Differences, differences
+from astra_data.dataset.reader import Dataset
 
 
 def test_equal_datasets_do_not_differ(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from damaged import DATA, EPISODES, alter_rows, edit, truncate
 from fake_dataset import LENGTHS, fake_episodes, write_fake
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.contents import read_contents
 from astra_data.dataset.format import METADATA_PATH
+from astra_data.dataset.reader import Dataset
 
 
 def drop_rows(root: Path) -> None:

@@ -24,10 +24,10 @@ from hypothesis import strategies as st
 from nested import places
 
 from astra_data.core.errors import AstraDataError
-from astra_data.dataset import Dataset
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.inspection import inspect_dataset
+from astra_data.dataset.reader import Dataset
 
 fuzzed = settings(
     max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "10")),

@@ -9,11 +9,12 @@ from damaged import DATA, alter
 from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import parquet
 from astra_data.dataset.columns import ACTION, REWARD, STATE
 from astra_data.dataset.edit import delete
 from astra_data.dataset.format import DIGESTS_PATH
 from astra_data.dataset.integrity import altered_columns, digests_of, read_digests
+from astra_data.dataset.reader import Dataset
 
 
 def test_the_file_holds_a_digest_of_each_episode_and_column(fake: Dataset) -> None:

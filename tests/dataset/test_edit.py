@@ -8,9 +8,9 @@ import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, write_fake, writer
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE, Column
 from astra_data.dataset.edit import delete, filter_episodes, merge, share, subset
+from astra_data.dataset.reader import Dataset
 
 
 def write(root: Path, uids: range) -> Dataset:

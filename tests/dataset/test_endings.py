@@ -2,9 +2,10 @@ from pathlib import Path
 
 import numpy as np
 
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, Column, Episode
 from astra_data.dataset.inspection import Endings, endings_of, outcome_of
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 
 
 def test_only_a_terminated_last_step_that_stands_still_was_made_up(tmp_path: Path) -> None:

@@ -3,9 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.dataset.compare import column_faults, names_apart
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 
 
 def recorded(folder: Path, names: tuple[str, ...] | None, units: list[str] | None = None) -> Dataset:

@@ -8,8 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import COLUMNS
 
-from astra_data.dataset import Dataset, parquet
 from astra_data.dataset import format as layout
+from astra_data.dataset import parquet
+from astra_data.dataset.reader import Dataset
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 

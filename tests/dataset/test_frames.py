@@ -8,9 +8,9 @@ from fake_frames import NAMES, assert_equal, everything
 from gpu import needs_cuda
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import INDEX, STATE
 from astra_data.dataset.frames import Frames
+from astra_data.dataset.reader import Dataset
 
 
 def test_columns_are_the_datasets(fake: Dataset) -> None:

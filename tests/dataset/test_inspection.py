@@ -10,11 +10,12 @@ from rich.console import Console
 
 from astra_data.cli.inspection_page import inspection_page, shaded, sparkline
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode, Scalar
 from astra_data.dataset.edit import filter_episodes
 from astra_data.dataset.inspection import BINS, CELLS, Inspection, Map, inspect_dataset, visited
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 from astra_data.io.hub.card import render_card
 from astra_data.io.hub.notes import Notes
 

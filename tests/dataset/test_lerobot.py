@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import COLUMNS, LENGTHS
 
-from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import ACTION, REWARD, STATE
 from astra_data.dataset.frames import Frames
+from astra_data.dataset.reader import Dataset
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 

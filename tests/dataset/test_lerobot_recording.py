@@ -19,7 +19,6 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -38,6 +37,7 @@ from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.edit import filter_episodes, merge, subset
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.lerobot_rows import RECORDED_TASK
+from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import EXPORTERS, export
 from astra_data.io.hub.push import push
 from astra_data.io.importing import import_dataset

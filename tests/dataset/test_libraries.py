@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE
+from astra_data.dataset.reader import Dataset
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning"),

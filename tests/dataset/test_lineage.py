@@ -7,12 +7,12 @@ import pytest
 from fake_dataset import DESCRIPTION, fake_episode, write_fake, writer
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.compare import hashes, lineage, recordings_of, tree_lines
 from astra_data.dataset.edit import delete, merge, subset
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.integrity import sealed
+from astra_data.dataset.reader import Dataset
 
 pytestmark = pytest.mark.usefixtures("home")
 

@@ -8,7 +8,6 @@ from fake_dataset import write_fake
 from nested import places
 
 from astra_data.core.errors import AstraDataError, CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.compare import lineage, tree_lines
 from astra_data.dataset.description import read_description
 from astra_data.dataset.doctor.check import check
@@ -17,6 +16,7 @@ from astra_data.dataset.edit import subset
 from astra_data.dataset.format import DATA_PATH, DATASET_PATH, INFO_PATH, STATS_PATH, SUBSETS_PATH
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.plain import is_data_path
+from astra_data.dataset.reader import Dataset
 
 VALUES: tuple[object, ...] = (
     *(None, True, -1, 0, 3, 0.5, 1e300, 10**400, float("nan"), float("inf")),

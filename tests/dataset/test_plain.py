@@ -8,7 +8,6 @@ import pytest
 from damaged import DATA
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, TIMESTAMP, Array
 from astra_data.dataset.plain import (
     TIMESTAMP_TOLERANCE_S,
@@ -25,6 +24,7 @@ from astra_data.dataset.plain import (
     run_faults,
     runs,
 )
+from astra_data.dataset.reader import Dataset
 
 
 def test_only_rows_of_numbers_are_plain_columns() -> None:

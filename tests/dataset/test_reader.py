@@ -10,10 +10,11 @@ from damaged import truncate
 from fake_dataset import COLUMNS, LENGTHS, concatenated, fake_columns, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import parquet
 from astra_data.dataset.columns import STATE, TIMESTAMP, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.mark.parametrize("block_rows", [1, 2**16])

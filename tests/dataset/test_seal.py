@@ -7,10 +7,10 @@ from damaged import EPISODES, edit
 from fake_dataset import write_fake
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.description import read_description
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.integrity import SEALED, altered_files, sealed
+from astra_data.dataset.reader import Dataset
 
 
 def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:

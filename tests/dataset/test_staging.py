@@ -25,8 +25,8 @@ from fake_dataset import (
 from shared_files import contents
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Episode
+from astra_data.dataset.reader import Dataset
 
 STEPS_OF_THE_RECORDED = 20
 EPISODES_OF_THE_RECORDED = 30

@@ -3,9 +3,9 @@ import pytest
 from fake_dataset import LENGTHS
 from fake_frames import NAMES, everything
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import INDEX, STATE
 from astra_data.dataset.frames import Frames
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.mark.parametrize("stride", [1, 3])

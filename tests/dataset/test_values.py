@@ -5,10 +5,11 @@ import pyarrow.parquet as pq
 import pytest
 from fake_dataset import LENGTHS, concatenated, write_fake
 
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import parquet
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.dataset.contents import alterations, measure, read_values
 from astra_data.dataset.integrity import digests_of
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.mark.parametrize("block_rows", [1, 20, 2**16])

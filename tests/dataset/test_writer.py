@@ -15,10 +15,12 @@ from fake_dataset import COLUMNS, DESCRIPTION, fake_episode, fake_episodes, stag
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset, DatasetWriter, parquet
+from astra_data.dataset import parquet
 from astra_data.dataset import statistics as episode_rows
 from astra_data.dataset.columns import STATE, Column
 from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 
 
 def test_the_same_episodes_give_the_same_bytes_in_every_file(tmp_path: Path) -> None:

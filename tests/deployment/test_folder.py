@@ -16,7 +16,7 @@ from astra_data.core.artifact import read_manifest
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.deployment.folder import deploy, describe, page
 from astra_data.deployment.graph import load_onnx
 from astra_data.grounding.alignment import TargetEncoder

@@ -9,7 +9,6 @@ from damaged import reseal
 from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -28,6 +27,8 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.edit import delete
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import Commands

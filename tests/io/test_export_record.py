@@ -10,8 +10,8 @@ from fake_dataset import COLUMNS, write_fake
 from fake_transitions import write_transitions
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import REWARD
+from astra_data.dataset.reader import Dataset
 from astra_data.io.export_record import Export, ExportRecord, read_record, restored
 from astra_data.io.exporters import export
 from astra_data.io.importers import csv, hdf5

@@ -24,7 +24,7 @@ from minari_recordings import episodes, write_minari
 from recordings import MAPPING, TABLES, rows, write_table
 
 from astra_data.core.errors import AstraDataError
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 
 fuzzed = settings(

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from fake_dataset import COLUMNS, fake_episodes, writer
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import GOAL, STATE, Column, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
+from astra_data.dataset.reader import Dataset
 
 WARM = Path(__file__).parents[1] / "warm_commands.py"
 LOADED = [f"lerobot.scripts.lerobot_{name}" for name in ("train", "edit_dataset", "dataset_viz")]

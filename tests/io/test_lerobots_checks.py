@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.pair import pair
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array
+from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 
 ROOT = Path(__file__).parents[2]

@@ -8,8 +8,8 @@ import pytest
 from recordings import MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Array
+from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 
 

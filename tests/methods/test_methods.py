@@ -7,8 +7,7 @@ from astra_data.grounding.fit import GroundConfig, HistoryFit
 from astra_data.grounding.model import LossWeights
 from astra_data.methods import METHODS, method_named, method_role, method_title, tables
 from astra_data.policies.train import InSimulator, InTarget
-from astra_data.reports.figures.catalog import method_color
-from astra_data.reports.figures.style import SPARE_COLORS
+from astra_data.reports.figures.style import SPARE_COLORS, method_color
 
 
 def test_methods_are_known_by_their_names() -> None:

@@ -22,8 +22,8 @@ from astra_data.pipeline.plan import plan
 from astra_data.pipeline.trained_policy import load_policy
 from astra_data.pipeline.user_code import OwnMethod
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.own_code import own_object
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import user_object
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "recipes/examples/methods"
@@ -94,7 +94,7 @@ DELTA = f"{EXAMPLES / 'delta_action.py'}:METHOD"
 
 @pytest.mark.parametrize("simulator", [Rail, NumpyRail])
 def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, simulator: type[Rail]) -> None:
-    method, task = own_object(DELTA), Task(**GIVEN | {"make_simulator": simulator})
+    method, task = user_object(DELTA), Task(**GIVEN | {"make_simulator": simulator})
     given = replace(fitting(tmp_path, 0.1 * 0.5, task), settings=method.table.usual)
     grounding, _ = method.fit(given)
     windows = given.training.windows
@@ -105,7 +105,7 @@ def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, sim
 
 def test_a_delta_action_tells_a_lag_from_the_history(tmp_path: Path) -> None:
     """The cart does what it was told a step before, so the step before is what is to be added."""
-    method, given = own_object(DELTA), fitting(tmp_path)
+    method, given = user_object(DELTA), fitting(tmp_path)
     windows = given.training.windows
     before = torch.cat([torch.zeros(8, 1, 1), windows.action[:, :-1]], dim=1)
     windows.next_state = windows.state + 0.1 * TASK.limits.in_units(before)  # type: ignore[misc]
@@ -128,7 +128,7 @@ def test_a_delta_action_tells_a_lag_from_the_history(tmp_path: Path) -> None:
 
 
 def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: Path) -> None:
-    method = own_object(f"{EXAMPLES / 'residual_ensemble.py'}:METHOD")
+    method = user_object(f"{EXAMPLES / 'residual_ensemble.py'}:METHOD")
     given = fitting(tmp_path, moved_by=0.0)
     windows = given.training.windows
     windows.next_state = windows.simulated_next + 0.3 * windows.state - 0.1 * windows.action  # type: ignore[misc]
@@ -144,7 +144,7 @@ def test_golemos_lstm_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> N
     lacking = torch.nn.functional.pad(0.1 * action[:, :-2], (0, 2, 2, 0))  # commanded two steps before
     both = toy_episodes(state, action, next_state=simulated + lacking, simulated_next=simulated)
     training, held_out = both.select(torch.arange(32)), both.select(torch.arange(32, 40))
-    method = own_object(f"{EXAMPLES / 'nas_golemo.py'}:METHOD")
+    method = user_object(f"{EXAMPLES / 'nas_golemo.py'}:METHOD")
     settings = method.table.model(epochs=12, hidden_size=16, layers=2, learning_rate=0.01)
     given = Fitting(ANTS, GroundConfig(), settings, training, held_out, 0, "cpu", tmp_path, silent)
     grounding, figures = method.fit(given)
@@ -157,7 +157,7 @@ def test_golemos_lstm_learns_a_lag_that_only_a_memory_knows(tmp_path: Path) -> N
 
 
 def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -> None:
-    method, ranges = own_object(f"{EXAMPLES / 'compass_causal.py'}:METHOD"), ANTS.varied.wide
+    method, ranges = user_object(f"{EXAMPLES / 'compass_causal.py'}:METHOD"), ANTS.varied.wide
     planted = {"friction": (0.92, 0.92), "timestep_scale": (1.1, 1.1), "heading_bias_deg": (3.0, 3.0)}
     start = torch.tensor([*ANTS.maze.cell_center(*ANTS.maze.start), 0.0, 0.0]).float()
     sets = []

@@ -12,7 +12,7 @@ from fake_items import crash, fail, fill_the_disk, touch
 
 from astra_data.core.errors import DiskError, MissingStageError
 from astra_data.pipeline.executors import Item, Reporter, pickled, run_in_order, run_item
-from astra_data.worlds.own_code import own_object
+from astra_data.worlds.user_code import user_object
 
 
 class Workshop:
@@ -99,9 +99,9 @@ def no_progress(made: partial[None], progress: object) -> None:
 def test_an_item_may_hold_an_object_of_a_file_that_its_preparation_runs(tmp_path: Path) -> None:
     (tmp_path / "sizes.py").write_text("class Size(float):\n    pass\n\n\nSIZE = Size(2.5)\n")
     place = f"{tmp_path / 'sizes.py'}:SIZE"
-    size = own_object(place)
+    size = user_object(place)
     call = partial(no_progress, partial(keep, tmp_path / "kept", size))
-    work = pickled(Item("a", (), call), partial(own_object, place))
+    work = pickled(Item("a", (), call), partial(user_object, place))
     del sys.modules[type(size).__module__]  # as in a process of its own
     assert isinstance(run_item("a", work, tmp_path / "log", lambda note: None), float)
     assert (tmp_path / "kept").read_text() == "2.5"

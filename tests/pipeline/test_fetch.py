@@ -12,7 +12,7 @@ from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
 from astra_data.dataset.reader import Dataset
 from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
 from astra_data.robots.registry import task_named
-from astra_data.worlds.own_code import own_object
+from astra_data.worlds.user_code import user_object
 from astra_data.worlds.walk_through import check_task
 
 FETCH = Path(__file__).parents[2] / "recipes/examples/fetch"
@@ -98,7 +98,7 @@ def test_the_puck_is_pushed_at_one_height_until_it_falls() -> None:
 
 
 def test_the_script_pushes_the_puck_to_its_goal() -> None:
-    task, method = task_named(f"{FETCH}/push.py:TASK"), own_object(f"{FETCH}/script.py:METHOD")
+    task, method = task_named(f"{FETCH}/push.py:TASK"), user_object(f"{FETCH}/script.py:METHOD")
     env, script = task.target(4, seed=3, num_threads=1), method.learn.learn(None, None)
     assert script.from_file(*script.to_file()).act(np.ones((1, 4))).shape == (1, 2)
     env.reset()

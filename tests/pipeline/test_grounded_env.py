@@ -30,7 +30,7 @@ from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SingleEnv
 from astra_data.policies.running_policy import UserPolicy
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import InSimulator
-from astra_data.worlds.own_code import own_object
+from astra_data.worlds.user_code import user_object
 
 gymnasium.register_envs(astra_data.envs)
 ID = "astra_data/Grounded-v0"
@@ -67,7 +67,7 @@ episodes = 3
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run of the cart, with a policy of one row; its recipe stands beside `runs`."""
     folder = tmp_path_factory.mktemp("grounded")
-    own_object(f"{EXAMPLES}/cart/robot.py:record")(folder / "csv", drives=8, seconds=6)
+    user_object(f"{EXAMPLES}/cart/robot.py:record")(folder / "csv", drives=8, seconds=6)
     (folder / "cart.py").write_text((EXAMPLES / "cart/cart.py").read_text())
     import_dataset(sorted((folder / "csv").glob("*.csv")), EXAMPLES / "cart/logs.toml", out=folder / "logs")
     (folder / "cart.toml").write_text(RECIPE)
@@ -307,7 +307,7 @@ def test_the_example_learns_and_is_tested_by_the_command_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(EXAMPLES / "random_search.py", tmp_path)
-    own_object("random_search.py:learn")(run, "nas", rounds=4)
+    user_object("random_search.py:learn")(run, "nas", rounds=4)
     returns = [float(line.split()[3].rstrip(",")) for line in capsys.readouterr().out.splitlines()]
     assert len(returns) == 4 and returns[-1] > returns[0] + 1.0
     shutil.copy("random_search.py", "learned.py")
@@ -318,7 +318,7 @@ def test_the_example_learns_and_is_tested_by_the_command_line(
     assert tested["policy"] == "Linear" and len(tested["grounded"]["success"]) == 3
     observation = torch.ones(1, 2 + 4)
     by_hand = np.tanh(np.ones((1, 2 + 4)) @ np.load("linear.npy"))
-    acted = UserPolicy(own_object("learned.py:POLICY"), 6, 2).act(observation)
+    acted = UserPolicy(user_object("learned.py:POLICY"), 6, 2).act(observation)
     np.testing.assert_allclose(acted, by_hand, atol=1e-6)
 
 

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import DatasetWriter
 from astra_data.dataset.columns import ACTION, GOAL, STATE, TERMINATED, Column, Episode
 from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 from astra_data.pipeline.new_robot import write_robot
 from astra_data.robots.registry import task_named
 from astra_data.worlds.walk_through import check_task

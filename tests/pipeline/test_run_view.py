@@ -13,7 +13,7 @@ from recordings_of_rerun import read, scalars
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.grounding.descent import DescentConfig
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding

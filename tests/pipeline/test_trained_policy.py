@@ -18,7 +18,7 @@ from astra_data.pipeline.stages.train import train
 from astra_data.pipeline.trained_policy import load_policy, settings_of, task_of, trained_policy
 from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.code_digest import code_digest
+from astra_data.worlds.user_code import code_digest
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import torch
 from toy_worlds import ConstantReward, GoToZero
 
 from astra_data.policies.learner import Acting
-from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.protocols import BatchedEnv
 
 
 def acting(env: BatchedEnv, horizon: int, *, is_staggered: bool = False) -> Acting:

@@ -13,7 +13,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.policies import ppo as module
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo, PpoConfig, generalized_advantages
-from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.protocols import BatchedEnv
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.policies import sac as module
 from astra_data.policies.networks import PolicyShape, SoftActor, features_of
 from astra_data.policies.sac import Sac, SacConfig
-from astra_data.worlds.batched import BatchedEnv
+from astra_data.worlds.protocols import BatchedEnv
 
 
 def sac(

@@ -11,8 +11,7 @@ from astra_data.policies.simulator_env import DataStarts, SimulatorEnv, policy_o
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
-from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.variation import PlanarVariation
 
 TASK = Navigation(U_MAZE, horizon=700)

@@ -9,7 +9,7 @@ from torch import Tensor
 from astra_data.reports.command_replay import can_replay, replay_commands
 from astra_data.robots.nao.target import NaoEnv
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.batched import Step
+from astra_data.worlds.protocols import Step
 
 
 def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place() -> None:

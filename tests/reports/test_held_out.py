@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.reports.figures.catalog import reliability
+from astra_data.reports.figures.reliability import reliability
 from astra_data.reports.held_out import write_held_out
 
 Rates = Mapping[str, Mapping[str, NDArray[np.float64]]]

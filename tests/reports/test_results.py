@@ -20,7 +20,7 @@ from astra_data.reports.results import (
     results_json,
     stage_seconds,
 )
-from astra_data.worlds.score import SURVIVED_STEPS
+from astra_data.worlds.objective import SURVIVED_STEPS
 
 
 def line(row: str, seed: int, where: str = TESTED, percent: int = 100, **values: float) -> Line:

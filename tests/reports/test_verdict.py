@@ -18,7 +18,7 @@ from astra_data.reports.results import (
     results_json,
 )
 from astra_data.reports.verdict import Verdict, verdict_of
-from astra_data.worlds.score import SURVIVED_STEPS
+from astra_data.worlds.objective import SURVIVED_STEPS
 
 Scores = Mapping[str, tuple[float, ...]]
 

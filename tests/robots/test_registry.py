@@ -6,9 +6,9 @@ import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, STATE
-from astra_data.robots.registry import ENTRY_POINTS, TASKS, known_names, known_tasks, place_of, task_named
-from astra_data.worlds import own_code
-from astra_data.worlds.plane.free_space import FreeSpace
+from astra_data.robots.registry import TASK_GROUP, TASKS, known_names, known_tasks, place_of, task_named
+from astra_data.worlds import user_code
+from astra_data.worlds.plane.mazes import FreeSpace
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import VariedSimulator
 
@@ -72,8 +72,8 @@ def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     names = ("rail-cart", "antmaze-umaze")
-    points = [EntryPoint(name, "small_cart:TASK", ENTRY_POINTS) for name in names]
-    monkeypatch.setattr(own_code, "entry_points", lambda group: points)
+    points = [EntryPoint(name, "small_cart:TASK", TASK_GROUP) for name in names]
+    monkeypatch.setattr(user_code, "entry_points", lambda group: points)
     assert known_names() == (*TASKS, "rail-cart")
     assert known_tasks()["antmaze-umaze"] is TASKS["antmaze-umaze"]
     assert place_of("rail-cart") == place_of("small_cart:TASK") == "small_cart:TASK"

@@ -13,13 +13,12 @@ from small_cart import GIVEN
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
-from astra_data.robots.registry import TASKS
-from astra_data.robots.simulator_loader import ENTRY_POINTS, built, checked_abstraction, pairing_named
-from astra_data.worlds import own_code
-from astra_data.worlds.mujoco_model import MujocoModel
-from astra_data.worlds.own_code import explained
+from astra_data.robots.registry import SIMULATOR_GROUP, TASKS, built, checked_abstraction, pairing_named
+from astra_data.worlds import user_code
 from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.simulators import MujocoModel
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import explained
 
 MINE = Path(my_simulator.__file__)
 STATES = np.arange(87, dtype=np.float32).reshape(3, 29)
@@ -66,7 +65,7 @@ def test_abstract_states_are_stored_as_float32_under_their_own_name(tmp_path: Pa
     abstract = checked_abstraction(pairing, STATES)
     assert abstract.dtype == np.float32 and abstract.flags.c_contiguous
     np.testing.assert_array_equal(abstract, STATES[:, [1, 0]])
-    assert any(name.startswith("astra_data_own_sim_") for name in sys.modules)
+    assert any(name.startswith("astra_data_user_sim_") for name in sys.modules)
 
 
 @pytest.mark.parametrize(
@@ -125,8 +124,10 @@ def test_errors_of_the_users_code_keep_their_cause() -> None:
 
 
 def test_installed_packages_offer_simulators_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    offered = [EntryPoint(name, "my_simulator:Glider", ENTRY_POINTS) for name in ("glider", "antmaze-umaze")]
-    monkeypatch.setattr(own_code, "entry_points", lambda group: {ENTRY_POINTS: offered}.get(group, []))
+    offered = [
+        EntryPoint(name, "my_simulator:Glider", SIMULATOR_GROUP) for name in ("glider", "antmaze-umaze")
+    ]
+    monkeypatch.setattr(user_code, "entry_points", lambda group: {SIMULATOR_GROUP: offered}.get(group, []))
     pairing = pairing_named("glider")
     assert (pairing.id, pairing.origin) == ("glider", {"package": "my_simulator:Glider"})
     assert pairing.simulator(2).step(torch.ones(2, 2)).tolist() == pytest.approx(np.full((2, 2), 0.05))

@@ -9,7 +9,7 @@ from toy_joints import FPS, NAMES, piece, write_log
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 from astra_data.studies.errors import Starts
 from astra_data.studies.joints import ALL, Joints, JointsConfig

@@ -3,7 +3,7 @@ import re
 from matplotlib.colors import to_hex
 
 from astra_data.methods import METHODS
-from astra_data.reports.figures.catalog import walk_prediction
+from astra_data.reports.figures.walks import walk_prediction
 from astra_data.studies.models import MODELS
 
 

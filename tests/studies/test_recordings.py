@@ -7,7 +7,7 @@ import pytest
 from toy_walks import actions, log, states, write_archive
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 from astra_data.studies.joints import JointsConfig
 from astra_data.studies.recordings import place_name, read_recordings

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.batched import BatchedEnv, TargetEnv, rows_in
+from astra_data.worlds.protocols import BatchedEnv, TargetEnv, rows_in
 
 TARGETS = {name: TASKS[name] for name in ("antmaze-umaze", "nao-navigation", "nao-kick", "humanoid-extended")}
 COUNT = 3

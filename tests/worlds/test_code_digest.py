@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.code_digest import code_digest
+from astra_data.worlds.user_code import code_digest
 
 
 def test_code_has_one_digest_in_every_version_of_python(tmp_path: Path) -> None:

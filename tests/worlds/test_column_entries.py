@@ -1,5 +1,5 @@
 from astra_data.dataset.columns import Column
-from astra_data.worlds.column_entries import (
+from astra_data.worlds.task import (
     ColumnEntry,
     column,
     free_body,

@@ -1,8 +1,7 @@
 import torch
 from small_cart import TASK, Rail
 
-from astra_data.worlds.commands import Commands
-from astra_data.worlds.driven import DrivenSimulator, VariedCommands
+from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands
 from astra_data.worlds.variation import CommandVariation
 
 DRIVE = Commands({"v": (-1.0, 4.0)})

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.expecting import expect, expect_same, first, judged, paid
 from astra_data.worlds.objective import Objective
+from astra_data.worlds.user_code import expect, expect_same, first, judged, paid
 
 STATE = torch.zeros(3, 2)
 

@@ -1,6 +1,6 @@
 import torch
 
-from astra_data.worlds.free_states import FreeStates
+from astra_data.worlds.simulators import FreeStates
 
 
 def test_states_are_set_row_by_row_and_those_handed_out_stay() -> None:

@@ -14,7 +14,7 @@ from small_cart import TASK, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.commands import Commands
-from astra_data.worlds.gymnasium_robot import Env, GymnasiumRobot, observed
+from astra_data.worlds.gymnasium_env import Env, GymnasiumRobot, observed
 from astra_data.worlds.robot import RobotEnv, State
 
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.gymnasium_robot import Env
-from astra_data.worlds.gymnasium_simulator import GymnasiumSimulator
+from astra_data.worlds.gymnasium_env import Env, GymnasiumSimulator
 from astra_data.worlds.robot import State
 
 

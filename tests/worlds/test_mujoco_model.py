@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.mujoco_model import MujocoModel
+from astra_data.worlds.simulators import MujocoModel
 
 PENDULUM = """
 <mujoco>

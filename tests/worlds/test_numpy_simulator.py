@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
-from astra_data.worlds.numpy_simulator import NumpySimulator
+from astra_data.worlds.simulators import NumpySimulator
 
 
 def turn(state: Floats, command: Floats) -> Floats:

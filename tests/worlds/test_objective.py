@@ -7,12 +7,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.robots.humanoid.objectives import JointWalking
-from astra_data.worlds.objective import Objective
-from astra_data.worlds.plane.kicking import Kicking
+from astra_data.robots.humanoid.tasks import JointWalking
+from astra_data.robots.nao.kicking import Kicking
+from astra_data.worlds.objective import RETURN, SUCCESS, SURVIVED_STEPS, Objective
 from astra_data.worlds.plane.mazes import FIELD, U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
-from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS
 
 TRUE_FALSE = torch.tensor([True, True, False, False])
 FALSE_TRUE = torch.tensor([False, True, False, True])

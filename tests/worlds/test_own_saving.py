@@ -10,8 +10,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.worlds.own_code import own_object
-from astra_data.worlds.own_saving import parts_of, restored
+from astra_data.worlds.user_code import parts_of, restored, user_object
 
 
 class Linear:
@@ -71,7 +70,7 @@ TENSORS, METADATA = {"matrix": torch.ones(2), "factor": torch.ones(1)}, {"sizes"
 
 def made_of(body: str, folder: Path) -> Any:  # noqa: ANN401 - a class of a user's
     (folder / "mine.py").write_text(OWN.format(body=body))
-    return own_object(f"{folder / 'mine.py'}:Own")
+    return user_object(f"{folder / 'mine.py'}:Own")
 
 
 def test_what_it_builds_is_returned(tmp_path: Path) -> None:

@@ -7,11 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.worlds.batched import Step
-from astra_data.worlds.planar_target import PlanarTarget
-from astra_data.worlds.plane.kicking import Kicking
+from astra_data.robots.nao.kicking import Kicking
 from astra_data.worlds.plane.mazes import FIELD, U_MAZE
-from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.plane.navigation import Navigation, PlanarTarget
+from astra_data.worlds.protocols import Step
 
 
 class Straight(Navigation):

@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import torch
 
-from astra_data.worlds.rotation import rotation, rotation_matrix
+from astra_data.worlds.geometry import rotation, rotation_matrix
 
 
 def test_rotation_matrix_is_mujocos() -> None:

@@ -14,9 +14,9 @@ from astra_data.dataset.columns import Column
 from astra_data.methods.follower import careful
 from astra_data.policies.collecting import WallWatch
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.driven import DrivenSimulator
+from astra_data.worlds.commands import DrivenSimulator
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.plane.point_mass import VariedPlanar
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import BallVariation, PlanarVariation
 

@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 from mcap.writer import Writer
 
-from astra_data.dataset import DatasetWriter
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -25,6 +24,7 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.writer import DatasetWriter
 from disks import looks
 
 COLLECT = "collect antmaze-umaze --episodes 3 --max-steps 6"

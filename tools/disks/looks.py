@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 
 from astra_data.core.errors import AstraDataError
-from astra_data.dataset import Dataset
 from astra_data.dataset.doctor.check import check
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.urls import UrlStore
 
 Look = Callable[[Path], str | None]

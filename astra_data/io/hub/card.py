@@ -11,11 +11,11 @@ import numpy as np
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import in_code, in_markdown
-from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import RESERVED, Column
 from astra_data.dataset.description import full_name
 from astra_data.dataset.inspection import visited
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.loading import loading
 from astra_data.io.hub.notes import Notes
 from astra_data.reports.figures.coverage import coverage

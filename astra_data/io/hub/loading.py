@@ -2,8 +2,8 @@
 
 import json
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.address import Hub, parse_source
 
 

@@ -8,10 +8,10 @@ from typing import Any
 from astra_data.core.durable import folder_for, held
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, SharingError
 from astra_data.core.progress import Progress, silent
-from astra_data.dataset import Dataset
 from astra_data.dataset.atomic import publish
 from astra_data.dataset.description import NAME
 from astra_data.dataset.doctor.check import check
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version, home_of, open_dataset
 from astra_data.io.hub.address import Hub, is_address, parse_source
 from astra_data.io.hub.fetch import fetch, refuse_planted

@@ -7,8 +7,8 @@ from tempfile import TemporaryDirectory
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import BadInputError, CorruptDatasetError, SharingError
 from astra_data.core.progress import Progress, silent
-from astra_data.dataset import Dataset
 from astra_data.dataset.doctor.check import check
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version, open_dataset
 from astra_data.io.hub.address import Hub, Url, parse_place
 from astra_data.io.hub.card import write_card

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import SharingError
 from astra_data.core.progress import Progress
-from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version
 from astra_data.io.hub.sums import Listed
 

@@ -8,8 +8,8 @@ from astra_data.core.durable import hidden_folder, move, sync, writing
 from astra_data.core.errors import AstraDataError, BadInputError, SharingError
 from astra_data.core.optional import how_to_install
 from astra_data.core.progress import Progress
-from astra_data.dataset import Dataset
 from astra_data.dataset import format as layout
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version
 from astra_data.io.hub.store import RemoteFolder
 from astra_data.io.hub.sums import SUMS_PATH, dataset_files

@@ -38,9 +38,9 @@ from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
 from astra_data.robots.registry import TASKS, task_named
-from astra_data.worlds.own_code import is_own_code
 from astra_data.worlds.plane.relocation import Copy, Relocation, Rotations
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import is_user_code
 
 DEFAULT_COPIES = 3
 _OUTCOMES = tuple(column.name for column in OUTCOME_COLUMNS)
@@ -178,7 +178,7 @@ def _task_of(source: Dataset, task: str | None) -> Task:
     called, collected_for = source.reference, source.description["environment"].get("id")
     if task is None and collected_for is None:
         raise BadInputError(f"{called} does not name its task: give --task")
-    if task is None and is_own_code(str(collected_for)):
+    if task is None and is_user_code(str(collected_for)):
         raise BadInputError(
             f"{called} was collected for {collected_for}, whose code would be run: read it, then give "
             f"--task {collected_for}"

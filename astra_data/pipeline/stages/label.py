@@ -33,9 +33,8 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 from astra_data.io.hub.pull import opened
 from astra_data.robots.registry import task_named
-from astra_data.worlds.expecting import judged, paid
-from astra_data.worlds.own_code import explained
 from astra_data.worlds.task import Task
+from astra_data.worlds.user_code import explained, judged, paid
 
 _log = logging.getLogger(__name__)
 

@@ -27,11 +27,9 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
-from astra_data.robots.registry import TASKS
-from astra_data.robots.simulator_loader import Pairing, built, checked_abstraction, pairing_named
-from astra_data.worlds.expecting import expect_tensor, stepped
-from astra_data.worlds.own_code import explained
+from astra_data.robots.registry import TASKS, Pairing, built, checked_abstraction, pairing_named
 from astra_data.worlds.protocols import AbstractSimulator
+from astra_data.worlds.user_code import expect_tensor, explained, stepped
 
 BATCH = 4096
 """Simulators that are reset and stepped in one batch."""

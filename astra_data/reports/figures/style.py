@@ -12,7 +12,7 @@ from matplotlib.style import context
 from PIL import Image
 
 from astra_data.core.naming import base_method, is_plus
-from astra_data.worlds.score import Score
+from astra_data.worlds.objective import Score
 
 SPARE_COLORS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
 """For methods without a color of their own. The others are Okabe and Ito's palette and shades that

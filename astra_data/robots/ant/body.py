@@ -20,8 +20,8 @@ from torch.nn import functional
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.rotation import rotation_matrix
 
 STATE_SIZE = 29
 """qpos (15): x, y, z, quaternion, 8 joint angles; qvel (14): linear, angular, 8 joint rates."""

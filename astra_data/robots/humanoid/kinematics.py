@@ -11,7 +11,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.dataset.columns import ABSTRACT_STATE, Column
-from astra_data.robots.humanoid.abstraction import humanoid_to_extended_kinematics, humanoid_to_kinematics
+from astra_data.robots.humanoid.abstraction import (
+    humanoid_to_extended_kinematics,
+    humanoid_to_kinematics,
+    mass_and_feet,
+)
 from astra_data.robots.humanoid.model import (
     COMMANDED,
     DAMPING,
@@ -22,8 +26,7 @@ from astra_data.robots.humanoid.model import (
     CommandRanges,
     humanoid_model,
 )
-from astra_data.robots.humanoid.skeleton import mass_and_feet
-from astra_data.worlds.free_states import FreeStates
+from astra_data.worlds.simulators import FreeStates
 
 _COUNT = len(JOINTS)
 _CENTER = slice(2 * _COUNT, 2 * _COUNT + 3)

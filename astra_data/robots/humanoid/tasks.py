@@ -1,28 +1,260 @@
-"""The humanoid's tasks: walking of Gymnasium's humanoid, with three abstract simulators (Section V-B)."""
+"""The objective of walking on each abstraction of the humanoid: the target's reward without its costs.
 
+All reward forward velocity and staying up, as `Locomotion` does; the costs of effort and contact forces,
+which are small in the target, are left out. There is no goal to reach: an episode that lasts to the horizon
+without a fall succeeds.
+"""
+
+import os
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
 
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import normalized
+from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.robots.humanoid.abstraction import (
     beyond_extended_kinematics,
     beyond_kinematics,
     beyond_walker2d,
+    humanoid_to_extended_kinematics,
+    humanoid_to_kinematics,
+    humanoid_to_walker2d,
+    mass_and_feet,
+    mass_velocity,
 )
-from astra_data.robots.humanoid.camera import photograph
 from astra_data.robots.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
-from astra_data.robots.humanoid.model import DAMPING, JOINTS, STIFFNESS, TIMESTEP_S, CommandRanges
-from astra_data.robots.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
+from astra_data.robots.humanoid.model import (
+    COMMANDED,
+    DAMPING,
+    JOINT_RATES_RAD_S,
+    JOINTS,
+    JOINTS_RAD,
+    LEAN_RAD,
+    POSITION_M,
+    POSITIONS,
+    SPIN_RAD_S,
+    STANDING,
+    STIFFNESS,
+    TIMESTEP_S,
+    VELOCITY_M_S,
+    CommandRanges,
+    Locomotion,
+    humanoid_model,
+)
 from astra_data.robots.humanoid.target import HumanoidEnv
-from astra_data.robots.humanoid.varied import VariedHumanoid
 from astra_data.robots.humanoid.walker2d import HumanoidWalker2d
-from astra_data.worlds.column_entries import ColumnEntry, column, free_body
-from astra_data.worlds.task import Task, Varied
-from astra_data.worlds.variation import JointVariation
+from astra_data.worlds.objective import Objective
+from astra_data.worlds.task import ColumnEntry, Task, Varied, column, free_body
+from astra_data.worlds.variation import JointVariation, VariedSimulator, noisy_command
 
 _COUNT = len(JOINTS)
+_LEGS_RAD = tuple(JOINTS_RAD[joint] for joint in COMMANDED)
+_LEG_RATES_RAD_S = tuple(JOINT_RATES_RAD_S[joint] for joint in COMMANDED)
+
+
+@dataclass(frozen=True)
+class Walking(Objective):
+    """Walk along x and do not fall; there is no goal.
+
+    Attributes:
+        locomotion: rewards and starts of the target.
+        failure_reward: minus the reward for staying up, which a step that ends in a fall does not get.
+    """
+
+    action_size = len(COMMANDED)
+    is_lasting = True
+    spread: ClassVar[tuple[float, ...]]
+    """Typical deviation of each entry of a state from standing, (X,)."""
+
+    locomotion: Locomotion = field(default_factory=Locomotion)
+    failure_reward: float = field(default=-5.0, kw_only=True)
+
+    @abstractmethod
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, X)."""
+
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return the deviations of states (..., X) from standing, in spreads and clipped to ±5, (..., X)."""
+        return normalized(state, state.new_tensor(self._standing), state.new_tensor(self.spread))
+
+    @cached_property
+    def _standing(self) -> NDArray[np.float64]:
+        return self.abstracted(np.array(STANDING))
+
+    @abstractmethod
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return the body's forward velocity in a step between states (B, X), (B,) in m/s."""
+
+    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X) as the target does: almost upright and at rest."""
+        return self.abstracted(self.locomotion.draw_starts(rng, count))
+
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return False for all states (B, X), (B,): there is no goal to reach."""
+        return torch.zeros(len(state), dtype=torch.bool, device=state.device)
+
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states (B, X), a fall where `failed` (B,)."""
+        task = self.locomotion
+        return (
+            task.forward_reward * self.velocity(before, after)
+            + task.healthy_reward
+            + self.failure_reward * failed
+        )
+
+
+@dataclass(frozen=True)
+class PlanarWalking(Walking):
+    """Walking of the planar walker, states (..., 15); outside of the healthy heights it has fallen."""
+
+    spread = (
+        *(POSITION_M, LEAN_RAD, *_LEGS_RAD),
+        *(VELOCITY_M_S, VELOCITY_M_S, SPIN_RAD_S, *_LEG_RATES_RAD_S),
+        *(1.0, 1.0),
+    )
+
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, 15)."""
+        return humanoid_to_walker2d(state)
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
+        low, high = self.locomotion.healthy_m
+        return ~((state[:, 0] > low) & (state[:, 0] < high))
+
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return the forward velocity of the center of mass after the step, with stiff arms, (B,) in m/s."""
+        joints = after.new_zeros(2, len(after), _COUNT)
+        joints[..., COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
+        mass, _ = mass_and_feet(joints[0])
+        swept = mass_velocity(*joints)
+        pitch, pitch_rate = after[:, 1], after[:, 8]
+        forward, up = swept[:, 0] + pitch_rate * mass[:, 2], swept[:, 2] - pitch_rate * mass[:, 0]
+        return after[:, 6] + torch.cos(pitch) * forward + torch.sin(pitch) * up
+
+
+@dataclass(frozen=True)
+class JointWalking(Walking):
+    """Walking of the joints alone, states (..., 34); they show no falls, so every episode succeeds."""
+
+    spread = (*JOINTS_RAD, *JOINT_RATES_RAD_S)
+
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, 34)."""
+        return humanoid_to_kinematics(state)
+
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return the velocity of a level torso over its lower foot, which does not slip, (B,) in m/s."""
+        feet, later = (mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
+        rows = torch.arange(len(feet), device=feet.device)
+        lower = feet[..., 2].argmin(dim=-1)
+        return (feet[rows, lower, 0] - later[rows, lower, 0]) / TIMESTEP_S
+
+
+@dataclass(frozen=True)
+class MassWalking(Walking):
+    """Walking of joints, center of mass and the torso's lean, states (..., 46).
+
+    Attributes:
+        lowest_mass_m: a humanoid whose center of mass is lower than this has fallen, on average two steps
+            before the target's episode ends; standing it is 0.9 m high.
+    """
+
+    spread = (
+        *JointWalking.spread,
+        *([POSITION_M] * 3 + [VELOCITY_M_S] * 3 + [LEAN_RAD] * 3 + [SPIN_RAD_S] * 3),
+    )
+
+    lowest_mass_m: float = 0.65
+
+    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return φ of target states (count, 47), (count, 46)."""
+        return humanoid_to_extended_kinematics(state)
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return which centers of mass of states (B, 46) are too low, (B,) bool."""
+        return ~(state[:, 2 * _COUNT + 2] >= self.lowest_mass_m)
+
+    def velocity(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return the velocity of the center of mass along the heading after the step, (B,) in m/s."""
+        return after[:, 2 * _COUNT + 3]
+
+
+class VariedHumanoid(VariedSimulator):
+    """B of one of the humanoid's simulators, each with the parameters of a `JointVariation`.
+
+    A command gets noise, is clipped to ±1 and scaled; the simulator clips the result again. Sensors show the
+    true state, scaled; rewards and falls are those of the observed state and of steps of the plain length.
+    """
+
+    @property
+    def _scale(self) -> Tensor:
+        return self.by_name()["observation_scale"]
+
+    @property
+    def state(self) -> Tensor:
+        """The observed states, (B, X) float32."""
+        return self._scale * self.true_state
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move from `before` to where `landed` is observed, both (B, X); return the observed states."""
+        self.simulator.settle(before / self._scale, landed / self._scale)
+        return self.state
+
+    def step(self, action: Tensor) -> Tensor:
+        """Follow the commands `action` (B, A); return the observed states (B, X)."""
+        parameters = self.by_name()
+        self.simulator.vary(parameters)
+        command = noisy_command(action, parameters["action_noise"])
+        self.simulator.step((1.0 + parameters["action_scale"]) * command)
+        return self.state
+
+
+_DISTANCE_M = 3.8
+_EYE_M = 0.95
+"""Height of the point that the camera looks at."""
+_SIDE_DEG = 90.0
+"""The camera looks along y, so that x goes to the right."""
+_DOWN_DEG = -8.0
+
+
+def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 200) -> NDArray[np.uint8]:
+    """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3).
+
+    Raises:
+        BadInputError: no OpenGL without a window is available.
+    """
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    model = humanoid_model()
+    data = mujoco.MjData(model)
+    try:
+        from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer  # noqa: PLC0415 - slow
+
+        viewer = OffScreenViewer(model, data, width, height)
+    except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
+        raise BadInputError(
+            f"expected OpenGL that works without a window, found none ({error}): set MUJOCO_GL to egl or "
+            "osmesa"
+        ) from error
+    viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = _DISTANCE_M, _SIDE_DEG, _DOWN_DEG
+    pictures = []
+    for state in states:
+        data.qpos[:] = state[:POSITIONS]
+        mujoco.mj_forward(model, data)
+        viewer.cam.lookat[:] = (*state[:2], _EYE_M)
+        pictures.append(viewer.render("rgb_array"))
+    return np.stack(pictures)
+
+
 _HORIZON = 1000
 """Of Gymnasium's Humanoid-v5: 15 s."""
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
-from astra_data.worlds.plane.geometry import wrapped
+from astra_data.worlds.geometry import wrapped
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,19 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import cores
-from astra_data.robots.nao.bodies import MOTORS, TICKS, BatchedBodies
-from astra_data.robots.nao.body import TICK_S, nao_model
-from astra_data.robots.nao.kinematics import TO_MOTORS, leg_angles
-from astra_data.robots.nao.links import HIP_OFFSET_Z_M
-from astra_data.robots.nao.steps import Gait, StepPlanner, WalkLimits, put_rows
-from astra_data.robots.nao.traits import Traits, TraitSpread
-from astra_data.robots.nao.walk import WalkEngine, WalkStyle
-from astra_data.worlds.plane.ball import BALL_RADIUS_M
+from astra_data.robots.nao.bodies import MOTORS, TICKS, BatchedBodies, nao_model
+from astra_data.robots.nao.kicking import BALL_RADIUS_M
+from astra_data.robots.nao.kinematics import (
+    HIP_OFFSET_Z_M,
+    TICK_S,
+    TO_MOTORS,
+    Traits,
+    TraitSpread,
+    leg_angles,
+)
+from astra_data.robots.nao.walk import Gait, StepPlanner, WalkEngine, WalkLimits, WalkStyle, put_rows
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.rotation import rotation_matrix
 
 CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS

@@ -4,19 +4,14 @@ from functools import partial
 from typing import Any
 
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
-from astra_data.robots.nao.abstraction import nao_beyond, nao_to_ball_agent, nao_to_point_mass
-from astra_data.robots.nao.body import TICK_S
-from astra_data.robots.nao.kinematics import JOINTS
+from astra_data.robots.nao.kicking import BallAgent, Kicking
+from astra_data.robots.nao.kinematics import JOINTS, TICK_S
 from astra_data.robots.nao.robot import CONTROL_STEP_S
-from astra_data.robots.nao.target import SPEED_M_S, NaoEnv
-from astra_data.worlds.column_entries import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, column
-from astra_data.worlds.plane.ball_agent import BallAgent
-from astra_data.worlds.plane.kicking import Kicking
+from astra_data.robots.nao.target import SPEED_M_S, NaoEnv, nao_beyond, nao_to_ball_agent, nao_to_point_mass
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.plane.navigation import Navigation
-from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.plane.states import VariedPlanar
-from astra_data.worlds.task import Plane, Task, Varied
+from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
+from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, Plane, Task, Varied, column
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
 _RADIUS_M = 0.1

@@ -4,6 +4,7 @@ The paper prints no reward. Ours: progress along the shortest free path to the g
 a negative reward for a failure.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,9 +13,45 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.objective import PlanarObjective
-from astra_data.worlds.plane.free_space import GoalDistance
+from astra_data.worlds.objective import Objective
+from astra_data.worlds.plane.mazes import GoalDistance, Maze
+from astra_data.worlds.protocols import Step
+
+
+@dataclass(frozen=True)
+class PlanarObjective(Objective):
+    """An objective in a maze; states begin with x and y of the robot in m, actions with its velocity.
+
+    Attributes:
+        maze: where it happens.
+    """
+
+    action_size = 2
+    goal_size = 2
+
+    maze: Maze
+
+    @property
+    def layout(self) -> Maze:
+        """The maze that it happens in."""
+        return self.maze
+
+    @abstractmethod
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, X), at rest, anywhere in the free space; where there is a ball, near it."""
+
+    def limit_command(self, action: Tensor, limit: float) -> Tensor:
+        """Shorten the velocities that actions (..., A) begin with, ±1 per axis, to at most `limit`."""
+        command, rest = super().limit_command(action, limit).tensor_split([2], dim=-1)
+        speed = command.norm(dim=-1, keepdim=True)
+        shorten: Tensor = (limit / speed.clamp_min(1e-6)).clamp_max(1.0)
+        return torch.cat([command * shorten, rest], dim=-1)
+
+    def places(self, state: Tensor) -> Tensor:
+        """Return x and y in m of the bodies in states (..., X); by default of the robot alone, (..., 2)."""
+        return state[..., :2]
 
 
 @dataclass(frozen=True)
@@ -125,3 +162,70 @@ class Navigation(PlanarObjective):
 
 def _at_rest(position: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([position, np.zeros_like(position)], axis=1)
+
+
+class PlanarTarget(ABC):
+    """B robots in a maze. An observation (B, O) is the state, then the goal.
+
+    Success, falls, misses and, where the objective says so, walls end an episode.
+
+    Attributes:
+        objective: maze, goal and reward.
+        goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
+    """
+
+    def __init__(self, objective: PlanarObjective, num_envs: int, *, start_anywhere: bool = False) -> None:
+        """Set no goals yet.
+
+        Args:
+            objective: maze, goal and reward.
+            num_envs: B.
+            start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
+        """
+        self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
+        self.goal = torch.zeros(num_envs, 2)
+        self.failed = torch.zeros(num_envs, dtype=torch.bool)
+
+    @property
+    @abstractmethod
+    def state(self) -> Tensor:
+        """The full target states, (B, S) float32."""
+
+    @property
+    @abstractmethod
+    def wall_contact(self) -> Tensor:
+        """Which robots touched a wall in their last step, (B,) bool."""
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers at `seed`."""
+        self._rng = np.random.default_rng(seed)
+
+    def _start(self, rows: NDArray[np.intp]) -> Floats:
+        """Return the abstract states (n, X) at which the robots `rows` (n,) start."""
+        objective = self.objective
+        draw = objective.draw_anywhere if self.start_anywhere else objective.draw_starts
+        return draw(self._rng, len(rows))
+
+    def _aim(self, rows: NDArray[np.intp]) -> None:
+        """Draw new goals for the robots `rows` (n,)."""
+        self.goal[rows] = torch.from_numpy(self.objective.draw_goals(self._rng, len(rows))).float()
+
+    def _judged(self, before: Tensor, after: Tensor, fallen: Bools) -> Step:
+        """Return the outcome of a step between states (B, 2 or more) that begin with true positions.
+
+        Who reaches the goal has not failed, `fallen` (B,) or not.
+        """
+        success = self.objective.reached(after, self.goal)
+        failed = torch.from_numpy(fallen) | self.objective.missed(after, self.goal)
+        if self.objective.ends_at_walls:
+            failed |= self.wall_contact
+        self.failed = failed & ~success
+        return Step(
+            observation=self._observe(),
+            reward=self.objective.reward(before, after, self.goal, self.failed),
+            terminated=success | self.failed,
+            success=success,
+        )
+
+    def _observe(self) -> Tensor:
+        return torch.cat([self.state, self.goal], dim=-1)

@@ -1,9 +1,163 @@
-"""The abstract simulator of navigation: a planar point mass that follows velocity commands perfectly."""
+"""States among the walls of a maze, and planar simulators whose parameters and sensors vary."""
+
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
-from astra_data.worlds.plane.states import PlanarStates
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.geometry import turned
+from astra_data.worlds.plane.mazes import FreeSpace, Maze
+from astra_data.worlds.protocols import VariableSimulator
+from astra_data.worlds.variation import Variation, VariedSimulator, noisy_command
+
+_CELLS_APART = 1e-6
+"""How far a radius may be from a whole number of cells, by rounding."""
+
+
+class PlanarStates:
+    """B planar states (B, X) that begin with x, y, vx, vy of a disc among the walls of a maze, in m and m/s.
+
+    Attributes:
+        parameters: what a dataset paired with this simulator records about it.
+        state: (B, X) float32.
+        free: where the disc's center may be.
+        blocked: (B,) bool, a wall stopped the disc in the last step, or in its correction.
+        period_s: control period, one for all or (B, 1).
+    """
+
+    state_size: int
+
+    def __init__(
+        self,
+        maze: Maze,
+        num_envs: int,
+        *,
+        timestep_s: float,
+        radius_m: float = 0.1,
+        speed_m_s: float = 1.0,
+        device: str = "cpu",
+    ) -> None:
+        """Put B of them at rest at the origin.
+
+        Args:
+            maze: the walls.
+            num_envs: B.
+            timestep_s: control period.
+            radius_m: distance that the disc's center keeps from walls, a multiple of the maze's `fine_m`.
+            speed_m_s: top speed along each axis.
+            device: torch device.
+
+        Raises:
+            BadInputError: the radius is no such multiple.
+        """
+        cells = radius_m / maze.fine_m
+        if abs(cells - round(cells)) > _CELLS_APART:
+            raise BadInputError(
+                f"radius_m: expected a multiple of the maze's fine_m, {maze.fine_m} m, got {radius_m}: "
+                "take another radius, or a finer maze"
+            )
+        self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
+        self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
+        self._maze, self._settles_in = maze, self.free
+        self.num_envs = num_envs
+        self.state = torch.zeros(num_envs, self.state_size, device=device)
+        self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.period_s: Tensor | float = timestep_s
+        self._gain: Tensor | None = None
+        self._heading_bias_rad = torch.zeros(())
+
+    def vary(self, parameters: Mapping[str, Tensor]) -> None:
+        """Use the parameters of a `PlanarVariation` by name, (B, 1) each, from the next step on."""
+        self.period_s = self.parameters["timestep_s"] * parameters["timestep_scale"]
+        self._gain = parameters["friction"] * (1.0 + parameters["action_scale"])
+        self._heading_bias_rad = torch.deg2rad(parameters["heading_bias_deg"][:, 0])
+
+    def commanded_velocity(self, command: Tensor) -> Tensor:
+        """Return the velocity (B, 2) in m/s that `command` (B, 2) asks for, clipped to ±1 per axis first."""
+        clipped = command.clamp(-1.0, 1.0)
+        if self._gain is not None:
+            clipped = self._gain * turned(clipped, self._heading_bias_rad)
+        return clipped * self.parameters["speed_m_s"]
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
+        # New tensors, so that callers can keep earlier ones.
+        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+        if rows is not None:
+            self.blocked = self.blocked.index_fill(0, rows, False)
+
+    def keep_clear(self, distance_m: float) -> None:
+        """Let corrections end no closer to walls than `distance_m`, to the nearest cell of the fine grid.
+
+        Steps come as close as the disc can.
+        """
+        widest = max(distance_m, self.parameters["radius_m"])
+        device = str(self.state.device)
+        self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=device)
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Slide the discs from `before` toward `landed`, both (B, X); all else is that of `landed`.
+
+        A wall that stopped the step itself still counts as touched: otherwise policies lean on walls that the
+        correction draws them away from. Who is kept clear of one stands there: otherwise policies lean on a
+        wall with the velocity of progress, and are paid for it.
+        """
+        position, stopped = self._settles_in.slide(before[:, :2], landed[:, :2])
+        self.blocked = self.blocked | stopped
+        velocity = landed[:, 2:4]
+        if self._settles_in is not self.free:
+            moved = (position - before[:, :2]) / self.period_s
+            velocity = torch.where(position == landed[:, :2], velocity, moved)
+        self.reset_to(torch.cat([position, velocity, landed[:, 4:]], dim=-1))
+        return self.state
+
+
+class VariedPlanar(VariedSimulator):
+    """B point masses, with balls or without, each with the parameters of a `PlanarVariation`.
+
+    Commanded velocities get Gaussian noise, observed positions and velocities uniform noise. A state is
+    observed without noise when it was set or corrected.
+    """
+
+    def __init__(self, simulator: VariableSimulator, variation: Variation) -> None:
+        super().__init__(simulator, variation)
+        self._observed = simulator.state
+
+    @property
+    def state(self) -> Tensor:
+        """The observed states, (B, X) float32."""
+        return self._observed
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the true states in `rows` (n,), by default all, to `state` (n, X)."""
+        self.simulator.reset_to(state, rows)
+        self._observed = self.true_state if rows is None else self._observed.index_copy(0, rows, state)
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X)."""
+        self._observed = self.simulator.settle(before, landed)
+        return self._observed
+
+    def step(self, action: Tensor) -> Tensor:
+        """Apply commands `action` (B, A), which begin with a velocity; return the observed states (B, X)."""
+        parameters = self.by_name()
+        velocity, rest = action.tensor_split([2], dim=-1)
+        command = torch.cat([noisy_command(velocity, parameters["action_noise"]), rest], dim=-1)
+        self.simulator.vary(parameters)
+        true = self.simulator.step(command)
+        half_widths = [
+            parameters[name].expand(-1, 2)
+            for name in (
+                "position_noise_m",
+                "velocity_noise_m_s",
+                "ball_position_noise_m",
+                "ball_velocity_noise_m_s",
+            )
+            if name in parameters
+        ]
+        self._observed = true + (torch.rand_like(true) * 2.0 - 1.0) * torch.cat(half_widths, dim=-1)
+        return self._observed
 
 
 class PointMass(PlanarStates):

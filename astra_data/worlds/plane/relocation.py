@@ -21,8 +21,8 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.worlds.geometry import PlanarMap
 from astra_data.worlds.objective import Objective
-from astra_data.worlds.plane.geometry import PlanarMap
 from astra_data.worlds.task import Task
 
 Rotations = Literal["quarter", "any", "none"]

@@ -7,7 +7,7 @@ import torch
 from fetch import STEP_M, TIMESTEP_S
 
 from astra_data import Column, Objective, Task
-from astra_data.worlds.gymnasium_robot import GymnasiumRobot
+from astra_data.worlds.gymnasium_env import GymnasiumRobot
 
 CONTACT_M = 0.045  # from the gripper's axis to the puck's
 PUSHING_HEIGHT_M, TABLE_M = 0.425, 0.40

@@ -7,7 +7,7 @@ import torch
 from fetch import STEP_M, TIMESTEP_S
 
 from astra_data import Column, Objective, Task
-from astra_data.worlds.gymnasium_robot import GymnasiumRobot
+from astra_data.worlds.gymnasium_env import GymnasiumRobot
 
 AXES = {"names": ("x", "y", "z"), "astra": {"unit": ["m"] * 3}}
 

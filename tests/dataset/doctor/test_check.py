@@ -12,10 +12,11 @@ from damaged import DATA, EPISODES, alter, drop, edit, reseal, retype, truncate,
 from fake_dataset import fake_columns, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import parquet
 from astra_data.dataset.columns import Episode
 from astra_data.dataset.doctor.check import MOST, check
 from astra_data.dataset.format import POLICY_PATH
+from astra_data.dataset.reader import Dataset
 
 
 def change_statistics(root: Path) -> None:

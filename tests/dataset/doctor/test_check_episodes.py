@@ -7,11 +7,11 @@ import pytest
 from damaged import DATA, EPISODES, alter, drop
 from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.contents import measure
 from astra_data.dataset.doctor.check import EXACT, EpisodeChecks, Report, is_close
 from astra_data.dataset.integrity import Digests
 from astra_data.dataset.plain import plain_columns
+from astra_data.dataset.reader import Dataset
 
 
 def checked(root: Path, is_ours: bool = True, digests: Digests | None = None) -> tuple[EpisodeChecks, Report]:

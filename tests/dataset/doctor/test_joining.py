@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from fake_dataset import COLUMNS, fake_columns, write_fake, writer
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import Array, Episode
 from astra_data.dataset.doctor.repair import join
+from astra_data.dataset.reader import Dataset
 
 
 def stored(*datasets: Dataset) -> list[tuple[int, dict[str, Array]]]:

@@ -10,10 +10,10 @@ from damaged import alter, drop, edit, reseal, retype, write
 from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import NEXT_STATE
 from astra_data.dataset.doctor.repair import Remains, remains_of
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, METADATA_PATH, SUBSETS_PATH
+from astra_data.dataset.reader import Dataset
 
 INFO, TASKS = INFO_PATH, "meta/tasks.parquet"
 SEED_0 = "the order of the subsets is that of seed 0"

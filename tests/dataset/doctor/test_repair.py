@@ -15,12 +15,12 @@ from damaged import DATA, EPISODES, alter_rows, drop, edit, reseal
 from fake_dataset import DESCRIPTION, LENGTHS, fake_episodes, write_fake
 
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, METADATA_PATH, POLICY_PATH, SUBSETS_PATH
 from astra_data.dataset.lerobot_rows import RECORDED_TASK
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 import pytest
 from fake_transitions import write_transitions
 
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, TERMINATED
+from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
 
 

@@ -4,8 +4,8 @@ import h5py
 import numpy as np
 import pytest
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED
+from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import d4rl, export
 
 

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, Array, Column, Episode
 from astra_data.dataset.description import ContentHash
+from astra_data.dataset.reader import Dataset
 from astra_data.io import export_record
 from astra_data.io.exporters import EXPORTERS, export
 from astra_data.io.importing import import_dataset

@@ -6,8 +6,8 @@ from fake_dataset import COLUMNS, LENGTHS, fake_columns, writer
 from fake_transitions import NEXT, write_transitions
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Episode
+from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
 from astra_data.io.exporters.minari import _attributes
 from astra_data.io.importing import import_dataset

@@ -7,8 +7,8 @@ import pytest
 from fake_dataset import COLUMNS, fake_columns, writer
 from fake_transitions import NEXT
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Episode
+from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
 
 

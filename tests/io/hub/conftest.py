@@ -4,7 +4,7 @@ import pytest
 from fake_dataset import write_fake
 from fake_hub import TOKEN, Hub, running_hub
 
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 
 
 @pytest.fixture(scope="session")

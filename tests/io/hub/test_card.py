@@ -9,8 +9,8 @@ from huggingface_hub import DatasetCard
 
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import BadInputError, DiskError, RecipeError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, STATE, SUCCESS, Column, Episode
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.card import _size_category, render_card, write_card
 from astra_data.io.hub.notes import Notes
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, SharingError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.pull import pull
 from astra_data.io.hub.push import push
 from astra_data.pipeline.stages.collect import CollectConfig, collect

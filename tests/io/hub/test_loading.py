@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from fake_dataset import concatenated, write_fake
 
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.card import render_card
 from astra_data.io.hub.notes import Notes
 

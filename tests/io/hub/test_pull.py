@@ -13,7 +13,7 @@ from fake_dataset import write_fake
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError, SharingError
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub import fetch
 from astra_data.io.hub.pull import pull
 from astra_data.io.hub.push import push

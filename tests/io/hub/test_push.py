@@ -9,7 +9,7 @@ from fsspec.implementations.local import LocalFileSystem
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError, DiskError, RecipeError, SharingError
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.push import push
 
 pytestmark = pytest.mark.usefixtures("quick_figure")

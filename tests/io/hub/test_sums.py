@@ -6,7 +6,7 @@ import pytest
 from shared_files import contents
 
 from astra_data.core.errors import SharingError
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.sums import SUMS_PATH, Listed, altered, dataset_files, make_sums, parse_sums
 
 DIGEST = "0" * 64

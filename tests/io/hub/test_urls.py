@@ -16,7 +16,7 @@ from moto.server import ThreadedMotoServer
 from shared_files import contents
 
 from astra_data.core.errors import BadInputError, SharingError
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version
 from astra_data.io.hub.pull import pull
 from astra_data.io.hub.push import push

@@ -11,9 +11,9 @@ from mcap_ros2.writer import Writer
 from recordings import imported
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.checkup.checkup import check_up
 from astra_data.dataset.columns import ACTION, STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.io.importers.mcap import check
 from astra_data.io.importing import import_dataset
 from astra_data.io.mapping import read_mapping

@@ -9,8 +9,8 @@ from recordings import MAPPING, rows
 from toy_joints import FPS, NAMES, positions, targets, write_log
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.io.importers import torch as importer
 from astra_data.io.importing import import_dataset
 from astra_data.io.recording import Source

@@ -11,8 +11,8 @@ from toy_episodes import no_episodes
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import STATE
+from astra_data.dataset.reader import Dataset
 from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
 from astra_data.grounding.files import load_history_model, load_target_encoder, save_grounding
 from astra_data.grounding.history import HistoryGrounding

@@ -15,11 +15,11 @@ from small_run import TASK
 from astra_data.cli.sharing import card
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
 from astra_data.dataset.compare import differences
 from astra_data.dataset.edit import delete, filter_episodes, merge, subset
 from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, METADATA_PATH, SUBSETS_PATH
 from astra_data.dataset.inspection import inspect_dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
 from astra_data.io.hub.push import push
 from astra_data.pipeline.stages.augment import AugmentConfig, augment

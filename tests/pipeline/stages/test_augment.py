@@ -11,7 +11,6 @@ from small_run import TASK, short_task
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -26,15 +25,17 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.pipeline.stages.augment import AugmentConfig, _free_uid, _moving, _shares, augment
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.robots.ant.body import WALL_REACH_M, up_cosine
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.relocation import Relocation
-from astra_data.worlds.rotation import rotation_matrix
 
 CONFIG = AugmentConfig(episodes=24, held_out_share=0.25, min_steps=5)
 

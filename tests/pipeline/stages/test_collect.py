@@ -13,7 +13,6 @@ from stopping import Stopped
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset, StagedWriter
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -26,6 +25,8 @@ from astra_data.dataset.columns import (
     Episode,
 )
 from astra_data.dataset.doctor.check import check
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.staging import StagedWriter
 from astra_data.pipeline.stages import collect as stage
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.policies import collecting as suboptimal

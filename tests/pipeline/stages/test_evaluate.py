@@ -27,8 +27,8 @@ from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.rma import RmaConfig
 from astra_data.policies.running_policy import PolicyFile
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.objective import RETURN
 from astra_data.worlds.plane.navigation import Navigation
-from astra_data.worlds.score import RETURN
 
 CONFIG = EvaluateConfig(episodes=3)
 HORIZON = 25

@@ -11,7 +11,6 @@ from toy_logs import write_logs
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
@@ -22,9 +21,10 @@ from astra_data.dataset.columns import (
     Column,
     Episode,
 )
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.writer import DatasetWriter
 from astra_data.pipeline.stages.pair import PairConfig, pair, pair_steps
-from astra_data.robots.registry import TASKS
-from astra_data.robots.simulator_loader import pairing_named
+from astra_data.robots.registry import TASKS, pairing_named
 
 _PLANAR = [0, 1, 15, 16]
 """x, y, vx and vy in an ant's qpos (15) and qvel (14)."""

@@ -35,7 +35,7 @@ from astra_data.pipeline.stages import report as stage
 from astra_data.pipeline.stages.report import is_current, report
 from astra_data.reports.figures import catalog as figures
 from astra_data.reports.results import read_results
-from astra_data.worlds.score import RETURN, SURVIVED_STEPS
+from astra_data.worlds.objective import RETURN, SURVIVED_STEPS
 
 DRAWN = figures.drawn
 

@@ -6,7 +6,7 @@ from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
+from astra_data.dataset.reader import Dataset
 from astra_data.pipeline.stages.subset import subset
 
 

@@ -11,7 +11,7 @@ from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import data_efficiency, learning_curves, on_one_grid, score_bars
 from astra_data.reports.results import SIMULATED, TESTED, Line, Results, TrainingFacts
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.score import RETURN, SUCCESS, SURVIVED_STEPS
+from astra_data.worlds.objective import RETURN, SUCCESS, SURVIVED_STEPS
 
 
 def results(*lines: Line, **changes: object) -> Results:

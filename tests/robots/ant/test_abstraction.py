@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from astra_data.robots.ant.abstraction import ant_beyond_point_mass, ant_to_point_mass
+from astra_data.robots.ant.tasks import ant_beyond_point_mass, ant_to_point_mass
 
 
 def test_keeps_planar_position_and_velocity() -> None:

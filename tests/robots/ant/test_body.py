@@ -20,8 +20,8 @@ from astra_data.robots.ant.body import (
     up_cosine,
 )
 from astra_data.worlds.batched_mujoco import wall_geoms
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.rotation import rotation_matrix
 
 gymnasium.register_envs(gymnasium_robotics)
 

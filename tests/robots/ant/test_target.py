@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from astra_data.robots.ant.body import VelocityController, ant_model, standing_pose
-from astra_data.robots.ant.target import AntMazeEnv
+from astra_data.robots.ant.tasks import AntMazeEnv
 from astra_data.worlds.batched_mujoco import wall_geoms
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation

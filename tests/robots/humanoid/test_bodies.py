@@ -4,7 +4,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from astra_data.robots.humanoid import Humanoids, Locomotion
+from astra_data.robots.humanoid.model import Locomotion
+from astra_data.robots.humanoid.target import Humanoids
 
 
 def theirs(seed: int) -> Any:  # noqa: ANN401 - Gymnasium's own

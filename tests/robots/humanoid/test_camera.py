@@ -3,8 +3,8 @@ import pytest
 from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.robots.humanoid.camera import photograph
 from astra_data.robots.humanoid.model import STANDING
+from astra_data.robots.humanoid.tasks import photograph
 
 
 def skin(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:

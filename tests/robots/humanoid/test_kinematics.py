@@ -8,9 +8,16 @@ import torch
 from torch import Tensor
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.humanoid import CommandRanges, Locomotion
 from astra_data.robots.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
-from astra_data.robots.humanoid.model import COMMANDED, FEET, JOINTS, TIMESTEP_S, humanoid_model
+from astra_data.robots.humanoid.model import (
+    COMMANDED,
+    FEET,
+    JOINTS,
+    TIMESTEP_S,
+    CommandRanges,
+    Locomotion,
+    humanoid_model,
+)
 from astra_data.robots.humanoid.target import HumanoidEnv
 
 KINDS = (HumanoidKinematics, HumanoidExtendedKinematics)

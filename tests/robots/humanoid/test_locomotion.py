@@ -1,6 +1,6 @@
 import numpy as np
 
-from astra_data.robots.humanoid import Locomotion
+from astra_data.robots.humanoid.model import Locomotion
 
 
 def test_healthy_heights_lie_between_the_bounds() -> None:

@@ -3,11 +3,10 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.robots.humanoid import Locomotion, humanoid_model
-from astra_data.robots.humanoid.model import COMMANDED, FEET, STANDING, TIMESTEP_S
-from astra_data.robots.humanoid.objectives import JointWalking, MassWalking, PlanarWalking, Walking
+from astra_data.robots.humanoid.model import COMMANDED, FEET, STANDING, TIMESTEP_S, Locomotion, humanoid_model
 from astra_data.robots.humanoid.target import HumanoidEnv
-from astra_data.robots.humanoid.walker import walker_model
+from astra_data.robots.humanoid.tasks import JointWalking, MassWalking, PlanarWalking, Walking
+from astra_data.robots.humanoid.walker2d import walker_model
 
 KINDS = (PlanarWalking, JointWalking, MassWalking)
 NOTHING = torch.zeros(3, 0)

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from astra_data.core.arrays import Floats
+from astra_data.robots.humanoid.abstraction import mass_and_feet, mass_velocity
 from astra_data.robots.humanoid.model import FEET, humanoid_model
-from astra_data.robots.humanoid.skeleton import mass_and_feet, mass_velocity
 
 
 def posed(joints: Floats, rates: Floats) -> mujoco.MjData:

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.robots.humanoid import CommandRanges, Humanoids, Locomotion
-from astra_data.robots.humanoid.target import HumanoidEnv
+from astra_data.robots.humanoid.model import CommandRanges, Locomotion
+from astra_data.robots.humanoid.target import HumanoidEnv, Humanoids
 
 
 def make(num_envs: int, seed: int = 0, ranges: CommandRanges | None = None) -> HumanoidEnv:

@@ -9,11 +9,9 @@ import pytest
 import torch
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.humanoid import Locomotion
-from astra_data.robots.humanoid.model import COMMANDED, FEET, JOINTS, STANDING, humanoid_model
-from astra_data.robots.humanoid.objectives import Walking
+from astra_data.robots.humanoid.model import COMMANDED, FEET, JOINTS, STANDING, Locomotion, humanoid_model
 from astra_data.robots.humanoid.target import HumanoidEnv
-from astra_data.robots.humanoid.tasks import HUMANOID_TASKS
+from astra_data.robots.humanoid.tasks import HUMANOID_TASKS, Walking
 from astra_data.worlds.task import Task
 
 WALKER, KINEMATICS, EXTENDED = HUMANOID_TASKS

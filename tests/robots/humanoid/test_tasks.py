@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset import Dataset
 from astra_data.dataset.columns import GOAL, SUCCESS
+from astra_data.dataset.reader import Dataset
 from astra_data.grounding.files import load_history_model
 from astra_data.pipeline.stages.augment import AugmentConfig, augment
 from astra_data.pipeline.stages.collect import CollectConfig, collect

@@ -6,13 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.robots.humanoid import Locomotion
 from astra_data.robots.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
-from astra_data.robots.humanoid.model import COMMANDED, CommandRanges
+from astra_data.robots.humanoid.model import COMMANDED, CommandRanges, Locomotion
 from astra_data.robots.humanoid.target import HumanoidEnv
-from astra_data.robots.humanoid.varied import VariedHumanoid
-from astra_data.robots.humanoid.walker import walker_model
-from astra_data.robots.humanoid.walker2d import HumanoidWalker2d
+from astra_data.robots.humanoid.tasks import VariedHumanoid
+from astra_data.robots.humanoid.walker2d import HumanoidWalker2d, walker_model
 from astra_data.worlds.variation import JointVariation, VariedSimulator
 
 KINDS = (HumanoidWalker2d, HumanoidKinematics, HumanoidExtendedKinematics)

@@ -5,7 +5,7 @@ import torch
 
 from astra_data.core.arrays import Floats
 from astra_data.robots.humanoid.model import COMMANDED, CONTACT_M, humanoid_model
-from astra_data.robots.humanoid.walker import sole_clearance, walker_model
+from astra_data.robots.humanoid.walker2d import sole_clearance, walker_model
 
 # The humanoid's velocities that the walker has: x, z, pitch, and the commanded joints.
 SHARED = [0, 2, 4, *(6 + joint for joint in COMMANDED)]

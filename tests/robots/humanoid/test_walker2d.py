@@ -7,13 +7,12 @@ import torch
 from torch import Tensor
 
 from astra_data.pipeline.stages.pair import pair_steps
-from astra_data.robots.humanoid import Locomotion, walker2d
+from astra_data.robots.humanoid import walker2d
 from astra_data.robots.humanoid.abstraction import humanoid_to_walker2d
-from astra_data.robots.humanoid.model import CommandRanges
+from astra_data.robots.humanoid.model import CommandRanges, Locomotion
 from astra_data.robots.humanoid.target import HumanoidEnv
-from astra_data.robots.humanoid.walker import walker_model
-from astra_data.robots.humanoid.walker2d import HumanoidWalker2d
-from astra_data.robots.simulator_loader import built, pairing_named
+from astra_data.robots.humanoid.walker2d import HumanoidWalker2d, walker_model
+from astra_data.robots.registry import built, pairing_named
 
 HELD = torch.tensor([3 / 7, 1.0, 3 / 7, 1.0])
 """Hips at zero, knees as straight as commands make them."""

@@ -9,13 +9,16 @@ import pytest
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.bodies import MOTORS, TICKS, BatchedBodies
-from astra_data.robots.nao.body import STIFFNESS_NM_PER_RAD, SUBSTEPS, nao_model
-from astra_data.robots.nao.kinematics import TO_MOTORS, leg_angles
-from astra_data.robots.nao.links import HIP_OFFSET_Z_M
-from astra_data.robots.nao.steps import Gait, StepPlanner, WalkLimits
-from astra_data.robots.nao.traits import IDENTICAL, Traits
-from astra_data.robots.nao.walk import Targets, WalkEngine, WalkStyle
+from astra_data.robots.nao.bodies import (
+    MOTORS,
+    STIFFNESS_NM_PER_RAD,
+    SUBSTEPS,
+    TICKS,
+    BatchedBodies,
+    nao_model,
+)
+from astra_data.robots.nao.kinematics import HIP_OFFSET_Z_M, IDENTICAL, TO_MOTORS, Traits, leg_angles
+from astra_data.robots.nao.walk import Gait, StepPlanner, Targets, WalkEngine, WalkLimits, WalkStyle
 
 STYLE = WalkStyle(gyro_gain=(0.0, 0.0))
 STANDING = leg_angles(WalkEngine(StepPlanner(np.ones(1)), STYLE).feet(Gait.standing(1, WalkLimits()))).angles[

@@ -3,17 +3,10 @@ import numpy as np
 import pytest
 
 from astra_data.robots.ant.body import ant_model
-from astra_data.robots.nao.body import (
-    BALL_MASS_KG,
-    PITCH_TORQUE_NM,
-    ROLL_TORQUE_NM,
-    SUBSTEPS,
-    TICK_S,
-    nao_model,
-)
-from astra_data.robots.nao.links import LEG_JOINTS
+from astra_data.robots.nao.bodies import BALL_MASS_KG, PITCH_TORQUE_NM, ROLL_TORQUE_NM, SUBSTEPS, nao_model
+from astra_data.robots.nao.kicking import BALL_RADIUS_M
+from astra_data.robots.nao.kinematics import LEG_JOINTS, TICK_S
 from astra_data.worlds.batched_mujoco import wall_geoms
-from astra_data.worlds.plane.ball import BALL_RADIUS_M
 from astra_data.worlds.plane.mazes import U_MAZE
 
 

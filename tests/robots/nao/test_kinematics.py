@@ -2,9 +2,18 @@ import mujoco
 import numpy as np
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.body import nao_model
-from astra_data.robots.nao.kinematics import JOINTS, TO_MOTORS, foot_poses, leg_angles
-from astra_data.robots.nao.links import FOOT_HEIGHT_M, HIP_OFFSET_Y_M, HIP_OFFSET_Z_M, THIGH_M, TIBIA_M
+from astra_data.robots.nao.bodies import nao_model
+from astra_data.robots.nao.kinematics import (
+    FOOT_HEIGHT_M,
+    HIP_OFFSET_Y_M,
+    HIP_OFFSET_Z_M,
+    JOINTS,
+    THIGH_M,
+    TIBIA_M,
+    TO_MOTORS,
+    foot_poses,
+    leg_angles,
+)
 
 STANDING_Z_M = -0.230 - HIP_OFFSET_Z_M
 

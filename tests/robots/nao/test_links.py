@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nao_values import TOTAL_MASS_KG
 
-from astra_data.robots.nao.links import (
+from astra_data.robots.nao.kinematics import (
     ARM,
     FOOT_M,
     HEAD,

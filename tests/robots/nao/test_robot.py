@@ -5,8 +5,8 @@ from nao_values import TOTAL_MASS_KG
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.robots.nao import IDENTICAL, BatchedNao
-from astra_data.robots.nao.body import GRAVITY
+from astra_data.robots.nao.kinematics import GRAVITY, IDENTICAL
+from astra_data.robots.nao.robot import BatchedNao
 from astra_data.worlds.plane.mazes import U_MAZE
 
 EVERYONE = np.arange(3)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.steps import START, STOP, STRIDE, Gait, StepPlanner, WalkLimits
+from astra_data.robots.nao.walk import START, STOP, STRIDE, Gait, StepPlanner, WalkLimits
 
 LIMITS = WalkLimits()
 TICK_S = 0.012

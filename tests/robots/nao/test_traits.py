@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from astra_data.robots.nao.kinematics import JOINTS
-from astra_data.robots.nao.traits import IDENTICAL, Traits, TraitSpread
+from astra_data.robots.nao.kinematics import IDENTICAL, JOINTS, Traits, TraitSpread
 
 
 def test_robots_without_a_spread_are_identical() -> None:

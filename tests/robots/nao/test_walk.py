@@ -2,11 +2,17 @@ import numpy as np
 import pytest
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.body import GRAVITY, TICK_S
-from astra_data.robots.nao.kinematics import foot_poses
-from astra_data.robots.nao.links import HIP_OFFSET_Y_M, HIP_OFFSET_Z_M
-from astra_data.robots.nao.steps import START, STOP, STRIDE, Gait, StepPlanner, WalkLimits
-from astra_data.robots.nao.walk import WalkEngine, WalkStyle
+from astra_data.robots.nao.kinematics import GRAVITY, HIP_OFFSET_Y_M, HIP_OFFSET_Z_M, TICK_S, foot_poses
+from astra_data.robots.nao.walk import (
+    START,
+    STOP,
+    STRIDE,
+    Gait,
+    StepPlanner,
+    WalkEngine,
+    WalkLimits,
+    WalkStyle,
+)
 
 STYLE = WalkStyle(step_scale=(1.0, 1.0, 1.0))
 LIMITS = WalkLimits()

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.plane.ball import ROLLING_M_S2, asks_to_kick, kick_away, knock, roll
+from astra_data.robots.nao.kicking import ROLLING_M_S2, asks_to_kick, kick_away, knock, roll
 
 
 def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:

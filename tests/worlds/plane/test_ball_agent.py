@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.worlds.plane.ball_agent import BallAgent
+from astra_data.robots.nao.kicking import BallAgent
 from astra_data.worlds.plane.mazes import FIELD
-from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.plane.point_mass import VariedPlanar
 from astra_data.worlds.variation import BallVariation
 
 OPTIONS: dict[str, Any] = {

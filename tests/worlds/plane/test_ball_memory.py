@@ -1,6 +1,6 @@
 import torch
 
-from astra_data.worlds.plane.ball_agent import BallAgent
+from astra_data.robots.nao.kicking import BallAgent
 from astra_data.worlds.plane.mazes import FIELD
 
 START = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.22, 0.0, 0.0, 0.0])

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.plane.free_space import FreeSpace, GoalDistance
-from astra_data.worlds.plane.mazes import U_MAZE, Maze
+from astra_data.worlds.plane.mazes import U_MAZE, FreeSpace, GoalDistance, Maze
 
 ROOM = Maze(rows=("111", "101", "111"), scale=4.0, start=(1, 1), goal=(1, 1))
 """One room, free in [-2, 2]²; with a radius of 0.1 m, in [-1.9, 1.9]²."""

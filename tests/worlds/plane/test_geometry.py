@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, Array, Column
 from astra_data.robots.ant.body import ant_model
-from astra_data.robots.ant.target import AntMazeEnv
+from astra_data.robots.ant.tasks import AntMazeEnv
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.batched_mujoco import BatchedPhysics
-from astra_data.worlds.plane.geometry import PlanarMap, wrapped
+from astra_data.worlds.geometry import PlanarMap, rotation_matrix, wrapped
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.rotation import rotation_matrix
 from astra_data.worlds.task import Task
 
 angles = st.floats(-10, 10)

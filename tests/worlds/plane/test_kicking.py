@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from astra_data.worlds.plane.kicking import Kicking
+from astra_data.robots.nao.kicking import Kicking
 from astra_data.worlds.plane.mazes import FIELD
 
 TASK = Kicking(FIELD, horizon=156)

@@ -2,8 +2,7 @@ import pytest
 import torch
 
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.plane.states import VariedPlanar
+from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.variation import PlanarVariation
 
 START = torch.tensor([[-4.0, 4.0, 0.0, 0.0]])

@@ -5,7 +5,7 @@ import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.plane.states import PlanarStates, VariedPlanar
+from astra_data.worlds.plane.point_mass import PlanarStates, VariedPlanar
 from astra_data.worlds.variation import BallVariation, PlanarVariation
 
 HERE = torch.tensor([[-4.0, 5.85, 0.0, 0.0, 7.0]]).expand(3, 5)

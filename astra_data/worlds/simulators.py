@@ -1,18 +1,91 @@
-"""Abstract simulators that are MuJoCo models, reset and stepped in batches by `mujoco.rollout`."""
+"""States of simulators without walls: any of them can be set, and any correction is taken over."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 from mujoco.rollout import Rollout
+from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import cores
-from astra_data.worlds.free_states import FreeStates
+
+
+class FreeStates:
+    """B states (B, X) in a space without obstacles.
+
+    Attributes:
+        state: (B, X) float32.
+    """
+
+    def __init__(self, state: Tensor) -> None:
+        """Begin at `state` (B, X)."""
+        self.state = state
+
+    @property
+    def blocked(self) -> Tensor:
+        """Which states were stopped by an obstacle: none, (B,) bool."""
+        return torch.zeros(len(self.state), dtype=torch.bool, device=self.state.device)
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, X)."""
+        # New tensors, so that callers can keep earlier ones.
+        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Move from `before` to `landed`, both (B, X); return `landed`."""
+        self.reset_to(landed)
+        return self.state
+
+
+class NumpySimulator(FreeStates):
+    """B abstract states that a NumPy function steps; `partial` makes of it what builds B of them.
+
+    Attributes:
+        state: (B, X) float32.
+        parameters: what a dataset paired with it records about it.
+
+    Example:
+        >>> from functools import partial
+        >>> import torch
+        >>> from astra_data.worlds.simulators import NumpySimulator
+        >>> def drive(state, command):
+        ...     return state + 0.1 * command
+        >>> make_simulator = partial(NumpySimulator, function=drive, size=2)
+        >>> make_simulator(3).step(torch.ones(3, 2)).shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        function: Callable[[Floats, Floats], NDArray[np.floating[Any]]],
+        size: int,
+        parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        """Begin with B states of zeros.
+
+        Args:
+            num_envs: B.
+            function: maps states (B, X) and commands (B, A), both float64, to the next states (B, X).
+            size: of a state, X.
+            parameters: numbers or texts about it, by default none.
+        """
+        super().__init__(torch.zeros(num_envs, size))
+        self._function = function
+        self.parameters: dict[str, float] = dict(parameters or {})
+
+    def step(self, action: Tensor) -> Tensor:
+        """Apply commands `action` (B, A); return the new states (B, X)."""
+        landed = self._function(self.state.double().numpy(), action.double().numpy())
+        self.state = torch.from_numpy(np.array(landed, dtype=np.float32))
+        return self.state
 
 
 class ColdSteps:

@@ -1,0 +1,350 @@
+"""A ball on a carpet: rolling, and contacts with bodies that kick it or walk into it. Batched torch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from astra_data.core.errors import BadInputError
+from astra_data.worlds.geometry import turned
+from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.plane.navigation import PlanarObjective
+from astra_data.worlds.plane.point_mass import PlanarStates
+
+ROLLING_M_S2 = 0.30
+"""Deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)."""
+BALL_RADIUS_M = 0.05
+"""Of the same ball."""
+_KICKS_ABOVE = 0.5
+"""A third entry of a command above this asks for a kick."""
+
+
+def asks_to_kick(command: Tensor) -> Tensor:
+    """Return which commands (B, 3), a planar velocity and a kick entry, ask for a kick: (B, 1) bool.
+
+    Raises:
+        BadInputError: the commands have no kick entry, as in datasets from before there was one.
+    """
+    if command.shape[-1] != 3:
+        raise BadInputError(
+            f"expected commands of 3 values, a planar velocity and whether to kick, got {command.shape[-1]}: "
+            "collect the episodes and train the policies of this task anew"
+        )
+    return command[:, 2:] > _KICKS_ABOVE
+
+
+def roll(
+    position: Tensor, velocity: Tensor, period_s: Tensor | float, deceleration_m_s2: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """Roll balls for `period_s`, slowed by an even friction until they lie.
+
+    Args:
+        position: of the balls, (B, 2) in m.
+        velocity: of the balls, (B, 2) in m/s.
+        period_s: duration, (B, 1) or one for all.
+        deceleration_m_s2: of a rolling ball, (B, 1) or one for all.
+
+    Returns:
+        positions and velocities (B, 2) of the balls.
+    """
+    speed = velocity.norm(dim=-1, keepdim=True)
+    slower = (speed - deceleration_m_s2 * period_s).clamp_min(0.0)
+    rolling_s = (speed - slower) / deceleration_m_s2
+    direction = velocity / speed.clamp_min(1e-9)
+    way = 0.5 * (speed + slower) * rolling_s
+    return position + direction * way, direction * slower
+
+
+def knock(
+    before: Tensor,
+    after: Tensor,
+    ball: Tensor,
+    velocity: Tensor,
+    *,
+    reach_m: float,
+    speed_m_s: Tensor | float,
+    turn_rad: Tensor | float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Move the balls that bodies walk into.
+
+    Args:
+        before: positions of the bodies before the step, (B, 2) in m.
+        after: after it, (B, 2) in m.
+        ball: positions of the balls, (B, 2) in m.
+        velocity: of the balls, (B, 2) in m/s.
+        reach_m: distance between the centers below which a body touches a ball.
+        speed_m_s: of a touched ball, along the line between the centers, (B, 1) or one for all.
+        turn_rad: angle between that line and the ball's direction, (B,) or one for all.
+
+    Returns:
+        positions and velocities (B, 2) of the balls.
+    """
+    direction, distance = _seen_from(after, ball)
+    approaches = ((after - before) * direction).sum(-1, keepdim=True) > 0
+    touched = (distance < reach_m) & approaches
+    leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
+    return (
+        torch.where(touched, after + direction * reach_m, ball),
+        torch.where(touched, leaving * speed_m_s, velocity),
+    )
+
+
+def kick_away(
+    body: Tensor,
+    ball: Tensor,
+    velocity: Tensor,
+    asked: Tensor,
+    *,
+    reach_m: float,
+    speed_m_s: Tensor | float,
+    turn_rad: Tensor | float = 0.0,
+) -> Tensor:
+    """Kick balls within reach.
+
+    Args:
+        body: positions of the bodies, (B, 2) in m.
+        ball: of the balls, (B, 2) in m.
+        velocity: of the balls, (B, 2) in m/s.
+        asked: which bodies are to kick, (B, 1) bool.
+        reach_m: distance between the centers below which a body can kick a ball.
+        speed_m_s: of a kicked ball, along the line between the centers, (B, 1) or one for all.
+        turn_rad: angle between that line and the ball's direction, (B,) or one for all.
+
+    Returns:
+        velocities (B, 2) of the balls.
+    """
+    direction, distance = _seen_from(body, ball)
+    leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
+    return torch.where(asked & (distance < reach_m), leaving * speed_m_s, velocity)
+
+
+def _seen_from(body: Tensor, ball: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the direction (B, 2) and distance (B, 1) of balls from bodies, both (B, 2)."""
+    apart = ball - body
+    distance = apart.norm(dim=-1, keepdim=True)
+    return apart / distance.clamp_min(1e-9), distance
+
+
+_LIES_M_S = 0.15
+"""A ball that is not faster lies: it would roll on for at most 4 cm, and a robot's estimate of its speed is
+never quite zero."""
+_LEAVES_M_S = 0.5
+"""Least speed with which corrections set a ball rolling that lay; the NAO's did about that in its kicks."""
+_NOTHING_M_S = 0.05
+"""Corrections to less than this set no ball rolling: scatter alone is as fast."""
+_TURN_RAD = 0.4
+"""Deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO."""
+_FADES = 0.75
+"""Share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps."""
+
+
+class BallAgent(PlanarStates):
+    """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
+
+    A command is the velocity of the next step, in units of the top speed along each axis, and whether to
+    stand and kick. Walls stop the mass, not the ball. A kicked ball within reach leaves at one speed along
+    the line between the centers, one that the mass walks into at another. Left out: the legs, the positions
+    and timing of the feet, and the robot's heading.
+
+    Corrections move only balls that rolled or were touched in the step, and say how fast they are, not where
+    they go: recorded balls keep to the way that they rolled, and leave along the line between the centers,
+    scattered, more than they keep to what is expected of them. Those that rolled go on, or lie again if that
+    is slow. Whether one that lay starts to roll is drawn, such that the speed expected after the step is the
+    corrected one: an expected correction mixes balls that are hit with others that are missed into one that
+    creeps, or never moves. It is drawn once for as long as the ball lies: what makes a kick miss stays while
+    nothing moves, and policies that kick from too far would else wait until it works.
+
+    Attributes:
+        memory: of each ball, the evidence of a hit that it takes to roll, in [0, 1), and what there was of
+            late, (B, 2).
+    """
+
+    state_size = 8
+    action_size = 3
+
+    def __init__(
+        self,
+        maze: Maze,
+        num_envs: int,
+        *,
+        timestep_s: float,
+        radius_m: float,
+        speed_m_s: float,
+        reach_m: float,
+        knock_m_s: float,
+        kick_reach_m: float,
+        kick_m_s: float,
+        device: str = "cpu",
+    ) -> None:
+        """Build B of them.
+
+        Args:
+            maze: the walls.
+            num_envs: B.
+            timestep_s: control period.
+            radius_m: distance that the mass keeps from walls, a multiple of the maze's `fine_m`.
+            speed_m_s: top speed along each axis.
+            reach_m: distance between the centers below which the mass touches the ball.
+            knock_m_s: speed of a ball that the mass walks into.
+            kick_reach_m: distance between the centers below which the mass can kick the ball.
+            kick_m_s: speed of a kicked ball.
+            device: torch device.
+        """
+        super().__init__(
+            maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device
+        )
+        self.parameters |= {
+            "reach_m": reach_m,
+            "knock_m_s": knock_m_s,
+            "kick_reach_m": kick_reach_m,
+            "kick_m_s": kick_m_s,
+        }
+        self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
+        self.memory = self._undecided(num_envs)
+        self._deceleration_m_s2: Tensor | float = ROLLING_M_S2
+        self._contact_turn_rad: Tensor | float = 0.0
+
+    def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
+        """Set the rows in `rows` (n,), by default all, to `state` (n, X); given `rows` are drawn for anew."""
+        super().reset_to(state, rows)
+        if rows is not None:
+            self.memory = self.memory.index_copy(0, rows, self._undecided(len(rows)))
+
+    def _undecided(self, count: int) -> Tensor:
+        """Return the memory (n, 2) of so many balls of which there is no evidence."""
+        device = self.state.device
+        return torch.cat([torch.rand(count, 1, device=device), torch.zeros(count, 1, device=device)], dim=-1)
+
+    def vary(self, parameters: Mapping[str, Tensor]) -> None:
+        """Use the parameters of a `BallVariation` by name, (B, 1) each, from the next step on."""
+        super().vary(parameters)
+        self._deceleration_m_s2 = ROLLING_M_S2 * parameters["ball_friction"]
+        self._contact_turn_rad = torch.deg2rad(parameters["contact_direction_deg"][:, 0])
+
+    def step(self, action: Tensor) -> Tensor:
+        """Apply commands `action` (B, 3), clipped to ±1 per axis; return the new state (B, 8)."""
+        of, turn, kicks = self.parameters, self._contact_turn_rad, asks_to_kick(action)
+        position, _, ball, velocity = self.state.split(2, dim=-1)
+        way = ~kicks * self.commanded_velocity(action[:, :2]) * self.period_s
+        moved, self.blocked = self.free.slide(position, position + way)
+        ball, velocity = knock(
+            position, moved, ball, velocity, reach_m=of["reach_m"], speed_m_s=of["knock_m_s"], turn_rad=turn
+        )
+        velocity = kick_away(
+            moved, ball, velocity, kicks, reach_m=of["kick_reach_m"], speed_m_s=of["kick_m_s"], turn_rad=turn
+        )
+        self._rolls = velocity.norm(dim=-1, keepdim=True) > _LIES_M_S
+        ball, velocity = roll(ball, velocity, self.period_s, self._deceleration_m_s2)
+        self.state = torch.cat([moved, (moved - position) / self.period_s, ball, velocity], dim=-1)
+        return self.state
+
+    def settle(self, before: Tensor, landed: Tensor) -> Tensor:
+        """Slide masses to `landed` (B, 8); move the balls, or draw whether they move: see the class."""
+        own = self.state[:, 6:]
+        moved = super().settle(before, landed)
+        ball, velocity = before[:, 4:6], before[:, 6:]
+        speed = moved[:, 6:].norm(dim=-1, keepdim=True)
+        lay = velocity.norm(dim=-1, keepdim=True) <= _LIES_M_S
+        turn_rad = _TURN_RAD * torch.randn(self.num_envs, device=ball.device)
+        direction = normalize(torch.where(lay, turned(own, turn_rad), velocity))
+        slowed_m_s = self._deceleration_m_s2 * self.period_s
+        leaving = (speed + slowed_m_s).clamp_min(_LEAVES_M_S * lay)
+        rolled = torch.cat(roll(ball, direction * leaving, self.period_s, self._deceleration_m_s2), dim=-1)
+        touched = self._rolls & lay & (speed > _NOTHING_M_S)
+        needed, evidence = self.memory.split(1, dim=-1)
+        evidence = _FADES * evidence + touched * speed / (leaving - slowed_m_s).clamp_min(_NOTHING_M_S)
+        rolls = torch.where(lay, touched & (evidence > needed), self._rolls & (speed > _LIES_M_S))
+        undecided = self._undecided(self.num_envs)
+        self.memory = torch.where(rolls, undecided, torch.cat([needed, evidence], dim=-1))
+        still = torch.cat([ball, torch.zeros_like(ball)], dim=-1)
+        self.reset_to(torch.cat([moved[:, :4], torch.where(rolls, rolled, still)], dim=-1))
+        return self.state
+
+
+_NEAR_M = (0.18, 0.5)
+"""Distances from the ball at which recorded episodes begin; a foot reaches as far as the first."""
+
+
+@dataclass(frozen=True)
+class Kicking(PlanarObjective):
+    """Get the ball into the goal at the right end of `maze`, an empty field, within `horizon` steps.
+
+    Abstract states begin with robot position and velocity, ball position and velocity, (..., 8). The goal
+    (..., 2) is the middle of the goal line. Actions (..., 3) end with whether to kick.
+
+    Attributes:
+        goal_line_m: x of the goal line. goal_half_width_m: of the goal on it.
+        side_line_m: |y| of the side lines. back_line_m: x of the line behind.
+        ball_x_m, ball_y_m: ranges of the ball's position at the start.
+        distance_m: of the robot from the ball at the start.
+        behind_m: distance from the ball of the point behind it that the shaping reward leads to.
+    """
+
+    action_size = 3
+
+    goal_line_m: float = 1.5
+    goal_half_width_m: float = 0.75
+    side_line_m: float = 2.0
+    back_line_m: float = -2.0
+    ball_x_m: tuple[float, float] = (-0.5, 0.0)
+    ball_y_m: tuple[float, float] = (-0.6, 0.6)
+    distance_m: tuple[float, float] = (0.4, 1.0)
+    behind_m: float = 0.2
+
+    def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, 8) at rest: the ball in front of the goal, the robot around it."""
+        ball = np.stack([rng.uniform(*self.ball_x_m, count), rng.uniform(*self.ball_y_m, count)], axis=1)
+        angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(*self.distance_m, count)
+        robot = ball + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        rest = np.zeros_like(robot)
+        return np.concatenate([robot, rest, ball, rest], axis=1)
+
+    def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Draw states (count, 8) at rest with the robot near its ball, which it rarely meets from afar."""
+        return replace(self, distance_m=_NEAR_M).draw_starts(rng, count)
+
+    def draw_goals(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Return the middle of the goal line, (count, 2)."""
+        return np.tile([self.goal_line_m, 0.0], (count, 1))
+
+    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return positions, velocities, and vectors to the ball, the goal and behind the ball, (..., 14)."""
+        robot, velocity, ball, rolling = state.split(2, dim=-1)
+        behind = self._behind(ball, goal) - robot
+        places = [robot / 2, ball / 2, (goal - ball) / 2]
+        return torch.cat([*places, 4 * velocity, rolling, 4 * (ball - robot), 4 * behind], dim=-1)
+
+    def _behind(self, ball: Tensor, goal: Tensor) -> Tensor:
+        to_goal = goal - ball
+        back: Tensor = self.behind_m * to_goal / to_goal.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        return ball - back
+
+    def places(self, state: Tensor) -> Tensor:
+        """Return the positions of robot and ball in states (..., 8), (..., 4)."""
+        return state[..., [0, 1, 4, 5]]
+
+    def reached(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return which balls (B,) of states (B, 8) are in the goal."""
+        ball = state[:, 4:6]
+        return (ball[:, 0] >= self.goal_line_m) & (ball[:, 1].abs() <= self.goal_half_width_m)
+
+    def missed(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Return which balls (B,) of states (B, 8) left the field beside the goal."""
+        x, y = state[:, 4:6].unbind(-1)
+        out = (x >= self.goal_line_m) | (x < self.back_line_m) | (y.abs() > self.side_line_m)
+        return out & ~self.reached(state, goal)
+
+    def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+        """Return the reward (B,) of a step between states (B, 8), a failure where `failed` (B,)."""
+        gained = self._potential(after, goal) - self._potential(before, goal)
+        return gained + self.success_reward * self.reached(after, goal) + self.failure_reward * failed
+
+    def _potential(self, state: Tensor, goal: Tensor) -> Tensor:
+        robot, _, ball, _ = state[:, :8].split(2, dim=-1)
+        ball_left: Tensor = (goal - ball).norm(dim=-1)
+        robot_left: Tensor = (self._behind(ball, goal) - robot).norm(dim=-1)
+        return -ball_left - 0.5 * robot_left

@@ -1,0 +1,501 @@
+"""Objects from the user's code: "cart.py:TASK" in a file, "package.module:TASK" in an installed package."""
+
+import ast
+import hashlib
+import importlib
+import importlib.util
+import json
+import os
+import sys
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from importlib.machinery import PathFinder
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from astra_data.core.durable import file_digest
+from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.worlds.objective import Objective
+from astra_data.worlds.protocols import AbstractSimulator
+
+_PREFIX = "astra_data_user_"
+"""Of the names of modules that are files of the user's."""
+_PACKAGE = Path(__file__).parents[1]
+
+
+def is_user_code(name: str) -> bool:
+    """Return whether `name` is of the form "file.py:OBJECT" or "package.module:OBJECT"."""
+    module, colon, attribute = name.rpartition(":")
+    return bool(colon and module and attribute.isidentifier())
+
+
+def place_beside(name: str, folder: Path) -> str:
+    """Return `name` with its file, if it is one, looked up in `folder`."""
+    return str(folder / name) if ".py:" in name else name
+
+
+def found_near(name: str, folder: Path) -> str:
+    """Return `name` with its file, if it is one, looked up in `folder` and those above it, and else here."""
+    place, folder = Path(name.rpartition(":")[0]), folder.resolve()
+    if place.suffix != ".py":
+        return name
+    found = next((one for one in (folder, *folder.parents) if (one / place).is_file()), Path.cwd())
+    return name if found == Path.cwd() else str(found / name)
+
+
+def user_object(name: str) -> Any:  # noqa: ANN401 - any object
+    """Run the file or module that `name` begins with, and return the object that it ends with.
+
+    Raises:
+        BadInputError: there is no such file, module or object, or running it fails.
+    """
+    place, _, attribute = name.rpartition(":")
+    module = _of_file(Path(place)) if place.endswith(".py") else _of_package(place)
+    if not hasattr(module, attribute):
+        raise BadInputError(
+            f"{place} has no '{attribute}'; it has {', '.join(_public_names(module)) or 'nothing'}"
+        )
+    return getattr(module, attribute)
+
+
+def offered(group: str) -> dict[str, str]:
+    """Return what installed packages offer under a group of entry points: the place of each, by name."""
+    return {point.name: point.value for point in entry_points(group=group)}
+
+
+def file_of(name: str) -> dict[str, str]:
+    """Return the sha256 of the file that `name` begins with, as "file_sha256"; empty where it is none."""
+    place = Path(name.rpartition(":")[0])
+    return {"file_sha256": file_digest(place)} if place.suffix == ".py" and place.is_file() else {}
+
+
+def _of_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        where = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise BadInputError(f"{path} does not exist{where}: expected a Python file")
+    key = hashlib.sha256(f"{path.resolve()}".encode()).hexdigest()[:12]
+    name = f"{_PREFIX}{path.stem}_{key}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look it up there
+    try:
+        with explained(f"importing {path}"), _among_neighbors(path.resolve()):
+            spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+_APPENDED: set[str] = set()
+"""Folders of files of the user's that stand at the end of Python's path."""
+
+
+@contextmanager
+def _among_neighbors(path: Path) -> Iterator[None]:
+    """Let a file import those beside it, whatever files of their names other files of the user's imported.
+
+    Installed packages come first. What the others imported is theirs again afterwards.
+    """
+    folder, loaded, places = path.parent, dict(sys.modules), [*sys.path]
+    known = {_folder_of(module) for name, module in loaded.items() if name.startswith(_PREFIX)} - {folder}
+    theirs = {}
+    with suppress(BadInputError):  # what is no Python is told where it is run
+        for file, _ in with_neighbors([path], path.parent):
+            if file.stem in loaded and _folder_of(loaded[file.stem]) in known:
+                theirs[file.stem] = sys.modules.pop(file.stem)
+    ours = [len(places) - 1 - places[::-1].index(place) for place in _APPENDED if place in places]
+    inserted = f"{folder}"
+    sys.path.insert(min(ours, default=len(places)), inserted)
+    try:
+        yield
+    finally:
+        sys.modules.update(theirs)
+        sys.path[:] = [place for place in sys.path if place is not inserted]
+    if f"{folder}" not in sys.path:
+        sys.path.append(f"{folder}")  # what is imported later, too, unless the file failed
+        _APPENDED.add(f"{folder}")
+
+
+def _folder_of(module: ModuleType) -> Path | None:
+    file = getattr(module, "__file__", None)
+    return Path(file).resolve().parent if file else None
+
+
+def _public_names(module: ModuleType) -> list[str]:
+    """Return the public names that a module defines itself."""
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and not isinstance(value, ModuleType)
+        and type(value).__module__ not in ("__future__", "typing")
+        and not (isinstance(value, type | FunctionType) and value.__module__ != module.__name__)
+    ]
+
+
+def _of_package(name: str) -> ModuleType:
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise BadInputError(f"{name}: expected a Python file, such as cart.py, or a module, package.module")
+    with explained(f"importing {name}"):
+        return importlib.import_module(name)
+
+
+@contextmanager
+def explained(what: str) -> Iterator[None]:
+    """Turn an exception of the user's code into an error of one line that begins with `what`.
+
+    Raises:
+        BadInputError: for any exception.
+    """
+    try:
+        yield
+    except AstraDataError:
+        raise
+    except SystemExit as error:
+        raise BadInputError(
+            f"{what} ends the program{_place(error)}: expected code that defines things and does not exit, "
+            'such as a script behind `if __name__ == "__main__":`'
+        ) from error
+    except Exception as error:
+        message = " ".join(filter(None, map(str.strip, str(error).splitlines())))
+        raise BadInputError(f"{what} fails with {type(error).__name__}: {message}{_place(error)}") from error
+
+
+def _place(error: BaseException) -> str:
+    """Return the file and line of the user's code at which `error` was raised, or else where it was.
+
+    Nothing is returned where that is this package or the import system, or where the message has it already.
+    """
+    if isinstance(error, SyntaxError):
+        return ""
+    own = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
+    frames = traceback.extract_tb(error.__traceback__)
+    last = next((frame for frame in reversed(frames) if frame.filename in own), frames[-1])
+    if last.filename.startswith("<frozen") or Path(last.filename).is_relative_to(_PACKAGE):
+        return ""
+    return f" ({Path(last.filename).name}, line {last.lineno})"
+
+
+_NOT_READ = (".log", ".py", ".pyc")
+"""Endings of files that code names and does not read as data: what it writes, and code, which it imports."""
+_WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) else {}
+"""What makes `ast.dump` write the same in each version of Python, for digests."""
+_INSTALLED = ("site-packages", "dist-packages")
+"""Names of folders in which what lies side by side need not belong together."""
+
+
+def code_digest(name: str) -> str | None:
+    """Return a digest of the code that `name` begins with; None where it is this package's, or not found.
+
+    Of a file, the files and packages beside it that it imports count too; of an installed module, all of its
+    package. So do models and data beside these that they name, such as a robot.xml; what they find without
+    its name, comments and layout do not.
+
+    Raises:
+        BadInputError: one of these files is no Python.
+    """
+    place = name.rpartition(":")[0]
+    file = Path(place)
+    files, folder = ([file], file.parent) if file.suffix == ".py" else _installed(place)
+    if not files or not files[0].is_file():
+        return None
+    digest = hashlib.sha256()
+    for path, tree in with_neighbors(files, folder):
+        name = path.relative_to(folder).as_posix()
+        digest.update(f"{name}\n{ast.dump(tree, **_WHOLE)}\n".encode())
+        for file in _named_beside(path, tree):
+            digest.update(f"{file.name}\n{file_digest(file)}\n".encode())
+    return digest.hexdigest()
+
+
+def with_neighbors(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast.Module]]:
+    """Yield `files` and those in `folder` that they import, all of a package, each once, and what is in it.
+
+    Raises:
+        BadInputError: one of those in `folder` is no Python.
+    """
+    todo, seen = [*files], set[Path]()
+    while todo:
+        path = todo.pop()
+        seen.add(path)
+        try:
+            tree = ast.parse(path.read_bytes())
+        except SyntaxError as error:
+            if path.parent == folder:
+                raise BadInputError(
+                    f"{path}, line {error.lineno}: expected Python, got {error.msg}"
+                ) from None
+            # A package may hold what is never imported, such as a template.
+            tree = ast.Module([ast.Expr(ast.Constant(path.read_bytes()))], [])
+        yield path, tree
+        beside = {file for module in _imported(tree) for file in _files_of(module, folder)}
+        todo += sorted(beside - seen - set(todo))
+
+
+def _installed(module: str) -> tuple[list[Path], Path]:
+    """Return the files of the outermost package that a module is in, or its own file, and their folder.
+
+    There are none of this package, and of what is not found. None is run.
+    """
+    parts, places = module.split("."), None
+    for end in range(1, len(parts) + 1) if parts[0] != _PACKAGE.name else ():
+        spec, name = None, ".".join(parts[:end])
+        with suppress(ImportError, ValueError):
+            spec = importlib.util.find_spec(name) if end == 1 else PathFinder.find_spec(name, places)
+        if spec is None:
+            break
+        places = spec.submodule_search_locations
+        if spec.origin and spec.origin.endswith(".py"):  # a folder of packages has none
+            file = Path(spec.origin)
+            if places:
+                return sorted(file.parent.rglob("*.py")), file.parents[1]
+            return [file], file.parent
+    return [], Path()
+
+
+def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
+    """Return the models and data in the folder of `place` whose paths within it are texts in it.
+
+    Or parts of their paths are, as in `folder / "data" / "weights.npz"`.
+    """
+    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    paths = sorted({Path(text) for text in texts if isinstance(text, str)})
+    paths = [path for path in paths if path.parts and not path.is_absolute() and ".." not in path.parts]
+    found, todo, seen = set[Path](), [place.parent], set[str]()
+    while todo:
+        folder = todo.pop()
+        if (real := os.path.realpath(folder)) in seen or not os.access(folder, os.R_OK):
+            continue
+        seen.add(real)
+        names = {*os.listdir(folder)}
+        beside = [folder / path for path in paths if path.parts[0] in names]
+        found |= {file for file in beside if file.suffix not in _NOT_READ and os.path.isfile(file)}
+        todo += [one for one in beside if os.path.isdir(one)]
+    return sorted(found)
+
+
+def _files_of(module: str, folder: Path) -> list[Path]:
+    """Return the file of a top module in `folder`, or all of its package there that is not installed."""
+    if folder.name in _INSTALLED:
+        return []
+    file, package = folder / f"{module}.py", folder / module
+    if file.is_file() or not package.is_dir():
+        return [file] if file.is_file() else []
+    spec = None
+    with suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(module)
+    if spec is not None and spec.origin and not Path(spec.origin).is_relative_to(folder.resolve()):
+        return []
+    return sorted(package.rglob("*.py"))
+
+
+def _imported(tree: ast.Module) -> set[str]:
+    """Return the names of the top modules that a file imports."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+_PACKAGE_NAME = __name__.partition(".")[0]
+
+
+class Saved(Protocol):
+    """What can be saved."""
+
+    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        """Return tensors and metadata (JSON values)."""
+        ...
+
+
+def parts_of(learned: Saved) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+    """Return the tensors and the metadata that `to_file` of something learned returns.
+
+    Raises:
+        BadInputError: it fails, or returns something else.
+    """
+    what = f"{type(learned).__name__}.to_file"
+    with explained(what):
+        returned: Any = learned.to_file()
+    is_pair = isinstance(returned, tuple | list) and len(returned) == 2
+    if not (is_pair and all(isinstance(values, Mapping) for values in returned)):
+        raise BadInputError(
+            f"{what}: expected a pair, a dict of tensors and one of JSON values, got {_kinds_in(returned)}"
+        )
+    tensors, metadata = returned
+    faults = [
+        f"{name!r} is a {type(value).__name__}, expected a torch tensor, as torch.as_tensor(value) is"
+        for name, value in tensors.items()
+        if not isinstance(value, Tensor)
+    ]
+    faults += [
+        f"{name!r} is a {type(value).__name__}, expected a JSON value, or it among the tensors"
+        for name, value in metadata.items()
+        if not _is_json(value)
+    ]
+    if faults:
+        raise BadInputError(f"{what}: {'; '.join(faults)}")
+    return tensors, metadata
+
+
+def restored[Learned](
+    made: type[Learned], tensors: dict[str, Tensor], metadata: Mapping[str, Any], *device: str
+) -> Learned:
+    """Return what `from_file` of the class `made` returns.
+
+    Raises:
+        BadInputError: it is a class of the user's, and fails; names what it asks for and the file has not.
+        KeyError, TypeError, ValueError, RuntimeError: it is one of the package, and fails.
+    """
+    from_file: Any = made.from_file  # type: ignore[attr-defined]
+    if made.__module__.partition(".")[0] == _PACKAGE_NAME:
+        return from_file(tensors, metadata, *device)  # type: ignore[no-any-return]
+    what = f"{made.__name__}.from_file"
+    try:
+        with explained(what):
+            return from_file(tensors, metadata, *device)  # type: ignore[no-any-return]
+    except BadInputError as error:
+        cause, line = error.__cause__, " ".join(f"{error}".split())
+        asked = cause.args[0] if isinstance(cause, KeyError) and cause.args else None
+        if isinstance(asked, str) and asked not in {*tensors, *metadata}:
+            line = (
+                f"{what} asks for {asked!r}, which its to_file did not write: the file has the tensors "
+                f"{', '.join(tensors)}, and {', '.join(metadata) or 'nothing'} beside them"
+            )
+        raise BadInputError(f"{line}: correct it or to_file, and run that stage again") from error
+
+
+def _kinds_in(returned: object) -> str:
+    """Return the types of what is no pair of dicts."""
+    kind = f"a {type(returned).__name__}"
+    if not isinstance(returned, tuple | list):
+        return kind
+    return f"{kind} of {', '.join(type(value).__name__ for value in returned) or 'nothing'}"
+
+
+def _is_json(value: object) -> bool:
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+_TOLERANCE = 1e-4
+"""Between states, relative to their size: simulators compute in single precision."""
+
+
+def expect(
+    what: str,
+    found: object,
+    shape: tuple[int, ...],
+    dtype: torch.dtype | None = None,
+    device: torch.device | None = None,
+) -> Tensor:
+    """Return `found`, a finite tensor of `shape`, where -1 stands for any length.
+
+    Raises:
+        BadInputError: it is something else.
+    """
+    found = expect_tensor(what, found)
+    fits = found.dim() == len(shape) and all(
+        size in (-1, length) for size, length in zip(shape, found.shape, strict=True)
+    )
+    if not fits:
+        expected = str(shape).replace("-1", "any")
+        raise BadInputError(f"{what}: expected shape {expected}, got {tuple(found.shape)}")
+    if dtype is not None and found.dtype != dtype:
+        raise BadInputError(f"{what}: expected {dtype}, got {found.dtype}")
+    if device is not None and found.device != device:
+        raise BadInputError(
+            f"{what}: expected a tensor on {device}, where its inputs are, got {found.device}"
+        )
+    if not found.isfinite().all():
+        raise BadInputError(f"{what}: expected finite numbers, got {first(found[~found.isfinite()])}")
+    return found
+
+
+def expect_same(what: str, shown: object, expected: Tensor, where: str = "") -> None:
+    """Refuse states (B, X), `shown`, that are not the `expected` ones but for rounding.
+
+    Raises:
+        BadInputError: they are others; tells those that are furthest apart.
+    """
+    shown = expect(what, shown, tuple(expected.shape))
+    if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
+        row, entry = ((shown - expected).abs() == (shown - expected).abs().max()).nonzero()[0].tolist()
+        raise BadInputError(
+            f"{what} {where}".rstrip()
+            + f": expected {first(expected[row, entry]):g} in row {row}, entry {entry}, got "
+            f"{first(shown[row, entry]):g}"
+        )
+
+
+def expect_tensor(what: str, found: object) -> Tensor:
+    """Return `found`, a tensor.
+
+    Raises:
+        BadInputError: it is something else.
+    """
+    if not isinstance(found, Tensor):
+        raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
+    return found
+
+
+def stepped(simulator: AbstractSimulator, command: Tensor, what: str) -> Tensor:
+    """Return the states (B, X) that a step with `command` (B, A) leads to; errors begin with `what`.
+
+    Raises:
+        BadInputError: the step fails, returns no tensor, or changes the states that were handed out before.
+    """
+    with explained(what):
+        before = simulator.state
+        kept = before.clone()
+        landed = simulator.step(command)
+    landed = expect_tensor(what, landed)
+    if not torch.equal(before, kept):
+        raise BadInputError(f"{what} changes the states handed out before: expected a new tensor")
+    return landed
+
+
+def first(values: Tensor) -> float:
+    """Return the first of `values`, of any shape."""
+    return float(values.flatten()[0])
+
+
+def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tensor:
+    """Return which states (B, X) are "reached" or "missed", as `name` says, (B,) bool.
+
+    Raises:
+        BadInputError: the objective fails, or returns something else.
+    """
+    what = f"objective.{name}(state, goal)"
+    with explained(what):
+        found = getattr(objective, name)(state, goal)
+    return expect(what, found, (len(state),), torch.bool, state.device)
+
+
+def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
+    """Return the rewards (B,) of steps between states (B, X).
+
+    Raises:
+        BadInputError: the objective fails, or returns something else.
+    """
+    what = "objective.reward(before, after, goal, failed)"
+    with explained(what):
+        found = objective.reward(before, after, goal, failed)
+    return expect(what, found, (len(after),), device=after.device)
