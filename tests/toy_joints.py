@@ -6,9 +6,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from astra_data.studies.joints import Joints
-from astra_data.studies.recordings import Piece
-
 FPS = 400
 NAMES = ("LF_HAA", "LF_HFE", "LF_KFE")
 STIFFNESS, DAMPING, FRICTION = 900.0, 40.0, 40.0
@@ -37,14 +34,6 @@ def positions(target: NDArray[np.float64], late_rows: int = LATE_ROWS) -> NDArra
         places.append(place)
     seen = np.array(places)
     return seen + np.random.default_rng(abs(int(1e6 * seen[-1, 0]))).normal(0, NOISE, seen.shape)
-
-
-def piece(rows: int, seed: int, *, has_targets: bool = True) -> Piece:
-    """Return a piece of the toy joints' motion."""
-    target = targets(rows, seed)
-    joints = Joints.named(NAMES, has_targets=has_targets)
-    given = target if has_targets else np.empty((rows, 0))
-    return Piece("toy", positions(target), given, np.zeros(rows, bool), joints)
 
 
 def write_log(path: Path, rows: int, seed: int) -> Path:

@@ -15,7 +15,6 @@ from typer.models import OptionInfo
 from astra_data.cli import (
     building,
     deploying,
-    predicting,
     recipes,
     selecting,
     sharing,
@@ -93,7 +92,6 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
         "report": recipes.report,
         "select": selecting.select,
         "deploy": deploying.deploy,
-        "gap": predicting.gap,
         "tasks": tasks.tasks,
     },
     "Recipes or datasets": {

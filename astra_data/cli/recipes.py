@@ -58,18 +58,11 @@ def check(
     """Check recipes without running them, and list which artifacts are finished, damaged or stale."""
     for recipe in recipes:
         recipe_at(recipe)
-    from astra_data.pipeline.recipe import is_gap_recipe
     from astra_data.pipeline.run import check as check_recipe
 
     faults: list[str] = []
     for recipe in recipes:
         try:
-            if is_gap_recipe(recipe):
-                from astra_data.studies.run import load_gap_recipe
-
-                load_gap_recipe(recipe)
-                typer.echo(f"{recipe}: no errors; a recipe for `astra-data gap`")
-                continue
             conditions = check_recipe(recipe, root=root, verify=verify)
         except AstraDataError as error:
             faults.append(str(error))

@@ -18,7 +18,6 @@ EXTRAS = {
     "matplotlib": "report",
     "PIL": "report",
     "pandas": "report",
-    "jinja2": "report",
     "onnxruntime": "deploy",
     "onnxscript": "deploy",
     "lerobot": "lerobot",

@@ -98,13 +98,9 @@ def read_tables(path: Path) -> dict[str, Any]:
     """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it.
 
     Raises:
-        RecipeError: it cannot be read, or is a recipe of `gap`.
+        RecipeError: it cannot be read.
     """
     tables = tables_of(path)
-    if {"mapping", "models"} <= tables.keys() and "methods" not in tables:
-        raise RecipeError(
-            f"{path}: expected a recipe for `astra-data run`, got one for `astra-data gap {path} --data LOGS`"
-        )
     task, data = tables.get("task"), tables.get("data")
     if isinstance(task, str):
         tables["task"] = place_beside(task, path.parent)
@@ -113,15 +109,6 @@ def read_tables(path: Path) -> dict[str, Any]:
     if isinstance(data, str) and (path.parent / data / INFO_PATH).is_file():
         tables["data"] = str(path.parent / data)
     return tables
-
-
-def is_gap_recipe(path: Path) -> bool:
-    """Return whether the file at `path` has the keys of a recipe for `astra-data gap`.
-
-    Raises:
-        RecipeError: as `tables_of`.
-    """
-    return {"mapping", "models"} <= tables_of(path).keys()
 
 
 def tables_of(path: Path) -> dict[str, Any]:

@@ -81,16 +81,15 @@ class ShippedRecipe:
 
     @property
     def files(self) -> set[Path]:
-        """The files that it needs, below `RECIPES`: its base, code, mappings, and what its head names."""
+        """The files that it needs, below `RECIPES`: its base, code, and what its head names."""
         files = {self.path}
         if base := self.table.get("based_on"):
             files |= shipped(base).files
         folders = [RECIPES / self.path.parent]
-        for key in ("task", "mapping"):
-            place = folders[0] / str(self.table.get(key, "")).partition(":")[0]
-            if place.is_file():
-                files.add(place.resolve().relative_to(RECIPES))
-                folders.append(place.resolve().parent)
+        place = folders[0] / str(self.table.get("task", "")).partition(":")[0]
+        if place.is_file():
+            files.add(place.resolve().relative_to(RECIPES))
+            folders.append(place.resolve().parent)
         text = (RECIPES / self.path).read_text().partition("\n\n")[0]
         named = {Path(name) for name in re.findall(r"recipes/(\S+\.(?:py|toml))", text)}
         files |= {path for path in named if (RECIPES / path).is_file()}
@@ -102,7 +101,7 @@ def shipped_recipes() -> tuple[ShippedRecipe, ...]:
     """Return all recipes, by name."""
     texts = {path.relative_to(RECIPES): path.read_text() for path in RECIPES.rglob("*.toml")}
     found = [ShippedRecipe(path, tomllib.loads(text), _about(text)) for path, text in texts.items()]
-    runnable = {"methods", "based_on", "models"}
+    runnable = {"methods", "based_on"}
     kept = [recipe for recipe in found if not runnable.isdisjoint(recipe.table)]
     return tuple(sorted(kept, key=lambda recipe: recipe.name))
 

@@ -1,51 +1,10 @@
-"""Numbers, tables and templates of the pages."""
+"""Numbers and tables of the pages."""
 
-import re
 from collections.abc import Iterable, Sequence
-from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from astra_data.reports.statistics import Summary
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
-    from markupsafe import Markup
-
-
-def fill(template: str, **values: object) -> str:
-    """Return a file of `templates/`, in Markdown, with its `values`."""
-    return _templates(escaped=False).get_template(template).render(values)
-
-
-def fill_html(template: str, **values: object) -> str:
-    """Return a file of `templates/`, in HTML, with its `values`, which are escaped."""
-    return _templates(escaped=True).get_template(template).render(values)
-
-
-@cache
-def _templates(*, escaped: bool) -> "Environment":
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    templates = Environment(
-        loader=PackageLoader("astra_data.reports"),
-        autoescape=escaped,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        undefined=StrictUndefined,
-    )
-    templates.globals |= {"table": table, "interval": interval, "duration": duration}
-    return templates
-
-
-def inline(text: str) -> "Markup":
-    """Return a sentence of a Markdown page as HTML: `code` and **strong**, all else escaped."""
-    from markupsafe import Markup, escape
-
-    marked = re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text)))
-    return Markup(re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", marked))
 
 
 def table(head: Sequence[str], lines: Iterable[Iterable[str]], *, words: int = 1) -> str:

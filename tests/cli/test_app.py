@@ -116,7 +116,7 @@ def test_a_mistake_loads_no_torch(place: Path) -> None:
 
 def test_every_command_has_an_example_of_options_that_it_has() -> None:
     commands: Any = get_command(cli.app).commands  # type: ignore[attr-defined]
-    assert cli.EXAMPLES.keys() == commands.keys() - {"recipes", "gap"}
+    assert cli.EXAMPLES.keys() == commands.keys() - {"recipes"}
     for name, example in cli.EXAMPLES.items():
         _, typed, *words = shlex.split(example)
         assert typed == name

@@ -460,19 +460,10 @@ def test_a_choice_depends_on_all_groundings(base: Path, tmp_path: Path) -> None:
 
 def test_recipes_are_read_without_what_only_trainings_and_tables_need() -> None:
     code = (
-        "import sys, astra_data.pipeline.run, astra_data.studies.run; "
+        "import sys, astra_data.pipeline.run; "
         "assert not {'pandas', 'matplotlib', 'gymnasium'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_a_recipe_for_gap_is_told_from_others(tmp_path: Path) -> None:
-    path = tmp_path / "walks.toml"
-    path.write_text('mapping = "logs.toml"\nmodels = ["ridge"]\nseeds = [0]\n')
-    with pytest.raises(
-        RecipeError, match="expected a recipe for `astra-data run`, got one for `astra-data gap"
-    ):
-        load_experiment(path, tmp_path)
 
 
 def test_a_stage_that_no_row_has_is_told(base: Path, tmp_path: Path) -> None:

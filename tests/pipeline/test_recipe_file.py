@@ -4,8 +4,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.pipeline.recipe import is_gap_recipe, read_tables, recorded_settings
-from astra_data.studies.run import load_gap_recipe
+from astra_data.pipeline.recipe import read_tables, recorded_settings
 
 
 def test_a_run_or_a_dataset_in_place_of_a_recipe_is_told(tmp_path: Path) -> None:
@@ -20,19 +19,17 @@ def test_a_run_or_a_dataset_in_place_of_a_recipe_is_told(tmp_path: Path) -> None
         (other, "a dataset: expected the recipe that made it"),
         (tmp_path, "a folder: expected a TOML file"),
     ):
-        for read in (read_tables, is_gap_recipe, load_gap_recipe):
-            with pytest.raises(RecipeError, match=f"^{path} is {told}$"):
-                read(path)
+        with pytest.raises(RecipeError, match=f"^{path} is {told}$"):
+            read_tables(path)
     with pytest.raises(RecipeError, match="cannot be read as a text file"):
         read_tables(tmp_path / ("n" * 300))
 
 
 def test_a_mapping_in_place_of_a_recipe_is_told() -> None:
     path = Path(__file__).parents[2] / "recipes/imports/nao_guda.toml"
-    for read in (read_tables, is_gap_recipe, load_gap_recipe):
-        with pytest.raises(RecipeError) as caught:
-            read(path)
-        assert str(caught.value) == f"{path} is a mapping: `astra-data import LOGS --mapping {path}`"
+    with pytest.raises(RecipeError) as caught:
+        read_tables(path)
+    assert str(caught.value) == f"{path} is a mapping: `astra-data import LOGS --mapping {path}`"
 
 
 def test_what_a_run_recorded_is_read_with_keys_of_any_age(tmp_path: Path) -> None:

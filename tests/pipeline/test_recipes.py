@@ -2,24 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from astra_data.core.config import load_recipe
 from astra_data.core.errors import RecipeError
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.plan import plan
-from astra_data.studies.gap_recipe import GapRecipe
 
 HOUSE = Path(__file__).parents[2]
-
-
-WALKS = [HOUSE / f"recipes/{name}.toml" for name in ("nao_real", "icub_joints", "pace_joints")]
-"""Recipes of `astra-data gap`, which have no stages."""
-
-
-@pytest.mark.parametrize("path", WALKS, ids=lambda path: path.stem)
-def test_a_recipe_of_walks_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
-    first = path.read_text().splitlines()[0]
-    assert first == f"# uv run astra-data gap recipes/{path.name} --data FOLDER"
-    assert (path.parent / load_recipe(path, GapRecipe).mapping).is_file()
 
 
 EXAMPLES = [path for path in (HOUSE / "recipes/examples").glob("*/*.toml") if path.name != "logs.toml"]
@@ -28,7 +15,7 @@ EXAMPLES = [path for path in (HOUSE / "recipes/examples").glob("*/*.toml") if pa
 @pytest.mark.usefixtures("forgotten_methods")
 @pytest.mark.parametrize(
     "path",
-    sorted({*(HOUSE / "recipes").glob("*.toml"), *EXAMPLES} - {*WALKS}),
+    sorted({*(HOUSE / "recipes").glob("*.toml"), *EXAMPLES}),
     ids=lambda path: path.stem,
 )
 def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:

@@ -19,7 +19,6 @@ from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import data_efficiency, learning_curves, score_bars
 from astra_data.reports.figures.style import method_color, method_title, png
 from astra_data.reports.figures.validity import predictive_validity
-from astra_data.reports.figures.walks import walk_prediction
 from astra_data.reports.results import Results
 
 __all__ = [
@@ -33,7 +32,6 @@ __all__ = [
     "pictures",
     "png",
     "reliability",
-    "walk_prediction",
 ]
 
 
