@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-from astra_data.grounding.protocols import FittedGrounding
 
-from astra_data.grounding.simulator import EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator, FittedGrounding
 from astra_data.methods.method import Method
 
 STEPS, PENALTY, HIDDEN = 5, 1e-3, 64
