@@ -60,7 +60,7 @@ def quick_failures(monkeypatch: pytest.MonkeyPatch) -> None:
 def forgotten_methods() -> Iterator[None]:
     """Forget afterwards the methods of one's own that a test adds to this process."""
     methods, policies = (
-        importlib.import_module(f"astra_data.{name}") for name in ("methods", "policies.own_policy")
+        importlib.import_module(f"astra_data.{name}") for name in ("methods", "policies.running_policy")
     )
     registered = (methods.METHODS, methods.KINDS, methods._PLACES, policies.KINDS)
     known = [dict(found) for found in registered]

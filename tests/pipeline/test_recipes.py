@@ -22,7 +22,7 @@ def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> 
     first, experiment = path.read_text().split("\n\n")[0], load_experiment(path, Path("runs"))
     command = "sweep" if experiment.recipe.sweep.percent else "run"
     assert any(
-        line.startswith("# ") and line.endswith(f"astra-data {command} {path.relative_to(HOUSE)}")
+        line.removesuffix(" --until ground").endswith(f"astra-data {command} {path.relative_to(HOUSE)}")
         for line in first.splitlines()
     )
     assert plan(experiment.recipe, path, experiment.folder)
