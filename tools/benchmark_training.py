@@ -1,4 +1,4 @@
-"""Measure how fast groundings are fitted and policies trained, against other ways to do the same work.
+"""Measure how fast policies are trained, against other ways to do the same work.
 
     uv run python tools/benchmark_training.py
     uv run python tools/benchmark_training.py --only ppo --only target --quick
@@ -12,7 +12,6 @@ networks, which candidates with the same updates share.
 """
 
 import json
-import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict
 from enum import StrEnum
@@ -25,18 +24,13 @@ import numpy as np
 import torch
 import typer
 from bare_work import bare_iql, bare_ppo, bare_sac
-from single_file_iql import SingleFileIql
-from step_by_step import step_by_step
 from timing import OURS, Candidates, Rate, Stretch, complain, measure, peer, print_rates
 
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import AstraDataError
-from astra_data.core.progress import silent
 from astra_data.core.provenance import cores
-from astra_data.grounding.fit import Fitting, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.pipeline.recipe import Recipe
 from astra_data.policies.iql import Experience, Iql, IqlConfig
@@ -52,7 +46,6 @@ SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.tom
 TASK = TASKS[SETTINGS.task]
 WALKER = TASKS["humanoid-walker2d"]
 SHAPE = GroundingShape(state_size=4, action_size=2, goal_size=2)
-ASTRA = HistoryFit(latent=True, reward=True)
 PEERS = Path(__file__).parent / "peers"
 BOUND = "bound: simulator and networks alone"
 GYMNASIUM_ID = "AntMaze_UMaze-v5"
@@ -69,15 +62,11 @@ class Part(StrEnum):
     recurrent = "recurrent"
     sac = "sac"
     iql = "iql"
-    grounding = "grounding"
     target = "target"
 
 
 def main(
     only: Annotated[list[Part] | None, typer.Option(help="Measure this alone; may be repeated.")] = None,
-    dataset: Annotated[Path, typer.Option(help="Paired, of the Long Maze; to ground.")] = Path(
-        "runs/antmaze_long/pair/seed_0"
-    ),
     rounds: Annotated[int, typer.Option(help="Turns that each candidate takes.")] = 4,
     quick: Annotated[bool, typer.Option("--quick", help="One turn, and shorter ones.")] = False,
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the figures there.")] = None,
@@ -88,7 +77,7 @@ def main(
     for part in only or list(Part):
         with ExitStack() as stack:
             try:
-                title, candidates = MEASUREMENTS[part](dataset, quick, stack)
+                title, candidates = MEASUREMENTS[part](quick, stack)
             except AstraDataError as error:
                 raise typer.Exit(complain(str(error))) from None
             figures[title] = measure(candidates, 1 if quick else rounds)
@@ -101,7 +90,7 @@ def main(
         json_path.write_text(json.dumps(report, indent=2) + "\n")
 
 
-def grounded_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+def grounded_ppo(_quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Train on latents in the grounded simulator; what the model has learned is the same to the speed."""
     grounding = HistoryGrounding(GroundingModel(SHAPE).requires_grad_(False))
     return (
@@ -115,7 +104,7 @@ def grounded_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, C
     )
 
 
-def recurrent_ppo(_dataset: Path, _quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+def recurrent_ppo(_quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Train a policy with a memory of its own in the raw simulator."""
     return (
         "PPO with a memory in the raw simulator, steps",
@@ -154,7 +143,7 @@ def ppo_parts(grounding: Grounding, memory_size: int) -> tuple[SimulatorEnv, Act
     return env, ActorCritic(shape), config
 
 
-def sac(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+def sac(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Train an actor without memory in an abstract simulator of the humanoid."""
     count, updates, steps = 32, 8, 8 if quick else 64
     env, bare = (SimulatorEnv(WALKER.objective, NO_GROUNDING.simulator(WALKER, count)) for _ in range(2))
@@ -184,7 +173,7 @@ def stable_baselines(stack: ExitStack, *arguments: str) -> Stretch:
     return peer(stack, *command, str(PEERS / "stable_baselines.py"), *arguments)
 
 
-def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+def iql(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Update critics and policy from single transitions, as the others do; random ones, for speed alone."""
     observation_size, action_size, updates = 8, 2, 20 if quick else 100
     episodes, steps = 100, 500
@@ -224,39 +213,17 @@ def iql(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]
 
     command = ["--no-project", "--python", "3.12", "--with", "d3rlpy", "--with", f"torch=={TORCH}", "python"]
     command += [str(PEERS / "d3rlpy_iql.py"), "time", str(observation_size), str(action_size)]
-    single_file = SingleFileIql(experience)
     return (
         "implicit Q-learning, updates of critics and policy",
         {
             OURS: ours,
             BOUND: bare_iql(observation_size, action_size, 256, updates),
             "d3rlpy": peer(stack, *command),
-            "plain torch in one file": lambda: single_file.learn(updates),
         },
     )
 
 
-def grounding(dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
-    """Fit ASTRA's history model."""
-    episodes = PairedEpisodes.load(dataset)
-    config = SETTINGS.ground.model_copy(update={"updates": 20 if quick else 100})
-    training, held_out = episodes.split(config.held_out_share, seed=0)
-
-    def ours() -> int:
-        with tempfile.TemporaryDirectory() as folder:
-            ASTRA(Fitting(TASK, config, None, training, held_out, 0, "cpu", Path(folder), silent))
-        return int(config.updates * config.batch_windows)
-
-    return (
-        f"grounding, windows of {config.window} steps",
-        {
-            OURS: ours,
-            "Algorithm 1, step by step": step_by_step(SHAPE, ASTRA.weights(config), training, config),
-        },
-    )
-
-
-def target(_dataset: Path, quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
+def target(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
     """Step the ants by random commands through their low-level controller."""
     env = TASKS["antmaze-umaze"].target(ANTS, seed=0)
     env.reset()
@@ -305,7 +272,6 @@ MEASUREMENTS = {
     Part.recurrent: recurrent_ppo,
     Part.sac: sac,
     Part.iql: iql,
-    Part.grounding: grounding,
     Part.target: target,
 }
 
