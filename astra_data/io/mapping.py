@@ -33,8 +33,8 @@ def _other_than_zero(factor: float) -> float:
 
 Factor = Annotated[float, AfterValidator(_other_than_zero)]
 MAPPED_FLAGS = (TERMINATED, TRUNCATED, SUCCESS)
-_OF_RECIPES = {"methods", "based_on", "models"}
-"""Keys that recipes of `run` and `gap` have, and no mapping."""
+_OF_RECIPES = {"methods", "based_on"}
+"""Keys that recipes have, and no mapping."""
 
 
 class ColumnMapping(Config):
@@ -248,9 +248,8 @@ def read_mapping(path: Path) -> ImportMapping:
         RecipeError: it is missing, not TOML or a recipe, or has faults; one message holds them all.
     """
     tables = load_tables(path)
-    if "columns" not in tables and (found := _OF_RECIPES & tables.keys()):
-        command = f"gap {path} --data LOGS" if "models" in found else f"run {path}"
+    if "columns" not in tables and _OF_RECIPES & tables.keys():
         raise RecipeError(
-            f"{path} is a recipe: `astra-data {command}`; expected a mapping, which `astra-data new` writes"
+            f"{path} is a recipe: `astra-data run {path}`; expected a mapping, which `astra-data new` writes"
         )
     return validated(tables, ImportMapping, str(path))
