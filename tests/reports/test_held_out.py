@@ -173,7 +173,7 @@ def test_the_figure_pools_the_steps_of_all_seeds_by_bin(
         shown.append(parts)
         return reliability(parts)
 
-    monkeypatch.setattr("astra_data.reports.figures.catalog.reliability", noted)
+    monkeypatch.setattr("astra_data.reports.figures.reliability.reliability", noted)
     for percent, seed in ((100, 0), (100, 1), (25, 0)):
         write(tmp_path, percent, seed, 0.1)
     write_failures(tmp_path, 0, 1.0)
