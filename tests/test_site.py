@@ -27,8 +27,8 @@ from astra_data.cli.app import app
 from astra_data.pipeline.recipe import Recipe
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
-NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+DOCS = sorted(path.relative_to(ROOT / "docs").as_posix().removesuffix(".md") for path in (ROOT / "docs").rglob("*.md"))
+NOTEBOOKS = sorted((ROOT / "docs/guide/notebooks").glob("*.ipynb"))
 COUNTED = {"blockquote", "em", "h2", "h3", "img", "li", "pre", "strong", "td", "tr"}
 SCHEMA: dict[str, Any] = Recipe.model_json_schema()
 TABLES = [name for name in SCHEMA["properties"] if name not in {"plus", "own_methods"}]
@@ -128,8 +128,8 @@ def test_every_page_is_in_the_navigation_and_shows_what_github_shows(site: Path,
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: str(path.stem))
 def test_notebooks_are_pages_with_what_they_printed_and_drew(site: Path, path: Path) -> None:
     navigation = (site / "404.html").read_text()
-    assert f'href="/notebooks/{path.stem}/"' in navigation
-    found = page(site / f"notebooks/{path.stem}/index.html")
+    assert f'href="/guide/notebooks/{path.stem}/"' in navigation
+    found = page(site / f"guide/notebooks/{path.stem}/index.html")
     code = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
     printed = [output for cell in code for output in cell["outputs"]]
     pictures = [output["data"]["image/png"] for output in printed if "image/png" in output.get("data", {})]
@@ -138,16 +138,16 @@ def test_notebooks_are_pages_with_what_they_printed_and_drew(site: Path, path: P
     text = " ".join(unescape(re.sub(r"<[^>]+>", "", found.text)).split())
     for output in printed:
         assert " ".join("".join(output.get("text", [])).split()) in text
-    assert (site / f"notebooks/{path.name}").read_bytes() == path.read_bytes()
+    assert (site / f"guide/notebooks/{path.name}").read_bytes() == path.read_bytes()
 
 
 def test_pictures_of_a_page_are_in_the_site(site: Path) -> None:
-    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (ROOT / "docs/real_nao_logs.md").read_text())
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (ROOT / "docs/results/real_nao.md").read_text())
     assert pictures
-    shown = page(site / "real_nao_logs/index.html").pictures
+    shown = page(site / "results/real_nao/index.html").pictures
     for picture in pictures:
         (loaded,) = (link for link in shown if Path(link).name == Path(picture).name)
-        assert (site / "real_nao_logs" / loaded).read_bytes() == (ROOT / "docs" / picture).read_bytes()
+        assert (site / "results/real_nao" / loaded).read_bytes() == (ROOT / "docs/results" / picture).read_bytes()
 
 
 def models_of(schema: dict[str, Any]) -> list[dict[str, Any]]:
@@ -240,10 +240,10 @@ def test_every_public_name_is_in_the_reference_with_its_docstring(site: Path) ->
 
 
 def test_pages_have_no_links_to_edit_them_until_an_address_is_set(site: Path) -> None:
-    assert 'rel="edit"' not in (site / "cart/index.html").read_text()
+    assert 'rel="edit"' not in (site / "results/cart/index.html").read_text()
     edited = {
-        "docs/cart.md": "edit/main/docs/cart.md",
-        "docs/notebooks/csv_to_card.ipynb": "edit/main/docs/notebooks/csv_to_card.ipynb",
+        "docs/results/cart.md": "edit/main/docs/results/cart.md",
+        "docs/guide/notebooks/csv_to_card.ipynb": "edit/main/docs/guide/notebooks/csv_to_card.ipynb",
         "CONTRIBUTING.md": "edit/main/CONTRIBUTING.md",
         "docs/reference/python.md": None,
         "recipes/examples/cart": None,
@@ -260,9 +260,10 @@ def test_pages_have_no_links_to_edit_them_until_an_address_is_set(site: Path) ->
         assert SitePage(None, file, config).edit_url == (place and f"{address}/{place}")
 
 
-def test_the_glossary_has_the_words_of_the_house() -> None:
-    section = (ROOT / "CONTRIBUTING.md").read_text().partition("\n| word |")[2].partition("| not | but |")[0]
-    words = re.findall(r"^\| ([^|]+?) \| .+ \|$", section, re.MULTILINE)
-    assert len(words) > 30
-    glossary = (ROOT / "docs/glossary.md").read_text()
-    assert not [word for word in words if f"\n| {word} |" not in glossary]
+def test_search_finds_guides_before_results_and_no_sources(site: Path) -> None:
+    found = json.loads((site / "search/search_index.json").read_text())["docs"]
+    boosts = {page["location"].partition("#")[0]: page.get("boost", 1) for page in found}
+    assert not [place for place in boosts if place.startswith("repository/")]
+    guides = [boost for place, boost in boosts.items() if place.startswith("guide/")]
+    results = [boost for place, boost in boosts.items() if place.startswith("results/")]
+    assert min(guides) > 1 > max(results)

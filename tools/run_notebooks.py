@@ -19,7 +19,7 @@ from typing import Any
 
 import matplotlib as mpl
 
-FOLDER = Path(__file__).parents[1] / "docs/notebooks"
+FOLDER = Path(__file__).parents[1] / "docs/guide/notebooks"
 Notebook = dict[str, Any]
 
 

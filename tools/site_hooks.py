@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
+from mkdocs.structure.pages import Page
 from pages.command_line import command_line
 from pages.links import linked
 from pages.notebooks import notebook_page
@@ -25,6 +26,8 @@ GENERATED = {
     "docs/reference/python.md": python_names,
 }
 """Pages of the reference, and what writes them anew for each build."""
+BOOSTS = {"docs/guide/": 4, "docs/results/": 0.25, "docs/": 1}
+"""How far up a search lists pages, by the folder that they are in; pages in none of these are not searched."""
 PICTURES = {".gif", ".jpg", ".png", ".svg"}
 
 
@@ -61,6 +64,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             file.inclusion = InclusionLevel.NOT_IN_NAV
         files.append(file)
     return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Let a search find guides before results, and no sources."""
+    boost = next((boost for folder, boost in BOOSTS.items() if page.file.src_uri.startswith(folder)), None)
+    page.meta["search"] = {"exclude": True} if boost is None else {"boost": boost}
+    return markdown
 
 
 def _names(nav: object) -> list[str]:

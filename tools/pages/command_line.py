@@ -10,8 +10,7 @@ from astra_data.cli.app import app
 
 _INTRODUCTION = """# The command line
 
-Every command with its arguments and options, as `--help` prints them;
-[commands](../commands.md) says what they are for.
+Every command with its arguments and options, as `--help` prints them. `--help` shows examples, too.
 """
 
 

@@ -10,7 +10,7 @@ def notebook_page(path: Path) -> str:
     """Return the page of a notebook, with a link to its file, which lies beside the page's folder."""
     cells = json.loads(path.read_text())["cells"]
     title, *rest = ("\n\n".join(_parts(cell)) for cell in cells)
-    place = f"`docs/notebooks/{path.name}` of a checkout"
+    place = f"`docs/guide/notebooks/{path.name}` of a checkout"
     link = f'<a href="../{path.name}" download>Download this notebook</a>, {place}.'
     return "\n\n".join([title, link, *rest]) + "\n"
 

@@ -32,7 +32,7 @@ MOVING = 0.1
 FEWEST_STEPS = 10
 """Shorter episodes tell nothing of it."""
 FEW_FAILURES = 10
-"""Fewer failures are little for a failure model (docs/failures.md)."""
+"""Fewer failures are little for a failure model (docs/results/failures.md)."""
 MOST_REPEATED = 0.05
 """Share of the steps above which states that repeat the row before, between others that move, are many."""
 MOST_ROWS = 5
