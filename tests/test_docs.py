@@ -1,4 +1,4 @@
-"""README, CONTRIBUTING and docs/: links lead somewhere, commands exist, snippets run in order, guides are short."""
+"""README, CONTRIBUTING and docs/: links lead somewhere, commands exist, snippets run, guides are short."""
 
 import glob
 import os
@@ -33,7 +33,10 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
-    for path in (*map(ROOT.joinpath, ("README.md", "CONTRIBUTING.md")), *sorted((ROOT / "docs").rglob("*.md")))
+    for path in (
+        *map(ROOT.joinpath, ("README.md", "CONTRIBUTING.md")),
+        *sorted((ROOT / "docs").rglob("*.md")),
+    )
 }
 GROUP = get_command(app)
 assert isinstance(GROUP, TyperGroup)
@@ -284,7 +287,9 @@ def test_the_index_leads_to_every_page() -> None:
 
 def test_nothing_that_no_registry_has_is_installed() -> None:
     """Only a folder, uv, and what a robot needs: the package itself may be on no registry."""
-    asked = [(page, found) for page, text in PAGES.items() for found in re.findall(r"pip install ([^&`\n]+)", text)]
+    asked = [
+        (page, found) for page, text in PAGES.items() for found in re.findall(r"pip install ([^&`\n]+)", text)
+    ]
     assert {found.strip() for _, found in asked} <= {"uv", '".[all]"', "numpy onnxruntime"}, asked
 
 

@@ -27,7 +27,9 @@ from astra_data.cli.app import app
 from astra_data.pipeline.recipe import Recipe
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted(path.relative_to(ROOT / "docs").as_posix().removesuffix(".md") for path in (ROOT / "docs").rglob("*.md"))
+DOCS = sorted(
+    path.relative_to(ROOT / "docs").as_posix().removesuffix(".md") for path in (ROOT / "docs").rglob("*.md")
+)
 NOTEBOOKS = sorted((ROOT / "docs/guide/notebooks").glob("*.ipynb"))
 COUNTED = {"blockquote", "em", "h2", "h3", "img", "li", "pre", "strong", "td", "tr"}
 SCHEMA: dict[str, Any] = Recipe.model_json_schema()
@@ -139,15 +141,6 @@ def test_notebooks_are_pages_with_what_they_printed_and_drew(site: Path, path: P
     for output in printed:
         assert " ".join("".join(output.get("text", [])).split()) in text
     assert (site / f"guide/notebooks/{path.name}").read_bytes() == path.read_bytes()
-
-
-def test_pictures_of_a_page_are_in_the_site(site: Path) -> None:
-    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (ROOT / "docs/results/real_nao.md").read_text())
-    assert pictures
-    shown = page(site / "results/real_nao/index.html").pictures
-    for picture in pictures:
-        (loaded,) = (link for link in shown if Path(link).name == Path(picture).name)
-        assert (site / "results/real_nao" / loaded).read_bytes() == (ROOT / "docs/results" / picture).read_bytes()
 
 
 def models_of(schema: dict[str, Any]) -> list[dict[str, Any]]:

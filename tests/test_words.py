@@ -1,4 +1,4 @@
-"""The glossary and the words of CONTRIBUTING.md, enforced: those that are not used, and one word for one thing."""
+"""The glossary and the words of CONTRIBUTING.md, enforced: one word for one thing, and words not used."""
 
 import ast
 import re

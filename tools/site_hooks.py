@@ -27,7 +27,7 @@ GENERATED = {
 }
 """Pages of the reference, and what writes them anew for each build."""
 BOOSTS = {"docs/guide/": 4, "docs/results/": 0.25, "docs/": 1}
-"""How far up a search lists pages, by the folder that they are in; pages in none of these are not searched."""
+"""How far up a search lists pages, by their folder; pages in none of these are not searched."""
 PICTURES = {".gif", ".jpg", ".png", ".svg"}
 
 
