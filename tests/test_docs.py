@@ -23,6 +23,7 @@ from astra_data.cli.app import app
 from astra_data.core.config import Config
 from astra_data.core.progress import silent
 from astra_data.io import mapping  # noqa: F401 - has the keys of mappings
+from astra_data.pipeline import recipe  # noqa: F401 - has all tables of settings
 from astra_data.pipeline.stages.align import align
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.ground import ground

@@ -1,7 +1,7 @@
 """The humanoid's joints without its body: they follow commands, whatever happens to its balance.
 
 Joints approach their targets, those that no command moves zero, as position control moves a massless joint;
-the extended simulator adds the center of mass and the torso's lean. What both leave out: docs/results/humanoid.md.
+the extended simulator adds the center of mass and the torso's lean. docs/results/humanoid.md: what both lack.
 """
 
 from collections.abc import Mapping
