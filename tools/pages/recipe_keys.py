@@ -19,8 +19,8 @@ _INTRODUCTION = """# Keys of recipes
 
 A [recipe](../guide/recipes.md) is a TOML file with the keys of the first table here and one table `[…]` for
 each section below it. A key that is left out has its default; without one it is not set, and its meaning
-says what happens then. Units are those of the key's name. Numbers of things are at most 10¹², of things that are in
-memory at the same time 10⁶.
+says what happens then. Units are those of the key's name. Numbers of things are at most 10¹², of things that
+are in memory at the same time 10⁶.
 """
 UNITS = {
     "m_s": "m/s",
