@@ -62,7 +62,7 @@ def forgotten_methods() -> Iterator[None]:
     methods, policies = (
         importlib.import_module(f"astra_data.{name}") for name in ("methods", "policies.running_policy")
     )
-    registered = (methods.METHODS, methods.KINDS, methods._PLACES, policies.KINDS)
+    registered = (methods.METHODS, methods.KINDS, methods.ENCODERS, methods._PLACES, policies.KINDS)
     known = [dict(found) for found in registered]
     yield
     for found, before in zip(registered, known, strict=True):

@@ -1,12 +1,13 @@
 """The target encoder ψ^t and the discrepancy that aligns it with the source encoder (paper, Section IV-B)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from astra_data.core.arrays import normalized
-from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, add_scales, take_scales
+from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, add_scales, take_scales
 
 LEAST_LATENT_R2 = 0.9
 """Of a target encoder on held-out episodes, to be deployed in place of the source encoder."""
@@ -33,9 +34,10 @@ class TargetEncoder(nn.Module):
         embedding_size: int,
         latent_size: int,
         position_octaves: int = 4,
+        encoder: str = HistoryEncoder.kind,
     ) -> None:
         super().__init__()
-        self.sizes = {
+        self.sizes: dict[str, Any] = {
             "state_size": state_size,
             "goal_size": goal_size,
             "action_size": action_size,
@@ -43,8 +45,10 @@ class TargetEncoder(nn.Module):
             "latent_size": latent_size,
             "position_octaves": position_octaves,
         }
+        if encoder != HistoryEncoder.kind:
+            self.sizes["encoder"] = encoder
         self.position_features = PositionFeatures(position_octaves)
-        self.encoder = HistoryEncoder(
+        self.encoder = ENCODERS[encoder](
             state_size + self.position_features.size + goal_size + action_size,
             embedding_size=embedding_size,
             latent_size=latent_size,

@@ -1,8 +1,9 @@
-"""The history encoder: a GRU over states and actions whose layer-normalized hidden state is the latent."""
+"""Encoders of histories of states and actions: the interface, and a GRU."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -44,42 +45,76 @@ class PositionFeatures(nn.Module):
         return torch.cat([phases.sin(), phases.cos()], dim=-1)
 
 
-class HistoryEncoder(nn.Module):
-    """Encode a history (x_1, x_2, ...) into latents (z_1, z_2, ...), one for each step.
+class Encoder(nn.Module, ABC):
+    """What encodes a history (x_1, x_2, ...) into latents (z_1, z_2, ...), one for each step.
 
-    x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). The hidden state is an
-    argument and a result, never kept. The latent is the hidden state after a LayerNorm without gain, which
-    fixes the length of each latent: the printed latent loss would otherwise shrink it without limit. What
-    keeps different histories apart is the target of that loss.
+    x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). What is remembered of a
+    history is an argument and a result, `memory` (B, M), never kept.
+
+    Attributes:
+        kind: names the class in files, see `ENCODERS`.
+        latent_size: Z.
     """
+
+    kind: ClassVar[str]
+    latent_size: int
 
     def __init__(self, input_size: int, *, embedding_size: int, latent_size: int) -> None:
         super().__init__()
         self.latent_size = latent_size
+
+    @abstractmethod
+    def initial(self, count: int) -> Tensor:
+        """Return the memory (count, M) before the first step."""
+
+    @abstractmethod
+    def step(self, inputs: Tensor, memory: Tensor) -> Tensor:
+        """Process one step `inputs` (B, I); return the next memory (B, M)."""
+
+    @abstractmethod
+    def latent(self, memory: Tensor) -> Tensor:
+        """Return the latent (..., Z) after the last step that `memory` (..., M) holds."""
+
+    @abstractmethod
+    def sequence(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the latents (B, T, Z) and memories (B, T, M) of `step` for `inputs` (B, T, I)."""
+
+
+class HistoryEncoder(Encoder):
+    """A GRU, whose memory is its hidden state, and whose latent is this after a LayerNorm without gain.
+
+    That fixes the length of each latent: the printed latent loss would otherwise shrink it without limit.
+    What keeps different histories apart is the target of that loss.
+    """
+
+    kind = "gru"
+
+    def __init__(self, input_size: int, *, embedding_size: int, latent_size: int) -> None:
+        super().__init__(input_size, embedding_size=embedding_size, latent_size=latent_size)
         self.embedding = nn.Linear(input_size, embedding_size)
         self.recurrence = nn.GRU(embedding_size, latent_size, batch_first=True)
 
-    def forward(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Encode `inputs` (B, T, I) from `hidden` (B, Z), by default zero.
+    def initial(self, count: int) -> Tensor:
+        """Return zeros (count, Z)."""
+        return torch.zeros(count, self.latent_size, device=self.embedding.weight.device)
 
-        Returns:
-            latents (B, T, Z) and hidden states (B, T, Z) after each step.
-        """
-        start = None if hidden is None else hidden.unsqueeze(0)
-        states, _ = self.recurrence(functional.elu(self.embedding(inputs)), start)
+    def step(self, inputs: Tensor, memory: Tensor) -> Tensor:
+        """Return the next hidden state (B, Z)."""
+        return self._next(functional.elu(self.embedding(inputs)), memory)
+
+    def latent(self, memory: Tensor) -> Tensor:
+        """Return the latent of a hidden state (..., Z)."""
+        return functional.layer_norm(memory, (self.latent_size,))
+
+    def sequence(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return latents and hidden states (B, T, Z)."""
+        states, _ = self.recurrence(functional.elu(self.embedding(inputs)))
         return self.latent(states), states
 
-    def step(self, inputs: Tensor, hidden: Tensor) -> Tensor:
-        """Process one step `inputs` (B, I); return the next hidden state (B, Z)."""
-        return self._next(functional.elu(self.embedding(inputs)), hidden)
-
     def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
-        """Encode `inputs` (B, T, I) of several episodes one after another, from `hidden` (B, Z).
+        """Return the hidden states (B, T, Z) of `inputs` (B, T, I) of several episodes one after another.
 
-        `start` (B, T) is 1 where a new episode begins: there the hidden state is set to zero.
-
-        Returns:
-            hidden states (B, T, Z) after each step.
+        They begin with `hidden` (B, Z). `start` (B, T) is 1 where a new episode begins, from zero.
         """
         embedded = functional.elu(self.embedding(inputs)).unbind(1)
         keep = (1.0 - start).unsqueeze(-1).unbind(1)
@@ -89,19 +124,19 @@ class HistoryEncoder(nn.Module):
             states.append(hidden)
         return torch.stack(states, dim=1)
 
-    def latent(self, hidden: Tensor) -> Tensor:
-        """Return the latent of a hidden state (..., Z)."""
-        return functional.layer_norm(hidden, (self.latent_size,))
-
     def _next(self, embedded: Tensor, hidden: Tensor) -> Tensor:
         (weights,) = self.recurrence.all_weights
         return torch.gru_cell(embedded, hidden, *weights)
 
 
+ENCODERS: dict[str, type[Encoder]] = {HistoryEncoder.kind: HistoryEncoder}
+"""The encoders that can be read, by what files call them; methods of the user's add theirs."""
+
+
 class LatentEncoder(Protocol):
     """A network with a history encoder: the source encoder ψ^s, or the target encoder ψ^t."""
 
-    encoder: HistoryEncoder
+    encoder: Encoder
 
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble the encoder's input (..., I) of states, goals and the actions that led there."""

@@ -16,6 +16,7 @@ from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.descent import Descent, DescentConfig, WindowedConfig
+from astra_data.grounding.encoder import Encoder, HistoryEncoder
 from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import (
@@ -90,6 +91,7 @@ class HistoryFit:
         reward: whether the target's reward is predicted.
         failures: whether failures are predicted by a failure model, if there are some.
         scatter: whether the simulator scatters around the correction as the target does.
+        encoder: the class of ψ.
         printed: whether R_pred learns the whole reward, failures included, as the paper prints it. By default
             it learns the residual reward: the target's less the task's own on the recorded abstract states.
     """
@@ -98,6 +100,7 @@ class HistoryFit:
     reward: bool
     failures: bool = True
     scatter: bool = True
+    encoder: type[Encoder] = HistoryEncoder
     printed: bool = False
 
     def weights(self, config: GroundConfig) -> LossWeights:
@@ -126,7 +129,7 @@ class HistoryFit:
         )
         fitting = replace(fitting, training=training, held_out=held_out)
         corrects_reward = training.windows.own_reward is not None
-        model, metrics = _fitted(fitting, self.weights(fitting.config), corrects_reward=corrects_reward)
+        model, metrics = self._fitted(fitting, corrects_reward=corrects_reward)
         if self.reward and corrects_reward:
             model.shrink_reward(held_out.windows)
             metrics["reward_shrinkage"] = float(model.reward_shrinkage)
@@ -144,6 +147,27 @@ class HistoryFit:
             grounding = replace(grounding, failures=failures)
         return grounding, metrics
 
+    def _fitted(self, fitting: Fitting, *, corrects_reward: bool) -> tuple[GroundingModel, dict[str, Any]]:
+        training, windows = fitting.training, fitting.training.windows
+        torch.manual_seed(derive(fitting.seed, "grounding"))
+        shape = GroundingShape(
+            state_size=windows.state.shape[-1],
+            action_size=windows.action.shape[-1],
+            goal_size=windows.goal.shape[-1],
+            latent_size=fitting.config.latent_size,
+            position_octaves=_POSITION_OCTAVES if fitting.task.plane else 0,
+            ball_index=fitting.task.ball_index,
+            corrects_reward=corrects_reward,
+            encoder=self.encoder.kind,
+        )
+        model = GroundingModel(shape).to(fitting.device)
+        correction = windows.next_state - windows.simulated_next
+        columns = {"state": windows.state, "goal": windows.goal, "correction": correction}
+        model.set_scales({name: training.steps(values) for name, values in columns.items()})
+        rewards = recorded_rewards(windows)
+        model.set_reward_scales(*map(training.steps, (rewards, windows.goes_on, windows.failed)))
+        return model, _optimize(model, self.weights(fitting.config), fitting)
+
     def _rewarded(self, task: Task, episodes: PairedEpisodes, predicts_failures: bool) -> PairedEpisodes:
         """Return the episodes with the rewards that R_pred learns."""
         windows = episodes.windows
@@ -151,35 +175,6 @@ class HistoryFit:
             windows = replace(windows, goes_on=windows.goes_on + windows.failed)
         episodes = replace(episodes, windows=windows)
         return episodes if self.printed or not episodes.has_rewards else with_own_rewards(task, episodes)
-
-
-def _fitted(
-    fitting: Fitting, weights: LossWeights, *, corrects_reward: bool
-) -> tuple[GroundingModel, dict[str, Any]]:
-    config, training = fitting.config, fitting.training
-    torch.manual_seed(derive(fitting.seed, "grounding"))
-    windows = training.windows
-    model = GroundingModel(
-        GroundingShape(
-            state_size=windows.state.shape[-1],
-            action_size=windows.action.shape[-1],
-            goal_size=windows.goal.shape[-1],
-            latent_size=config.latent_size,
-            position_octaves=_POSITION_OCTAVES if fitting.task.plane else 0,
-            ball_index=fitting.task.ball_index,
-            corrects_reward=corrects_reward,
-        )
-    ).to(fitting.device)
-    model.set_scales(
-        {
-            "state": training.steps(windows.state),
-            "goal": training.steps(windows.goal),
-            "correction": training.steps(windows.next_state - windows.simulated_next),
-        }
-    )
-    rewards = recorded_rewards(windows)
-    model.set_reward_scales(*map(training.steps, (rewards, windows.goes_on, windows.failed)))
-    return model, _optimize(model, weights, fitting)
 
 
 def with_own_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:

@@ -6,9 +6,9 @@ from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from astra_data.core.checkpoint import as_part, loaded, part_of
+from astra_data.grounding.encoder import HistoryEncoder
 from astra_data.grounding.failures import FailureModel, FailureShape
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedWindows
@@ -27,7 +27,7 @@ class GroundedSimulator(EpisodeSimulator):
         model: the trained grounding model; only read.
         failures: the failure model, if one is used; only read.
         scatter_model: the model of the target's scatter around the correction, if one is used; only read.
-        hidden: of the encoder, (B, Z). goal: (B, G).
+        hidden: the memory of the encoder, (B, M). goal: (B, G).
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class GroundedSimulator(EpisodeSimulator):
         self.model, self.failures, self.scatter_model = model, failures, scatter_model
         shape, (count, _), device = model.shape, simulator.state.shape, simulator.state.device
         self.latent_size = shape.latent_size
-        self.hidden = torch.zeros(count, shape.latent_size, device=device)
+        self.hidden = model.encoder.initial(count)
         self.goal = torch.zeros(count, shape.goal_size, device=device)
         self._last = self.latent, torch.zeros(count, shape.action_size, device=device)
         self._remembered = torch.zeros(count, 0 if failures is None else failures.memory_size, device=device)
@@ -85,12 +85,11 @@ class GroundedSimulator(EpisodeSimulator):
         if self._touches is not None:
             self._touches = self._touches.index_fill(0, rows, False)
         self.goal[rows] = goal
-        latent_size = self.latent_size
         if previous_action is None:
             previous_action = torch.zeros(len(state), self.model.shape.action_size, device=state.device)
         if hidden is None:
-            hidden = torch.zeros(len(state), latent_size, device=state.device)
-        hidden, averages = hidden.tensor_split([latent_size], dim=-1)
+            hidden = self.model.encoder.initial(len(state))
+        hidden, averages = hidden.tensor_split([self.hidden.shape[1]], dim=-1)
         if self.failures is not None:
             known = averages if averages.shape[-1] else None
             self._remembered[rows] = self.failures.initial_memory(state, previous_action, known)
@@ -116,7 +115,7 @@ class GroundedSimulator(EpisodeSimulator):
         return state
 
     def _encoded(self, state: Tensor, goal: Tensor, previous_action: Tensor, hidden: Tensor) -> Tensor:
-        """Return the encoder's hidden states (n, Z) after one more step."""
+        """Return the encoder's memory (n, M) after one more step."""
         return self.model.encoder.step(self.model.encoder_input(state, goal, previous_action), hidden)
 
     def failure_risk(self) -> Tensor | None:
@@ -184,9 +183,10 @@ class HistoryGrounding(FittedGrounding):
 
     @torch.no_grad()
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
-        """Return the encoder's hidden state before each `every`-th step, (E, ceil(T / every), H)."""
+        """Return the encoder's memory before each `every`-th step, (E, ceil(T / every), M)."""
         _, after = self.model.encode(windows)
-        return functional.pad(after[:, :-1], (0, 0, 1, 0))[:, ::every]
+        before = self.model.encoder.initial(len(after)).unsqueeze(1)
+        return torch.cat([before, after[:, :-1]], dim=1)[:, ::every]
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return weights and sizes."""
@@ -195,6 +195,8 @@ class HistoryGrounding(FittedGrounding):
             "shape": asdict(self.model.shape),
             "fails_at_walls": self.fails_at_walls,
         }
+        if self.model.shape.encoder == HistoryEncoder.kind:
+            del metadata["shape"]["encoder"]
         for part, model in ((_FAILURES, self.failures), (_SCATTER, self.scatter_model)):
             if model is not None:
                 tensors |= as_part(model.state_dict(), part)

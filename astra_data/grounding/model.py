@@ -12,7 +12,14 @@ from torch import Tensor, nn
 
 from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, add_scales, mlp, take_scales
+from astra_data.grounding.encoder import (
+    ENCODERS,
+    HistoryEncoder,
+    PositionFeatures,
+    add_scales,
+    mlp,
+    take_scales,
+)
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
 _BALL_M = 0.1
@@ -38,6 +45,7 @@ class GroundingShape:
         state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
         position_octaves: of `PositionFeatures`; 0 for none, as in states without a position.
         ball_index: index in the state where the position of a ball begins; None where there is no ball.
+        encoder: the kind of the encoder, see `ENCODERS`.
         corrects_reward: R_pred predicts the residual reward, the target's less the task's own, beside the
             target's.
     """
@@ -52,6 +60,7 @@ class GroundingShape:
     ball_index: int | None = None
     corrects_reward: bool = True
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
+    encoder: str = HistoryEncoder.kind
 
 
 class GroundingModel(nn.Module):
@@ -67,7 +76,7 @@ class GroundingModel(nn.Module):
         states, actions, latent = shape.state_size, shape.action_size, shape.latent_size
         self.position_features = PositionFeatures(shape.position_octaves)
         features = states + self.position_features.size + (0 if shape.ball_index is None else 3)
-        self.encoder = HistoryEncoder(
+        self.encoder = ENCODERS[shape.encoder](
             features + shape.goal_size + actions, embedding_size=shape.embedding_size, latent_size=latent
         )
         heads = shape.head_sizes
@@ -147,11 +156,9 @@ class GroundingModel(nn.Module):
         return torch.cat([self.state_features(state), self.normal_goal(goal), previous_action], dim=-1)
 
     def encode(self, windows: PairedWindows) -> tuple[Tensor, Tensor]:
-        """Return the latents (B, T, Z) and hidden states (B, T, H) of histories that begin with `windows`."""
-        latent, hidden = self.encoder(
-            self.encoder_input(windows.state, windows.goal, windows.previous_action)
-        )
-        return latent, hidden
+        """Return the latents (B, T, Z) and memories (B, T, M) of histories that begin with `windows`."""
+        inputs = self.encoder_input(windows.state, windows.goal, windows.previous_action)
+        return self.encoder.sequence(inputs)
 
     def predict_latent(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """P_lat: return mean and log-variance (..., Z) of the next latent."""
@@ -200,7 +207,7 @@ class GroundingModel(nn.Module):
     def losses(self, windows: PairedWindows, weights: LossWeights) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the joint loss (paper, Section IV-A) and its parts, each a mean over real steps and dims."""
         inputs = self.encoder_input(windows.state, windows.goal, windows.previous_action)
-        latent, _ = self.encoder(inputs)
+        latent, _ = self.encoder.sequence(inputs)
         action, mask = windows.action, windows.mask
         parts: dict[str, Tensor] = {}
         total = torch.zeros((), device=mask.device)
@@ -238,8 +245,8 @@ class GroundingModel(nn.Module):
         With the encoder itself the loss is unbounded below: it can predict a constant latent exactly.
         """
         with torch.no_grad():
-            slow, _ = self.target_encoder(inputs)
-        return torch.as_tensor(slow[:, 1:])
+            slow, _ = self.target_encoder.sequence(inputs)
+        return slow[:, 1:]
 
 
 def recorded_rewards(windows: PairedWindows) -> Tensor:

@@ -8,7 +8,9 @@ from pathlib import Path
 from astra_data.core.config import Config
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
+from astra_data.grounding.encoder import ENCODERS
 from astra_data.grounding.files import KINDS, missing_parts
+from astra_data.grounding.fit import HistoryFit
 from astra_data.methods.astra import (
     ASTRA,
     ASTRA_PRINTED,
@@ -97,6 +99,12 @@ def add_method(name: str, place: str) -> None:
             raise BadInputError(
                 f"{place}: groundings of kind '{kind.kind}' are those of {owner.__name__} in "
                 f"{owner.__module__}: rename its kind"
+            )
+    if isinstance(method.fit, HistoryFit):
+        encoder = method.fit.encoder
+        if ENCODERS.setdefault(encoder.kind, encoder) is not encoder:
+            raise BadInputError(
+                f"{place}: there are encoders of kind '{encoder.kind}' already: rename its kind"
             )
     if isinstance(method.learn, UserLearner):
         add_policy_kind(method.learn.policy)

@@ -132,7 +132,7 @@ class Memory(NamedTuple):
     Attributes:
         previous_output: what the policy put out last, (B, A). previous_action: the same as it was given to
             the robot, (B, A).
-        policy: the policy's own memory, (B, M). encoder: that of the encoder, (B, Z).
+        policy: the policy's own memory. encoder: that of the encoder, (B, ...) each.
     """
 
     previous_output: Tensor
@@ -171,8 +171,9 @@ class RunningPolicy:
     def start(self, count: int, generator: torch.Generator | None = None) -> None:
         """Start B = `count` episodes without history; with `generator`, draw actions as in training."""
         still = torch.zeros(count, self.policy.shape.action_size)
-        latent = torch.zeros(count, self._latent_size)
-        self.resume(Memory(still, still, self.policy.initial_hidden(count), latent))
+        encoder = self.target_encoder or self.source_encoder
+        encoded = torch.zeros(count, 0) if encoder is None else encoder.encoder.initial(count)
+        self.resume(Memory(still, still, self.policy.initial_hidden(count), encoded))
         self._generator = generator
 
     def resume(self, memory: Memory) -> None:

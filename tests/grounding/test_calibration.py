@@ -1,9 +1,5 @@
-from typing import Any
-
-import numpy as np
 import pytest
 import torch
-from scipy.optimize import minimize
 
 from astra_data.grounding.failures import calibration, folds
 
@@ -17,21 +13,6 @@ def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:
         scale, shift = calibration((factor * (true + 1.0)).expand(2, -1), happens, 1)
         assert float(scale) == pytest.approx(1 / factor, rel=0.05)
         assert float(shift) == pytest.approx(-1.0, abs=0.05)
-
-
-@pytest.mark.parametrize("members", [1, 3])
-def test_the_prior_weighs_as_much_as_a_failure_however_many_members_there_are(members: int) -> None:
-    """Minus the log of the posterior, by scipy: the steps of each member, of which 20 count as one."""
-    rng = np.random.default_rng(0)
-    odds, fails = rng.normal(size=400), np.arange(400) < 20
-
-    def surprise(of: Any) -> float:  # noqa: ANN401 - an array
-        said = np.exp(of[0]) * odds + of[1]
-        return float(np.sum(np.logaddexp(0, said) - fails * said) / 20 + 0.5 * of[0] ** 2)
-
-    log_scale, expected = minimize(surprise, [0.0, -3.0]).x
-    scale, shift = calibration(torch.from_numpy(odds).expand(members, -1), torch.from_numpy(fails), 20)
-    assert [float(scale), float(shift)] == pytest.approx([np.exp(log_scale), expected], abs=1e-3)
 
 
 @pytest.mark.parametrize(("failing", "count"), [(1, 0), (2, 2), (4, 4), (13, 5)])

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_episodes import no_episodes, toy_episodes
+from toy_episodes import toy_episodes
 
 from astra_data.core.progress import silent
-from astra_data.grounding.files import load_grounding, save_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded_clearance_m
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
@@ -59,10 +58,6 @@ def test_what_is_recorded_is_the_distance_that_99_of_100_steps_keep() -> None:
     assert padded == pytest.approx(1.5, abs=0.11)
 
 
-def test_there_is_none_without_walls() -> None:
-    assert recorded_clearance_m(TASKS["humanoid-extended"], recorded(1.0, 1.0)) is None
-
-
 def test_corrected_states_come_no_closer() -> None:
     assert highest_m(HistoryGrounding(pushed_up())) == pytest.approx(TOP_M - 0.2, abs=0.11)
     assert highest_m(HistoryGrounding(pushed_up(), clearance_m=0.7)) == pytest.approx(TOP_M - 0.7, abs=0.01)
@@ -96,16 +91,6 @@ def test_where_touches_are_failures_scatter_touches_nothing(
     assert least <= float(world.blocked.float().mean()) <= most
     world.start(start[:5], torch.arange(5), torch.zeros(5, 2))
     assert not world.blocked[:5].any()
-
-
-@pytest.mark.parametrize(("clearance_m", "fails_at_walls"), [(None, False), (0.7, False), (None, True)])
-def test_files_hold_it(tmp_path: Path, clearance_m: float | None, fails_at_walls: bool) -> None:
-    made = HistoryGrounding(pushed_up(), clearance_m=clearance_m, fails_at_walls=fails_at_walls)
-    save_grounding(tmp_path / "grounding.safetensors", made, no_episodes())
-    found = load_grounding(tmp_path / "grounding.safetensors")
-    assert isinstance(found, HistoryGrounding)
-    for one in (found, found.for_replay()):
-        assert (one.clearance_m, one.fails_at_walls) == (clearance_m, fails_at_walls)
 
 
 @pytest.mark.parametrize(("printed", "at_walls"), [(False, False), (True, False), (False, True)])

@@ -81,23 +81,6 @@ def test_the_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
         Descent(nn.Linear(5, 2), CONFIG, checkpoint=checkpoint)
 
 
-def test_parameters_that_rest_are_left_alone() -> None:
-    one = model()
-    one.bias.requires_grad_(False)
-    before = one.bias.clone()
-    descent = Descent(one, CONFIG, weight_decay=0.1)
-    fit(one, descent)
-    assert descent.parameters == [one.weight]
-    assert torch.equal(one.bias, before)
-
-
-def test_only_a_held_out_error_of_a_number_is_kept() -> None:
-    descent = Descent(model(), CONFIG)
-    with pytest.raises(BadInputError, match="diverged by update 0, with a held_out_error that is not finite"):
-        descent.keep(math.nan)
-    assert descent.best is None and not descent.points
-
-
 @pytest.mark.parametrize("stopped", [None, 4, 8, 12])
 @pytest.mark.parametrize(
     ("errors", "best", "last"),
@@ -125,17 +108,6 @@ def test_it_waits_for_a_lower_error_and_returns_to_the_lowest(
     assert not torch.equal(one.weight, seen[best])
     descent.finish()
     assert torch.equal(one.weight, seen[best])
-
-
-def test_without_a_held_out_error_the_last_weights_are_kept() -> None:
-    one = model()
-    descent = Descent(one, CONFIG)
-    while not descent.is_over:
-        descent.update(loss_of(one, descent.done))
-        descent.keep(loss=1.0)
-    last = one.weight.detach().clone()
-    descent.finish()
-    assert descent.done == 40 and torch.equal(one.weight, last)
 
 
 @pytest.mark.parametrize(

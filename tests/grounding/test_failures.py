@@ -175,36 +175,6 @@ def test_the_likelihood_is_that_of_the_moments_over_a_constant_rate(monkeypatch:
     assert [len(one) for one in fitted] == counts and len(counts) == 5
 
 
-def test_the_model_is_fitted_to_all_episodes_from_the_same_start_and_scaled(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    made, fitted, given = module._descended, list[tuple[FailureModel, Tensor]](), list[Tensor]()
-
-    def noted(begin: FailureModel, inputs: Tensor, fails: Tensor) -> FailureModel:
-        fitted.append((begin, fails))
-        return made(begin, inputs, fails)
-
-    def scaled(odds: Tensor, fails: Tensor, risk_steps: int) -> tuple[Tensor, Tensor]:
-        assert risk_steps == 2 and odds.shape == (5, len(fails))
-        given.append(fails)
-        return torch.tensor(0.0), torch.tensor(-1.0)
-
-    monkeypatch.setattr(module, "_descended", noted)
-    monkeypatch.setattr(module, "calibration", scaled)
-    monkeypatch.setattr(module, "_DESCENT", FEW)
-    episodes = hurried(10, 0)
-    model, _ = fit_failures(TASK, GROUNDING, episodes, seed=0)
-    begins, fails = zip(*fitted, strict=True)
-    assert len(fitted) == 5 + 5 + 1 and len({id(begin) for begin in begins}) == 2
-    steps = int(episodes.windows.mask.sum())
-    assert len(fails[-1]) == steps and float(fails[-1].sum()) == 2 * 5
-    for first in (0, 5):  # each step is left out once
-        assert sum(steps - len(one) for one in fails[first : first + 5]) == steps
-    assert all(len(one) == steps and float(one.sum()) == 2 * 5 for one in given)
-    said = model.probability(replayed_inputs(TASK, GROUNDING, model, episodes))
-    torch.testing.assert_close(said, torch.full_like(said, 1 / (1 + 2.718281828)))
-
-
 @pytest.mark.parametrize("case", ["a single failure", "copies of a single one"])
 def test_a_single_recorded_failure_leaves_nothing_to_compare(
     case: str, monkeypatch: pytest.MonkeyPatch
@@ -219,29 +189,6 @@ def test_a_single_recorded_failure_leaves_nothing_to_compare(
     assert [one["nats_per_failure"] for one in figures["candidates"]] == [None, None]
     rate = training.steps(failing(TASK, training).windows.fails_soon).mean()
     torch.testing.assert_close(made.log_odds_shift, rate.logit() - torch.tensor(0.25).logit())
-
-
-def test_where_whole_episodes_are_before_their_failure_probabilities_are_still_numbers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of three episodes two fail, from their first step on: half of what is left out tells nothing."""
-    monkeypatch.setattr(module, "_DESCENT", FEW)
-    short = hurried(3, 0)
-    mask = torch.ones(3, 100)
-    mask[[0, 2], 2:] = 0
-    episodes = marked(short, mask * torch.tensor([[1.0], [0.0], [1.0]]), mask)
-    made, _ = fit_failures(TASK, GROUNDING, episodes, seed=0)
-    said = episodes.steps(made.probability(replayed_inputs(TASK, GROUNDING, made, episodes)))
-    assert ((said > 0) & (said < 1)).all()
-
-
-def test_the_seed_decides_everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_DESCENT", FEW)
-    one, same, other = (
-        fit_failures(TASK, GROUNDING, one_failing(4, 40), seed)[0].state_dict() for seed in (0, 0, 1)
-    )
-    assert all(torch.equal(values, same[name]) for name, values in one.items())
-    assert any(not torch.equal(values, other[name]) for name, values in one.items())
 
 
 @pytest.mark.parametrize("soon", [0.0, 1.0])
@@ -324,45 +271,6 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     # Before the last window of others, its steps are calm ones, too: 20 of 110 on the level.
     near = failure_skill(said, episodes, [(11, 20)])["auc"]
     assert near == {"11-20": pytest.approx((130 + 10 / 2) / 140)}
-
-
-def test_to_say_the_rate_always_has_no_skill_and_is_reliable() -> None:
-    episodes = hurried(20, 0)
-    mask = episodes.windows.mask.bool()
-    rate = float(episodes.windows.fails_soon[mask].mean())
-    found = failure_skill(torch.full(mask.shape, rate), episodes)
-    assert found["brier_skill"] == pytest.approx(0.0, abs=1e-6)
-    assert found["auc"] == {"1-20": 0.5, "11-30": 0.5, "21-40": 0.5}
-    assert found["reliability"] == [[pytest.approx(rate), pytest.approx(rate), int(mask.sum())]]
-
-
-def test_what_there_is_nothing_of_has_no_figure() -> None:
-    """Without failures, without steps so long before one, and where nothing but failures is to be told."""
-    said = torch.rand(2, 100)
-    nothing = {"failures": 0, "auc": None, "brier_skill": None, "reliability": None}
-    assert failure_skill(said, marked(hurried(2, 0), torch.zeros(2, 100), torch.ones(2, 100))) == nothing
-    for length, is_known in ((25, True), (15, False)):
-        found = failure_skill(said, one_failing(2, length))["auc"]
-        assert found["1-20"] is not None and (found["21-40"] is not None) == is_known
-    alone = one_failing(2, 15)
-    fails = alone.windows.fails_soon
-    assert failure_skill(said, marked(alone, fails, fails))["brier_skill"] is None
-
-
-@pytest.mark.parametrize("steps", [30, 60])
-def test_calm_episodes_are_calm_however_short_they_are(steps: int) -> None:
-    episodes = one_failing(6, 25, steps=steps)
-    found = failure_skill(episodes.windows.fails_soon.clone(), episodes)["auc"]
-    assert found == {"1-20": 1.0, "11-30": pytest.approx(5 / 6, abs=0.02), "21-40": 0.5}
-
-
-def test_a_failure_model_is_measured_on_what_it_foresees(monkeypatch: pytest.MonkeyPatch) -> None:
-    episodes = hurried(4, 0)
-    failures = untrained(episodes)
-    soon = failing(TASK, episodes, 2).windows.fails_soon
-    monkeypatch.setattr(failures, "probability", lambda inputs: soon)
-    found = failure_figures(TASK, GROUNDING, failures, episodes, ahead=[(1, 3)])
-    assert found["brier_skill"] == 1.0 and list(found["auc"]) == ["1-3"]
 
 
 def test_reliability_is_what_was_said_beside_what_happened() -> None:

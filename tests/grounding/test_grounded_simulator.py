@@ -43,17 +43,6 @@ def test_each_step_is_corrected_given_the_latent_of_the_history_before_it() -> N
         assert not torch.equal(state, before)
 
 
-def test_corrections_stop_at_walls() -> None:
-    used = model()
-    with torch.no_grad():
-        list(used.correction.parameters())[-1].copy_(torch.tensor([0.0, 30.0, 0.0, 0.0]))
-    one = simulator(used)
-    state = one.step(torch.zeros(3, 2))
-    free = PointMass(U_MAZE, 1, timestep_s=0.05).free
-    assert one.blocked.all()
-    assert not free.blocked[free.cells(state[:, :2])].any()
-
-
 def test_a_start_changes_its_rows_alone() -> None:
     used = model()
     one = simulator(used)

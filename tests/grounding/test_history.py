@@ -2,19 +2,9 @@ import json
 
 import pytest
 import torch
-from grounding_models import TASK, failure_model, model
+from grounding_models import failure_model, model
 
-from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
-
-
-def test_simulators_are_corrected_by_the_model_and_replays_by_it_alone() -> None:
-    whole = HistoryGrounding(model(), failure_model(), 0.3)
-    assert whole.encoder is whole.model
-    one = whole.simulator(TASK, 2)
-    assert isinstance(one, GroundedSimulator)
-    assert (one.model, one.failures, one.scatter_model) == (whole.model, whole.failures, None)
-    assert (one.latent_size, one.latent.shape) == (8, (2, 8))
-    assert whole.for_replay() == HistoryGrounding(whole.model, clearance_m=0.3)
+from astra_data.grounding.history import HistoryGrounding
 
 
 @pytest.mark.parametrize("latent_size", [None, 0, 8])

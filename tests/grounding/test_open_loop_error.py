@@ -40,12 +40,6 @@ def untrained() -> HistoryGrounding:
     return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(8,))))
 
 
-def test_quantities_are_measured_apart() -> None:
-    task = replace(TASK, quantities={"height_m": (2,), "way_m": (0, 3)})
-    wrong = torch.tensor([[[3.0, 9.0, -2.0, 4.0], [0.0, 9.0, 0.5, -1.0]]])
-    assert distances(task, wrong).tolist() == [[[2.0, 5.0], [0.5, 1.0]]]
-
-
 def test_a_perfect_simulator_has_no_gap() -> None:
     report = gap_report(TASK, untrained(), episodes(speed=1.0), seed=0)
     assert report["horizons"] == [1, 10, 50]
@@ -54,30 +48,6 @@ def test_a_perfect_simulator_has_no_gap() -> None:
         for quantity in ("position_m", "velocity_m_s"):
             for figure in ("mean", "low", "high"):
                 assert report[kind][quantity][figure] == pytest.approx([0.0, 0.0, 0.0], abs=2e-4)
-
-
-def test_who_stands_still_is_left_behind_by_the_way_that_the_target_goes() -> None:
-    report = gap_report(TASK, untrained(), episodes(speed=1.0), seed=0)
-    # After one step all eight replays count, after 50 the two of the episodes that are so long.
-    speeds = {1: [3 * 0.5, 3 * 0.8, 2 * 1.0], 50: [0.5, 0.8]}
-    for index, (steps, count) in ((0, (1, 8)), (2, (50, 2))):
-        way = sum(speeds[steps]) / count * steps * TASK.timestep_s
-        assert report["still"]["position_m"]["mean"][index] == pytest.approx(way, rel=0.01)
-
-
-def test_a_slow_target_is_left_behind_in_proportion_to_the_horizon() -> None:
-    report = gap_report(TASK, untrained(), episodes(speed=0.9), seed=0)
-    # Of eight replays only two are still within the data after 50 steps.
-    speeds = [(3 * 0.5 + 3 * 0.8 + 2 * 1.0) / 8] * 2 + [(0.5 + 0.8) / 2]
-    position = [
-        0.1 * speed * TASK.timestep_s * steps for speed, steps in zip(speeds, (1, 10, 50), strict=True)
-    ]
-    for kind in ("raw", "grounded"):  # an untrained grounding is the raw simulator
-        assert report[kind]["position_m"]["mean"] == pytest.approx(position, rel=0.01)
-        velocity = report[kind]["velocity_m_s"]
-        assert velocity["mean"] == pytest.approx([0.1 * speed for speed in speeds], rel=0.01)
-        for low, mean, high in zip(velocity["low"], velocity["mean"], velocity["high"], strict=True):
-            assert low < mean < high
 
 
 def test_a_constant_correction_closes_a_constant_gap() -> None:
@@ -118,16 +88,6 @@ def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
     # What repeats within an episode tells nothing new.
     again = _interval(errors.repeat(5), episode.repeat(5), np.random.default_rng(0))
     assert again == pytest.approx((mean, low, high))
-
-
-def test_long_episodes_weigh_more_also_where_they_are_resampled() -> None:
-    """Every other episode has three errors of 0, the others one of 1."""
-    episode = torch.arange(400).repeat_interleave(torch.tensor([3, 1]).repeat(200))
-    mean, low, high = _interval((episode % 2).double(), episode, np.random.default_rng(0))
-    assert low is not None
-    assert high is not None
-    assert mean == 0.25
-    assert 0.2 < low < 0.25 < high < 0.3
 
 
 def test_a_grounding_starts_with_the_history_before_each_replay() -> None:

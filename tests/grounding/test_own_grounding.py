@@ -5,14 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import shifted_method
 import torch
 from shifted_method import Lossy, Shifted, ShiftedSimulator
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.files import KINDS, check_step, fitted, missing_parts
-from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.simulator import FittedGrounding
+from astra_data.grounding.files import KINDS, check_step, fitted
 from astra_data.robots.registry import task_named
 
 SHIFTED = Shifted(torch.tensor([0.01]))
@@ -21,23 +18,6 @@ SHIFTED = Shifted(torch.tensor([0.01]))
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
-
-
-def test_parts_that_a_grounding_does_not_inherit_are_to_be_written() -> None:
-    class Half(FittedGrounding):
-        pass
-
-    class Alone:
-        kind = "alone"
-
-    assert missing_parts(Shifted) == missing_parts(Lossy) == missing_parts(HistoryGrounding) == []
-    assert missing_parts(Half) == ["kind", "to_file", "from_file"]
-    assert {"from_file", "simulator", "for_replay"} <= {*missing_parts(Alone)}
-
-
-def test_a_pair_of_a_grounding_and_figures_is_as_it_was(known: None) -> None:
-    figures = {"loss": 0.5, "epochs": [{"step": 1}], "note": None}
-    assert fitted((SHIFTED, figures)) == (SHIFTED, figures)
 
 
 @pytest.mark.parametrize(
@@ -145,11 +125,3 @@ def test_a_step_returns_where_a_wall_stopped_its_correction(monkeypatch: pytest.
     monkeypatch.setattr(ShiftedSimulator, "step", beyond)
     with pytest.raises(BadInputError, match=r"up to 50 from .* as far as walls allow$"):
         check_step(task, through_walls, windows)
-
-
-def test_a_step_that_fails_is_told_with_its_place() -> None:
-    file = Path(shifted_method.__file__).name
-    with pytest.raises(
-        BadInputError, match=rf"^a step of rail-cart as corrected by Shifted fails with .*\({file}"
-    ):
-        check_step(task_named(RAIL), Shifted(torch.zeros(3, 4, 7)), windows_of(4))

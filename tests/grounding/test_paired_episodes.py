@@ -115,16 +115,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("pairs") / "dataset", SIZES)
 
 
-def test_without_a_goal_all_else_is_the_same(root: Path, tmp_path: Path) -> None:
-    sizes = {name: size for name, size in SIZES.items() if name != GOAL}
-    aimless, usual = PairedEpisodes.load(write(tmp_path / "dataset", sizes)), PairedEpisodes.load(root)
-    assert usual.windows.own_reward is None and aimless.windows.own_reward is None
-    for name, values in vars(replace(usual.windows, own_reward=usual.reward)).items():
-        found = getattr(replace(aimless.windows, own_reward=aimless.reward), name)
-        assert found.shape == (5, 30, 0) if name == "goal" else torch.equal(found, values)
-    assert aimless.draw_windows(3, 10)[0].goal.shape == (3, 10, 0)
-
-
 @pytest.fixture
 def episodes(root: Path) -> PairedEpisodes:
     return PairedEpisodes.load(root)
@@ -143,11 +133,6 @@ def test_episodes_are_padded_at_the_end(episodes: PairedEpisodes) -> None:
     assert len(episodes.steps(windows.goal)) == sum(LENGTHS)
 
 
-def test_success_and_failure_terminate_and_time_outs_do_not(episodes: PairedEpisodes) -> None:
-    assert episodes.terminated.dtype == torch.bool
-    assert episodes.terminated.nonzero().tolist() == [[2, LENGTHS[2] - 1], [3, LENGTHS[3] - 1]]
-
-
 def test_rewards_are_as_recorded_and_what_ends_an_episode_is_marked(episodes: PairedEpisodes) -> None:
     windows = episodes.windows
     for episode, length in enumerate(LENGTHS):
@@ -161,13 +146,6 @@ def test_rewards_are_as_recorded_and_what_ends_an_episode_is_marked(episodes: Pa
 
 def test_only_the_last_second_before_a_bad_end_fails_soon(episodes: PairedEpisodes) -> None:
     assert episodes.windows.fails_soon.nonzero().tolist() == [[3, step] for step in range(10, 30)]
-
-
-def test_the_previous_action_is_one_step_late(episodes: PairedEpisodes) -> None:
-    windows = episodes.windows
-    assert (windows.previous_action[:, 0] == 0).all()
-    for episode, length in enumerate(LENGTHS):
-        assert torch.equal(windows.previous_action[episode, 1:length], windows.action[episode, : length - 1])
 
 
 def test_a_split_is_by_episodes_and_by_the_seed(episodes: PairedEpisodes) -> None:
@@ -294,22 +272,6 @@ def test_pairs_of_another_task_are_told_with_every_mismatch(tmp_path: Path) -> N
     moved = replace(PairedEpisodes.load(tmp_path / "ant"), commands=Commands(bounded))
     with pytest.raises(BadInputError, match=r"was paired for commands within \{'vx': \(-1.0, 2.0\)"):
         moved.check(ant)
-
-
-def test_an_episode_of_nothing_but_a_made_up_step_is_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(globals(), "LENGTHS", (7, 3, 1, 30, 5))  # the third is terminated
-    sizes = SIZES | {NEXT_STATE: 3}
-    folder = write(tmp_path / "made_up", sizes, held_out=(3,), made_up=True, sources={3: 0})
-    left = PairedEpisodes.load(folder)
-    assert left.lengths.tolist() == [7, 3, 29, 5]
-    assert left.uids is not None and left.uids.tolist() == [0, 1, 3, 4]
-    assert left.held_out is not None and left.held_out.tolist() == [False, False, True, False]
-    assert left.recordings is not None and left.recordings.tolist() == [0, 1, 0, 3]
-    # The episode before it is as it was.
-    assert left.reward[1, :3].tolist() == [-label(1, step) for step in range(3)]
-    assert left.terminated.nonzero().tolist() == [[2, 28]]
 
 
 def test_commands_are_multiples_of_their_bounds(root: Path, tmp_path: Path) -> None:

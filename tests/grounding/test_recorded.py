@@ -36,11 +36,6 @@ def test_windows_are_steps_in_a_row_inside_their_episodes() -> None:
     assert (drawn.int().diff(dim=1).abs().sum(1) <= 1).all()
 
 
-def test_a_window_is_no_longer_than_the_longest_episode() -> None:
-    _, steps, drawn = draw_steps(LENGTHS, 5, 100)
-    assert steps.shape == drawn.shape == (5, 25)
-
-
 @pytest.fixture
 def recorded() -> Recorded:
     """Return episodes whose observation is 100 times the episode plus the step."""

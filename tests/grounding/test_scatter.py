@@ -8,12 +8,8 @@ import pytest
 import torch
 from toy_episodes import no_episodes, toy_episodes
 
-from astra_data.core.progress import silent
-from astra_data.grounding import scatter
 from astra_data.grounding.descent import DescentConfig
-from astra_data.grounding.failures import FailureModel, FailureShape, averages_before, replayed_inputs
 from astra_data.grounding.files import load_grounding, save_grounding
-from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
@@ -41,11 +37,6 @@ def scattered_episodes(seed: int, episodes: int = 30) -> PairedEpisodes:
     mask[:, -MASKED:] = 0.0
     residual = scale * torch.randn(episodes, 50, 4) + 1e3 * (1 - mask)[..., None]
     return toy_episodes(state, action, simulated_next=state, next_state=state + residual, mask=mask)
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("astra_data.grounding.scatter._DESCENT", DescentConfig(updates=3, learning_rate=1e-3))
 
 
 @pytest.fixture(scope="module")
@@ -83,32 +74,6 @@ def test_the_scale_is_told_by_the_moment_and_the_forms_are_those_of_held_out_ste
     assert figures["kurtosis"] == pytest.approx(3.0, abs=0.6)
 
 
-def test_entries_that_are_always_right_have_no_say_in_the_figures(quick: None) -> None:
-    training, held_out = scattered_episodes(0), scattered_episodes(1)
-
-    def exact(episodes: PairedEpisodes, entries: slice) -> PairedEpisodes:
-        windows = episodes.windows
-        next_state = windows.next_state.clone()
-        next_state[..., entries] = windows.simulated_next[..., entries]
-        return replace(episodes, windows=replace(windows, next_state=next_state))
-
-    model = grounding_model()
-    assert torch.equal(
-        model.correct(
-            model.encode(training.windows)[0], training.windows.action, training.windows.simulated_next
-        ),
-        training.windows.simulated_next,
-    )
-    _, whole = fit_scatter(model, training, held_out, seed=0)
-    _, figures = fit_scatter(model, exact(training, slice(2, 4)), exact(held_out, slice(2, 4)), seed=0)
-    # All entries scatter alike, so half of them gain half.
-    assert figures["gain_nats"] == pytest.approx(whole["gain_nats"] / 2, rel=0.3)
-    assert figures["kurtosis"] == pytest.approx(whole["kurtosis"], rel=0.1)
-    scatters, figures = fit_scatter(model, exact(training, slice(None)), exact(held_out, slice(None)), seed=0)
-    assert figures["gain_nats"] == 0.0 and figures["kurtosis"] is None  # JSON has no NaN
-    assert not scatters.forms.any()
-
-
 def test_forms_are_as_wild_as_held_out_steps_where_training_ones_are_not(
     fitted: tuple[ScatterModel, dict[str, float]],
 ) -> None:
@@ -121,26 +86,6 @@ def test_forms_are_as_wild_as_held_out_steps_where_training_ones_are_not(
     assert float(scatters.forms.std()) == pytest.approx(3.0, abs=0.45)
     # A size alone tells nothing.
     assert figures["gain_nats"] == pytest.approx(fitted[1]["gain_nats"], abs=1e-3)
-
-
-def test_forms_are_of_all_held_out_episodes_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scatter, "_MOST_FORMS", 200)
-    monkeypatch.setattr(scatter, "_DESCENT", DescentConfig(updates=1, learning_rate=1e-3))
-    calm = scattered_episodes(1)
-    aside = torch.where(torch.arange(30) < 15, WILD, -WILD)[:, None, None]
-    held_out = replace(calm, windows=replace(calm.windows, next_state=calm.windows.state + aside))
-    scatters, _ = fit_scatter(grounding_model(), scattered_episodes(0), held_out, seed=0)
-    assert len(scatters.forms) == 200
-    assert float((scatters.forms[:, 0] > 0).float().mean()) == pytest.approx(0.5, abs=0.15)
-
-
-def test_the_seed_decides_everything(quick: None) -> None:
-    one, same, other = (
-        fit_scatter(grounding_model(), scattered_episodes(0), scattered_episodes(1), seed)[0].state_dict()
-        for seed in (0, 0, 1)
-    )
-    assert all(torch.equal(values, same[name]) for name, values in one.items())
-    assert not torch.equal(one["forms"], other["forms"])
 
 
 def even(size: float = 0.05) -> ScatterModel:
@@ -176,31 +121,3 @@ def test_files_hold_it_and_are_as_before_without_it(tmp_path: Path) -> None:
         if scatters is not None and loaded.scatter_model is not None:
             assert torch.equal(loaded.scatter_model.forms, scatters.forms)
             assert not any(one.requires_grad for one in loaded.scatter_model.parameters())
-
-
-def test_a_failure_model_is_fitted_to_replays_that_are_scattered() -> None:
-    episodes = scattered_episodes(0, episodes=4)
-    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
-    failures.set_move_scales(episodes.windows)
-    seen = []
-    for scatters in (None, even(), even()):
-        torch.manual_seed(0)
-        grounding = HistoryGrounding(grounding_model(), scatter_model=scatters)
-        seen.append(replayed_inputs(TASK, grounding, failures, episodes))
-    assert torch.equal(seen[1], seen[2])
-    assert not torch.allclose(seen[0], seen[1])
-    averages = []
-    for drawn in (3, 4):  # what it remembers is the same whatever was drawn before
-        torch.manual_seed(drawn)
-        averages.append(averages_before(TASK, grounding, failures, episodes))
-    assert torch.equal(*averages) and averages[0].any()
-
-
-@pytest.mark.parametrize("used", [False, True])
-def test_a_fit_has_it_if_it_is_asked_to(tmp_path: Path, used: bool, quick: None) -> None:
-    config = GroundConfig(updates=1, batch_windows=1, window=2, latent_size=8)
-    fitting = Fitting(
-        TASK, config, None, scattered_episodes(0), scattered_episodes(1), 0, "cpu", tmp_path, silent
-    )
-    grounding, metrics = HistoryFit(latent=False, reward=False, scatter=used)(fitting)
-    assert (grounding.scatter_model is not None) == ("scatter" in metrics) == used

@@ -31,13 +31,6 @@ def test_it_is_the_simulator_itself() -> None:
         assert torch.equal(one.blocked, raw.blocked)
 
 
-def test_the_raw_simulator_has_no_latents_and_predicts_nothing() -> None:
-    one = simulator(3)
-    one.step(torch.ones(3, 2))
-    assert (one.latent, one.latent_size, one.parameters) == (None, 0, None)
-    assert (one.failure_risk(), one.predicted_reward(torch.ones(3))) == (None, None)
-
-
 def test_a_start_draws_the_parameters_of_its_rows_anew() -> None:
     torch.manual_seed(0)
     one = varied(4)
@@ -84,9 +77,3 @@ def test_a_saved_state_holds_what_a_simulator_remembers() -> None:
     memory = torch.rand_like(one.state_dict()["memory"])
     one.load_state_dict(one.state_dict() | {"memory": memory})
     assert torch.equal(one.state_dict()["memory"], memory)
-
-
-def test_what_a_simulator_remembers_is_held_where_its_parameters_vary_as_well() -> None:
-    walker = TASKS["humanoid-walker2d"]
-    one = EpisodeSimulator(abstract_simulator(walker, 2, "cpu", walker.varied.wide))
-    assert one.state_dict().keys() == {"state", "true", "parameters", "memory"}

@@ -1,9 +1,8 @@
 import numpy as np
-import pytest
 import torch
 
 from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.methods.follower import CarefulFollower, CarefulKicker, careful
+from astra_data.methods.follower import CarefulFollower, careful
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import TASKS
 
@@ -30,16 +29,6 @@ def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:
             break
     assert reached.all()
     assert closest > 1.0
-
-
-@pytest.mark.parametrize(
-    ("robot", "kicks"), [((0.31, 0.0), True), ((0.2, 0.0), False), ((0.5, 0.19), False), ((0.69, 0.0), False)]
-)
-def test_the_careful_kicker_kicks_from_near_behind_the_ball(robot: tuple[float, float], kicks: bool) -> None:
-    state = torch.tensor([[*robot, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0]])
-    command = CarefulKicker().command(state, torch.tensor([[1.5, 0.0]]))
-    assert command.shape == (1, 3)
-    assert bool(command[0, 2] > 0.5) == kicks
 
 
 def test_the_careful_kicker_scores_from_every_start_of_its_simulator() -> None:

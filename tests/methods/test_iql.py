@@ -9,8 +9,6 @@ from spending import SPENT, spend
 from stopping import Stopped
 from toy_episodes import toy_episodes
 
-from astra_data.core.checkpoint import save_state
-from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING
@@ -92,21 +90,6 @@ def learn(episodes: PairedEpisodes, tmp_path: Path) -> Learn:
     return learn
 
 
-def test_only_the_targets_side_is_learned_from(episodes: PairedEpisodes) -> None:
-    experience = experience_of(TASK, episodes)
-    assert experience.observation.shape == experience.next_observation.shape == (6, STEPS, 8 + 16)
-    assert torch.equal(experience.observation[:, 1:, :2], experience.next_observation[:, :-1, :2])
-    assert experience.observation.isfinite().all()
-    assert torch.equal(experience.reward, episodes.reward)
-    assert experience.lengths.tolist() == [STEPS] * 5 + [20]
-    assert experience.terminated.nonzero().tolist() == [[5, 19]]
-
-
-def test_without_places_the_critics_see_what_the_policy_sees(episodes: PairedEpisodes) -> None:
-    seen = experience_of(replace(TASK, plane=None), episodes).observation
-    assert torch.equal(seen, experience_of(TASK, episodes).observation[..., :8])
-
-
 def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
     trained, curve = learn()
     assert trained.policy.shape == ActorCriticShape(8, 2, 8, hidden_sizes=(16,))
@@ -178,14 +161,6 @@ def test_cloning_is_iql_at_temperature_zero(learn: Learn, tmp_path: Path) -> Non
     assert all(map(torch.equal, cloned.parameters(), plain.parameters()))
 
 
-def test_cloning_needs_no_steps_to_look_ahead(learn: Learn, episodes: PairedEpisodes, tmp_path: Path) -> None:
-    episodes.windows.mask[:, 4:] = 0.0
-    episodes.terminated[:] = False
-    with pytest.raises(BadInputError, match=r"at least 10 steps \(return_steps\)"):
-        learn(temperature=0.0, critic_updates=1, return_steps=10)
-    assert learn(how=clone_behavior, return_steps=10)
-
-
 def test_after_an_interruption_it_goes_on(
     learn: Learn, given: PolicyFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -214,11 +189,3 @@ def test_after_an_interruption_it_goes_on(
     whole.save(tmp_path / "whole")
     resumed.save(tmp_path / "resumed")
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
-
-
-def test_a_checkpoint_of_another_version_is_refused(learn: Learn, tmp_path: Path) -> None:
-    state: dict[str, Any] = {"networks": {"weight": torch.zeros(1)}, "updates": 3}
-    clocks = {"points": [], "spent": SPENT}
-    save_state(tmp_path / "checkpoint.safetensors", state, clocks)
-    with pytest.raises(BadInputError, match="expected a checkpoint of this version"):
-        learn()

@@ -1,13 +1,10 @@
-import re
-
 import pytest
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.fit import GroundConfig, HistoryFit
 from astra_data.grounding.model import LossWeights
-from astra_data.methods import METHODS, method_named, method_role, method_title, tables
-from astra_data.policies.train import InSimulator, InTarget
-from astra_data.reports.figures.style import SPARE_COLORS, method_color
+from astra_data.methods import METHODS, method_named, tables
+from astra_data.policies.train import InSimulator
 
 
 def test_methods_are_known_by_their_names() -> None:
@@ -15,26 +12,6 @@ def test_methods_are_known_by_their_names() -> None:
     assert method_named("astra_plus") is method_named("astra") is METHODS["astra"]
     with pytest.raises(BadInputError, match="unknown method 'astro'; known: direct_transfer, "):
         method_named("astro")
-
-
-def test_methods_have_titles_and_colors_of_their_own() -> None:
-    assert method_title("iql") == METHODS["iql"].title and method_title("nas_plus") == "NAS+"
-    assert method_title("my_own_plus") == "My own+"
-    titles = [method.title for method in METHODS.values()]
-    assert len(set(titles)) == len(titles)
-    assert all(re.fullmatch(r"#[0-9A-F]{6}", method.color) for method in METHODS.values())
-    colors = [method_color(name) for name in METHODS]
-    assert len(set(colors)) == len(colors)
-    assert not set(colors).intersection(SPARE_COLORS)
-
-
-def test_roles_say_what_the_others_are_compared_with() -> None:
-    assert {name: role for name in METHODS if (role := method_role(name))} == {
-        "direct_transfer": "floor",
-        "target": "trained there",
-        "full_obs": "trained there",
-        "follower": "ceiling",
-    }
 
 
 def test_settings_are_read_from_one_table_by_the_stage_that_takes_them() -> None:
@@ -77,13 +54,6 @@ def test_what_the_rows_of_the_paper_differ_in() -> None:
         "rma": ("abstract", "wide"),
         "compass": ("abstract", "wide"),
     }
-
-
-def test_methods_say_of_themselves_what_their_parts_do() -> None:
-    places = {InSimulator: "simulator", InTarget: "target"}
-    for method in METHODS.values():
-        known = [place for kind, place in places.items() if isinstance(method.learn, kind)]
-        assert not method.trains or method.learns_from == (known or ["episodes"])[0]
 
 
 def test_what_a_method_borrows_is_there() -> None:

@@ -11,16 +11,14 @@ from small_cart import GIVEN, TASK, Rail
 from toy_episodes import toy_episodes
 
 import astra_data.methods as registry
-from astra_data.core.config import validated
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.progress import silent
 from astra_data.grounding.files import load_grounding
 from astra_data.grounding.fit import Fitting, GroundConfig
-from astra_data.methods import METHODS, add_method, method_named
+from astra_data.methods import METHODS, add_method
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.plan import plan
 from astra_data.pipeline.trained_policy import load_policy
-from astra_data.pipeline.user_code import OwnMethod
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import user_object
@@ -101,30 +99,6 @@ def test_a_delta_action_finds_what_was_added_to_the_commands(tmp_path: Path, sim
     added, _ = grounding.delta(windows.state, windows.action)
     # 0.5 m/s of a range of 5 m/s, which is 2 of the action's units.
     torch.testing.assert_close(added, torch.full((8, 20, 1), 0.2), atol=0.07, rtol=0)
-
-
-def test_a_delta_action_tells_a_lag_from_the_history(tmp_path: Path) -> None:
-    """The cart does what it was told a step before, so the step before is what is to be added."""
-    method, given = user_object(DELTA), fitting(tmp_path)
-    windows = given.training.windows
-    before = torch.cat([torch.zeros(8, 1, 1), windows.action[:, :-1]], dim=1)
-    windows.next_state = windows.state + 0.1 * TASK.limits.in_units(before)  # type: ignore[misc]
-    given = replace(
-        given,
-        config=GroundConfig(updates=600),
-        settings=method.table.model(memory=16, learning_rate=0.01),
-    )
-    grounding, figures = method.fit(given)
-    assert grounding.delta.sizes == [1, 1, 16] and figures["loss"] < 0.01
-    simulator = grounding.simulator(TASK, 8)
-    simulator.start(windows.state[:, 0], torch.arange(8), torch.zeros(8, 1))
-    simulator.step(windows.action[:, 0])
-    saved = {name: values.clone() for name, values in simulator.state_dict().items()}
-    for _ in range(2):
-        moved = simulator.step(windows.action[:, 1]) - saved["state"]
-        told = 0.1 * TASK.limits.in_units(windows.action[:, 0])
-        torch.testing.assert_close(moved, told, atol=0.06, rtol=0)
-        simulator.load_state_dict(saved)
 
 
 def test_a_residual_ensemble_finds_by_how_much_the_simulator_is_wrong(tmp_path: Path) -> None:
@@ -208,23 +182,6 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     assert policy.act(torch.zeros(2, 2), torch.ones(2, 1)).shape == (2, 1)
 
 
-def test_its_settings_stand_in_the_recipe(tmp_path: Path) -> None:
-    own = f'delta_action = {{method = "{DELTA}", memory = 4}}\n'
-    recipe_of = load_experiment(recipe(tmp_path, '["delta_action_plus"]', own), tmp_path / "runs").recipe
-    settings = recipe_of.settings_of("delta_action_plus", "ground")
-    assert settings is not None and settings.model_dump() == {"memory": 4, "learning_rate": 0.003}
-    assert recipe_of.settings_of("delta_action_plus", "train") is None
-    table = METHODS["delta_action"].table
-    assert table is not None
-    slow = replace(table, default=table.model(learning_rate=0.5))  # type: ignore[call-arg]
-    METHODS["delta_action"] = replace(METHODS["delta_action"], table=slow)
-    given = OwnMethod(method=DELTA, memory=4)  # type: ignore[call-arg]
-    assert given.settings("delta_action") == table.model(memory=4, learning_rate=0.5)  # type: ignore[call-arg]
-    METHODS["delta_action"] = replace(METHODS["delta_action"], table=table)
-    again = validated(recipe_of.settings, type(recipe_of), "recipe.json")
-    assert again.settings_of("delta_action", "ground") == settings
-
-
 @pytest.mark.parametrize(
     ("method", "given", "told"),
     [
@@ -250,14 +207,6 @@ def test_one_name_is_not_two_methods(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=f"method 'mine' is {DELTA} already: give {other} another name"):
         add_method("mine", other)
     assert METHODS["mine"].title == "Delta action"
-
-
-def test_a_file_is_looked_up_beside_the_recipe(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text((EXAMPLES / "delta_action.py").read_text())
-    path = recipe(tmp_path, '["mine", "mine_plus"]', 'mine = "mine.py:METHOD"\n')
-    loaded = load_experiment(path, tmp_path / "runs").recipe
-    assert loaded.own_methods["mine"].method == str(tmp_path / "mine.py:METHOD")
-    assert METHODS["mine"].name == "mine" and METHODS["mine"].title == "Delta action"
 
 
 @pytest.mark.parametrize(
@@ -330,16 +279,6 @@ def test_what_a_method_lacks_is_told_before_anything_runs(tmp_path: Path, rest: 
     assert "mine" not in METHODS
 
 
-def test_a_kind_of_the_package_is_not_replaced(tmp_path: Path) -> None:
-    text = (EXAMPLES / "delta_action.py").read_text().replace('kind = "delta action"', 'kind = "history"')
-    (tmp_path / "mine.py").write_text(text)
-    with pytest.raises(
-        BadInputError, match=r"kind 'history' are those of HistoryGrounding in astra_data\.gr"
-    ):
-        add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
-    assert "mine" not in METHODS
-
-
 def test_another_methods_kind_is_not_replaced(tmp_path: Path) -> None:
     example = EXAMPLES / "delta_action.py"
     (tmp_path / "mine.py").write_text(example.read_text())
@@ -350,11 +289,3 @@ def test_another_methods_kind_is_not_replaced(tmp_path: Path) -> None:
     ):
         add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
     assert {"first", "again"} <= METHODS.keys() and "mine" not in METHODS
-
-
-def test_installed_packages_offer_methods(monkeypatch: pytest.MonkeyPatch) -> None:
-    offered = {"theirs": f"{EXAMPLES / 'delta_action.py'}:METHOD"}
-    monkeypatch.setattr(registry, "offered", lambda _: offered)
-    assert method_named("theirs_plus").title == "Delta action"
-    with pytest.raises(BadInputError, match="unknown method 'thiers'"):
-        method_named("thiers")

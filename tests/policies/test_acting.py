@@ -58,13 +58,3 @@ def test_going_on_is_as_never_having_stopped() -> None:
     for _ in range(10):
         assert torch.equal(take(rows)[1], take(resumed)[1])
     assert rows.figures() == resumed.figures()
-
-
-def test_the_time_of_the_environments_steps_is_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = acting(ConstantReward(2, 9.0), 9)
-    monkeypatch.setattr(
-        "astra_data.policies.learner.time.perf_counter", iter([1.0, 4.0, 10.0, 15.0]).__next__
-    )
-    take(rows)
-    take(rows)
-    assert rows.world_seconds == 8.0

@@ -8,7 +8,6 @@ from astra_data.policies.collecting import (
     RandomCommands,
     StressCommands,
     WallWatch,
-    held_steps,
 )
 from astra_data.robots.registry import task_named
 
@@ -69,16 +68,6 @@ def test_commands_are_held_and_repeat_with_the_seed() -> None:
     assert not torch.equal(commands[3], commands[4])
 
 
-def test_each_axis_of_a_command_is_drawn_by_itself() -> None:
-    behavior = RandomCommands(4, (1, 1))
-    behavior.start(range(500), seed=0)
-    command = behavior.act(torch.zeros(500, 47), torch.zeros(500, 0))
-    assert command.shape == (500, 4)
-    correlation = torch.corrcoef(command.T) - torch.eye(4)
-    assert float(correlation.abs().max()) < 0.2
-    assert 0.5 < float(command.std()) < 0.65
-
-
 def commands_of(behavior: RandomCommands, steps: int) -> Tensor:
     """Return the commands (steps, B, A) of a behavior that was started."""
     return torch.stack([behavior.act(torch.zeros(200, 47), torch.zeros(200, 0)) for _ in range(steps)])
@@ -97,48 +86,6 @@ def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_befo
     assert float((new.abs() == 1).float().mean()) == pytest.approx(1 / 3, abs=0.01)
 
 
-def test_short_and_long_times_of_stress_are_alike_frequent() -> None:
-    behavior = StressCommands(2, (2, 31))
-    behavior.start(range(200), seed=0)
-    times = behavior._times(20_000)
-    assert times.min() == 2
-    assert times.max() == 31
-    # Log-uniform on [2, 32): each doubling has a fourth of the draws.
-    for shortest in (2, 4, 8, 16):
-        share = np.mean((times >= shortest) & (times < 2 * shortest))
-        assert share == pytest.approx(0.25, abs=0.02)
-
-
-def test_stress_keeps_clear_of_walls_where_they_are_watched() -> None:
-    assert nearest(StressCommands(2, HOLD, WallWatch(TASK, 0.25))) >= 0.25 - 1e-6
-
-
-@pytest.mark.parametrize(
-    ("share", "expected"),
-    [
-        (0.5, [False, True, False, True, False, True]),
-        (0.34, [False, False, True, False, False, True]),
-        (1.0, [True] * 6),
-    ],
-)
-def test_random_commands_are_spread_over_the_robots(share: float, expected: list[bool]) -> None:
-    policy, random = RandomCommands(2, (1, 1)), StressCommands(2, (1, 1))
-    mixed = MixedBehavior(policy, random, share)
-    mixed.start(range(6), seed=0)
-    assert mixed.is_random[:, 0].tolist() == expected
-    state = believed(torch.zeros(6, 2))
-    acted = mixed.act(state, state[:, :2])
-    for behavior, rows in ((policy, ~mixed.is_random[:, 0]), (random, mixed.is_random[:, 0])):
-        behavior.start(range(6), seed=0)
-        torch.testing.assert_close(acted[rows], behavior.act(state, state[:, :2])[rows])
-
-
-def test_a_share_of_many_robots_is_exact() -> None:
-    mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
-    mixed.start(range(100), seed=0)
-    assert int(mixed.is_random.sum()) == 29
-
-
 @pytest.mark.parametrize("batch", [1, 7, 25])
 def test_batches_of_any_size_have_the_share_of_one(batch: int) -> None:
     mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
@@ -149,17 +96,3 @@ def test_batches_of_any_size_have_the_share_of_one(batch: int) -> None:
         mixed.start(rows, seed=first)
         found += mixed.is_random[:, 0].tolist()
     assert found == expected
-
-
-def test_a_command_is_held_for_a_step_at_least() -> None:
-    assert held_steps((0.0, 0.01), 0.2) == (1, 1)
-    assert held_steps((0.5, 3.0), 0.2) == (2, 15)
-
-
-def test_commands_that_all_keep_clear_are_not_chosen_among() -> None:
-    """Otherwise robots in a corridor would be told to keep to its middle."""
-    behavior = RandomCommands(2, HOLD, WallWatch(TASK, 0.1))
-    behavior.start(range(400), seed=0)
-    command = behavior.act(believed(STARTS[1:2].expand(400, 2)), torch.zeros(400, 2))
-    for along_axis in command.T:
-        assert float(along_axis.std()) == pytest.approx(1 / 3**0.5, rel=0.1)

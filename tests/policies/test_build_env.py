@@ -119,16 +119,3 @@ def test_recorded_starts_come_with_the_history_before_them(
         assert torch.equal(starts.state[row], windows.state[1, step])
         assert torch.equal(starts.previous_action[row], windows.previous_action[1, step])
         hidden = model.encoder.step(inputs[1:, step], hidden)
-
-
-def test_a_recorded_start_is_one_of_the_recorded_moments(
-    episodes: PairedEpisodes, grounding: HistoryGrounding
-) -> None:
-    mask = (torch.arange(400) < 3) * torch.ones(2, 1)
-    few = replace(episodes, windows=replace(episodes.windows, mask=mask))
-    starts = data_starts(TASK, FROM_DATA, few, grounding)
-    world = built(FROM_DATA, grounding, num_envs=64, starts=starts)
-    world.reset()
-    moments = few.steps(few.windows.state)
-    assert len(moments) == 6
-    assert torch.equal(world.simulator.state.unique(dim=0), moments.unique(dim=0))

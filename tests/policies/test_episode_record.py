@@ -32,11 +32,3 @@ def test_what_happens_after_the_end_does_not_count() -> None:
         "return": [2.0, 6.0, 12.0],
     }
     assert outcome.position[:, :, 0].nan_to_num(-1.0).tolist() == [[0, 1, 2, -1], [0, 1, 2, 3], [0, 1, 2, 3]]
-
-
-def test_where_an_episode_began_is_kept_when_the_robot_moves_on() -> None:
-    place = torch.zeros(1, 2)
-    record = EpisodeRecord(place)
-    place += 1.0
-    record.add(place, torch.zeros(1), flags(1), flags(0), flags(0))
-    assert record.outcome().position.tolist() == [[[0.0, 0.0], [1.0, 1.0]]]

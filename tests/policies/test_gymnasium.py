@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from dataclasses import replace
 
 import gymnasium
@@ -45,19 +43,6 @@ def goal_ward(observation: Array) -> Array:
     return command
 
 
-def test_registration_loads_no_world() -> None:
-    code = "import sys, astra_data.envs; assert not {'torch', 'mujoco'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
-
-
-def test_without_gymnasium_one_line_says_how_to_install_it() -> None:
-    code = "import sys; sys.modules['gymnasium'] = None; import astra_data.envs"
-    ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
-    assert ran.returncode == 1
-    last = ran.stderr.splitlines()[-1]
-    assert last.endswith("BadInputError: gymnasium is needed but not installed: uv sync --extra sim")
-
-
 def test_failures_are_told_apart_from_successes() -> None:
     task = TASKS["antmaze-umaze"]
     walls = replace(task.objective, ends_at_walls=True)
@@ -84,27 +69,6 @@ def test_gymnasiums_own_checks_pass(name: str) -> None:
     check_env(env.unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_time_limits_are_the_tasks_horizons(name: str) -> None:
-    spec = gymnasium.spec(name)
-    assert spec.max_episode_steps == TASKS[spec.kwargs["task"]].objective.horizon
-    assert spec.kwargs["task"].endswith("long" if "Long" in name else "umaze")
-
-
-def test_an_option_reaches_the_world() -> None:
-    env = gymnasium.make(NAMES[0], leg_scale=1.25)
-    assert env.unwrapped.env.leg_scale == 1.25  # type: ignore[attr-defined]
-
-
-def test_one_env_is_truncated_and_tells_of_walls() -> None:
-    env = gymnasium.make(NAMES[2], max_episode_steps=60)
-    env.reset(seed=0)
-    for _ in range(60):
-        _, _, terminated, truncated, info = env.step(np.array([-1.0, 1.0], dtype=np.float32))
-    assert (terminated, truncated) == (False, True)
-    assert info == {"success": False, "failed": False, "wall_contact": True}
-
-
 def test_the_same_seed_repeats_all_episodes() -> None:
     def run() -> list[bytes]:
         env = point_mazes(3, max_episode_steps=5)
@@ -114,14 +78,6 @@ def test_the_same_seed_repeats_all_episodes() -> None:
         return [observation.tobytes() for observation in observations]
 
     assert run() == run()
-
-
-def test_a_seed_of_a_list_is_the_first_and_nothing_else_is_drawn_from() -> None:
-    env = point_mazes(2, max_episode_steps=5)
-    drawn = torch.get_rng_state()
-    listed, (first, second) = env.reset(seed=[3, 9])[0], (env.reset(seed=seed)[0] for seed in (3, 9))
-    assert np.array_equal(listed, first) and not np.array_equal(listed, second)
-    assert torch.equal(torch.get_rng_state(), drawn)
 
 
 def test_noise_comes_from_the_seed_and_differs_from_step_to_step() -> None:
@@ -145,42 +101,6 @@ def test_noise_comes_from_the_seed_and_differs_from_step_to_step() -> None:
 
     one, again, other = (velocities(seed) for seed in (1, 1, 2))
     assert one == again and one[0] != one[1] and one[0] != other[0]
-
-
-def test_episodes_are_cut_off_so_long_after_their_start() -> None:
-    env = point_mazes(2, max_episode_steps=4)
-
-    def cut(steps: int) -> list[int]:
-        still = np.zeros((2, 2), dtype=np.float32)
-        return [number for number in range(1, steps + 1) if env.step(still)[3].all()]
-
-    env.reset(seed=0)
-    assert cut(10) == [4, 8]
-    env.reset()  # in the middle of one
-    assert cut(5) == [4]
-    one = SingleEnv(gymnasium.make(NAMES[2]).unwrapped.env, max_episode_steps=3)  # type: ignore[attr-defined]
-    for steps in (2, 3):
-        one.reset()
-        truncated = [one.step(np.zeros(2, dtype=np.float32))[3] for _ in range(steps)]
-        assert truncated == [False, False, True][:steps]
-
-
-def test_the_vector_env_declares_and_does_same_step_resets() -> None:
-    env = point_mazes(3, max_episode_steps=4)
-    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-    assert env.observation_space.shape == (3, 8)
-    observation, infos = env.reset(seed=0)
-    for _ in range(4):
-        before = observation
-        observation, rewards, terminated, truncated, infos = env.step(np.ones((3, 2), dtype=np.float32))
-    assert truncated.all()
-    assert not terminated.any()
-    assert rewards.dtype == np.float64
-    assert env.observation_space.contains(observation)
-    np.testing.assert_array_equal(observation[:, 2:4], 0)  # anew: at rest
-    final = np.stack(infos["final_obs"])
-    np.testing.assert_allclose(final[:, 0] - before[:, 0], 0.05 / 10, atol=1e-5)
-    assert infos["_final_info"].all()
 
 
 def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
@@ -211,16 +131,6 @@ def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
                 assert all(infos["final_obs"][row] is None for row in np.flatnonzero(~terminated))
                 successes += len(rows)
         assert successes == 2
-
-
-def test_ants_in_a_vector_env() -> None:
-    env = gymnasium.make_vec(NAMES[1], num_envs=2, vectorization_mode="vector_entry_point")
-    observation, _ = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
-    observation, _, terminated, truncated, infos = env.step(env.action_space.sample())
-    assert observation.shape == (2, 31)
-    assert not (terminated | truncated).any()
-    assert infos["wall_contact"].tolist() == [False, False]
 
 
 def test_a_grounded_simulator_shows_its_latents() -> None:

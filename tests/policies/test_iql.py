@@ -1,9 +1,7 @@
-from dataclasses import fields
 from typing import Any
 
 import pytest
 import torch
-from gpu import needs_cuda
 from kept_states import came_back
 from pydantic import ValidationError
 from torch import Tensor
@@ -12,7 +10,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.policies import iql as module
 from astra_data.policies.iql import Experience, Iql, IqlConfig, transitions
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, PolicyShape, SoftActor
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy
 
 QUICK = IqlConfig(
     critic_updates=300,
@@ -116,20 +114,6 @@ def constant_reward(*, terminated: bool) -> Experience:
     )
 
 
-@pytest.mark.parametrize(
-    ("terminated", "steps", "expected"),
-    [(True, 1, [1.75, 1.5, 1.0]), (False, 1, [2.0, 2.0, 2.0]), (True, 2, [1.75, 1.5, 1.0])],
-)
-def test_there_is_value_beyond_the_record_but_not_beyond_the_task(
-    terminated: bool, steps: int, expected: list[float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_TARGET_RATE", 0.2)
-    settings = config(discount=0.5, return_steps=steps, reward_scale=1.0, policy_updates=0)
-    iql = trained(learner(constant_reward(terminated=terminated), settings))
-    found = iql.values(torch.arange(3.0).unsqueeze(-1))
-    assert found.tolist() == pytest.approx(expected, abs=0.1)
-
-
 @pytest.mark.parametrize("expectile", [0.5, 0.8])
 def test_a_state_is_worth_the_expectile_of_what_its_actions_pay(
     expectile: float, monkeypatch: pytest.MonkeyPatch
@@ -156,25 +140,6 @@ def test_a_weight_is_at_most_100() -> None:
     iql = trained(learner(walks(), config(critic_updates=20, temperature=1e4, policy_updates=1)))
     assert iql._weights is not None
     assert (float(iql._weights.max()), iql._weights.shape) == (100.0, (64, 24))
-
-
-def test_an_action_at_the_bound_can_be_learned_by_a_policy_that_squashes() -> None:
-    experience = walks()
-    experience.action.fill_(1.0)
-    policy = SoftActor(PolicyShape(1, 1, hidden_sizes=(8,)))
-    before = mean_action(policy)
-    settings = config(critic_updates=1, temperature=0.0)
-    assert (mean_action(trained(Iql(policy, experience, settings, seed=0)).policy) > before + 0.3).all()
-
-
-@needs_cuda
-@pytest.mark.parametrize("memory", [0, 8])
-def test_it_learns_on_a_gpu(memory: int) -> None:
-    torch.manual_seed(1)
-    policy = ActorCritic(ActorCriticShape(1, 1, memory, 8, (32,))).to("cuda")
-    columns = {field.name: getattr(walks(), field.name).to("cuda") for field in fields(Experience)}
-    iql = trained(Iql(policy, Experience(**columns), config(critic_updates=5, policy_updates=5), seed=2))
-    assert {parameter.device.type for parameter in iql.policy.parameters()} == {"cuda"}
 
 
 def test_returns_are_those_of_a_plain_loop() -> None:
@@ -258,16 +223,6 @@ def test_a_training_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) -> No
     iql = learner(walks(), config(critic_updates=20, policy_updates=1))
     with pytest.raises(BadInputError, match=r"diverged in update \d+, with a .*: make learning_rate smaller"):
         trained(iql)
-
-
-def test_the_policy_rests_while_the_critics_learn() -> None:
-    iql = learner(walks(), config(critic_updates=5, policy_updates=1), memory=8)
-    before = [parameter.detach().clone() for parameter in iql.policy.parameters()]
-    for _ in range(5):
-        assert iql.iterate().keys() == {"value", "action_value"}
-    assert all(map(torch.equal, before, iql.policy.parameters()))
-    assert iql.iterate().keys() == {"policy"}
-    assert not all(map(torch.equal, before, iql.policy.parameters()))
 
 
 @pytest.mark.parametrize("updates", [3, 8])

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
-from toy_worlds import ConstantReward, GoToZero
+from toy_worlds import GoToZero
 
 from astra_data.core.seeding import derive
 from astra_data.policies.learner import Acting, Learner
@@ -59,23 +59,6 @@ def test_it_ends_after_as_many_steps_as_its_pace_asks_for(paces: list[float], sh
     assert found == pytest.approx(shares) and learner.done
 
 
-def test_rounding_adds_no_iteration() -> None:
-    """Ten times a tenth is less than one."""
-    learner = Noisy(world(), 10)
-    while not learner.done:
-        learner.iterate()
-    assert learner.steps == 240
-
-
-def test_a_last_stretch_may_go_beyond_the_total() -> None:
-    learner = Noisy(world(), 2)
-    learner.total_steps = 25
-    learner.iterate()
-    assert not learner.done
-    learner.iterate()
-    assert learner.done and learner.steps == 48
-
-
 def test_every_iteration_is_seeded_by_its_number() -> None:
     learner = Noisy(world(), 3)
     for iteration in range(3):
@@ -84,15 +67,6 @@ def test_every_iteration_is_seeded_by_its_number() -> None:
         torch.manual_seed(99)
         assert learner.iterate()["noise"] == expected
     assert Noisy(world(), 3, seed=4).iterate()["noise"] != Noisy(world(), 3).iterate()["noise"]
-
-
-def test_its_figures_stand_beside_those_of_acting() -> None:
-    class Constant(ConstantReward, GoToZero):
-        pass
-
-    found = Noisy(Constant(6, 2.0), 1).iterate()
-    assert found.keys() == {"success", "episode_steps", "episodes", "reward", "noise"}
-    assert (found["episodes"], found["episode_steps"], found["success"]) == (12.0, 2.0, 1.0)
 
 
 def test_resumed_it_does_what_an_uninterrupted_one_does() -> None:

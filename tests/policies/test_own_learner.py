@@ -98,25 +98,6 @@ def test_prices_grow_as_in_other_trainings(
     assert scales == pytest.approx(expected)
 
 
-def test_a_curve_that_stops_between_two_points_ends_with_its_last_step(tmp_path: Path) -> None:
-    _, curve = driving(1.0, steps=12)(training(tmp_path))
-    assert [point["steps"] for point in curve["points"]] == [8, 12]
-
-
-def test_its_randomness_is_that_of_the_seed(tmp_path: Path) -> None:
-    drawn = []
-
-    def learn(env: WatchedEnv, training: Training) -> Constant:
-        drawn.append(float(torch.rand(())))
-        return Constant(0.0)
-
-    for seed in (7, 7, 8):
-        given = training(tmp_path)
-        object.__setattr__(given, "seed", seed)
-        UserLearner(learn=learn, policy=Constant)(given)
-    assert drawn[0] == drawn[1] != drawn[2]
-
-
 def test_it_runs_on_the_cpu_alone(tmp_path: Path) -> None:
     given = training(tmp_path)
     object.__setattr__(given, "device", "cuda")
@@ -148,11 +129,6 @@ def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
         PolicyFile.load(tmp_path / "policy.safetensors")
 
 
-def test_a_hand_written_policy_takes_no_step(tmp_path: Path) -> None:
-    _, curve = driving(1.0, 0)(training(tmp_path))
-    assert curve == {"points": [{"steps": 0, "share": 0.0, "success": None, "episode_steps": None}]}
-
-
 def test_what_is_not_learned_is_told(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="learn returned a float, expected a Constant"):
         UserLearner(learn=lambda env, training: 1.0, policy=Constant)(training(tmp_path))  # type: ignore[arg-type, return-value]
@@ -170,20 +146,3 @@ def test_another_learners_kind_is_not_replaced() -> None:
         add_policy_kind(other)
     add_policy_kind(Constant)
     assert KINDS["constant"] is Constant
-
-
-def test_where_it_is_to_last_no_success_is_told(tmp_path: Path) -> None:
-    """Ends within the horizon are failures there, whatever the simulator says of them."""
-    told = list[str]()
-    given = training(tmp_path, lambda share, note: told.append(note))
-    object.__setattr__(given, "task", replace(TASK, objective=Last(horizon=40)))
-    _, curve = driving(-1.0, steps=400)(given)
-    assert {point["success"] for point in curve["points"]} == {None}
-    assert [point["steps"] for point in curve["points"] if point["episode_steps"] == 40.0] == [160, 320]
-    assert "steps of training episodes 40" in told
-
-
-def test_whoever_takes_more_steps_than_were_asked_for_is_done_all_the_same(tmp_path: Path) -> None:
-    shares = list[float]()
-    driving(1.0, steps=500)(training(tmp_path, lambda share, note: shares.append(share)))
-    assert shares == sorted(shares) and shares[-1] == 1.0

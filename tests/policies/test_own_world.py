@@ -38,13 +38,6 @@ def test_a_policy_that_knows_no_simulator_cannot_be_tried() -> None:
         reached_in_own_world(TASK, trained, NO_GROUNDING, seed=0)
 
 
-def test_it_starts_where_the_task_does() -> None:
-    simulation = Simulation(WorldConfig(data_start_share=1.0))
-    world = own_world(TASK, simulation, NO_GROUNDING, 5)
-    world.reset()
-    assert world.starts is None and not world.simulator.state.any()
-
-
 def test_its_parameters_vary_as_they_did_when_it_was_trained() -> None:
     varied = replace(SIMULATION, variation=TASK.varied.randomized)
     shown = [own_world(TASK, known, NO_GROUNDING, 5).simulator.parameters for known in (SIMULATION, varied)]

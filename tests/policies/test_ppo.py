@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, train, whole_and_resumed
 
 from astra_data.core.errors import BadInputError
@@ -203,27 +203,6 @@ def test_the_learning_rate_falls_to_zero_along_a_line() -> None:
     assert rates == pytest.approx([3e-3 * left for left in (1.0, 0.75, 0.5, 0.25)])
 
 
-def test_an_epoch_learns_from_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"EPOCHS": 2, "MINIBATCHES": 4, "_MAX_KL": math.inf}.items():
-        monkeypatch.setattr(module, name, value)
-    learner = ppo(GoToZero(10), 1, horizon=5, memory=2)
-    rollout = learner._collect()
-    starts = rollout["observation"][:, 0, 0]
-    learned: list[list[int]] = []
-    remember = learner.policy.remember_sequence
-
-    def watched(observation: Tensor, *rest: Tensor) -> Tensor:
-        learned.append([int((starts == start).nonzero()) for start in observation[:, 0, 0]])
-        return remember(observation, *rest)
-
-    monkeypatch.setattr(learner.policy, "remember_sequence", watched)
-    learner._learn(rollout)
-    assert [len(rows) for rows in learned] == [3, 3, 3, 1] * 2
-    for epoch in (learned[:4], learned[4:]):
-        assert sorted(row for rows in epoch for row in rows) == list(range(10))
-    assert learned[:4] != learned[4:]
-
-
 def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
     settings: dict[str, Any] = {"horizon": 100, "learning_rate": 1e-2}
     with_memory = train(ppo(Recall(32), 25, memory=8, **settings))
@@ -251,14 +230,6 @@ def test_a_single_step_has_no_advantage_over_others() -> None:
     train(ppo(GoToZero(2), 1, horizon=5, rollout_steps=1))
 
 
-def test_an_untrained_critic_begins_near_zero() -> None:
-    torch.manual_seed(0)
-    plain = ActorCritic(ActorCriticShape(1, 1, 0, 16, (32,)))
-    small, seen = ppo(GoToZero(8), 1, horizon=7).policy, torch.linspace(-1, 1, 9)[:, None]
-    torch.testing.assert_close(small.value(seen), 0.01 * plain.value(seen))
-    assert torch.equal(small.policy(seen)[0], plain.policy(seen)[0])
-
-
 @pytest.mark.parametrize(("learned", "share"), [(1.0, 0.5), (1.0, 1.0), (0.1, 0.5)])
 def test_the_actions_scatter_falls_to_what_is_tested_and_may_be_less(
     learned: float, share: float, monkeypatch: pytest.MonkeyPatch
@@ -282,24 +253,3 @@ def test_an_iteration_ends_once_the_policy_has_moved_too_far(
     learner._optimizer.register_step_post_hook(lambda *_: made.append(None))
     learner.iterate()
     assert len(made) == updates
-
-
-@pytest.mark.parametrize("memory", [0, 8])
-def test_a_loss_is_all_on_the_device_of_the_policy(memory: int) -> None:
-    """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
-    learner = ppo(GoToZero(8), 1, horizon=7, memory=memory)
-    rollout = learner._collect()
-    learner.policy.to("meta")
-    loss, moved = learner._loss({name: values.to("meta") for name, values in rollout.items()})
-    loss.backward()
-    assert (loss.device.type, moved.device.type) == ("meta", "meta")
-
-
-def test_where_it_begins_is_of_the_seed_whatever_was_drawn_before() -> None:
-    begun = []
-    for drawn, seed in ((5, 1), (6, 1), (5, 2)):
-        torch.manual_seed(drawn)
-        policy = ActorCritic(ActorCriticShape(1, 1, hidden_sizes=(8,)))
-        acting = Ppo(GoToZero(8), policy, PpoConfig(), horizon=100, seed=seed).acting
-        begun.append(torch.cat([acting.observation[:, 0], acting.state_dict()["age"]]))
-    assert torch.equal(begun[0], begun[1]) and not torch.equal(begun[0], begun[2])

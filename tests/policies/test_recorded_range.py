@@ -1,10 +1,5 @@
-from pathlib import Path
-
-import numpy as np
 import torch
-from fake_dataset import writer
 
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
 from astra_data.policies.episodes import RecordedRange
 from astra_data.worlds.commands import Commands
 
@@ -21,17 +16,3 @@ def test_steps_of_active_robots_beyond_any_axis_are_counted() -> None:
     assert asked.share == 3 / 11
     asked.count(torch.full((1, 2), -40.0), torch.ones(1, dtype=torch.bool))  # is given as the least command
     assert asked.share == 4 / 12
-
-
-def test_the_range_is_that_of_the_dataset(tmp_path: Path) -> None:
-    columns = [Column(STATE, size=2), Column(NEXT_STATE, size=2), Column(ACTION, size=2)]
-    states = np.zeros((3, 2), np.float32)
-    with writer(tmp_path / "set", columns=columns) as made:
-        actions = np.array([[0.0, -1.0], [1.0, 0.0], [0.5, 1.0]], np.float32)
-        made.add(Episode(0, {STATE: states, NEXT_STATE: states, ACTION: actions}, {}))
-    asked = RecordedRange.of(tmp_path / "set", LIMITS)
-    assert asked is not None
-    asked.count(LIMITS.normal(torch.tensor([[1.0, 1.0], [1.1, 1.0]])), torch.ones(2, dtype=torch.bool))
-    assert asked.share == 0.5
-    (tmp_path / "set/meta/stats.json").unlink()
-    assert RecordedRange.of(tmp_path / "set", LIMITS) is RecordedRange.of(tmp_path, LIMITS) is None

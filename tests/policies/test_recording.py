@@ -40,24 +40,3 @@ def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated()
         assert torch.equal(row[TERMINATED], ends)
         assert torch.equal(row[TRUNCATED], truncated)
         assert torch.equal(row[DONE], ends | truncated)
-
-
-def test_steps_are_counted_of_the_robots_that_still_drive() -> None:
-    recorded = list[Episode]()
-    env, fast = TASK.target(3, seed=0), torch.tensor([[-0.24], [-0.24], [-1.0]])  # 0.9 m/s, and backward
-    env.reset()
-    behavior: Any = SimpleNamespace(act=lambda state, goal: fast)
-    writer: Any = SimpleNamespace(staged=set(), add=lambda episode, number: recorded.append(episode))
-    steps = record(TASK, env, behavior, range(3), writer, max_steps=30, seed=0, progress=silent)
-    lengths = [len(episode.columns[DONE]) for episode in recorded]
-    assert min(lengths) < max(lengths) == 30 and steps == sum(lengths)
-
-
-def test_progress_is_told_by_the_longest_that_episodes_may_be() -> None:
-    env, told = TASK.target(1, seed=0), list[float]()
-    env.reset()
-    behavior: Any = SimpleNamespace(act=lambda state, goal: torch.full((1, 1), -0.6))
-    writer: Any = SimpleNamespace(staged={0}, add=None)
-    note = lambda done, _: told.append(done)  # noqa: E731
-    record(TASK, env, behavior, range(1), writer, max_steps=4, seed=0, progress=note)
-    assert told == [0.25, 0.5, 0.75, 1.0]

@@ -51,14 +51,6 @@ def test_what_is_learned_from_has_a_known_outcome_and_a_filled_memory() -> None:
             assert bool(use[index]) == (known and filled), (window, index)
 
 
-def test_the_first_steps_of_episodes_are_learned_from_as_often_as_others() -> None:
-    drawn, learned = replay(ROWS * 1000, 1000).windows(20_000, 32, 8)
-    step = (drawn["observation"].squeeze(-1) + 0.05).floor()[:, :-1] % 5
-    counts = torch.stack([(step[learned] == place).sum() for place in range(4)]).double()
-    assert counts.min() > 0.9 * counts.max()
-    assert learned.double().mean() > 0.8
-
-
 def test_nothing_is_learned_across_a_cut() -> None:
     """Where an episode had ended there, it stays as it was."""
     kept = replay(ROWS * 12, 40)

@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -105,56 +104,6 @@ def test_all_tries_cost_time(tmp_path: Path) -> None:
     assert command == -0.44
     assert (curve["wall_seconds"], curve["cpu_seconds"]) == (2 + 4 + 6, 1 + 2 + 3)
     assert "wall_seconds" not in restarted(tmp_path, [-1.0, 1.0], tries=2)[1]
-
-
-def test_without_tries_nothing_is_tested(tmp_path: Path) -> None:
-    command, curve, seeds = restarted(tmp_path, [-1.0], tries=1)
-    assert (command, seeds) == (-1.0, [7]) and "tries" not in curve
-
-
-@pytest.mark.parametrize(
-    ("device", "tries", "read"), [("cpu", 1, 0), ("cpu", 2, 0), ("cuda", 1, 0), ("cuda", 2, 1)]
-)
-def test_a_grounding_is_read_again_only_to_test_on_the_cpu_what_is_trained_elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, tries: int, read: int
-) -> None:
-    grounding_at, given = Mock(), list[object]()
-    monkeypatch.setattr("astra_data.policies.train.grounding_at", grounding_at)
-
-    def tested(task: Any, policy: Any, grounding: object, seed: int) -> Reached:  # noqa: ANN401
-        given.append(grounding)
-        return Reached(1.0, 1.0)
-
-    monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", tested)
-    kept: Any = Mock()
-    monkeypatch.setattr(PolicyFile, "load", Mock())
-    training: Any = Training(
-        task=TASK,
-        config=PpoTrainConfig(tries=tries),
-        settings=None,
-        episodes=Mock(),
-        grounding=NO_GROUNDING,
-        initial=None,
-        seed=7,
-        device=device,
-        folder=tmp_path,
-        progress=silent,
-    )
-    with_restarts(lambda _: (kept, {"points": []}), training, tmp_path / "grounding")
-    assert grounding_at.call_count == read
-    assert given == ([grounding_at.return_value if read else NO_GROUNDING] if tries > 1 else [])
-
-
-def test_all_tries_meet_the_same_starts_and_goals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seeds: list[int] = []
-
-    def tested(task: Any, policy: Any, grounding: Any, seed: int) -> Reached:  # noqa: ANN401
-        seeds.append(seed)
-        return Reached(0.0, 40.0)
-
-    monkeypatch.setattr("astra_data.policies.train.reached_in_own_world", tested)
-    restarted(tmp_path, [-1.0, -0.9], tries=2)
-    assert seeds == [7, 7]
 
 
 def test_what_is_just_enough_masters_it() -> None:

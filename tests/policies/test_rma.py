@@ -1,11 +1,6 @@
-import math
-
-import pytest
 import torch
-from pydantic import ValidationError
 from toy_worlds import Slope, train, whole_and_resumed
 
-from astra_data.core.errors import BadInputError
 from astra_data.policies.networks import AdaptiveShape, Student, Teacher
 from astra_data.policies.rma import Adaptation, RmaConfig
 
@@ -82,31 +77,3 @@ def test_resuming_gives_the_same_parameters_to_the_bit() -> None:
     whole, resumed = whole_and_resumed(lambda: begin(4, 4))
     for one, other in zip(resumed.student.parameters(), whole.student.parameters(), strict=True):
         assert torch.equal(one, other)
-
-
-def test_too_short_a_history_is_refused() -> None:
-    with pytest.raises(ValidationError, match="greater than or equal to 40"):
-        RmaConfig(history_length=39)
-
-
-def test_the_learning_rate_falls_to_zero_along_a_line() -> None:
-    learner, rates = begin(4, 4), list[float]()
-    while not learner.done:
-        learner.iterate()
-        rates.append(learner._optimizer.param_groups[0]["lr"])
-    assert rates == pytest.approx([3e-3 * left for left in (1.0, 0.75, 0.5, 0.25)])
-
-
-def test_a_training_that_diverges_says_so() -> None:
-    learner = begin(4, 8)
-    with torch.no_grad():
-        next(learner.student.adaptation.parameters()).fill_(math.inf)
-    with pytest.raises(
-        BadInputError, match=r"diverged after step 0, with a squared error that is not finite"
-    ):
-        learner.iterate()
-
-
-def test_where_nothing_varies_there_is_nothing_to_explain(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Slope, "draw", lambda world: torch.zeros(world.num_envs, 2))
-    assert math.isnan(begin(4, 1).iterate()["r2_extrinsics"])

@@ -1,10 +1,7 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from small_cart import TASK as RAIL_CART
-from small_cart import Reach
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
@@ -132,19 +129,3 @@ def test_states_and_goals_come_as_arrays_too_and_are_looked_at_first() -> None:
     state[2, 1] = np.nan
     with pytest.raises(BadInputError, match="state: expected finite values, got nan in row 2, entry 1"):
         running.command(state, goal)
-
-
-class Ahead(Reach):
-    """Shows how far away the goal is, of B states at a time."""
-
-    def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        return torch.stack([goal[:, 0] - state[:, 0]] * 3, dim=1)
-
-
-def test_abstraction_and_objective_may_be_of_batches_alone() -> None:
-    task = replace(RAIL_CART, abstraction=lambda state: state[:, :1], objective=Ahead(horizon=40))
-    running = RunningPolicy(task, ActorCritic(ActorCriticShape(observation_size=3, action_size=1)))
-    assert running.observation_size == 3
-    state, goal = torch.randn(2, 5, 1), torch.randn(2, 5, 1)
-    expected = (goal - state).expand(2, 5, 3)
-    torch.testing.assert_close(policy_observation(task.objective, state, goal, None), expected)

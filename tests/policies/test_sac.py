@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
-from toy_worlds import ConstantReward, EndsAtZero, GoToZero, Recall, train, whole_and_resumed
+from toy_worlds import ConstantReward, EndsAtZero, GoToZero, train, whole_and_resumed
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies import sac as module
@@ -225,31 +225,6 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
     assert all(parameter.requires_grad for parameter in critics.parameters())
 
 
-def test_it_learns_so_often_after_each_step_that_a_window_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = sac(GoToZero(8), 20, horizon=9, memory=4, window=4, burn_in=1, updates_per_step=3)
-    at: list[int] = []
-    monkeypatch.setattr(learner, "_learn", lambda: at.append(len(learner._replay)))
-    learner.iterate()
-    assert at == [kept for kept in range(5, 11) for _ in range(3)]
-
-
-def test_a_memory_recalls_what_a_single_observation_does_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_REWARD_SCALE", 1.0)
-    settings: dict[str, Any] = {"horizon": 100, "window": 3, "burn_in": 0, "batch_size": 96}
-    settings["updates_per_step"] = 3
-    with_memory = train(sac(Recall(32), 120, memory=8, learning_rate=3e-3, **settings))
-    without = train(sac(Recall(32), 120, learning_rate=3e-3, **settings))
-    # An episode of three steps is worth at most 1.
-    assert 3 * with_memory[-1]["reward"] > 0.7
-    assert 3 * without[-1]["reward"] < 0.3
-
-
-def test_a_training_that_diverges_says_so() -> None:
-    learner = sac(GoToZero(4), 40, horizon=20, learning_rate=1e30)
-    with pytest.raises(BadInputError, match=r"diverged after step .* with a loss that is not finite: make"):
-        train(learner)
-
-
 def test_a_window_has_to_hold_steps_to_learn_from() -> None:
     with pytest.raises(ValueError, match=r"burn_in: expected less than the window of 8, got 8"):
         SacConfig(window=8, burn_in=8)
@@ -262,40 +237,3 @@ def test_the_buffer_has_to_hold_a_window() -> None:
     with pytest.raises(BadInputError, match=r"buffer_size: expected at least 56 steps.* got 55"):
         sac(GoToZero(8), 10, buffer_size=55, **sizes)
     sac(GoToZero(8), 10, buffer_size=56, **sizes)
-
-
-@pytest.mark.parametrize(("memory", "windows"), [(0, (64, 1, 0)), (8, (10, 6, 2))])
-def test_an_update_takes_as_many_windows_as_its_steps_make(
-    memory: int, windows: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Their number, their steps, and those that only warm up a memory."""
-    learner = sac(GoToZero(8), 40, horizon=9, memory=memory, window=6, burn_in=2)
-    drawn: list[tuple[int, ...]] = []
-    draw = learner._replay.windows
-
-    def counted(*sizes: int) -> Any:  # noqa: ANN401
-        drawn.append(sizes)
-        return draw(*sizes)
-
-    monkeypatch.setattr(learner._replay, "windows", counted)
-    learner.iterate()
-    assert set(drawn) == {windows}
-
-
-def test_where_every_step_runs_out_of_time_nothing_is_learned() -> None:
-    learner = sac(GoToZero(8), 20, horizon=1)
-    before = copy.deepcopy(learner.policy)
-    assert [point["temperature"] for point in train(learner)] == pytest.approx([0.2] * 2)
-    pairs = zip(before.parameters(), learner.policy.parameters(), strict=True)
-    assert all(torch.equal(*pair) for pair in pairs)
-
-
-def test_where_it_begins_is_of_the_seed_whatever_was_drawn_before() -> None:
-    begun = []
-    for drawn, seed in ((5, 1), (6, 1), (5, 2)):
-        torch.manual_seed(drawn)
-        policy, config = SoftActor(PolicyShape(1, 1, hidden_sizes=(8,))), SacConfig(buffer_size=1000)
-        learner = Sac(GoToZero(8), policy, config, horizon=7, seed=seed)
-        critics = [values.detach().flatten() for values in learner._critics.parameters()]
-        begun.append(torch.cat([*critics, learner.acting.observation[:, 0]]))
-    assert torch.equal(begun[0], begun[1]) and not torch.equal(begun[0], begun[2])

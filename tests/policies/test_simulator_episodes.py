@@ -44,10 +44,3 @@ def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
     world = own_world(replace(TASK, objective=Last(horizon=6)), SIMULATION, NO_GROUNDING, 3)
     found, _ = in_simulator(world, lambda goal: lambda state, goal: torch.full_like(goal, -0.6), 6, seed=0)
     assert found.success == [1.0] * 3 and found.steps == [6] * 3
-
-
-def test_what_was_told_of_episodes_stays_when_others_follow_in_the_same_simulator() -> None:
-    world, acting = own_world(TASK, SIMULATION, NO_GROUNDING, 3), running(TASK, FORWARD, NO_GROUNDING)
-    begin = partial(started, acting, acting.act_in_simulator)
-    (_, first), (_, second), (_, again) = (in_simulator(world, begin, 40, seed) for seed in (0, 1, 0))
-    assert torch.equal(first["goal"], again["goal"]) and not torch.equal(first["goal"], second["goal"])

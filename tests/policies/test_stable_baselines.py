@@ -3,7 +3,6 @@
 import gymnasium
 import numpy as np
 import pytest
-from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecMonitor
 
 import astra_data.envs  # noqa: F401
@@ -41,16 +40,3 @@ def test_who_ends_in_the_last_moment_is_not_timed_out(monkeypatch: pytest.Monkey
     monkeypatch.setattr(env, "step", lambda _: (zeros, zeros[:, 0], ended, late, {"final_obs": zeros}))
     _, _, done, infos = rows.step(np.zeros((3, 2), np.float32))
     assert done.all() and [info["TimeLimit.truncated"] for info in infos] == [False, False, True]
-
-
-def test_the_seed_that_is_set_is_that_of_the_next_reset() -> None:
-    rows = StableBaselinesEnv(gymnasium.make_vec("astra_data/PointMazeUMaze-v0", num_envs=3))
-    truth = gymnasium.make_vec("astra_data/PointMazeUMaze-v0", num_envs=3)
-    for _ in range(2):
-        rows.seed(5)
-        np.testing.assert_array_equal(rows.reset(), truth.reset(seed=5)[0])
-        np.testing.assert_array_equal(rows.reset(), truth.reset()[0])
-
-
-def test_its_checker_finds_nothing_in_a_single_one() -> None:
-    check_env(gymnasium.make("astra_data/PointMazeUMaze-v0").unwrapped)

@@ -137,36 +137,3 @@ def test_where_good_episodes_are_short_sac_is_refused(tmp_path: Path) -> None:
             MAZE, steps=1, episode_steps=1, seed=0, folder=tmp_path, num_threads=1, progress=silent
         )
     assert not Counting.made
-
-
-def test_how_long_episodes_last_is_the_mean_over_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of three robots one fails in its second step, one in its fourth, one not within the horizon of 6."""
-
-    class Env:
-        state, goal = torch.zeros(3, 1), torch.zeros(3, 0)
-        steps = 0
-
-        def reset(self) -> None:
-            self.steps = 0
-
-        def step(self, action: Tensor, active: Tensor) -> Any:  # noqa: ANN401
-            self.steps += 1
-            self.actives = [*getattr(self, "actives", []), active.tolist()]
-            ends = torch.tensor([self.steps == 2, self.steps == 4, False])  # in this step alone
-            return type("Step", (), {"terminated": ends})()
-
-    class Deployed:
-        class task:  # noqa: N801 - stands for an attribute
-            objective = type("Objective", (), {"horizon": 6})()
-            target = staticmethod(lambda count, seed, num_threads: env)
-
-        def start(self, count: int, generator: torch.Generator) -> None:
-            assert count == 3
-
-        def act(self, state: Tensor, goal: Tensor) -> Tensor:
-            return torch.zeros(3, 1)
-
-    env = Env()
-    monkeypatch.setattr(suboptimal, "_TEST_EPISODES", 3)
-    assert suboptimal._lasts(Deployed(), 0, 1) == pytest.approx((2 + 4 + 6) / 3)  # type: ignore[arg-type]
-    assert env.actives[2] == [False, True, True]

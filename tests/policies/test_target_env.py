@@ -92,17 +92,6 @@ def test_a_deployed_policy_sees_what_it_saw_in_training() -> None:
         assert torch.equal(deployed.act(saved["physics"][:, 1:30].float(), saved["goal"]), expected)
 
 
-def test_toppling_ends_the_episode_and_costs() -> None:
-    lying = recorded().state[:1].repeat(1, 1)
-    lying[0, 2:7] = torch.tensor([2.0, 0.0, 1.0, 0.0, 0.0])  # on its back, above the ground
-    starts = TargetStarts(lying, torch.tensor([[3.0, -4.0]]))
-    env = ObservedTargetEnv(TASK, 3, starts=starts, data_start_share=1.0, num_threads=1)
-    env.reset()
-    step = env.step(torch.zeros(3, 2))
-    assert step.terminated.all() and not step.success.any()
-    assert step.reward.tolist() == pytest.approx([-10.0] * 3, abs=0.1)
-
-
 def test_a_share_of_the_episodes_starts_from_the_data() -> None:
     torch.manual_seed(0)
     env = world("abstract", share=0.3, count=200)
@@ -116,21 +105,3 @@ def test_a_share_of_the_episodes_starts_from_the_data() -> None:
     start, goal = (torch.tensor(TASK.maze.cell_center(*cell)) for cell in (TASK.maze.start, TASK.maze.goal))
     assert ((saved["physics"][~from_data, 1:3] - start).abs() < 0.7).all()
     assert ((saved["goal"][~from_data] - goal).abs() < 0.7).all()
-
-
-def test_only_those_that_start_anew_are_put_into_the_data() -> None:
-    torch.manual_seed(0)
-    env = world(share=1.0)
-    before = env.reset()
-    after = env.reset(torch.tensor([True, False, True, False]))
-    assert torch.equal(after[1::2], before[1::2])
-    assert not torch.equal(after[::2], before[::2])
-
-
-def test_each_episode_begins_somewhere_else() -> None:
-    torch.manual_seed(0)
-    env = world()
-    first, second = env.reset(), env.reset()
-    assert (first != second).any(dim=1).all()
-    torch.manual_seed(0)
-    assert torch.equal(world().reset(), first)

@@ -15,10 +15,7 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
-from astra_data.policies.learner import Acting, lately
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
 from astra_data.policies.ppo import Ppo
-from astra_data.policies.sac import Sac
 from astra_data.policies.simulator_env import RewardSource, WorldConfig
 from astra_data.policies.train import (
     AnyTrainConfig,
@@ -26,7 +23,6 @@ from astra_data.policies.train import (
     PpoTrainConfig,
     SacTrainConfig,
     Training,
-    learner_of,
     optimize,
     train_in,
 )
@@ -90,19 +86,6 @@ def test_the_learner_that_is_named_has_the_settings_ppo_by_default() -> None:
     assert read.validate_python(sac) is sac
     with pytest.raises(ValidationError, match="burn_in"):
         read.validate_python({"burn_in": 3})
-
-
-def test_each_learner_gets_its_policy_in_the_asked_sizes() -> None:
-    shape = PolicyShape(1, 1, 5, hidden_sizes=(8, 6))
-    given: dict[str, Any] = {"horizon": 7, "seed": 3}
-    ppo = learner_of(PPO, ToyWorld(4), shape, "cpu", **given)
-    assert type(ppo) is Ppo and type(ppo.policy) is ActorCritic
-    assert ppo.policy.shape == ActorCriticShape(1, 1, 5, hidden_sizes=(8, 6))
-    assert (ppo.total_steps, ppo.acting.horizon) == (48, 7)
-    sac = learner_of(SAC, ToyWorld(4), shape, "cpu", **given)
-    assert type(sac) is Sac and type(sac.policy) is SoftActor
-    assert sac.policy.shape == shape
-    assert sac.acting.horizon == 7
 
 
 @pytest.mark.parametrize("config", [PPO, SAC])
@@ -188,36 +171,6 @@ def test_a_mastered_training_ends_early_and_only_its_penalties_grow(
     assert notes[-1][1].endswith(told)
 
 
-def test_with_sac_penalties_are_whole_and_it_ends_early_as_well(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A learner that is no PPO: its replay holds rewards of long ago."""
-    monkeypatch.setattr("astra_data.policies.train.Ppo", int)
-    learner, _ = counted(replace(training(tmp_path), is_plus=True), lambda step: {"success": 1.0})
-    assert learner.scales == [1.0] * 4
-
-
-@pytest.mark.parametrize(("success", "iterations"), [(1.0, 3), (0.0, 6)])
-def test_ppo_itself_takes_fewer_steps_once_episodes_succeed_and_completes_its_schedules(
-    success: float, iterations: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config, rates = PPO.model_copy(update={"total_steps": 16 * 6}), list[float]()
-    figures = Acting.figures
-    monkeypatch.setattr(Acting, "figures", lambda acting: figures(acting) | {"success": success})
-    learn = Ppo._learn
-
-    def noted(ppo: Ppo, rollout: dict[str, Tensor]) -> None:
-        rates.append(ppo._optimizer.param_groups[0]["lr"] / config.learning_rate)
-        learn(ppo, rollout)
-
-    monkeypatch.setattr(Ppo, "_learn", noted)
-    _, curve = train_in(ToyWorld(4), config, 5, training(tmp_path, config), 20)
-    assert len(curve["points"]) == iterations and curve["points"][-1]["steps"] == 16 * iterations
-    done = [0, 1, 4] if success else range(6)
-    assert rates == pytest.approx([1 - sixths / 6 for sixths in done])
-    assert curve["points"][-1]["share"] == pytest.approx(1.0)
-
-
 def test_the_curve_has_every_iteration_and_null_for_what_is_undefined(tmp_path: Path) -> None:
     notes: list[tuple[float, str]] = []
     given = training(tmp_path, progress=lambda share, note: notes.append((share, note)))
@@ -297,33 +250,3 @@ def test_parameters_vary_as_the_method_says_unless_its_settings_do(tmp_path: Pat
         env, simulation = InSimulator(ranges=ranges).world(given, shows_parameters=True)  # type: ignore[arg-type]
         assert simulation.variation == expected
         assert env.parameter_count == (0 if expected is None else len(own.names))
-
-
-def test_policies_that_observe_latents_have_no_memory(tmp_path: Path) -> None:
-    config = PPO.model_copy(update={"episode_steps": 3})
-    for name, used, memory_size, observed in (("raw", NO_GROUNDING, 5, 8), ("latents", grounding(), 0, 16)):
-        (tmp_path / name).mkdir()
-        trained, curve = InSimulator()(training(tmp_path / name, config, grounding=used))
-        shape = trained.policy.shape
-        assert (shape.memory_size, shape.observation_size, shape.hidden_sizes) == (
-            memory_size,
-            observed,
-            (8, 6),
-        )
-        assert trained.simulation is not None and (trained.dataset, trained.content_hash) == (
-            "toy@data-1.0.0",
-            "0",
-        )
-        assert max(point["episode_steps"] or 0 for point in curve["points"]) <= 3
-
-
-def test_simulated_episodes_last_as_long_as_the_tasks_unless_told_otherwise(tmp_path: Path) -> None:
-    given = training(tmp_path)
-    assert given.simulated_steps == TASK.objective.horizon
-    assert replace(given, config=PPO.model_copy(update={"episode_steps": 9})).simulated_steps == 9
-
-
-def test_what_is_told_on_the_way_is_of_the_last_ten_points() -> None:
-    points = [{"success": value} for value in (*[0.0] * 5, *[1.0] * 9, None)]
-    assert lately(points, "success").endswith("1.00")
-    assert lately(points[:-1], "success").endswith("0.90")

@@ -67,9 +67,3 @@ def test_settings_for_the_target_are_laid_over_those_of_the_training(
     assert (trained.simulation, trained.observed) == (None, observed)
     assert str(trained.policy) == "policy"
     assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "0")
-
-
-def test_without_settings_it_is_the_recipes_training(asked: dict[str, Any], tmp_path: Path) -> None:
-    InTarget("abstract")(training(tmp_path, None))
-    _, config, memory_size, _, _ = asked["train"]
-    assert (config, memory_size) == (TRAIN, 7)

@@ -72,6 +72,7 @@ def align(
         embedding_size=model.shape.embedding_size,
         latent_size=model.shape.latent_size,
         position_octaves=model.shape.position_octaves,
+        encoder=model.shape.encoder,
     ).to(device)
     # Where φ drops the robot's place, latents must not depend on where it came from.
     encoder.set_scales(
@@ -118,7 +119,7 @@ def _losses(
     with torch.no_grad():
         source, _ = model.encode(windows)
         source_mean, source_log_variance = model.predict_latent(source, windows.action)
-    target, _ = encoder.encoder(encoder.encoder_input(state, windows.goal, windows.previous_action))
+    target, _ = encoder.encoder.sequence(encoder.encoder_input(state, windows.goal, windows.previous_action))
     mean, log_variance = model.predict_latent(target, windows.action)
     discrepancy = gaussian_mmd(source_mean, source_log_variance.exp(), mean, log_variance.exp(), bandwidths)
     distance = (target - source).square().mean(-1)

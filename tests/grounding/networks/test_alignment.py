@@ -4,7 +4,6 @@ from torch import Tensor
 
 from astra_data.grounding.alignment import TargetEncoder, gaussian_mmd
 from astra_data.grounding.encoder import PositionFeatures
-from astra_data.pipeline.stages.align import _BANDWIDTHS
 
 
 def mean_kernel(x: Tensor, y: Tensor, bandwidths: Tensor) -> tuple[float, float]:
@@ -31,15 +30,6 @@ def test_closed_form_agrees_with_sampling() -> None:
     assert exact > 20 * error  # the comparison above can tell something
 
 
-def test_equal_gaussians_have_none_and_others_some() -> None:
-    torch.manual_seed(0)
-    mean, variance, bandwidths = torch.randn(5, 8), 0.1 + torch.rand(5, 8), torch.tensor([1.0, 4.0])
-    equal = gaussian_mmd(mean, variance, mean, variance, bandwidths)
-    torch.testing.assert_close(equal, torch.zeros(5), atol=1e-6, rtol=0)
-    assert (gaussian_mmd(mean, variance, mean + 0.3, variance, bandwidths) > 1e-3).all()
-    assert (gaussian_mmd(mean, variance, mean, 3 * variance, bandwidths) > 1e-3).all()
-
-
 def gradient(bandwidths: Tensor) -> float:
     """Return the gradient's norm between unrelated latents of size 64."""
     torch.manual_seed(0)
@@ -49,11 +39,6 @@ def gradient(bandwidths: Tensor) -> float:
     gaussian_mmd(source, variance, target, variance, bandwidths).sum().backward()
     assert target.grad is not None
     return float(target.grad.norm(dim=-1).min())
-
-
-def test_the_gradient_is_alive_at_latent_size_64() -> None:
-    assert gradient(torch.tensor(_BANDWIDTHS) * 64**0.5) > 1e-2
-    assert gradient(torch.tensor([1.0])) < 1e-12  # without the factor sqrt(Z) it is dead
 
 
 def test_target_encoder_clips_normalized_states() -> None:

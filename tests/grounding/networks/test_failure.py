@@ -132,16 +132,3 @@ def test_the_members_probabilities_are_averaged_after_the_shift() -> None:
     made.calibrate(torch.tensor(0.5), torch.tensor(-3.0))
     torch.testing.assert_close(made.probability(inputs), (0.5 * odds - 3.0).sigmoid().mean(0))
     assert FAILURE_STEPS == 2 and float(made.hazard(torch.tensor(0.5))) == pytest.approx(0.25)
-
-
-def test_scales_are_those_of_moves_and_inputs() -> None:
-    made, of = model(), windows(8, 30)
-    made.set_move_scales(of)
-    torch.testing.assert_close(made.wanted_std, (of.simulated_next - of.state).flatten(0, 1).std(0))
-    torch.testing.assert_close(made.moved_std, (of.next_state - of.state).flatten(0, 1).std(0))
-    torch.testing.assert_close(made.missed_std, (of.next_state - of.simulated_next).flatten(0, 1).std(0))
-    inputs = seen(made, of).flatten(0, 1)
-    made.set_input_scales(inputs)
-    normal = (inputs - made.input_mean) / made.input_std
-    assert float(normal.mean(0).abs().max()) < 1e-4
-    torch.testing.assert_close(normal.std(0), torch.ones(20), atol=1e-3, rtol=0)

@@ -54,7 +54,7 @@ def test_the_agreement_is_that_of_held_out_episodes_alone(
         steps = slice(row, row + 1), slice(0, length)
         history = [windows.goal[steps], windows.previous_action[steps]]
         source, _ = model.encoder(model.encoder_input(windows.state[steps], *history))
-        target, _ = encoder.encoder(encoder.encoder_input(held_out.target_state[steps], *history))
+        target, _ = encoder.encoder.sequence(encoder.encoder_input(held_out.target_state[steps], *history))
         latents.append(source[0])
         squares.append((target - source).square().flatten())
         (mean, log_variance), (other, other_log_variance) = (

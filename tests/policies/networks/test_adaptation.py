@@ -3,7 +3,6 @@ from dataclasses import asdict
 import torch
 
 from astra_data.policies.networks import (
-    SHORTEST_HISTORY,
     ActorCritic,
     ActorCriticShape,
     AdaptiveShape,
@@ -12,18 +11,6 @@ from astra_data.policies.networks import (
 )
 
 SHAPE = AdaptiveShape(3, 2, memory_size=8, hidden_sizes=(16,), extrinsics_size=4, history_length=45)
-
-
-def test_a_history_is_zeros_before_the_start_and_ends_with_the_newest_step() -> None:
-    student = Student(SHAPE)
-    observation, action = torch.randn(60, 7, 3), torch.randn(60, 7, 2)
-    hidden = student.initial_hidden(7)
-    for step in range(60):
-        _, hidden = student.remember(observation[step], action[step], hidden)
-        rows = hidden[:, 8:].reshape(7, 45, 5)
-        seen = torch.cat([observation, action], dim=-1)[max(0, step - 44) : step + 1].transpose(0, 1)
-        assert torch.equal(rows[:, 45 - seen.shape[1] :], seen)
-        assert not rows[:, : 45 - seen.shape[1]].any()
 
 
 @torch.no_grad()
@@ -89,10 +76,3 @@ def test_a_student_remembers_a_sequence_as_it_does_step_by_step() -> None:
     other = student.remember_sequence(observation, action, torch.randn_like(first), start)
     torch.testing.assert_close(other[1, 4:], features[1, 4:])
     assert (other[1, :4] - features[1, :4]).abs().max() > 1e-4
-
-
-def test_the_shortest_history_is_long_enough() -> None:
-    for length in (SHORTEST_HISTORY, SHORTEST_HISTORY + 3):
-        student = Student(AdaptiveShape(3, 2, hidden_sizes=(16,), history_length=length))
-        features, _ = student.remember(torch.zeros(2, 3), torch.zeros(2, 2), student.initial_hidden(2))
-        assert features.shape == (2, 3 + 8)

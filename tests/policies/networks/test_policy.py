@@ -29,21 +29,6 @@ def steps(policy: Policy, hidden: Tensor) -> Tensor:
     return torch.stack(features, dim=1)
 
 
-def test_features_are_the_observation_and_the_memory() -> None:
-    shape = PolicyShape(4, 2, memory_size=6)
-    assert (shape.feature_size, PolicyShape(4, 2).feature_size) == (10, 4)
-    memory = shape.new_memory()
-    assert memory is not None and PolicyShape(4, 2).new_memory() is None
-    assert memory.embedding.in_features == 4 + 2
-    for policy in policies(6):
-        assert policy.memory is not None
-        features, hidden = policy.remember(OBSERVATION[:, 0], ACTION[:, 0], torch.ones(3, 6))
-        assert torch.equal(features[:, :4], OBSERVATION[:, 0])
-        inputs = torch.cat([OBSERVATION[:, 0], ACTION[:, 0]], dim=-1)
-        torch.testing.assert_close(hidden, policy.memory.step(inputs, torch.ones(3, 6)))
-        torch.testing.assert_close(features[:, 4:], policy.memory.latent(hidden))
-
-
 @pytest.mark.parametrize("memory_size", [0, 6])
 def test_a_sequence_is_remembered_as_step_by_step(memory_size: int) -> None:
     for policy in policies(memory_size):
@@ -113,17 +98,3 @@ def test_the_bounds_of_actions_have_a_density() -> None:
     for policy in policies(0):
         assert policy.log_prob(OBSERVATION, torch.ones(3, 5, 2)).isfinite().all()
         assert policy.log_prob(OBSERVATION, -torch.ones(3, 5, 2)).isfinite().all()
-
-
-@pytest.mark.parametrize("memory_size", [0, 6])
-def test_nothing_is_made_on_another_device_than_the_policys(memory_size: int) -> None:
-    """On "meta", which holds no values and refuses tensors of the CPU beside its own."""
-    seen, action, start = (values.to("meta") for values in (OBSERVATION, ACTION, torch.zeros(3, 5)))
-    for policy in (policy.to("meta") for policy in policies(memory_size)):
-        hidden = policy.initial_hidden(3)
-        features, after = policy.remember(seen[:, 0], action[:, 0], hidden)
-        sequence = policy.remember_sequence(seen, action, hidden, start)
-        policy.log_prob(sequence, action).mean().backward()
-        acted = policy.act(features)
-        assert {tensor.device.type for tensor in (hidden, features, after, sequence, acted)} == {"meta"}
-        assert (acted.shape, sequence.shape) == ((3, 2), (3, 5, 4 + memory_size))

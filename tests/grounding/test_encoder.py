@@ -1,0 +1,124 @@
+"""Encoders of histories, and another one from a file."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from toy_episodes import no_episodes
+
+from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, mlp
+from astra_data.grounding.files import (
+    load_grounding,
+    load_target_encoder,
+    save_grounding,
+    save_target_encoder,
+)
+from astra_data.grounding.history import HistoryGrounding
+from astra_data.grounding.model import GroundingModel, GroundingShape
+from astra_data.methods import add_method
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
+from astra_data.policies.running_policy import RunningPolicy
+from astra_data.robots.registry import TASKS
+from astra_data.worlds.user_code import user_object
+
+TRANSFORMER = f"{Path(__file__).parents[2]}/recipes/examples/methods/transformer.py:Transformer"
+
+
+@pytest.fixture
+def encoder() -> HistoryEncoder:
+    torch.manual_seed(0)
+    return HistoryEncoder(5, embedding_size=16, latent_size=32)
+
+
+@pytest.mark.parametrize("kind", ["gru", "transformer"])
+def test_step_by_step_is_the_whole_sequence(kind: str) -> None:
+    torch.manual_seed(0)
+    made = {"gru": HistoryEncoder, "transformer": user_object(TRANSFORMER)}[kind]
+    encoder, inputs = made(5, embedding_size=16, latent_size=32), torch.randn(3, 20, 5)
+    latents, memories = encoder.sequence(inputs)
+    memory = encoder.initial(3)
+    for step in range(20):
+        memory = encoder.step(inputs[:, step], memory)
+        torch.testing.assert_close(memory, memories[:, step])
+        torch.testing.assert_close(encoder.latent(memory), latents[:, step])
+    torch.testing.assert_close(encoder.sequence(inputs[:, :7])[0], latents[:, :7])
+
+
+@pytest.mark.usefixtures("forgotten_methods")
+def test_another_encoder_grounds_aligns_and_acts(tmp_path: Path) -> None:
+    add_method("astra_transformer", TRANSFORMER.replace(":Transformer", ":METHOD"))
+    torch.manual_seed(0)
+    shape = GroundingShape(4, 2, 2, latent_size=8, embedding_size=8, encoder="transformer")
+    model = GroundingModel(shape)
+    list(model.correction.parameters())[-1].data.fill_(0.1)
+    save_grounding(tmp_path / "grounding", HistoryGrounding(model), no_episodes())
+    grounding = load_grounding(tmp_path / "grounding")
+    assert isinstance(grounding, HistoryGrounding) and grounding.model.shape == shape
+    state, action, goal = torch.randn(2, 4), torch.rand(2, 2), torch.ones(2, 2)
+    simulator = grounding.simulator(TASKS["antmaze-umaze"], 2)
+    simulator.start(state, torch.arange(2), goal)
+    states, actions = [simulator.state], [torch.zeros(2, 2)]
+    for _ in range(3):
+        states.append(simulator.step(action))
+        actions.append(action)
+    history = model.encoder_input(
+        torch.stack(states, 1), goal[:, None].expand(2, 4, 2), torch.stack(actions, 1)
+    )
+    torch.testing.assert_close(simulator.latent, model.encoder.sequence(history)[0][:, -1])
+    encoder = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8, encoder="transformer")
+    save_target_encoder(tmp_path / "encoder", encoder)
+    policy = ActorCritic(ActorCriticShape(8 + 8, 2))
+    running = RunningPolicy(TASKS["antmaze-umaze"], policy, model, load_target_encoder(tmp_path / "encoder"))
+    running.start(2)
+    first, second = (running.act(torch.ones(2, 29), goal) for _ in range(2))
+    assert not torch.equal(first, second)  # it remembers
+
+
+def test_latents_have_zero_mean_and_unit_variance(encoder: HistoryEncoder) -> None:
+    latents, states = encoder.sequence(3.0 * torch.randn(4, 10, 5))
+    torch.testing.assert_close(latents.mean(-1), torch.zeros(4, 10), atol=1e-5, rtol=0)
+    torch.testing.assert_close(latents.var(-1, unbiased=False), torch.ones(4, 10), atol=0.02, rtol=0)
+    # The length of the hidden state is gone from the latent, which is what the LayerNorm is for.
+    torch.testing.assert_close(encoder.latent(100.0 * states), latents, atol=0.02, rtol=0)
+
+
+def test_position_features_have_halving_wavelengths() -> None:
+    features = PositionFeatures(3)
+    values = features(torch.tensor([[1.5, -2.0]]))[0].tolist()
+    phases = [2 * math.pi * place / wavelength for place in (1.5, -2.0) for wavelength in (16, 8, 4)]
+    assert len(values) == features.size == 12
+    assert values == pytest.approx([math.sin(p) for p in phases] + [math.cos(p) for p in phases], abs=1e-6)
+
+
+def test_a_step_is_that_of_a_gru_written_out(encoder: HistoryEncoder) -> None:
+    """Cho et al. 2014: gates r and z, candidate n, h' = (1 - z) n + z h; the input is embedded with ELU."""
+    inputs, hidden = torch.randn(3, 5), torch.randn(3, 32)
+    embedded = inputs @ encoder.embedding.weight.T + encoder.embedding.bias
+    embedded = torch.where(embedded > 0, embedded, embedded.exp() - 1.0)
+    gru = dict(encoder.recurrence.named_parameters())
+    of_input = (embedded @ gru["weight_ih_l0"].T + gru["bias_ih_l0"]).split(32, dim=-1)
+    of_hidden = (hidden @ gru["weight_hh_l0"].T + gru["bias_hh_l0"]).split(32, dim=-1)
+    reset, update = ((of_input[i] + of_hidden[i]).sigmoid() for i in (0, 1))
+    candidate = torch.tanh(of_input[2] + reset * of_hidden[2])
+    expected = (1.0 - update) * candidate + update * hidden
+    torch.testing.assert_close(encoder.step(inputs, hidden), expected, atol=1e-6, rtol=1e-5)
+
+
+def test_episodes_in_one_sequence_do_not_touch(encoder: HistoryEncoder) -> None:
+    inputs, hidden, start = torch.randn(2, 6, 5), torch.randn(2, 32), torch.zeros(2, 6)
+    start[0, 4] = start[1, 0] = 1.0
+    states = encoder.through_episodes(inputs, hidden, start)
+    torch.testing.assert_close(states[:1, 0], encoder.step(inputs[:1, 0], hidden[:1]))
+    torch.testing.assert_close(states[:1, 4:], encoder.sequence(inputs[:1, 4:])[1])
+    torch.testing.assert_close(states[1:], encoder.sequence(inputs[1:])[1])
+
+
+def test_an_mlp_has_activations_between_its_layers_alone() -> None:
+    network = mlp((3, 4, 5, 2), torch.nn.ReLU)
+    assert [type(layer).__name__ for layer in network] == ["Linear", "ReLU", "Linear", "ReLU", "Linear"]
+    sizes = [
+        (layer.in_features, layer.out_features) for layer in network if isinstance(layer, torch.nn.Linear)
+    ]
+    assert sizes == [(3, 4), (4, 5), (5, 2)]
