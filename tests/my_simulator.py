@@ -105,14 +105,6 @@ class Relapsing(Glider):
         self.state = state.numpy()  # type: ignore[assignment]
 
 
-class Sliding(Glider):
-    """Moves the states that it handed out."""
-
-    def step(self, action: Tensor) -> Tensor:
-        self.state += 0.05 * action
-        return self.state
-
-
 @dataclass
 class Settings:
     """Dataclasses look for their module."""

@@ -1,7 +1,4 @@
-"""The tasks by name: those of the package, of other installed packages, and of files of the user's.
-
-A task of a file or of a package is code, which is run when the task is named.
-"""
+"""Tasks and abstract simulators by name: of this package, of other installed ones, of files of the user's."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -12,20 +9,37 @@ import numpy as np
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, Array, Column
-from astra_data.robots.ant.tasks import ANTMAZE_TASKS
-from astra_data.robots.humanoid.tasks import HUMANOID_TASKS
-from astra_data.robots.nao.tasks import NAO_TASKS
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import expect_tensor, explained, file_of, is_user_code, offered, user_object
 
-TASKS: dict[str, Task] = {task.name: task for task in (*ANTMAZE_TASKS, *NAO_TASKS, *HUMANOID_TASKS)}
-"""The tasks of the package."""
-
 TASK_GROUP = "astra_data.tasks"
 """The group of entry points under which installed packages offer tasks."""
+SIMULATOR_GROUP = "astra_data.simulators"
+"""Likewise, of abstract simulators."""
+
+
+def _task_at(name: str, place: str) -> Task:
+    found = user_object(place)
+    if not isinstance(found, Task):
+        raise BadInputError(f"{name} is a {type(found).__name__}, expected a Task")
+    return found
+
+
+_PLACES = {
+    "antmaze-umaze": "astra_data.robots.ant.tasks:UMAZE",
+    "antmaze-long": "astra_data.robots.ant.tasks:LONG",
+    "nao-navigation": "astra_data.robots.nao.tasks:NAVIGATION",
+    "nao-kick": "astra_data.robots.nao.tasks:KICK",
+    "humanoid-walker2d": "astra_data.robots.humanoid.tasks:WALKER2D",
+    "humanoid-kinematics": "astra_data.robots.humanoid.tasks:KINEMATICS",
+    "humanoid-extended": "astra_data.robots.humanoid.tasks:EXTENDED",
+}
+"""As the entry points of an installed package name them."""
+TASKS: dict[str, Task] = {name: _task_at(name, place) for name, place in _PLACES.items()}
+"""The tasks of the package."""
 
 
 def known_names() -> tuple[str, ...]:
@@ -43,11 +57,8 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
     """
     if name in TASKS:
         return TASKS[name]
-    if is_user_code(name):
-        return _a_task(name, user_object(name))
-    installed = offered(TASK_GROUP)
-    if name in installed:
-        return _a_task(name, user_object(installed[name]))
+    if place := name if is_user_code(name) else offered(TASK_GROUP).get(name):
+        return _task_at(name, place)
     known = (*known_names(), *besides)
     raise BadInputError(
         f"unknown task '{name}'{did_you_mean(name, known)}; name your own task like cart.py:TASK"
@@ -66,16 +77,6 @@ def known_tasks() -> dict[str, Task]:
         BadInputError: a package offers something else, or it fails.
     """
     return {name: task_named(name) for name in known_names()}
-
-
-def _a_task(name: str, found: object) -> Task:
-    if not isinstance(found, Task):
-        raise BadInputError(f"{name} is a {type(found).__name__}, expected a Task")
-    return found
-
-
-SIMULATOR_GROUP = "astra_data.simulators"
-"""The group of entry points under which installed packages offer abstract simulators."""
 
 
 @dataclass(frozen=True)

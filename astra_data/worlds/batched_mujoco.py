@@ -56,13 +56,11 @@ class BatchedPhysics:
     """B independent copies of `model`, stepped `substeps` physics steps per control step.
 
     Attributes:
-        qpos: positions, (B, nq) float64, refreshed by `step` and `set_state`.
-        qvel: velocities, (B, nv) float64, likewise.
-        state: the full state of each copy, warm start included, (B, N) float64; a copy of it can be written
-            back.
-        touching: whether anything touched a watched geom at the end of the copy's last step, (B,) bool.
-        measured: the numbers that `measure` read off each copy when it was last stepped or set, (B, M)
-            float64.
+        qpos: positions, (B, nq) float64, refreshed by `step` and `set_state`. qvel: velocities, (B, nv)
+        float64, likewise. state: the full state of each copy, warm start included, (B, N) float64; a copy of
+        it can be written back. touching: whether anything touched a watched geom at the end of the copy's
+        last step, (B,) bool. measured: the numbers that `measure` read off each copy when it was last stepped
+        or set, (B, M) float64.
     """
 
     def __init__(
@@ -77,13 +75,8 @@ class BatchedPhysics:
     ) -> None:
         """Allocate B copies in the model's initial state.
 
-        Args:
-            model: the model.
-            num_envs: B.
-            substeps: physics steps per control step.
-            watched_geoms: first and last id of the geoms whose contacts are reported, by default none.
-            measure: reads M numbers off a copy that was just stepped or set, without changing its state.
-            num_threads: by default one per core.
+        watched_geoms: first and last id of the geoms whose contacts are reported, by default none. measure:
+        reads M numbers off a copy that was just stepped or set, without changing its state.
         """
         self.model = model
         self.num_envs = num_envs

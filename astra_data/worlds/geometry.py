@@ -24,8 +24,7 @@ class PlanarMap:
     """A rigid motion of the plane: p ↦ R(rotation) p + shift.
 
     Attributes:
-        rotation_rad: angle of R, counterclockwise.
-        shift_m: (x, y).
+        rotation_rad: angle of R, counterclockwise. shift_m: (x, y).
     """
 
     rotation_rad: float = 0.0

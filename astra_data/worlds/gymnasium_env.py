@@ -103,15 +103,12 @@ class GymnasiumRobot:
     ) -> None:
         """Make the environment.
 
-        Args:
-            env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0"; or the
-                class itself, or a function that makes the environment. Wrappers are left out; one that
-                changes actions or observations is refused.
-            read_state: makes the state (S,) of the environment, without its wrappers, and an observation.
-            command: makes an action of the environment of a command (A,) and the state that it is given in.
-            failed: whether the robot failed, from the state after a step and whether the environment
-                terminated; by default the latter, and to terminate at the task's goal is an error.
-            options: of the environment.
+        env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0"; or the class
+        itself, or a function that makes the environment. Wrappers are left out; one that changes actions or
+        observations is refused. read_state: makes the state (S,) of the environment, without its wrappers,
+        and an observation. command: makes an action of the environment of a command (A,) and the state that
+        it is given in. failed: whether the robot failed, from the state after a step and whether the
+        environment terminated; by default the latter, and to terminate at the task's goal is an error.
 
         Raises:
             BadInputError: the environment cannot be made.
@@ -203,15 +200,10 @@ class GymnasiumSimulator(NumpySimulator):
     ) -> None:
         """Make the environment, and begin with B states of zeros.
 
-        Args:
-            num_envs: B.
-            env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0".
-            size: of a state, X.
-            read: returns the abstract state (X,) of the environment, without its wrappers.
-            write: sets it, so that `read` returns it again; this is tried after the first step. All that a
-                step depends on has to be in it.
-            parameters: numbers or texts about it, by default none.
-            options: of the environment.
+        env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0". size: of a
+        state, X. read: returns the abstract state (X,) of the environment, without its wrappers. write: sets
+        it, so that `read` returns it again; this is tried after the first step. All that a step depends on
+        has to be in it. parameters: numbers or texts about it, by default none.
 
         Raises:
             BadInputError: the environment cannot be made.

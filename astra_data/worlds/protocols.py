@@ -1,23 +1,4 @@
-"""The interfaces of abstract simulators.
-
-A class of your own is a `Simulator`; `astra-data pair --simulator cart.py:Cart` pairs a dataset with it:
-
-    class Cart:
-        abstract_state = Column("abstract.state", size=2, names=("x", "v"))
-        parameters = {"timestep_s": 0.05}
-
-        def __init__(self, num_envs: int) -> None: ...
-
-        @staticmethod
-        def abstraction(state: Array) -> Array: ...                               # φ: (B, S) -> (B, 2)
-
-        def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None: ...
-
-        def step(self, action: Tensor) -> Tensor: ...                             # (B, A) -> (B, 2)
-
-`self.state` holds the present states. A simulator that policies are trained in also needs what
-`TaskSimulator` adds.
-"""
+"""Interfaces of abstract simulators, a user's `Simulator` among them, and of batched environments."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,15 +17,12 @@ class SteppedSimulator(Protocol):
     @property
     def state(self) -> Tensor:
         """The present states, (B, X) float32."""
-        ...
 
     def reset_to(self, state: Tensor, rows: Tensor | None = None) -> None:
         """Set `rows` (n,), by default all, to `state` (n, X)."""
-        ...
 
     def step(self, action: Tensor) -> Tensor:
         """Apply `action` (B, A); return the new states (B, X)."""
-        ...
 
 
 class AbstractSimulator(SteppedSimulator, Protocol):
@@ -53,7 +31,6 @@ class AbstractSimulator(SteppedSimulator, Protocol):
     @property
     def parameters(self) -> Mapping[str, float]:
         """Numbers or texts that a dataset paired with this simulator records about it."""
-        ...
 
 
 class Simulator(AbstractSimulator, Protocol):
@@ -91,7 +68,6 @@ class Simulator(AbstractSimulator, Protocol):
     @staticmethod
     def abstraction(state: Any) -> Any:  # noqa: ANN401 - numpy arrays of either precision
         """Map target states (B, S) to abstract states (B, X), numpy in, numpy out."""
-        ...
 
 
 class PlacedSimulator(SteppedSimulator, Protocol):
@@ -100,14 +76,12 @@ class PlacedSimulator(SteppedSimulator, Protocol):
     @property
     def blocked(self) -> Tensor:
         """Which states (B,) were stopped at the edge of the free space in the last step, bool."""
-        ...
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X).
 
         What the correction cannot tell may be drawn, with torch's generator.
         """
-        ...
 
 
 @runtime_checkable
@@ -116,7 +90,6 @@ class WalledSimulator(Protocol):
 
     def keep_clear(self, distance_m: float) -> None:
         """Let corrections end no closer to walls than `distance_m`."""
-        ...
 
 
 def keep_clear(simulator: object, distance_m: float) -> None:
@@ -130,7 +103,6 @@ class VariableSimulator(PlacedSimulator, Protocol):
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use `parameters` by name, (B, 1) each, from the next step on; those without effect are ignored."""
-        ...
 
 
 class TaskSimulator(VariableSimulator, AbstractSimulator, Protocol):
@@ -172,11 +144,9 @@ class BatchedEnv(Protocol):
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Restart the rows in `mask` (B,), by default all; return observations (B, O)."""
-        ...
 
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A) to every row."""
-        ...
 
 
 class TargetEnv(BatchedEnv, Protocol):
@@ -191,42 +161,33 @@ class TargetEnv(BatchedEnv, Protocol):
     @property
     def state(self) -> Tensor:
         """The full target states, (B, S) float32."""
-        ...
 
     @property
     def position(self) -> Tensor:
         """True positions of robots, then of their balls where there are any, (B, 2) or (B, 4) float32, m."""
-        ...
 
     @property
     def failed(self) -> Tensor:
         """Which robots failed in their last step, (B,) bool."""
-        ...
 
     @property
     def wall_contact(self) -> Tensor:
         """Which robots touched a wall in their last step, (B,) bool."""
-        ...
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers at `seed`."""
-        ...
 
     def reset_to(self, rows: NDArray[np.intp], state: NDArray[np.float64]) -> None:
         """Set the robots `rows` (n,) to `state` (n, S)."""
-        ...
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Apply `action` (B, A); rows outside `active` (B,) stay as they are."""
-        ...
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
-        ...
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
-        ...
 
 
 def rows_in(mask: Tensor | None, num_envs: int) -> NDArray[np.intp]:

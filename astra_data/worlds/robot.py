@@ -33,20 +33,17 @@ class Robot(Protocol):
 
     def reset(self) -> State:
         """Bring the robot to where an episode starts; return its state (S,)."""
-        ...
 
     def step(self, command: NDArray[np.float64]) -> tuple[State, bool]:
         """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed."""
-        ...
 
 
 class RobotEnv:
     """B robots, stepped one after another, as a batched target environment.
 
     Attributes:
-        goal: (B, G) float32.
-        failed: which robots failed in their last step, by their own account or the objective's, (B,) bool.
-        wall_contact: none of them, (B,) bool: robots do not tell.
+        goal: (B, G) float32. failed: which robots failed in their last step, by their own account or the
+        objective's, (B,) bool. wall_contact: none of them, (B,) bool: robots do not tell.
     """
 
     def __init__(
@@ -64,16 +61,8 @@ class RobotEnv:
     ) -> None:
         """Build B robots.
 
-        Args:
-            objective: of the task.
-            num_envs: B.
-            robot: builds one.
-            state: the column of its states.
-            commands: the bounds of its commands.
-            abstraction: φ.
-            seed: of goals, and of the robots if they take one.
-            num_threads: without effect.
-            start_anywhere: without effect: a robot starts where it is put.
+        robot: builds one. state: the column of its states. commands: the bounds of its commands. abstraction:
+        φ.
         """
         self.num_envs, self.action_size = num_envs, len(commands)
         self._objective, self._column, self._commands = objective, state, commands

@@ -71,11 +71,8 @@ class NumpySimulator(FreeStates):
     ) -> None:
         """Begin with B states of zeros.
 
-        Args:
-            num_envs: B.
-            function: maps states (B, X) and commands (B, A), both float64, to the next states (B, X).
-            size: of a state, X.
-            parameters: numbers or texts about it, by default none.
+        function: maps states (B, X) and commands (B, A), both float64, to the next states (B, X). size: of a
+        state, X. parameters: numbers or texts about it, by default none.
         """
         super().__init__(torch.zeros(num_envs, size))
         self._function = function
@@ -110,11 +107,8 @@ class ColdSteps:
     ) -> Floats:
         """Return where `substeps` physics steps under a constant control lead.
 
-        Args:
-            model: the model, or one for each of the B copies, which differ in numbers alone.
-            motion: qpos then qvel, (B, nq + nv).
-            control: of the actuators, (B, nu).
-            substeps: their number.
+        model: the model, or one for each of the B copies, which differ in numbers alone. motion: qpos then
+        qvel, (B, nq + nv). control: of the actuators, (B, nu). substeps: their number.
 
         Returns:
             qpos then qvel after them, (B, nq + nv).
@@ -142,12 +136,6 @@ class MujocoModel(FreeStates):
         self, model: mujoco.MjModel, num_envs: int, *, substeps: int, num_threads: int | None = None
     ) -> None:
         """Allocate B copies in the model's initial state.
-
-        Args:
-            model: the model.
-            num_envs: B.
-            substeps: physics steps per step.
-            num_threads: by default one per core.
 
         Raises:
             BadInputError: the model's actuators have states of their own, which (qpos, qvel) leaves out.

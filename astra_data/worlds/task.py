@@ -1,4 +1,4 @@
-"""The entries of a task's columns, one row each."""
+"""A task: target environment, abstract simulator, the map between their states, and the objective."""
 
 import inspect
 import re
@@ -34,25 +34,21 @@ class ColumnEntry(NamedTuple):
     role: str
 
 
-PLANAR_STATE = (
-    ColumnEntry("x", "m", "world", "position"),
-    ColumnEntry("y", "m", "world", "position"),
-    ColumnEntry("vx", "m/s", "world", "vector"),
-    ColumnEntry("vy", "m/s", "world", "vector"),
-)
+def entries(names: str, unit: str, frame: str, role: str) -> tuple[ColumnEntry, ...]:
+    """Return an entry for each of `names`, which are apart by blanks; unit, frame and role are the same."""
+    return tuple(ColumnEntry(name, unit, frame, role) for name in names.split())
+
+
+PLANAR_STATE = (*entries("x y", "m", "world", "position"), *entries("vx vy", "m/s", "world", "vector"))
 """Abstract states of a robot in the plane."""
-
-PLANAR_GOAL = (
-    ColumnEntry("goal_x", "m", "world", "position"),
-    ColumnEntry("goal_y", "m", "world", "position"),
-)
+PLANAR_GOAL = entries("goal_x goal_y", "m", "world", "position")
 
 
-def column(name: str, entries: Sequence[ColumnEntry], meaning: str) -> Column:
-    """Return the column `name` with `entries`."""
-    names, units, frames, roles = zip(*entries, strict=True)
+def column(name: str, values: Sequence[ColumnEntry], meaning: str) -> Column:
+    """Return the column `name` with `values`."""
+    names, units, frames, roles = zip(*values, strict=True)
     astra = {"unit": [*units], "frame": [*frames], "role": [*roles]}
-    return Column(name, size=len(entries), names=names, meaning=meaning, astra=astra)
+    return Column(name, size=len(values), names=names, meaning=meaning, astra=astra)
 
 
 def names_with_units(column: Column) -> list[str]:
@@ -74,19 +70,16 @@ def repeated_names(column: Column | None) -> list[str]:
 
 def free_body(joints: Sequence[str]) -> list[ColumnEntry]:
     """Return the entries of MuJoCo's qpos, then qvel, of a free body with hinge `joints`, in their order."""
+    rates = " ".join(f"{joint}_rate" for joint in joints)
     return [
-        ColumnEntry("x", "m", "world", "position"),
-        ColumnEntry("y", "m", "world", "position"),
+        *entries("x y", "m", "world", "position"),
         ColumnEntry("z", "m", "world", "invariant"),
-        *(ColumnEntry(name, "1", "world", "quaternion") for name in ("qw", "qx", "qy", "qz")),
-        *(ColumnEntry(joint, "rad", "joint", "invariant") for joint in joints),
-        ColumnEntry("vx", "m/s", "world", "vector"),
-        ColumnEntry("vy", "m/s", "world", "vector"),
+        *entries("qw qx qy qz", "1", "world", "quaternion"),
+        *entries(" ".join(joints), "rad", "joint", "invariant"),
+        *entries("vx vy", "m/s", "world", "vector"),
         ColumnEntry("vz", "m/s", "world", "invariant"),
-        ColumnEntry("wx", "rad/s", "body", "invariant"),
-        ColumnEntry("wy", "rad/s", "body", "invariant"),
-        ColumnEntry("wz", "rad/s", "body", "invariant"),
-        *(ColumnEntry(f"{joint}_rate", "rad/s", "joint", "invariant") for joint in joints),
+        *entries("wx wy wz", "rad/s", "body", "invariant"),
+        *entries(rates, "rad/s", "joint", "invariant"),
     ]
 
 
@@ -100,10 +93,9 @@ class Varied:
     """How the parameters of an abstract simulator vary from episode to episode.
 
     Attributes:
-        kind: of simulator whose parameters vary; built from a plain one and the ranges.
-        randomized: what domain randomization varies, in which ranges.
-        wide: what COMPASS varies or identifies, and RMA adapts to; its kind is that of all parameters that
-            the simulator has.
+        kind: of simulator whose parameters vary; built from a plain one and the ranges. randomized: what
+        domain randomization varies, in which ranges. wide: what COMPASS varies or identifies, and RMA adapts
+        to; its kind is that of all parameters that the simulator has.
     """
 
     kind: Callable[[VariableSimulator, Variation], VariedSimulator]
@@ -190,11 +182,7 @@ class Task:
     derived: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Fill in the defaults.
-
-        Raises:
-            BadInputError: the fields contradict each other, or a simulator has no φ; lists every fault.
-        """
+        """Fill in the defaults."""
         for one in fields(self):
             if one.name in self.derived and getattr(self, one.name) is self.derived[one.name]:
                 object.__setattr__(self, one.name, one.default)

@@ -1,4 +1,4 @@
-"""Objects from the user's code: "cart.py:TASK" in a file, "package.module:TASK" in an installed package."""
+"""The user's code: "cart.py:TASK" in a file, "package.module:TASK" in a package; its digests and faults."""
 
 import ast
 import hashlib
@@ -27,6 +27,14 @@ from astra_data.worlds.protocols import AbstractSimulator
 _PREFIX = "astra_data_user_"
 """Of the names of modules that are files of the user's."""
 _PACKAGE = Path(__file__).parents[1]
+_NOT_READ = (".log", ".py", ".pyc")
+"""Endings of files that code names and does not read as data: what it writes, and code, which it imports."""
+_WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) else {}
+"""What makes `ast.dump` write the same in each version of Python, for digests."""
+_INSTALLED = ("site-packages", "dist-packages")
+"""Names of folders in which what lies side by side need not belong together."""
+_TOLERANCE = 1e-4
+"""Between states, relative to their size: simulators compute in single precision."""
 
 
 def is_user_code(name: str) -> bool:
@@ -49,6 +57,17 @@ def found_near(name: str, folder: Path) -> str:
     return name if found == Path.cwd() else str(found / name)
 
 
+def offered(group: str) -> dict[str, str]:
+    """Return what installed packages offer under a group of entry points: places of objects by name."""
+    return {point.name: point.value for point in entry_points(group=group)}
+
+
+def file_of(name: str) -> dict[str, str]:
+    """Return the sha256 of the file that `name` begins with, as "file_sha256"; empty where it is none."""
+    place = Path(name.rpartition(":")[0])
+    return {"file_sha256": file_digest(place)} if place.suffix == ".py" and place.is_file() else {}
+
+
 def user_object(name: str) -> Any:  # noqa: ANN401 - any object
     """Run the file or module that `name` begins with, and return the object that it ends with.
 
@@ -62,17 +81,6 @@ def user_object(name: str) -> Any:  # noqa: ANN401 - any object
             f"{place} has no '{attribute}'; it has {', '.join(_public_names(module)) or 'nothing'}"
         )
     return getattr(module, attribute)
-
-
-def offered(group: str) -> dict[str, str]:
-    """Return what installed packages offer under a group of entry points: the place of each, by name."""
-    return {point.name: point.value for point in entry_points(group=group)}
-
-
-def file_of(name: str) -> dict[str, str]:
-    """Return the sha256 of the file that `name` begins with, as "file_sha256"; empty where it is none."""
-    place = Path(name.rpartition(":")[0])
-    return {"file_sha256": file_digest(place)} if place.suffix == ".py" and place.is_file() else {}
 
 
 def _of_file(path: Path) -> ModuleType:
@@ -89,7 +97,7 @@ def _of_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
     try:
-        with explained(f"importing {path}"), _among_neighbors(path.resolve()):
+        with explained(f"importing {path}"), _among_neighbors(str(path.resolve().parent)):
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
@@ -97,39 +105,39 @@ def _of_file(path: Path) -> ModuleType:
     return module
 
 
-_APPENDED: set[str] = set()
-"""Folders of files of the user's that stand at the end of Python's path."""
+def _of_package(name: str) -> ModuleType:
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise BadInputError(f"{name}: expected a Python file, such as cart.py, or a module, package.module")
+    with explained(f"importing {name}"):
+        return importlib.import_module(name)
 
 
 @contextmanager
-def _among_neighbors(path: Path) -> Iterator[None]:
-    """Let a file import those beside it, whatever files of their names other files of the user's imported.
+def _among_neighbors(folder: str) -> Iterator[None]:
+    """Let a file import those in its `folder`, not files of the same names beside other files of the user's.
 
-    Installed packages come first. What the others imported is theirs again afterwards.
+    Installed packages come first. What the other files imported is theirs again afterwards.
     """
-    folder, loaded, places = path.parent, dict(sys.modules), [*sys.path]
-    known = {_folder_of(module) for name, module in loaded.items() if name.startswith(_PREFIX)} - {folder}
-    theirs = {}
-    with suppress(BadInputError):  # what is no Python is told where it is run
-        for file, _ in with_neighbors([path], path.parent):
-            if file.stem in loaded and _folder_of(loaded[file.stem]) in known:
-                theirs[file.stem] = sys.modules.pop(file.stem)
-    ours = [len(places) - 1 - places[::-1].index(place) for place in _APPENDED if place in places]
-    inserted = f"{folder}"
-    sys.path.insert(min(ours, default=len(places)), inserted)
+    files = {name: getattr(module, "__file__", None) or "" for name, module in sys.modules.items()}
+    places = {
+        name: os.path.dirname(os.path.realpath(file)) for name, file in files.items() if _PREFIX in name
+    }
+    others = {*places.values()} - {folder}
+    theirs = {
+        name: sys.modules.pop(name)
+        for name, file in files.items()
+        if name not in places and others and os.path.dirname(file) in others
+    }
+    paths = [*sys.path]
+    sys.path[:] = [*(path for path in paths if path not in others), folder]
     try:
         yield
     finally:
+        added = [path for path in sys.path if path not in (*paths, folder)]
+        sys.path[:] = [*added, *paths]
         sys.modules.update(theirs)
-        sys.path[:] = [place for place in sys.path if place is not inserted]
-    if f"{folder}" not in sys.path:
-        sys.path.append(f"{folder}")  # what is imported later, too, unless the file failed
-        _APPENDED.add(f"{folder}")
-
-
-def _folder_of(module: ModuleType) -> Path | None:
-    file = getattr(module, "__file__", None)
-    return Path(file).resolve().parent if file else None
+    if folder not in sys.path:
+        sys.path.append(folder)  # of what is imported later
 
 
 def _public_names(module: ModuleType) -> list[str]:
@@ -142,13 +150,6 @@ def _public_names(module: ModuleType) -> list[str]:
         and type(value).__module__ not in ("__future__", "typing")
         and not (isinstance(value, type | FunctionType) and value.__module__ != module.__name__)
     ]
-
-
-def _of_package(name: str) -> ModuleType:
-    if not all(part.isidentifier() for part in name.split(".")):
-        raise BadInputError(f"{name}: expected a Python file, such as cart.py, or a module, package.module")
-    with explained(f"importing {name}"):
-        return importlib.import_module(name)
 
 
 @contextmanager
@@ -179,20 +180,12 @@ def _place(error: BaseException) -> str:
     """
     if isinstance(error, SyntaxError):
         return ""
-    own = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
+    users = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
     frames = traceback.extract_tb(error.__traceback__)
-    last = next((frame for frame in reversed(frames) if frame.filename in own), frames[-1])
+    last = next((frame for frame in reversed(frames) if frame.filename in users), frames[-1])
     if last.filename.startswith("<frozen") or Path(last.filename).is_relative_to(_PACKAGE):
         return ""
     return f" ({Path(last.filename).name}, line {last.lineno})"
-
-
-_NOT_READ = (".log", ".py", ".pyc")
-"""Endings of files that code names and does not read as data: what it writes, and code, which it imports."""
-_WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) else {}
-"""What makes `ast.dump` write the same in each version of Python, for digests."""
-_INSTALLED = ("site-packages", "dist-packages")
-"""Names of folders in which what lies side by side need not belong together."""
 
 
 def code_digest(name: str) -> str | None:
@@ -211,7 +204,7 @@ def code_digest(name: str) -> str | None:
     if not files or not files[0].is_file():
         return None
     digest = hashlib.sha256()
-    for path, tree in with_neighbors(files, folder):
+    for path, tree in _with_neighbors(files, folder):
         name = path.relative_to(folder).as_posix()
         digest.update(f"{name}\n{ast.dump(tree, **_WHOLE)}\n".encode())
         for file in _named_beside(path, tree):
@@ -219,12 +212,8 @@ def code_digest(name: str) -> str | None:
     return digest.hexdigest()
 
 
-def with_neighbors(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast.Module]]:
-    """Yield `files` and those in `folder` that they import, all of a package, each once, and what is in it.
-
-    Raises:
-        BadInputError: one of those in `folder` is no Python.
-    """
+def _with_neighbors(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast.Module]]:
+    """Yield `files` and those in `folder` that they import, all of a package, each once with its content."""
     todo, seen = [*files], set[Path]()
     while todo:
         path = todo.pop()
@@ -258,9 +247,7 @@ def _installed(module: str) -> tuple[list[Path], Path]:
         places = spec.submodule_search_locations
         if spec.origin and spec.origin.endswith(".py"):  # a folder of packages has none
             file = Path(spec.origin)
-            if places:
-                return sorted(file.parent.rglob("*.py")), file.parents[1]
-            return [file], file.parent
+            return (sorted(file.parent.rglob("*.py")), file.parents[1]) if places else ([file], file.parent)
     return [], Path()
 
 
@@ -311,15 +298,11 @@ def _imported(tree: ast.Module) -> set[str]:
     return names
 
 
-_PACKAGE_NAME = __name__.partition(".")[0]
-
-
 class Saved(Protocol):
     """What can be saved."""
 
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """Return tensors and metadata (JSON values)."""
-        ...
 
 
 def parts_of(learned: Saved) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
@@ -334,7 +317,8 @@ def parts_of(learned: Saved) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
     is_pair = isinstance(returned, tuple | list) and len(returned) == 2
     if not (is_pair and all(isinstance(values, Mapping) for values in returned)):
         raise BadInputError(
-            f"{what}: expected a pair, a dict of tensors and one of JSON values, got {_kinds_in(returned)}"
+            f"{what}: expected a pair, a dict of tensors and one of JSON values, got a "
+            f"{type(returned).__name__}"
         )
     tensors, metadata = returned
     faults = [
@@ -342,11 +326,12 @@ def parts_of(learned: Saved) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         for name, value in tensors.items()
         if not isinstance(value, Tensor)
     ]
-    faults += [
-        f"{name!r} is a {type(value).__name__}, expected a JSON value, or it among the tensors"
-        for name, value in metadata.items()
-        if not _is_json(value)
-    ]
+    for name, value in metadata.items():
+        try:
+            json.dumps(value)
+        except (TypeError, ValueError):
+            kind = type(value).__name__
+            faults.append(f"{name!r} is a {kind}, expected a JSON value, or it among the tensors")
     if faults:
         raise BadInputError(f"{what}: {'; '.join(faults)}")
     return tensors, metadata
@@ -358,45 +343,20 @@ def restored[Learned](
     """Return what `from_file` of the class `made` returns.
 
     Raises:
-        BadInputError: it is a class of the user's, and fails; names what it asks for and the file has not.
+        BadInputError: it is a class of the user's, and fails.
         KeyError, TypeError, ValueError, RuntimeError: it is one of the package, and fails.
     """
     from_file: Any = made.from_file  # type: ignore[attr-defined]
-    if made.__module__.partition(".")[0] == _PACKAGE_NAME:
+    if made.__module__.partition(".")[0] == _PACKAGE.name:
         return from_file(tensors, metadata, *device)  # type: ignore[no-any-return]
-    what = f"{made.__name__}.from_file"
     try:
-        with explained(what):
+        with explained(f"{made.__name__}.from_file"):
             return from_file(tensors, metadata, *device)  # type: ignore[no-any-return]
     except BadInputError as error:
-        cause, line = error.__cause__, " ".join(f"{error}".split())
-        asked = cause.args[0] if isinstance(cause, KeyError) and cause.args else None
-        if isinstance(asked, str) and asked not in {*tensors, *metadata}:
-            line = (
-                f"{what} asks for {asked!r}, which its to_file did not write: the file has the tensors "
-                f"{', '.join(tensors)}, and {', '.join(metadata) or 'nothing'} beside them"
-            )
-        raise BadInputError(f"{line}: correct it or to_file, and run that stage again") from error
-
-
-def _kinds_in(returned: object) -> str:
-    """Return the types of what is no pair of dicts."""
-    kind = f"a {type(returned).__name__}"
-    if not isinstance(returned, tuple | list):
-        return kind
-    return f"{kind} of {', '.join(type(value).__name__ for value in returned) or 'nothing'}"
-
-
-def _is_json(value: object) -> bool:
-    try:
-        json.dumps(value)
-    except (TypeError, ValueError):
-        return False
-    return True
-
-
-_TOLERANCE = 1e-4
-"""Between states, relative to their size: simulators compute in single precision."""
+        raise BadInputError(
+            f"{error}: the file has the tensors {', '.join(tensors)}, and {', '.join(metadata) or 'nothing'} "
+            "beside them: correct it or to_file, and run that stage again"
+        ) from error
 
 
 def expect(
@@ -412,10 +372,9 @@ def expect(
         BadInputError: it is something else.
     """
     found = expect_tensor(what, found)
-    fits = found.dim() == len(shape) and all(
-        size in (-1, length) for size, length in zip(shape, found.shape, strict=True)
-    )
-    if not fits:
+    if len(shape) != found.dim() or any(
+        size not in (-1, length) for size, length in zip(shape, found.shape, strict=True)
+    ):
         expected = str(shape).replace("-1", "any")
         raise BadInputError(f"{what}: expected shape {expected}, got {tuple(found.shape)}")
     if dtype is not None and found.dtype != dtype:
@@ -425,23 +384,22 @@ def expect(
             f"{what}: expected a tensor on {device}, where its inputs are, got {found.device}"
         )
     if not found.isfinite().all():
-        raise BadInputError(f"{what}: expected finite numbers, got {first(found[~found.isfinite()])}")
+        raise BadInputError(f"{what}: expected finite numbers, got {float(found[~found.isfinite()][0])}")
     return found
 
 
-def expect_same(what: str, shown: object, expected: Tensor, where: str = "") -> None:
+def expect_same(what: str, shown: object, expected: Tensor) -> None:
     """Refuse states (B, X), `shown`, that are not the `expected` ones but for rounding.
 
     Raises:
-        BadInputError: they are others; tells those that are furthest apart.
+        BadInputError: they are others; names the entry that is furthest off.
     """
     shown = expect(what, shown, tuple(expected.shape))
     if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
         row, entry = ((shown - expected).abs() == (shown - expected).abs().max()).nonzero()[0].tolist()
         raise BadInputError(
-            f"{what} {where}".rstrip()
-            + f": expected {first(expected[row, entry]):g} in row {row}, entry {entry}, got "
-            f"{first(shown[row, entry]):g}"
+            f"{what}: expected {float(expected[row, entry]):g} in row {row}, entry {entry}, got "
+            f"{float(shown[row, entry]):g}"
         )
 
 
@@ -460,21 +418,11 @@ def stepped(simulator: AbstractSimulator, command: Tensor, what: str) -> Tensor:
     """Return the states (B, X) that a step with `command` (B, A) leads to; errors begin with `what`.
 
     Raises:
-        BadInputError: the step fails, returns no tensor, or changes the states that were handed out before.
+        BadInputError: the step fails, or returns no tensor.
     """
     with explained(what):
-        before = simulator.state
-        kept = before.clone()
         landed = simulator.step(command)
-    landed = expect_tensor(what, landed)
-    if not torch.equal(before, kept):
-        raise BadInputError(f"{what} changes the states handed out before: expected a new tensor")
-    return landed
-
-
-def first(values: Tensor) -> float:
-    """Return the first of `values`, of any shape."""
-    return float(values.flatten()[0])
+    return expect_tensor(what, landed)
 
 
 def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tensor:

@@ -1,8 +1,7 @@
 """Walk through a task, and name what is wrong with it, before anything long begins."""
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -57,7 +56,7 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
         return faults
     starts = starts.to(simulator.state.device)
     if tried(_reset, simulator, starts):
-        landed = tried(_step, simulator, starts, device)
+        landed = tried(_step, simulator, starts)
         apart = None if faults else tried(_starts_apart, simulator, starts)
         if apart:
             _log.warning(f"task {task.name}: {apart}")
@@ -176,62 +175,11 @@ def _reset(task: Task, simulator: AbstractSimulator, starts: Tensor) -> bool:
     return True
 
 
-def _step(task: Task, simulator: AbstractSimulator, starts: Tensor, device: str) -> Tensor:
-    what = "make_simulator: step(command)"
-    command = _commands(task).to(starts.device)
-
-    def landing(rows: slice) -> Tensor:
-        count = len(starts[rows])
-        batch = simulator if count == _COUNT else task.own_simulator(count, device)
-        with explained(what):
-            batch.reset_to(starts[rows].clone())
-        landed = stepped(batch, command[rows].clone(), what)
-        expect(f"{what} of shape {tuple(command[rows].shape)}", landed, (count, starts.shape[1]))
-        return landed.clone()
-
-    landed = landing(slice(None))
-    if torch.equal(landed, landing(slice(None))):
-        for row in range(_COUNT):
-            alone = landing(slice(row, row + 1))
-            expect_same(f"{what}: row {row} by itself and", alone, landed[row : row + 1], "in the batch")
-    elif _remembers(lambda: task.own_simulator(_COUNT, device), starts, command):
-        raise BadInputError(
-            f"{what}: expected a result that depends on the state alone, but it depends on commands before "
-            "reset_to(state): reset all memory there, such as filters and delays"
-        )
-    return landed  # of a noisy one, whose rows cannot be compared, too
-
-
-def _remembers(build: Callable[[], AbstractSimulator], starts: Tensor, command: Tensor) -> bool:
-    """Return whether a step after `reset_to` depends on the command before, with the same noise.
-
-    Noise that no seed repeats hides it: then nothing is said.
-    """
-
-    def landed(earlier: Tensor) -> Tensor:
-        with _seeded(), explained("make_simulator: step(command)"):
-            simulator = build()  # with the same seeds, too, for generators of its own
-            simulator.reset_to(starts.clone())
-            simulator.step(earlier.clone())
-        with _seeded(), explained("make_simulator: step(command)"):
-            simulator.reset_to(starts.clone())
-            return simulator.step(command.clone()).clone()
-
-    plain = landed(command)
-    return torch.equal(plain, landed(command)) and not torch.equal(plain, landed(command.flip(0)))
-
-
-@contextmanager
-def _seeded() -> Iterator[None]:
-    """Let torch's and NumPy's global random numbers begin anew, and go on as before afterwards."""
-    before = np.random.get_state()
-    try:
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            np.random.seed(0)
-            yield
-    finally:
-        np.random.set_state(before)
+def _step(task: Task, simulator: AbstractSimulator, starts: Tensor) -> Tensor:
+    what, command = "make_simulator: step(command)", _commands(task).to(starts.device)
+    simulator.reset_to(starts.clone())
+    landed = stepped(simulator, command.clone(), what)
+    return expect(f"{what} of shape {tuple(command.shape)}", landed, tuple(starts.shape)).clone()
 
 
 def _starts_apart(task: Task, simulator: AbstractSimulator, starts: Tensor) -> str:

@@ -1,14 +1,28 @@
+import hashlib
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
+import my_simulator
 import numpy as np
 import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, STATE
-from astra_data.robots.registry import TASK_GROUP, TASKS, known_names, known_tasks, place_of, task_named
+from astra_data.robots.registry import (
+    SIMULATOR_GROUP,
+    TASK_GROUP,
+    TASKS,
+    built,
+    checked_abstraction,
+    known_names,
+    known_tasks,
+    pairing_named,
+    place_of,
+    task_named,
+)
 from astra_data.worlds import user_code
-from astra_data.worlds.plane.mazes import FreeSpace
+from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import VariedSimulator
 
@@ -48,26 +62,6 @@ def test_simulators_vary(task: Task) -> None:
     torch.testing.assert_close(landed[2], task.simulator(3).step(action))
 
 
-IN_A_MAZE = [task for task in TASKS.values() if task.plane is not None]
-
-
-@pytest.mark.parametrize("task", IN_A_MAZE, ids=lambda task: task.name)
-def test_targets_start_in_the_free_space(task: Task) -> None:
-    env = task.target(2, seed=0, num_threads=1)
-    env.reset()
-    free = FreeSpace.of_maze(task.maze, radius_m=0.1)
-    assert not free.blocked[free.cells(task.abstraction(env.state)[:, :2])].any()
-
-
-@pytest.mark.parametrize("task", IN_A_MAZE, ids=lambda task: task.name)
-def test_the_horizon_leaves_time_to_walk(task: Task) -> None:
-    maze = task.maze
-    start = maze.fine_index(np.array(maze.cell_center(*maze.start)))
-    meters = maze.distance_field(np.array(maze.cell_center(*maze.goal)))[start]
-    # Below the largest command along one axis, 1 m/s, with time to spare.
-    assert meters / (task.objective.horizon * task.timestep_s) < 0.8
-
-
 def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -85,6 +79,84 @@ def test_an_unknown_task_answers_with_the_known_ones() -> None:
         task_named("antmaze-umase")
 
 
-@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
-def test_a_task_in_a_maze_has_an_objective_there(task: Task) -> None:
-    assert (task.objective.layout is None) == (task.plane is None)
+MINE = Path(my_simulator.__file__)
+STATES = np.arange(87, dtype=np.float32).reshape(3, 29)
+
+
+def test_a_task_brings_its_own_simulator() -> None:
+    pairing, task = pairing_named("antmaze-umaze"), TASKS["antmaze-umaze"]
+    assert (pairing.id, pairing.origin, pairing.maze) == ("point_mass", {"task": "antmaze-umaze"}, U_MAZE)
+    assert pairing.abstract_state == task.abstract_state
+    assert built(pairing, 5).state.shape == (5, 4)
+    np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, [0, 1, 15, 16]])
+    assert pairing_named("humanoid-kinematics").maze is None
+    # Commands of ±1 need no bounds.
+    assert pairing.commands is None
+    assert dict(pairing_named("small_cart:TASK").commands or {}) == {"v": (-1.0, 4.0)}
+
+
+def test_a_class_of_a_file_is_known_by_its_name_and_the_files_digest() -> None:
+    pairing = pairing_named(f"{MINE}:Glider")
+    assert (pairing.id, pairing.maze) == ("Glider", None)
+    assert pairing.origin == {"file_sha256": hashlib.sha256(MINE.read_bytes()).hexdigest()}
+    batch = built(pairing, 2)
+    batch.reset_to(torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
+    batch.reset_to(torch.tensor([[5.0, 6.0]]), torch.tensor([1]))
+    assert batch.step(torch.tensor([[2.0, 0.0], [0.0, -2.0]])).tolist() == pytest.approx(
+        np.array([[1.1, 2.0], [5.0, 5.9]])
+    )
+    np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, :2])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("1 / 0", r"importing .*sim.py fails with ZeroDivisionError: division by zero \(sim.py, line 1\)$"),
+        ("class Other: pass", r"sim.py has no 'Mine'; it has Other$"),
+        (
+            "class Mine: pass",
+            r"has no abstract_state, abstraction, parameters, reset_to, step: expected what a",
+        ),
+        (
+            "class Mine:\n    abstract_state = abstraction = parameters = reset_to = step = 1",
+            r"sim.py:Mine.abstract_state is a int, expected a Column",
+        ),
+    ],
+)
+def test_a_file_without_a_simulator_is_refused(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "sim.py").write_text(text)
+    with pytest.raises(BadInputError, match=told):
+        pairing_named(f"{tmp_path}/sim.py:Mine")
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("Narrow", r"Narrow\(4\).state has shape \(4, 1\), expected \(4, 2\)"),
+        ("Bare", r"Bare.parameters: expected numbers or texts for maze"),
+        ("Clumsy", r"Clumsy\(4\) fails with TypeError"),
+    ],
+)
+def test_a_batch_of_another_kind_is_refused(kind: str, told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        built(pairing_named(f"{MINE}:{kind}"), 4)
+
+
+def test_a_map_to_another_shape_is_refused() -> None:
+    with pytest.raises(BadInputError, match=r"Wide makes \(3, 3\) of states \(3, 29\), expected \(3, 2\)"):
+        checked_abstraction(pairing_named(f"{MINE}:Wide"), STATES)
+    with pytest.raises(BadInputError, match=r"Greedy, given states \(3, 29\), fails with IndexError"):
+        checked_abstraction(pairing_named(f"{MINE}:Greedy"), STATES)
+
+
+def test_installed_packages_offer_simulators_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    offered = [
+        EntryPoint(name, "my_simulator:Glider", SIMULATOR_GROUP) for name in ("glider", "antmaze-umaze")
+    ]
+    monkeypatch.setattr(user_code, "entry_points", lambda group: {SIMULATOR_GROUP: offered}.get(group, []))
+    pairing = pairing_named("glider")
+    assert (pairing.id, pairing.origin) == ("glider", {"package": "my_simulator:Glider"})
+    assert pairing.simulator(2).step(torch.ones(2, 2)).tolist() == pytest.approx(np.full((2, 2), 0.05))
+    assert pairing_named("antmaze-umaze").id == "point_mass"
+    with pytest.raises(BadInputError, match=r"unknown task 'glidr': did you mean 'glider'"):
+        pairing_named("glidr")

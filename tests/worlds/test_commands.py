@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 import torch
 from fake_dataset import COLUMNS, concatenated, fake_episode, write_fake, writer
+from small_cart import TASK, Rail
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION
-from astra_data.worlds.commands import Commands
+from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands
+from astra_data.worlds.variation import CommandVariation
 
 DRIVE = Commands({"v": (-0.2, 1.0), "w": (-1.5, 1.5)})
 
@@ -34,11 +36,6 @@ def test_commands_of_one_are_left_to_the_bit() -> None:
     one_of_two = Commands({"vx": (-1.0, 1.0), "w": (-2.0, 2.0)})
     assert not one_of_two.are_normal
     assert one_of_two.in_units(torch.tensor([0.5, 0.5])).tolist() == [0.5, 1.0]
-
-
-def test_they_are_a_mapping_of_names_to_bounds() -> None:
-    assert dict(DRIVE) == {"v": (-0.2, 1.0), "w": (-1.5, 1.5)} and len(DRIVE) == 2
-    assert Commands({"v": (0, 1)}) == {"v": (0.0, 1.0)}
 
 
 @pytest.mark.parametrize(
@@ -80,3 +77,102 @@ def test_a_range_that_is_none_is_refused(tmp_path: Path) -> None:
         none.add(replace(fake_episode(1, 5), columns=columns))
     with pytest.raises(BadInputError, match="has no column action: give their bounds"):
         Commands.recorded(tmp_path / "none")
+
+
+DRIVE_DRIVEN = Commands({"v": (-1.0, 4.0)})
+
+
+def driven(count: int = 2) -> DrivenSimulator:
+    return DrivenSimulator(Rail(count), DRIVE_DRIVEN, "cpu")
+
+
+def test_actions_become_commands_in_their_units() -> None:
+    simulator = driven(3)
+    landed = simulator.step(torch.tensor([[-1.0], [1.0], [5.0]]))
+    torch.testing.assert_close(landed, torch.tensor([[-0.1], [0.4], [0.4]]))
+    assert torch.equal(simulator.state, landed)
+
+
+def test_there_are_no_walls_where_the_simulator_has_none() -> None:
+    simulator = driven()
+    simulator.reset_to(torch.tensor([[1.0]]), torch.tensor([1]))
+    assert simulator.state.tolist() == [[0.0], [1.0]]
+    settled = simulator.settle(simulator.state, torch.tensor([[7.0], [8.0]]))
+    assert settled.tolist() == simulator.state.tolist() == [[7.0], [8.0]]
+    assert simulator.blocked.tolist() == [False, False]
+    simulator.vary({"friction": torch.ones(2, 1)})
+    assert simulator.parameters == {"timestep_s": 0.1}
+
+
+class Walled(Rail):
+    """A rail with an end at 1."""
+
+    blocked = torch.tensor([True, False])
+    varied = 0
+    kept_m = 0.0
+
+    def keep_clear(self, distance_m: float) -> None:
+        self.kept_m = distance_m
+
+    def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
+        self.reset_to(landed.clamp_max(1.0))
+        return self.state
+
+    def vary(self, parameters: dict[str, torch.Tensor]) -> None:
+        self.varied += len(parameters)
+
+
+def test_walls_and_parameters_of_the_simulator_are_its_own() -> None:
+    walled = Walled(2)
+    simulator = DrivenSimulator(walled, DRIVE_DRIVEN, "cpu")
+    assert simulator.settle(simulator.state, torch.tensor([[0.5], [3.0]])).tolist() == [[0.5], [1.0]]
+    assert simulator.blocked.tolist() == [True, False]
+    simulator.vary({"friction": torch.ones(2, 1)})
+    assert walled.varied == 1
+    simulator.keep_clear(0.3)
+    assert walled.kept_m == 0.3
+    driven().keep_clear(0.3)  # no walls, nothing to keep clear of
+
+
+def test_commands_vary_from_episode_to_episode() -> None:
+    longer = CommandVariation(action_scale=(0.5, 0.5))
+    simulator = TASK.varied_simulator(2, longer)
+    assert isinstance(simulator, VariedCommands)
+    # 0.4 of ±1 becomes 0.6: 1.5 + 2.5 * 0.6 = 3 m/s for a tenth of a second.
+    torch.testing.assert_close(simulator.step(torch.full((2, 1), 0.4)), torch.full((2, 1), 0.3))
+    # What is beyond ±1 is clipped before it is made shorter: 1.5 + 2.5 * 0.5 = 2.75 m/s.
+    shorter = TASK.varied_simulator(2, CommandVariation(action_scale=(-0.5, -0.5)))
+    torch.testing.assert_close(shorter.step(torch.full((2, 1), 4.0)), torch.full((2, 1), 0.275))
+    torch.manual_seed(0)
+    noisy = TASK.varied_simulator(500, CommandVariation(action_noise=(0.05, 0.05)))
+    landed = noisy.step(torch.zeros(500, 1))
+    assert abs(float(landed.std()) / (0.05 * 2.5 * 0.1) - 1.0) < 0.1
+    assert abs(float(landed.mean()) - 0.15) < 0.002
+
+
+class InPlace:
+    """A simulator that has one tensor of states, and writes into it."""
+
+    def __init__(self) -> None:
+        self.state = torch.zeros(2, 1)
+
+    def reset_to(self, state: torch.Tensor, rows: torch.Tensor | None = None) -> None:
+        self.state[slice(None) if rows is None else rows] = state
+
+    def step(self, command: torch.Tensor) -> torch.Tensor:
+        self.state += command
+        return self.state
+
+    def settle(self, before: torch.Tensor, landed: torch.Tensor) -> torch.Tensor:
+        self.state[:] = landed
+        return self.state
+
+
+def test_states_that_were_handed_out_stay_as_they_were() -> None:
+    simulator = DrivenSimulator(InPlace(), DRIVE_DRIVEN, "cpu")
+    state, landed = simulator.state, simulator.step(torch.ones(2, 1))
+    kept = landed.clone()
+    settled = simulator.settle(state, torch.full((2, 1), 7.0))
+    simulator.reset_to(torch.full((1, 1), 9.0), torch.tensor([0]))
+    assert state.tolist() == [[0.0], [0.0]] and torch.equal(landed, kept)
+    assert settled.tolist() == [[7.0], [7.0]] and simulator.state.tolist() == [[9.0], [7.0]]

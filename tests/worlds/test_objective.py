@@ -45,20 +45,6 @@ class LastingBalance(Balance):
     is_lasting = True
 
 
-def test_an_objective_that_says_nothing_more_has_no_walls_bodies_or_misses() -> None:
-    plain = Balance(horizon=3)
-    assert plain.layout is None and not plain.ends_at_walls
-    assert (plain.success_reward, plain.failure_reward) == (10.0, -10.0)
-    states = torch.randn(4, 5, 1)
-    assert plain.places(states).shape == (4, 5, 0)
-    assert plain.missed(states[:, 0], states[:, 0, :0]).tolist() == [False] * 4
-
-
-def test_actions_are_clipped_and_a_speed_limit_is_for_velocities() -> None:
-    action = torch.tensor([[2.0, -3.0], [0.3, 0.4]])
-    assert Balance(horizon=1).limit_command(action, 0.1).tolist() == [[1.0, -1.0], pytest.approx([0.3, 0.4])]
-
-
 def test_a_goal_succeeds_when_it_is_reached() -> None:
     plain = Balance(horizon=3)
     for step in (1, 2, 3, 4):
@@ -88,12 +74,6 @@ def test_a_speed_limit_shortens_and_does_not_turn(objective: Objective) -> None:
     torch.testing.assert_close(limited, expected)
     assert torch.equal(objective.limit_command(action[:1], 2.0), action[:1])
     assert not objective.limit_command(action, 0.0)[:, :2].any()
-
-
-def test_what_is_reached_or_missed_is_decided() -> None:
-    states = torch.zeros(3, 8)
-    states[:, 4:6] = torch.tensor([[1.6, 0.0], [0.0, 2.1], [0.0, 0.0]])  # in the goal, out, on the field
-    assert PLANAR["kicking"].decided(states, torch.tensor([[1.5, 0.0]] * 3)).tolist() == [True, True, False]
 
 
 def test_planar_objectives_know_their_maze_and_their_bodies() -> None:

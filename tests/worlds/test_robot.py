@@ -25,16 +25,6 @@ def test_robots_are_stepped_by_commands_in_their_units() -> None:
     assert not step.success.any() and not env.wall_contact.any()
 
 
-def test_robots_that_are_done_stay_as_they_are() -> None:
-    env = TASK.target(2, seed=0)
-    env.reset()
-    env.step(torch.zeros(2, 1))
-    env.step(torch.zeros(2, 1), torch.tensor([True, False]))
-    torch.testing.assert_close(env.state[:, 0], torch.tensor([0.27, 0.135]))
-    env.reset(torch.tensor([True, False]))
-    torch.testing.assert_close(env.state[:, 0], torch.tensor([0.0, 0.135]))
-
-
 def test_an_episode_ends_at_its_goal() -> None:
     env = TASK.target(1, seed=3)
     env.reset()
@@ -109,14 +99,6 @@ def test_the_same_seed_gives_the_same_goals_and_seeds() -> None:
     assert -1 not in Noted.seeds
 
 
-class Scattered(Cart):
-    """A robot that starts at random, by its seed."""
-
-    def reset(self, seed: int = 0) -> list[float]:
-        super().reset()
-        return [self.x, float(np.random.default_rng(seed).normal())]
-
-
 class Careless(Cart):
     """One that takes a seed and draws from elsewhere."""
 
@@ -125,18 +107,6 @@ class Careless(Cart):
     def reset(self, seed: int = 0) -> list[float]:
         super().reset()
         return [self.x, float(self.drawn.normal())]
-
-
-class Unseeded(Careless):
-    """One that takes none."""
-
-    def reset(self) -> list[float]:  # type: ignore[override]
-        return super().reset()
-
-
-@pytest.mark.parametrize("robot", [Cart, Scattered, Unseeded])
-def test_the_same_seed_gives_the_same_start(robot: type[Cart]) -> None:
-    RobotEnv(**of_robots(robot)).check_seed()
 
 
 def test_a_robot_that_ignores_its_seed_is_told() -> None:
@@ -148,19 +118,6 @@ def of_robots(robot: type[Cart]) -> dict[str, Any]:
     task = replace(TASK, robot=robot)
     given = {"state": task.state, "commands": task.limits, "abstraction": task.abstraction, "seed": 3}
     return {"objective": task.objective, "num_envs": 2, "robot": robot, **given}
-
-
-def test_goals_are_not_drawn_as_the_robot_draws_its_start() -> None:
-    """A robot that draws its start as goals are drawn would stand on its goal, were both of one seed."""
-
-    class Drawn(Cart):
-        def reset(self, seed: int = 0) -> list[float]:
-            super().reset()
-            return [float(TASK.objective.draw_goals(np.random.default_rng(seed), 1)[0, 0]), 0.0]
-
-    env = replace(TASK, robot=Drawn).target(4, seed=0)
-    env.reset()
-    assert not (env.state[:, 0] == env.goal[:, 0]).any()
 
 
 @pytest.mark.parametrize("state", [[0.0], [0.0, float("nan")], [0.0, 0.0, 0.0], None])
@@ -227,9 +184,3 @@ def test_a_robot_that_breaks_is_told_in_one_line(call: str, monkeypatch: pytest.
     monkeypatch.setattr(Cart, call, fail)
     with pytest.raises(BadInputError, match=f"{call} of the robot fails with RuntimeError: motor"):
         broken[call == "step"]()
-
-
-def test_a_robot_is_not_put_anywhere() -> None:
-    env = TASK.target(1, seed=0)
-    with pytest.raises(BadInputError, match="data_start_share = 0"):
-        env.reset_to(np.array([0]), np.zeros((1, 2)))

@@ -1,12 +1,9 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from fake_dataset import COLUMNS, write_fake
 from small_cart import GIVEN, LOGS_ALONE, TASK, Rail, Reach
 
 from astra_data.core.errors import BadInputError
@@ -17,8 +14,46 @@ from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import DrivenSimulator
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import VariedPlanar
-from astra_data.worlds.task import Task
+from astra_data.worlds.task import (
+    ColumnEntry,
+    Task,
+    column,
+    free_body,
+    names_with_units,
+    repeated_names,
+)
 from astra_data.worlds.variation import BallVariation, PlanarVariation
+
+
+def test_entries_become_a_column() -> None:
+    place = column(
+        "place", [ColumnEntry(name, "m", "world", "position") for name in ("a", "b")], "where it is"
+    )
+    assert place.names == ("a", "b") and place.meaning == "where it is"
+    assert place.astra == {"unit": ["m", "m"], "frame": ["world"] * 2, "role": ["position"] * 2}
+
+
+def test_names_end_with_units_where_they_do_not_yet() -> None:
+    units = ["m/s", "°", "1", "", "m"]
+    state = Column("state", size=5, names=("v", "tilt", "share", "n", "x_m"), astra={"unit": units})
+    assert names_with_units(state) == ["v_m_s", "tilt_deg", "share", "n", "x_m"]
+    assert names_with_units(Column("state", size=2)) == ["0", "1"]
+
+
+def test_names_that_several_values_have_are_told_once() -> None:
+    assert repeated_names(Column("state", size=5, names=("x", "v", "x", "v", "x"))) == ["v", "x"]
+    assert repeated_names(Column("state", size=2, names=("x", "v"))) == []
+    assert repeated_names(Column("state", size=2)) == repeated_names(None) == []
+
+
+def test_a_free_body_has_position_attitude_joints_and_their_rates() -> None:
+    state = column("state", free_body(("left", "right")), "qpos and qvel")
+    assert [state.labels[index] for index in (7, 8, 15, 16)] == ["left", "right", "left_rate", "right_rate"]
+    assert state.size == 17 and state.units[15:] == ["rad/s"] * 2
+    assert [(role, group.start) for role, group in state.roles if role != "invariant"] == [
+        *(("position", 0), ("quaternion", 3), ("vector", 9))
+    ]
+
 
 ANT, WALKER, KICK = (TASKS[name] for name in ("antmaze-umaze", "humanoid-walker2d", "nao-kick"))
 
@@ -34,34 +69,6 @@ def test_what_needs_a_maze_is_refused_where_there_is_none() -> None:
     for ask in asked:
         with pytest.raises(BadInputError, match=r"a task in a maze, got 'humanoid-walker2d'.*leave out"):
             ask()
-
-
-def test_its_bounds_may_be_a_dataset_s(tmp_path: Path) -> None:
-    write_fake(tmp_path / "fake", columns=COLUMNS)
-    task = Task(**GIVEN | {"commands": f"{tmp_path / 'fake'}", "objective": ANT.objective})
-    assert list(task.limits) == ["x", "y"] and max(low for low, _ in task.limits.values()) < -0.9
-
-
-def test_targets_are_shared_by_the_tasks_that_say_so() -> None:
-    assert WALKER.shares_target(TASKS["humanoid-kinematics"])
-    assert not WALKER.shares_target(ANT)
-    assert not ANT.shares_target(ANT) and not ANT.shares_target(TASKS["antmaze-long"])
-
-
-def test_steps_per_second_are_whole_numbers() -> None:
-    assert [task.fps for task in (ANT, WALKER, KICK)] == [20, 67, 5]
-
-
-def test_only_quantities_of_a_ball_make_a_ball() -> None:
-    assert (ANT.ball_index, WALKER.ball_index, KICK.ball_index) == (None, None, 4)
-    shifted = replace(KICK, quantities={"ball_position_m": (6, 7)})
-    assert shifted.ball_index == 6
-
-
-def test_the_target_gets_the_objective_and_the_options() -> None:
-    env = ANT.target(3, seed=0, num_threads=1, leg_scale=1.25)
-    assert env.num_envs == 3
-    assert (env.objective, env.leg_scale) == (ANT.objective, 1.25)  # type: ignore[attr-defined]
 
 
 def test_ranges_are_completed_to_those_that_the_simulator_has() -> None:
@@ -100,20 +107,6 @@ class HalfRail(Rail):
     @staticmethod
     def abstraction(state: Any) -> Any:  # noqa: ANN401
         return 0.5 * state[..., :1]
-
-
-@pytest.mark.parametrize(
-    ("unit", "name"),
-    [
-        *(("m", "v_m"), ("m/s", "v_m_s"), ("rad/s", "v_rad_s"), ("m/s²", "v_m_s2"), ("°", "v_deg")),
-        *(("1", "v"), ("", "v"), (None, "v")),
-    ],
-)
-def test_what_the_gap_lists_by_default_is_named_with_its_unit(unit: str | None, name: str) -> None:
-    astra = None if unit is None else {"unit": ["rad", unit]}
-    state = Column("abstract.state", size=2, names=("lean_rad", "v"), astra=astra)
-    task = Task(**{**GIVEN, "abstract_state": state, "abstraction": lambda state: state})
-    assert task.quantities == {"lean_rad": (0,), name: (1,)}
 
 
 def test_what_was_filled_in_is_filled_in_anew_where_a_field_is_replaced() -> None:
@@ -230,8 +223,3 @@ def test_a_task_without_a_target_says_so() -> None:
 def test_fields_that_contradict_each_other_are_refused(wrong: dict[str, Any], told: str) -> None:
     with pytest.raises(BadInputError, match=told):
         Task(**GIVEN | wrong)
-
-
-def test_a_horizon_may_be_an_integer_of_numpy() -> None:
-    reach = Reach(horizon=np.int64(40))  # type: ignore[arg-type]
-    assert Task(**GIVEN | {"objective": reach}).objective.horizon == 40

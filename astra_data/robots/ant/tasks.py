@@ -30,11 +30,11 @@ from astra_data.worlds.protocols import Step, rows_in
 from astra_data.worlds.task import (
     PLANAR_GOAL,
     PLANAR_STATE,
-    ColumnEntry,
     Plane,
     Task,
     Varied,
     column,
+    entries,
     free_body,
 )
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
@@ -66,14 +66,8 @@ class AntMazeEnv(PlanarTarget):
     ) -> None:
         """Build B ants.
 
-        Args:
-            objective: maze, goal and reward.
-            num_envs: B.
-            seed: of starts, goals and headings.
-            leg_scale: factor on the legs' length.
-            start_anywhere: start anywhere in the free space, not at the task's start (for data collection).
-            controller: the low-level controller, by default the one shipped.
-            num_threads: physics threads, by default one per core.
+        leg_scale: factor on the legs' length. controller: the low-level controller, by default the one
+        shipped.
         """
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.leg_scale = leg_scale
@@ -164,10 +158,7 @@ def ant_beyond_point_mass(state: Tensor) -> Tensor:
 
 
 _JOINTS = tuple(f"{joint}_{leg}" for leg in range(1, 5) for joint in ("hip", "ankle"))
-_COMMAND = (
-    ColumnEntry("command_vx", "m/s", "world", "vector"),
-    ColumnEntry("command_vy", "m/s", "world", "vector"),
-)
+_COMMAND = entries("command_vx command_vy", "m/s", "world", "vector")
 
 
 def _antmaze(name: str, maze: Maze, horizon: int) -> Task:
@@ -193,4 +184,4 @@ def _antmaze(name: str, maze: Maze, horizon: int) -> Task:
     )
 
 
-ANTMAZE_TASKS = (_antmaze("antmaze-umaze", U_MAZE, 700), _antmaze("antmaze-long", LONG_MAZE, 1000))
+UMAZE, LONG = _antmaze("antmaze-umaze", U_MAZE, 700), _antmaze("antmaze-long", LONG_MAZE, 1000)

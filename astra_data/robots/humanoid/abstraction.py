@@ -53,11 +53,10 @@ class _Skeleton:
     """All bodies, in an order in which parents come first.
 
     Attributes:
-        links: by the body's number.
-        axes: of the joints in their bodies, (17, 3). crosses: matrices K with K v = axis x v, (17, 3, 3).
-        centers: of mass of each of the 13 bodies in its own frame, (3,) by its number.
-        shares: of the bodies in the total mass, (13,). moved: the shares that each joint moves, (17, 13).
-        feet: number of the body that each foot belongs to, and the foot's center, (3,).
+        links: by the body's number. axes: of the joints in their bodies, (17, 3). crosses: matrices K with K
+        v = axis x v, (17, 3, 3). centers: of mass of each of the 13 bodies in its own frame, (3,) by its
+        number. shares: of the bodies in the total mass, (13,). moved: the shares that each joint moves, (17,
+        13). feet: number of the body that each foot belongs to, and the foot's center, (3,).
     """
 
     links: dict[int, _Link]

@@ -122,10 +122,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
     def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
         """Build B standing humanoids.
 
-        Args:
-            num_envs: B.
-            follow_s: time constant of the body's velocity and angular velocity, above 0.
-            device: torch device.
+        follow_s: time constant of the body's velocity and angular velocity, above 0.
         """
         super().__init__(num_envs, device=device)
         self.follow_s = follow_s

@@ -95,18 +95,9 @@ class CommandRanges:
 
     def targets(self, action: Tensor) -> Tensor:
         """Return the angles (..., 4) in rad of commands (..., 4), clipped to ±1."""
-        low, high = self._ends(action)
-        return low + (high - low) * (action.clamp(-1.0, 1.0) + 1.0) / 2.0
-
-    def commands(self, target: Tensor) -> Tensor:
-        """Return the commands (..., 4) of angles (..., 4) in rad."""
-        low, high = self._ends(target)
-        return 2.0 * (target - low) / (high - low) - 1.0
-
-    def _ends(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        ends = torch.tensor([self.hip_deg, self.knee_deg] * 2, dtype=like.dtype, device=like.device)
+        ends = torch.tensor([self.hip_deg, self.knee_deg] * 2, dtype=action.dtype, device=action.device)
         low, high = torch.deg2rad(ends).unbind(-1)
-        return low, high
+        return low + (high - low) * (action.clamp(-1.0, 1.0) + 1.0) / 2.0
 
 
 JOINTS_RAD = tuple(0.3 if joint in COMMANDED else 0.025 for joint in range(len(JOINTS)))
@@ -138,12 +129,10 @@ class Locomotion:
     """Rewards, starts and ends of episodes.
 
     Attributes:
-        forward_reward: per m/s of the center of mass along x.
-        healthy_reward: for every step that ends at a healthy height.
-        healthy_m: range of healthy heights of the torso, outside of which the episode ends.
-        effort_cost: per unit of the sum of the squared controls.
-        contact_cost: per unit of the sum of the squared contact forces and torques.
-        contact_cost_limit: the largest contact cost of a step.
+        forward_reward: per m/s of the center of mass along x. healthy_reward: for every step that ends at a
+        healthy height. healthy_m: range of healthy heights of the torso, outside of which the episode ends.
+        effort_cost: per unit of the sum of the squared controls. contact_cost: per unit of the sum of the
+        squared contact forces and torques. contact_cost_limit: the largest contact cost of a step.
         reset_noise: half width of the uniform noise on positions and velocities at the start.
     """
 

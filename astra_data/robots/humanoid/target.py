@@ -31,8 +31,7 @@ class Humanoids:
     apply, each divided by the gear of the motor in its place. Otherwise targets would cost, not effort.
 
     Attributes:
-        physics: their bodies.
-        reward: of the last step, (B,) float64; 0 for humanoids that were not active.
+        physics: their bodies. reward: of the last step, (B,) float64; 0 for humanoids that were not active.
     """
 
     def __init__(
@@ -45,11 +44,7 @@ class Humanoids:
     ) -> None:
         """Build B humanoids in the model's initial pose.
 
-        Args:
-            locomotion: the task.
-            num_envs: B.
-            actuators: meaning of the controls, see `humanoid_model`.
-            num_threads: physics threads, by default one per core.
+        locomotion: the task. actuators: meaning of the controls, see `humanoid_model`.
         """
         self.locomotion = locomotion
         model, motors = humanoid_model(actuators), humanoid_model("motors")
@@ -116,18 +111,11 @@ class HumanoidEnv:
         *,
         seed: int,
         start_anywhere: bool = False,
-        ranges: CommandRanges | None = None,
         num_threads: int | None = None,
     ) -> None:
         """Build B humanoids.
 
-        Args:
-            locomotion: reward, ends and starts.
-            num_envs: B.
-            seed: of starts.
-            start_anywhere: false, for there is no maze.
-            ranges: joint angles of commands.
-            num_threads: physics threads, by default one per core.
+        locomotion: reward, ends and starts.
 
         Raises:
             BadInputError: `start_anywhere` is true.
@@ -136,7 +124,7 @@ class HumanoidEnv:
             raise BadInputError("collect.start: expected 'task' for a humanoid, got 'anywhere'")
         self.locomotion = locomotion
         self.num_envs = num_envs
-        self.ranges = ranges or CommandRanges()
+        self.ranges = CommandRanges()
         self.bodies = Humanoids(locomotion, num_envs, num_threads=num_threads)
         self.goal = torch.zeros(num_envs, 0)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)

@@ -7,7 +7,7 @@ without a fall succeeds.
 
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
@@ -53,7 +53,7 @@ from astra_data.robots.humanoid.model import (
 from astra_data.robots.humanoid.target import HumanoidEnv
 from astra_data.robots.humanoid.walker2d import HumanoidWalker2d
 from astra_data.worlds.objective import Objective
-from astra_data.worlds.task import ColumnEntry, Task, Varied, column, free_body
+from astra_data.worlds.task import Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import JointVariation, VariedSimulator, noisy_command
 
 _COUNT = len(JOINTS)
@@ -259,7 +259,7 @@ _HORIZON = 1000
 """Of Gymnasium's Humanoid-v5: 15 s."""
 
 _COMMANDS = ("left_hip", "left_knee", "right_hip", "right_knee")
-_COMMAND = [ColumnEntry(name, "1", "joint", "invariant") for name in _COMMANDS]
+_COMMAND = entries(" ".join(_COMMANDS), "1", "joint", "invariant")
 
 RANDOMIZED_ACTIONS = JointVariation(action_noise=(0.05, 0.05), action_scale=(-0.05, 0.05))
 """Of domain randomization, as printed in the paper (Section V-B)."""
@@ -276,7 +276,7 @@ of 0.015 to 0.025 s begins at the simulator's own, so it only gets longer; in na
 have another one, it is read as factors around theirs."""
 
 Kind = type[HumanoidWalker2d] | type[HumanoidKinematics]
-Quantities = Mapping[str, tuple[int, ...]]
+Quantities = dict[str, tuple[int, ...]]
 
 _JOINT_QUANTITIES: Quantities = {
     "joints_rad": tuple(range(_COUNT)),
@@ -327,16 +327,16 @@ def _task(
     )
 
 
-HUMANOID_TASKS = (
-    _task("walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, beyond_walker2d, _WALKER_QUANTITIES),
-    _task(
-        "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, beyond_kinematics, _JOINT_QUANTITIES
-    ),
-    _task(
-        "extended",
-        MassWalking(horizon=_HORIZON),
-        HumanoidExtendedKinematics,
-        beyond_extended_kinematics,
-        {**_JOINT_QUANTITIES, **_BODY_QUANTITIES},
-    ),
+WALKER2D = _task(
+    "walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, beyond_walker2d, _WALKER_QUANTITIES
+)
+KINEMATICS = _task(
+    "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, beyond_kinematics, _JOINT_QUANTITIES
+)
+EXTENDED = _task(
+    "extended",
+    MassWalking(horizon=_HORIZON),
+    HumanoidExtendedKinematics,
+    beyond_extended_kinematics,
+    _JOINT_QUANTITIES | _BODY_QUANTITIES,
 )

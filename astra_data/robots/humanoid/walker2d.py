@@ -200,26 +200,11 @@ class HumanoidWalker2d(FreeStates):
     )
     abstraction = staticmethod(humanoid_to_walker2d)
 
-    def __init__(
-        self,
-        num_envs: int,
-        *,
-        ranges: CommandRanges | None = None,
-        num_threads: int | None = None,
-        device: str = "cpu",
-    ) -> None:
-        """Build B standing walkers.
-
-        Args:
-            num_envs: B.
-            ranges: joint angles of commands.
-            num_threads: physics threads, by default one per core.
-            device: torch device of states and actions; the physics runs on the CPU.
-        """
+    def __init__(self, num_envs: int, *, num_threads: int | None = None, device: str = "cpu") -> None:
         standing = humanoid_to_walker2d(torch.tensor(STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
         self.memory = self._sunk(self.state)
-        self.ranges = ranges or CommandRanges()
+        self.ranges = CommandRanges()
         self._model = walker_model()
         self._models = [self._model]
         self._steps = ColdSteps(self._model, num_envs, num_threads)

@@ -218,17 +218,13 @@ class BatchedBodies:
     """B bodies of one model.
 
     Attributes:
-        state: MuJoCo's full states, (B, N).
-        qpos, qvel: views of it, (B, nq), (B, nv).
-        sent: angles sent to the servos, (B, delay + 16, 12) in rad: the last ticks of the previous control
-            step, which may not have arrived, then this one's.
-        tilting: low-passed measured rates about x and y, (B, 2) in rad/s.
-        held: angles planned for the last tick, (B, 12) in rad.
-        waited: ticks for which the present lift of a foot has been delayed, (B,) int.
-        gyro: last measured rates, (B, 3) in rad/s.
-        pressure: on the points of the soles, left foot's then right foot's, (B, 8) in N.
-        fallen: (B,) bool; a fallen robot stays as it is until its reset.
-        touching: whether the robot touched a wall in its last control step, (B,) bool.
+        state: MuJoCo's full states, (B, N). qpos, qvel: views of it, (B, nq), (B, nv). sent: angles sent to
+        the servos, (B, delay + 16, 12) in rad: the last ticks of the previous control step, which may not
+        have arrived, then this one's. tilting: low-passed measured rates about x and y, (B, 2) in rad/s.
+        held: angles planned for the last tick, (B, 12) in rad. waited: ticks for which the present lift of a
+        foot has been delayed, (B,) int. gyro: last measured rates, (B, 3) in rad/s. pressure: on the points
+        of the soles, left foot's then right foot's, (B, 8) in N. fallen: (B,) bool; a fallen robot stays as
+        it is until its reset. touching: whether the robot touched a wall in its last control step, (B,) bool.
     """
 
     def __init__(

@@ -182,17 +182,10 @@ class BallAgent(PlanarStates):
     ) -> None:
         """Build B of them.
 
-        Args:
-            maze: the walls.
-            num_envs: B.
-            timestep_s: control period.
-            radius_m: distance that the mass keeps from walls, a multiple of the maze's `fine_m`.
-            speed_m_s: top speed along each axis.
-            reach_m: distance between the centers below which the mass touches the ball.
-            knock_m_s: speed of a ball that the mass walks into.
-            kick_reach_m: distance between the centers below which the mass can kick the ball.
-            kick_m_s: speed of a kicked ball.
-            device: torch device.
+        radius_m: distance that the mass keeps from walls, a multiple of the maze's `fine_m`. speed_m_s: top
+        speed along each axis. reach_m: distance between the centers below which the mass touches the ball.
+        knock_m_s: speed of a ball that the mass walks into. kick_reach_m: distance between the centers below
+        which the mass can kick the ball. kick_m_s: speed of a kicked ball.
         """
         super().__init__(
             maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device
@@ -277,11 +270,10 @@ class Kicking(PlanarObjective):
     (..., 2) is the middle of the goal line. Actions (..., 3) end with whether to kick.
 
     Attributes:
-        goal_line_m: x of the goal line. goal_half_width_m: of the goal on it.
-        side_line_m: |y| of the side lines. back_line_m: x of the line behind.
-        ball_x_m, ball_y_m: ranges of the ball's position at the start.
-        distance_m: of the robot from the ball at the start.
-        behind_m: distance from the ball of the point behind it that the shaping reward leads to.
+        goal_line_m: x of the goal line. goal_half_width_m: of the goal on it. side_line_m: |y| of the side
+        lines. back_line_m: x of the line behind. ball_x_m, ball_y_m: ranges of the ball's position at the
+        start. distance_m: of the robot from the ball at the start. behind_m: distance from the ball of the
+        point behind it that the shaping reward leads to.
     """
 
     action_size = 3

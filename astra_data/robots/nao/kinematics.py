@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
-from astra_data.worlds.geometry import wrapped
 
 Triple = tuple[float, float, float]
 
@@ -42,13 +41,10 @@ class Link:
     """A rigid link with its joint to the parent, if it has one.
 
     Attributes:
-        name: its joint's name in Aldebaran's documentation, without the side.
-        offset_m: its frame's origin in the parent's frame.
-        mass_kg: its mass.
-        center_m: its center of mass.
-        inertia: about the center of mass along the frame's axes, in kg m².
-        axis: the joint's axis; None for a fixed link.
-        limits_deg: the joint's range.
+        name: its joint's name in Aldebaran's documentation, without the side. offset_m: its frame's origin in
+        the parent's frame. mass_kg: its mass. center_m: its center of mass. inertia: about the center of mass
+        along the frame's axes, in kg m². axis: the joint's axis; None for a fixed link. limits_deg: the
+        joint's range.
     """
 
     name: str
@@ -162,21 +158,6 @@ _MIRRORED_POSE = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 _MIRRORED_LEG = np.array([-1.0, 1.0, 1.0, 1.0, -1.0])
 
 
-@dataclass(frozen=True)
-class LegAngles:
-    """Joint angles for a pair of foot poses.
-
-    Attributes:
-        angles: the eleven angles in rad, (..., 11).
-        yaw_error: yaw reached minus yaw wanted, left and right, in rad, (..., 2).
-        reached: whether the foot is within the leg's length from the hip, (..., 2) bool.
-    """
-
-    angles: Floats
-    yaw_error: Floats
-    reached: NDArray[np.bool_]
-
-
 def about_x(angle: Floats) -> Floats:
     """Return rotations about x, (..., 3, 3)."""
     return _rotation(angle, 1, 2)
@@ -201,22 +182,8 @@ def _rotation(angle: Floats, first: int, second: int) -> Floats:
     return matrix
 
 
-def foot_poses(angles: Floats) -> Floats:
-    """Return left and right foot pose (..., 2, 6) at the eleven `angles` (..., 11) in rad."""
-    shared = np.broadcast_to(angles[..., None, :1], (*angles.shape[:-1], 2, 1))
-    legs = np.stack([angles[..., 1:6], angles[..., 6:] * _MIRRORED_LEG], axis=-2)
-    roll, pitch, knee, ankle_pitch, ankle_roll = np.moveaxis(legs, -1, 0)
-    thigh = _hip_yaw_pitch(shared[..., 0]) @ about_x(roll) @ about_y(pitch)
-    tibia = thigh @ about_y(knee)
-    foot = tibia @ about_y(ankle_pitch) @ about_x(ankle_roll)
-    position = _HIP - THIGH_M * thigh[..., 2] - TIBIA_M * tibia[..., 2] - FOOT_HEIGHT_M * foot[..., 2]
-    poses = np.concatenate([position, _roll_pitch_yaw(foot)], axis=-1)
-    poses[..., 1, :] *= _MIRRORED_POSE
-    return np.asarray(poses)
-
-
-def leg_angles(poses: Floats) -> LegAngles:
-    """Solve for the joint angles that bring the feet to `poses` (..., 2, 6), left then right.
+def leg_angles(poses: Floats) -> Floats:
+    """Return the eleven joint angles (..., 11) in rad that bring the feet to `poses` (..., 2, 6), left first.
 
     Positions beyond a leg's reach are approached with a straight leg. Joint limits are not applied.
     """
@@ -240,16 +207,7 @@ def leg_angles(poses: Floats) -> LegAngles:
     ankle_pitch = np.arctan2(up_x, up_z)
 
     legs = np.stack([hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll], axis=-1)
-    reached_foot = tibia @ about_y(ankle_pitch) @ about_x(ankle_roll)
-    error = wrapped(_roll_pitch_yaw(reached_foot)[..., 2] - yaw)
-    error[..., 1] *= -1.0
-    return LegAngles(
-        angles=np.concatenate(
-            [shared[..., 0, None], legs[..., 0, :], legs[..., 1, :] * _MIRRORED_LEG], axis=-1
-        ),
-        yaw_error=error,
-        reached=distance <= THIGH_M + TIBIA_M,
-    )
+    return np.concatenate([shared[..., 0, None], legs[..., 0, :], legs[..., 1, :] * _MIRRORED_LEG], axis=-1)
 
 
 def _hip_yaw_pitch(angle: Floats) -> Floats:
@@ -283,17 +241,6 @@ def _wanted_hip_yaw_pitch(foot: Floats, ankle: Floats, knee: Floats, thigh_lead:
     return np.asarray(np.arctan2(hip[..., 0, 1], hip[..., 2, 1]))
 
 
-def _roll_pitch_yaw(rotation: Floats) -> Floats:
-    return np.stack(
-        [
-            np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2]),
-            np.arcsin(np.clip(-rotation[..., 2, 0], -1.0, 1.0)),
-            np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]),
-        ],
-        axis=-1,
-    )
-
-
 @dataclass(frozen=True)
 class TraitSpread:
     """Ranges that a robot's traits are drawn from; ours where no source is named."""
@@ -321,11 +268,9 @@ class Traits:
     """The traits of B robots.
 
     Attributes:
-        joint_offset_rad: true minus measured joint angles, (B, 11).
-        stiffness: share of the servos' stiffness, (B,).
-        delay_ticks: from command to servo, (B,) int.
-        friction: of the floor, (B,).
-        quality: factor on the top speeds, (B,).
+        joint_offset_rad: true minus measured joint angles, (B, 11). stiffness: share of the servos'
+        stiffness, (B,). delay_ticks: from command to servo, (B,) int. friction: of the floor, (B,). quality:
+        factor on the top speeds, (B,).
     """
 
     joint_offset_rad: Floats

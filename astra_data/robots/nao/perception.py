@@ -99,8 +99,7 @@ class BallSight:
     """Estimates of B robots of their balls, in the world frame.
 
     Attributes:
-        position: in m, (B, 2). velocity: in m/s, (B, 2).
-        unseen_s: time since the ball was last seen, (B,).
+        position: in m, (B, 2). velocity: in m/s, (B, 2). unseen_s: time since the ball was last seen, (B,).
     """
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:

@@ -34,14 +34,11 @@ class Senses:
     """Sensor readings of B robots at the end of a control step.
 
     Attributes:
-        angles: measured joint angles, (B, 11) in rad (`worlds.nao.kinematics.JOINTS`).
-        gyro: measured rates about x, y, z, (B, 3) in rad/s.
-        tilt: roll and pitch of the torso, (B, 2) in rad.
-        pressure: on the soles in N; left and right foot, front left, front right, back left, back right
-            point, (B, 2, 4).
-        phase: fraction of the step done, (B,).
-        left_swings: which foot is in the air, (B,) bool.
-        planned: velocity of the present step, m/s, m/s, rad/s, (B, 3).
+        angles: measured joint angles, (B, 11) in rad (`worlds.nao.kinematics.JOINTS`). gyro: measured rates
+        about x, y, z, (B, 3) in rad/s. tilt: roll and pitch of the torso, (B, 2) in rad. pressure: on the
+        soles in N; left and right foot, front left, front right, back left, back right point, (B, 2, 4).
+        phase: fraction of the step done, (B,). left_swings: which foot is in the air, (B,) bool. planned:
+        velocity of the present step, m/s, m/s, rad/s, (B, 3).
     """
 
     angles: Floats
@@ -57,9 +54,8 @@ class BatchedNao:
     """B NAOs, each on a floor of its own.
 
     Attributes:
-        gait: the robots' phases in their steps.
-        traits: individual differences of the robots.
-        bodies: their physics.
+        gait: the robots' phases in their steps. traits: individual differences of the robots. bodies: their
+        physics.
     """
 
     def __init__(
@@ -74,13 +70,7 @@ class BatchedNao:
     ) -> None:
         """Build B robots standing at the origin.
 
-        Args:
-            num_robots: B.
-            seed: of the gyroscopes' noise and the first traits.
-            maze: walls, by default none.
-            ball: give each robot a ball.
-            spread: ranges of the traits.
-            num_threads: by default one per core.
+        ball: give each robot a ball. spread: ranges of the traits.
         """
         self.num_robots = num_robots
         self.spread = spread or TraitSpread()
@@ -121,7 +111,7 @@ class BatchedNao:
         put_rows(self.traits, rows, Traits.draw(self.spread, len(rows), rng))
         standing = Gait.standing(len(rows), self._limits)
         put_rows(self.gait, rows, standing)
-        angles = leg_angles(self._engine.feet(standing)).angles
+        angles = leg_angles(self._engine.feet(standing))
         x, y, yaw = poses.T
         qpos = np.tile(self.bodies.model.qpos0, (len(rows), 1))
         qpos[:, 0], qpos[:, 1] = x, y

@@ -75,8 +75,7 @@ class NaoEnv(PlanarTarget):
     failure depend on true positions. Success, falling, and the task's own failures end an episode.
 
     Attributes:
-        goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
-        robots: the robots.
+        goal: (B, 2) float32. failed: (B,) bool, failed in the last step. robots: the robots.
     """
 
     def __init__(
@@ -92,14 +91,7 @@ class NaoEnv(PlanarTarget):
     ) -> None:
         """Build B robots.
 
-        Args:
-            objective: maze, goal and reward.
-            num_envs: B.
-            seed: of everything random.
-            ball: whether there is a ball.
-            start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
-            errors: of the estimates.
-            num_threads: of the physics, by default one per core.
+        ball: whether there is a ball. errors: of the estimates.
         """
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.has_ball, self.action_size = ball, objective.action_size

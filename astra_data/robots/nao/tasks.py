@@ -11,7 +11,16 @@ from astra_data.robots.nao.target import SPEED_M_S, NaoEnv, nao_beyond, nao_to_b
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
-from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, Plane, Task, Varied, column
+from astra_data.worlds.task import (
+    PLANAR_GOAL,
+    PLANAR_STATE,
+    ColumnEntry,
+    Plane,
+    Task,
+    Varied,
+    column,
+    entries,
+)
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
 _RADIUS_M = 0.1
@@ -38,37 +47,23 @@ _BALL_QUANTITIES = {"ball_position_m": (4, 5), "ball_velocity_m_s": (6, 7)}
 
 
 _STATE = [
-    ColumnEntry("x", "m", "world", "position"),
-    ColumnEntry("y", "m", "world", "position"),
-    ColumnEntry("cos_heading", "1", "world", "vector"),
-    ColumnEntry("sin_heading", "1", "world", "vector"),
-    ColumnEntry("vx", "m/s", "world", "vector"),
-    ColumnEntry("vy", "m/s", "world", "vector"),
-    *(ColumnEntry(joint, "rad", "joint", "invariant") for joint in JOINTS),
-    ColumnEntry("gyro_x", "rad/s", "body", "invariant"),
-    ColumnEntry("gyro_y", "rad/s", "body", "invariant"),
-    ColumnEntry("gyro_z", "rad/s", "body", "invariant"),
-    ColumnEntry("roll", "rad", "body", "invariant"),
-    ColumnEntry("pitch", "rad", "body", "invariant"),
-    ColumnEntry("load_left", "50 N", "body", "invariant"),
-    ColumnEntry("load_right", "50 N", "body", "invariant"),
-    ColumnEntry("step_sine", "1", "body", "invariant"),
-    ColumnEntry("step_cosine", "1", "body", "invariant"),
-    ColumnEntry("planned_forward", "m/s", "body", "invariant"),
-    ColumnEntry("planned_left", "m/s", "body", "invariant"),
+    *entries("x y", "m", "world", "position"),
+    *entries("cos_heading sin_heading", "1", "world", "vector"),
+    *entries("vx vy", "m/s", "world", "vector"),
+    *entries(" ".join(JOINTS), "rad", "joint", "invariant"),
+    *entries("gyro_x gyro_y gyro_z", "rad/s", "body", "invariant"),
+    *entries("roll pitch", "rad", "body", "invariant"),
+    *entries("load_left load_right", "50 N", "body", "invariant"),
+    *entries("step_sine step_cosine", "1", "body", "invariant"),
+    *entries("planned_forward planned_left", "m/s", "body", "invariant"),
     ColumnEntry("planned_turn", "rad/s", "body", "invariant"),
 ]
 _BALL = [
-    ColumnEntry("ball_x", "m", "world", "position"),
-    ColumnEntry("ball_y", "m", "world", "position"),
-    ColumnEntry("ball_vx", "m/s", "world", "vector"),
-    ColumnEntry("ball_vy", "m/s", "world", "vector"),
+    *entries("ball_x ball_y", "m", "world", "position"),
+    *entries("ball_vx ball_vy", "m/s", "world", "vector"),
 ]
 _UNSEEN = ColumnEntry("ball_unseen", "s", "body", "invariant")
-_COMMAND = [
-    ColumnEntry("command_vx", "0.25 m/s", "world", "vector"),
-    ColumnEntry("command_vy", "0.25 m/s", "world", "vector"),
-]
+_COMMAND = [*entries("command_vx command_vy", "0.25 m/s", "world", "vector")]
 _KICK = ColumnEntry("kick", "1", "body", "invariant")
 
 
@@ -101,39 +96,37 @@ def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
     )
 
 
-NAO_TASKS = (
-    _task(
-        name="nao-navigation",
-        ball=False,
-        instruction="walk through the maze to the goal",
-        objective=Navigation(
-            S_MAZE,
-            horizon=500,
-            success_radius_m=0.3,
-            spread_m=0.05,
-            start_clearance_m=0.3,
-            start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0)),
-            # A touch costs as much as a meter; if it cost a third of the path, policies would learn to stand.
-            meter_reward=4.0,
-            failure_reward=-4.0,
-            path_clearance_m=0.25,
-            # Policies without a memory, whose position is not in the latent, do not learn it without these.
-            position_waves=3,
-            ends_at_walls=True,
-        ),
-        make_simulator=partial(PointMass, S_MAZE, **_BODY),
-        varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),
-        abstraction=nao_to_point_mass,
-        simulator_id="point_mass",
+NAVIGATION = _task(
+    name="nao-navigation",
+    ball=False,
+    instruction="walk through the maze to the goal",
+    objective=Navigation(
+        S_MAZE,
+        horizon=500,
+        success_radius_m=0.3,
+        spread_m=0.05,
+        start_clearance_m=0.3,
+        start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0)),
+        # A touch costs as much as a meter; if it cost a third of the path, policies would learn to stand.
+        meter_reward=4.0,
+        failure_reward=-4.0,
+        path_clearance_m=0.25,
+        # Policies without a memory, whose position is not in the latent, do not learn it without these.
+        position_waves=3,
+        ends_at_walls=True,
     ),
-    _task(
-        name="nao-kick",
-        ball=True,
-        instruction="kick the ball into the goal",
-        objective=Kicking(FIELD, horizon=156),
-        make_simulator=partial(BallAgent, FIELD, **_BODY, **_CONTACT),
-        varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, KICK_RANGES),
-        abstraction=nao_to_ball_agent,
-        simulator_id="ball_agent",
-    ),
+    make_simulator=partial(PointMass, S_MAZE, **_BODY),
+    varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, WIDE_RANGES),
+    abstraction=nao_to_point_mass,
+    simulator_id="point_mass",
+)
+KICK = _task(
+    name="nao-kick",
+    ball=True,
+    instruction="kick the ball into the goal",
+    objective=Kicking(FIELD, horizon=156),
+    make_simulator=partial(BallAgent, FIELD, **_BODY, **_CONTACT),
+    varied=Varied(VariedPlanar, RANDOMIZED_ACTIONS, KICK_RANGES),
+    abstraction=nao_to_ball_agent,
+    simulator_id="ball_agent",
 )

@@ -51,14 +51,11 @@ class Gait:
     """Phases of B walking robots in their steps.
 
     Attributes:
-        phase: fraction of the step done, (B,).
-        duration_s: of the step, (B,).
-        left_swings: which foot is in the air, (B,) bool.
-        walking: False for robots that stand, (B,) bool.
-        kind: of step: `STRIDE`, `START` or `STOP`, (B,) int.
-        before, after: spread at the step's start and end, (B, 3).
-        forward_m_s: forward speed of the previous step, from which the next may differ by a limit, (B,).
-        kicking: whether the swinging foot kicks, (B,) bool.
+        phase: fraction of the step done, (B,). duration_s: of the step, (B,). left_swings: which foot is in
+        the air, (B,) bool. walking: False for robots that stand, (B,) bool. kind: of step: `STRIDE`, `START`
+        or `STOP`, (B,) int. before, after: spread at the step's start and end, (B, 3). forward_m_s: forward
+        speed of the previous step, from which the next may differ by a limit, (B,). kicking: whether the
+        swinging foot kicks, (B,) bool.
     """
 
     phase: Floats
@@ -205,10 +202,9 @@ class Targets:
     """Targets of the legs for the next ticks.
 
     Attributes:
-        angles: the eleven angles, (B, ticks, 11) in rad.
-        supports: feet that a walking robot stands on, left and right, (B, ticks, 2) bool.
-        lifts_off: foot that leaves the floor at the tick: 1 left, -1 right, 0 none, (B, ticks).
-        gaits: the gait before the first tick and after each, ticks + 1.
+        angles: the eleven angles, (B, ticks, 11) in rad. supports: feet that a walking robot stands on, left
+        and right, (B, ticks, 2) bool. lifts_off: foot that leaves the floor at the tick: 1 left, -1 right, 0
+        none, (B, ticks). gaits: the gait before the first tick and after each, ticks + 1.
     """
 
     angles: Floats
@@ -232,8 +228,7 @@ class WalkEngine:
     """Walks B robots.
 
     Attributes:
-        planner: plans their steps.
-        style: how their feet move.
+        planner: plans their steps. style: how their feet move.
     """
 
     planner: StepPlanner
@@ -262,14 +257,14 @@ class WalkEngine:
             lifts_off.append((begins & (gait.kind == STRIDE)) * np.where(gait.left_swings, 1, -1))
             gaits.append(replace(gait))
         return Targets(
-            leg_angles(np.stack(feet, axis=1)).angles,
+            leg_angles(np.stack(feet, axis=1)),
             np.stack(supports, axis=1),
             np.stack(lifts_off, axis=1),
             gaits,
         )
 
     def feet(self, gait: Gait) -> Floats:
-        """Return the present target poses of the feet in the torso's frame, (B, 2, 6), see `foot_poses`."""
+        """Return the present target poses of the feet in the torso's frame, (B, 2, 6), see `leg_angles`."""
         style, phase = self.style, gait.phase[:, None]
         scale = np.array(style.step_scale) / 2
         behind, ahead = -gait.before * scale, gait.after * scale

@@ -23,11 +23,9 @@ class Maze:
     """A maze of square cells.
 
     Attributes:
-        rows: one string per row; "1" is wall, "0" is free.
-        scale: side of a cell in m.
-        start: (row, column) of the usual start cell.
-        goal: (row, column) of the usual goal cell.
-        fine_m: cell size of the fine grid for clearances and distances; divides the scale.
+        rows: one string per row; "1" is wall, "0" is free. scale: side of a cell in m. start: (row, column)
+        of the usual start cell. goal: (row, column) of the usual goal cell. fine_m: cell size of the fine
+        grid for clearances and distances; divides the scale.
     """
 
     rows: tuple[str, ...]
@@ -37,13 +35,7 @@ class Maze:
     fine_m: float = 0.1
 
     def __post_init__(self) -> None:
-        """Check the maze.
-
-        Raises:
-            BadInputError: rows differ in length or have other characters, the start or the goal is no free
-                cell, no way leads from one to the other, or the fine grid does not divide the cells; lists
-                every fault.
-        """
+        """Check the maze."""
         faults = []
         if not self.rows or not self.rows[0] or len({len(row) for row in self.rows}) != 1:
             faults.append("rows: expected strings of one length")
@@ -215,9 +207,8 @@ class FreeSpace:
     """The cells in which the center of a disc may be.
 
     Attributes:
-        blocked: (height, width) bool, True where the disc would overlap a wall.
-        half_extent: half of the maze's width and height in m, (2,).
-        cell_m: side of a cell.
+        blocked: (height, width) bool, True where the disc would overlap a wall. half_extent: half of the
+        maze's width and height in m, (2,). cell_m: side of a cell.
     """
 
     def __init__(self, blocked: Tensor, half_extent: Tensor, cell_m: float) -> None:
@@ -287,10 +278,8 @@ class GoalDistance:
     There is one distance field per point of a lattice around the cell's middle; a goal uses the nearest.
 
     Attributes:
-        fields: (goals, height, width) in m.
-        lattice: the goal of each field, (goals, 2) in m.
-        half_extent: (2,) in m.
-        cell_m: side of a field's cell.
+        fields: (goals, height, width) in m. lattice: the goal of each field, (goals, 2) in m. half_extent:
+        (2,) in m. cell_m: side of a field's cell.
     """
 
     fields: Tensor

@@ -59,14 +59,13 @@ class Navigation(PlanarObjective):
     """Reach the goal of `maze` within `horizon` steps.
 
     Attributes:
-        meter_reward: for a meter of progress.
-        path_clearance_m: clearance from walls of the shortest free path.
-        success_radius_m: distance from the goal within which the episode ends in success.
-        position_waves: number of waves of which policies see sine and cosine of the position along each
-            axis; the first is as long as the maze is wide, each other half as long as the one before.
-        spread_m: standard deviation of start and goal around their cells' centers, per axis.
-        start_clearance_m: clearance from walls of starts that are drawn anywhere.
-        start_offsets_m: offsets of the usual starts from the center of the start cell, drawn uniformly.
+        meter_reward: for a meter of progress. path_clearance_m: clearance from walls of the shortest free
+        path. success_radius_m: distance from the goal within which the episode ends in success.
+        position_waves: number of waves of which policies see sine and cosine of the position along each axis;
+        the first is as long as the maze is wide, each other half as long as the one before. spread_m:
+        standard deviation of start and goal around their cells' centers, per axis. start_clearance_m:
+        clearance from walls of starts that are drawn anywhere. start_offsets_m: offsets of the usual starts
+        from the center of the start cell, drawn uniformly.
     """
 
     meter_reward: float = 1.0
@@ -78,11 +77,7 @@ class Navigation(PlanarObjective):
     start_offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
 
     def __post_init__(self) -> None:
-        """Check that starts and goals are in free space.
-
-        Raises:
-            BadInputError: they are spread into the walls around their cells.
-        """
+        """Check that starts and goals are in free space."""
         farthest = 3 * self.spread_m + self.path_clearance_m
         if farthest >= self.maze.scale / 2:
             raise BadInputError(
@@ -170,18 +165,10 @@ class PlanarTarget(ABC):
     Success, falls, misses and, where the objective says so, walls end an episode.
 
     Attributes:
-        objective: maze, goal and reward.
-        goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
+        objective: maze, goal and reward. goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
     """
 
     def __init__(self, objective: PlanarObjective, num_envs: int, *, start_anywhere: bool = False) -> None:
-        """Set no goals yet.
-
-        Args:
-            objective: maze, goal and reward.
-            num_envs: B.
-            start_anywhere: start anywhere in the free space, not at the task's start (for collecting).
-        """
         self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
         self.goal = torch.zeros(num_envs, 2)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)

@@ -19,11 +19,9 @@ class PlanarStates:
     """B planar states (B, X) that begin with x, y, vx, vy of a disc among the walls of a maze, in m and m/s.
 
     Attributes:
-        parameters: what a dataset paired with this simulator records about it.
-        state: (B, X) float32.
-        free: where the disc's center may be.
-        blocked: (B,) bool, a wall stopped the disc in the last step, or in its correction.
-        period_s: control period, one for all or (B, 1).
+        parameters: what a dataset paired with this simulator records about it. state: (B, X) float32. free:
+        where the disc's center may be. blocked: (B,) bool, a wall stopped the disc in the last step, or in
+        its correction. period_s: control period, one for all or (B, 1).
     """
 
     state_size: int
@@ -40,13 +38,8 @@ class PlanarStates:
     ) -> None:
         """Put B of them at rest at the origin.
 
-        Args:
-            maze: the walls.
-            num_envs: B.
-            timestep_s: control period.
-            radius_m: distance that the disc's center keeps from walls, a multiple of the maze's `fine_m`.
-            speed_m_s: top speed along each axis.
-            device: torch device.
+        radius_m: distance that the disc's center keeps from walls, a multiple of the maze's `fine_m`.
+        speed_m_s: top speed along each axis.
 
         Raises:
             BadInputError: the radius is no such multiple.

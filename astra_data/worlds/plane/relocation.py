@@ -52,11 +52,10 @@ class Relocation:
     """How segments of episodes may be moved within the maze of `task`.
 
     Attributes:
-        rotations: by multiples of 90 degrees, by any angle, or none.
-        translations: to anywhere; otherwise a segment starts where it did.
-        margin_m: clearance from walls that every step keeps before and after it is moved.
-        min_steps: length of the shortest segment.
-        tries: rotations that are drawn, with 64 shifts for each, before a segment is given up.
+        rotations: by multiples of 90 degrees, by any angle, or none. translations: to anywhere; otherwise a
+        segment starts where it did. margin_m: clearance from walls that every step keeps before and after it
+        is moved. min_steps: length of the shortest segment. tries: rotations that are drawn, with 64 shifts
+        for each, before a segment is given up.
     """
 
     task: Task

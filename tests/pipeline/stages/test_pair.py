@@ -156,7 +156,6 @@ def test_the_largest_reset_error_of_all_blocks_is_recorded(
         ("antmaze-long", r"was collected for antmaze-short, which has another maze .*: give --simulator"),
         (f"{MINE}:Numeric", r"Numeric\(4096\).state: expected a torch tensor, got a ndarray"),
         (f"{MINE}:Relapsing", r"after reset_to, Relapsing.state: expected a torch tensor, got a ndarray"),
-        (f"{MINE}:Sliding", r"step of Sliding changes the states handed out before: expected a new tensor"),
         (f"{MINE}:Lazy", r"step of Lazy fails with NotImplementedError"),
         (f"{MINE}:Wide", r"abstraction of Wide makes \(\d+, 3\) of states .* expected \(\d+, 2\)"),
         (f"{MINE}:Half", r"Half has no abstraction, parameters, reset_to, step"),

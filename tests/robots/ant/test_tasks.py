@@ -4,26 +4,139 @@ import pytest
 import torch
 
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE
-from astra_data.robots.ant.body import ant_model
-from astra_data.robots.ant.tasks import ANTMAZE_TASKS
+from astra_data.robots.ant.body import ant_model, standing_pose
+from astra_data.robots.ant.tasks import AntMazeEnv, ant_beyond_point_mass, ant_to_point_mass
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE
-from astra_data.worlds.plane.point_mass import PointMass
-from astra_data.worlds.task import Task
-
-TASK = TASKS["antmaze-umaze"]
+from astra_data.worlds.batched_mujoco import wall_geoms
+from astra_data.worlds.plane.mazes import U_MAZE
+from astra_data.worlds.plane.navigation import Navigation
 
 
-def test_each_task_has_its_maze_and_horizon() -> None:
-    assert [(task.name, task.maze, task.objective.horizon) for task in ANTMAZE_TASKS] == [
-        ("antmaze-umaze", U_MAZE, 700),
-        ("antmaze-long", LONG_MAZE, 1000),
-    ]
+def test_keeps_planar_position_and_velocity() -> None:
+    state = np.arange(2 * 3 * 29, dtype=np.float32).reshape(2, 3, 29)
+    abstract = ant_to_point_mass(state)
+    assert abstract.shape == (2, 3, 4)
+    assert abstract.dtype == np.float32
+    np.testing.assert_array_equal(abstract[..., :2], state[..., :2])  # x, y open qpos
+    np.testing.assert_array_equal(abstract[..., 2:], state[..., 15:17])  # vx, vy open qvel
+    assert torch.equal(ant_to_point_mass(torch.from_numpy(state)), torch.from_numpy(abstract))
+
+
+def test_what_is_dropped_is_the_rest_with_slower_joint_rates() -> None:
+    state = torch.arange(29.0).repeat(2, 1)
+    rest = ant_beyond_point_mass(state)
+    slowed = [0.2 * entry for entry in range(21, 29)]
+    expected = [*range(2, 15), *range(17, 21), *slowed]
+    torch.testing.assert_close(rest, torch.tensor([expected, expected]))
+    assert torch.equal(state, torch.arange(29.0).repeat(2, 1))  # a copy was scaled
+
+
+TASK = Navigation(U_MAZE, horizon=700)
+
+
+def placed(positions: list[list[float]], **options: float) -> AntMazeEnv:
+    """Stand ants at `positions`, with the goal far away."""
+    env = AntMazeEnv(TASK, len(positions), seed=0, num_threads=1, **options)  # type: ignore[arg-type]
+    env.reset()
+    state = np.concatenate([standing_pose(len(positions)), np.zeros((len(positions), 14))], axis=1)
+    state[:, :2] = positions
+    env.reset_to(np.arange(len(positions)), state)
+    return env
+
+
+def rolled(env: AntMazeEnv, rows: list[int], angle: float) -> None:
+    """Turn `rows` by `angle` about x, well above the ground."""
+    state = env.state.numpy().astype(np.float64)[rows]
+    state[:, 2], state[:, 3:7] = 2.0, [np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]
+    env.reset_to(np.array(rows), state)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "toppled"),
+    # A cosine of 0.2 is that of 78.5 degrees.
+    [(0.0, False), (60.0, False), (76.0, False), (81.0, True), (100.0, True), (180.0, True)],
+)
+def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> None:
+    env = placed([[-4, 4], [-4, 4]])
+    rolled(env, [0], np.radians(degrees))
+    step = env.step(torch.zeros(2, 2))
+    assert env.failed.tolist() == [toppled, False]
+    assert step.terminated.tolist() == [toppled, False]
+    assert float(step.reward[0]) == pytest.approx(-10.0 * toppled, abs=0.1)
+    env.reset(step.terminated)
+    assert not env.failed.any()
+
+
+def test_walls_are_felt_and_the_floor_is_not() -> None:
+    # The walls' faces are at y = 6 and x = -6, and feet stand 0.6 m to the sides.
+    env = placed([[-4.0, 5.45], [-5.45, 4.0], [-4.0, 4.0], [0.0, 4.0]])
+    felt = torch.zeros(4, dtype=torch.bool)
+    for _ in range(6):
+        env.step(torch.zeros(4, 2))
+        felt |= env.wall_contact
+    assert felt.tolist() == [True, True, False, False]
+
+
+def test_wall_contact_equals_a_search_through_all_contacts() -> None:
+    env = placed([[x, 4.0] for x in (-5.5, -5.0, -4.5, -4.0)], leg_scale=1.25)
+    model = ant_model(U_MAZE, leg_scale=1.25)
+    first, last = wall_geoms(model) or (0, 0)
+    copies = [mujoco.MjData(model) for _ in range(4)]
+    for data, qpos in zip(copies, env.physics.qpos, strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+    command = torch.tensor([[-1.0, 0.0]]).expand(4, 2)
+    for _ in range(20):
+        torques = env.controller(env.physics.qpos, env.physics.qvel, command.double().numpy())
+        env.step(command)
+        touching = []
+        for data, control in zip(copies, torques, strict=True):
+            data.ctrl[:] = control
+            mujoco.mj_step(model, data, 5)
+            pairs = [{int(geom) for geom in contact.geom} for contact in data.contact]
+            touching.append(any(first <= geom <= last for pair in pairs for geom in pair))
+        assert env.wall_contact.tolist() == touching
+    assert env.wall_contact.any()
+
+
+def test_commands_are_clipped() -> None:
+    wild, tame = placed([[-4, 4]]), placed([[-4, 4]])
+    for _ in range(3):
+        first = wild.step(torch.tensor([[7.0, -3.0]]))
+        second = tame.step(torch.tensor([[1.0, -1.0]]))
+    assert torch.equal(first.observation[:, :29], second.observation[:, :29])
+
+
+def test_starts_goals_and_headings() -> None:
+    env = AntMazeEnv(TASK, 400, seed=0, num_threads=2)
+    observation = env.reset().double()
+    assert observation.shape == (400, 31)
+    for points, cell in ((observation[:, :2], U_MAZE.start), (observation[:, 29:], U_MAZE.goal)):
+        offset = points - torch.tensor(U_MAZE.cell_center(*cell))
+        assert float(offset.mean()) == pytest.approx(0.0, abs=0.03)
+        assert float(offset.std()) == pytest.approx(0.2, abs=0.02)
+    yaw = 2 * torch.atan2(observation[:, 6], observation[:, 3])
+    assert torch.allclose(yaw.cos().mean(), torch.tensor(0.0).double(), atol=0.12)
+    assert torch.allclose(yaw.sin().mean(), torch.tensor(0.0).double(), atol=0.12)
+    assert bool((observation[:, 15:29] == 0).all())
+
+
+def test_who_topples_at_the_goal_has_reached_it() -> None:
+    env = placed([[-4, 4], [-4, 4]])
+    rolled(env, [0, 1], np.pi)
+    env.goal = env.position + torch.tensor([[0.0, 0.0], [3.0, 0.0]])
+    step = env.step(torch.zeros(2, 2))
+    assert step.success.tolist() == [True, False] and env.failed.tolist() == [False, True]
+    assert step.terminated.tolist() == [True, True]
+    assert step.reward.tolist() == pytest.approx([10.0, -10.0], abs=0.2)
+
+
+UMAZE = TASKS["antmaze-umaze"]
 
 
 def test_states_are_named_as_mujoco_orders_them() -> None:
     model = ant_model()
-    columns = {column.name: column for column in TASK.state_columns}
+    columns = {column.name: column for column in UMAZE.state_columns}
     joints = [model.joint(joint).name for joint in range(1, model.njnt)]
     expected = ("x", "y", "z", "qw", "qx", "qy", "qz", *joints)
     rates = ("vx", "vy", "vz", "wx", "wy", "wz", *(f"{joint}_rate" for joint in joints))
@@ -43,20 +156,10 @@ def test_states_are_named_as_mujoco_orders_them() -> None:
 
 
 def test_the_point_mass_is_as_fast_as_the_longest_command() -> None:
-    assert TASK.simulator(1).parameters == {"timestep_s": 0.05, "radius_m": 0.1, "speed_m_s": 1.0}
-    assert TASK.abstract_state.names == ("x", "y", "vx", "vy")
-    assert {name: list(group) for name, group in TASK.quantities.items()} == {
+    assert UMAZE.simulator(1).parameters == {"timestep_s": 0.05, "radius_m": 0.1, "speed_m_s": 1.0}
+    assert UMAZE.abstract_state.names == ("x", "y", "vx", "vy")
+    assert {name: list(group) for name, group in UMAZE.quantities.items()} == {
         "position_m": [0, 1],
         "velocity_m_s": [2, 3],
     }
-    assert TASK.planar.wall_reach_m == 1.3
-
-
-@pytest.mark.parametrize("task", ANTMAZE_TASKS, ids=lambda task: task.name)
-def test_point_masses_stand_among_the_walls_of_their_own_maze(task: Task) -> None:
-    simulator = task.simulator(1)
-    assert isinstance(simulator, PointMass)
-    walls = [task.maze.cell_center(*cell) for cell in task.maze.wall_cells()]
-    for centers, blocked in ((task.maze.free_centers(), False), (walls, True)):
-        cells = simulator.free.cells(torch.tensor(np.array(centers), dtype=torch.float32))
-        assert (simulator.free.blocked[cells] == blocked).all()
+    assert UMAZE.planar.wall_reach_m == 1.3

@@ -1,66 +1,22 @@
 import math
-from itertools import product
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from astra_data.core.arrays import Floats
 from astra_data.robots.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
 from astra_data.robots.humanoid.model import (
     COMMANDED,
     FEET,
-    JOINTS,
     TIMESTEP_S,
     CommandRanges,
-    Locomotion,
     humanoid_model,
 )
-from astra_data.robots.humanoid.target import HumanoidEnv
 
 KINDS = (HumanoidKinematics, HumanoidExtendedKinematics)
 Kind = type[HumanoidKinematics]
-
-
-def moving(count: int) -> tuple[Tensor, Tensor]:
-    """Return states (count, 47) of humanoids under random commands, and further commands."""
-    env = HumanoidEnv(Locomotion(), count, seed=0, num_threads=1)
-    env.reset()
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(30):
-        action = 2 * torch.rand(count, 4, generator=generator) - 1
-        env.step(action)
-    return env.state, action
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_it_shows_what_it_is_reset_to(kind: Kind) -> None:
-    state, action = moving(8)
-    abstract = kind.abstraction(state)
-    simulator = kind(8)
-    assert simulator.state.shape == abstract.shape == (8, kind.abstract_state.size)
-    simulator.reset_to(abstract)
-    assert torch.equal(simulator.state, abstract)
-    kept = simulator.step(action)
-    assert kept.dtype == torch.float32
-    simulator.reset_to(abstract[:2], torch.tensor([3, 5]))
-    assert torch.equal(simulator.state[[3, 5]], abstract[:2])
-    assert torch.equal(simulator.state[[0, 1, 2, 4, 6, 7]], kept[[0, 1, 2, 4, 6, 7]])
-    assert not torch.equal(kept[3], abstract[0])
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_batch_steps_as_its_rows_do(kind: Kind) -> None:
-    state, action = moving(8)
-    abstract = kind.abstraction(state)
-    together, single = kind(8), kind(1)
-    together.reset_to(abstract)
-    after = together.step(action)
-    for row in range(8):
-        single.reset_to(abstract[row : row + 1])
-        torch.testing.assert_close(single.step(action[row : row + 1])[0], after[row], atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -79,30 +35,6 @@ def test_joints_approach_their_targets(kind: Kind) -> None:
         assert float(state[17 + joint]) == pytest.approx(target * rate * left, abs=1e-4)
     others = [joint for joint in range(17) if joint not in COMMANDED]
     assert not state[others].any()
-
-
-def test_joints_without_commands_go_back_to_zero() -> None:
-    simulator = HumanoidKinematics(1)
-    state = torch.zeros(1, 34)
-    state[0, JOINTS.index("left_elbow")] = 0.3
-    simulator.reset_to(state)
-    rate = 200 / 11
-    landed = simulator.step(torch.zeros(1, 4))[0, JOINTS.index("left_elbow")]
-    assert float(landed) == pytest.approx(0.3 * math.exp(-rate * 0.015), abs=1e-6)
-
-
-def test_no_command_asks_a_motor_for_more_than_it_has() -> None:
-    limits = humanoid_model().actuator_forcerange[list(COMMANDED), 1]
-    ends = torch.tensor(list(product((-1.0, 1.0), repeat=4)))
-    targets = CommandRanges().targets(ends).numpy()
-    for start in targets:
-        simulator = HumanoidKinematics(len(ends))
-        state = torch.zeros(len(ends), 34)
-        state[:, COMMANDED] = torch.from_numpy(start)
-        simulator.reset_to(state)
-        state = simulator.step(ends)
-        angles, rates = state[:, COMMANDED].numpy(), state[:, 17:][:, COMMANDED].numpy()
-        assert (np.abs(200 * (targets - angles) - 10 * rates) < limits).all()
 
 
 def level(angles: Floats) -> tuple[Floats, Floats]:
@@ -167,21 +99,3 @@ def test_the_torso_turns_on_and_ever_slower() -> None:
     lean = 0.8 * 0.3 * (1 - slowed)
     expected = torch.tensor([-math.sin(lean), 0.0, math.cos(lean)])
     torch.testing.assert_close(after[40:43], expected, atol=0.01, rtol=0)
-
-
-def test_a_falling_humanoid_can_be_told_from_a_standing_one() -> None:
-    env = HumanoidEnv(Locomotion(), 4, seed=0, num_threads=1)
-    env.reset()
-    first = HumanoidExtendedKinematics.abstraction(env.state)
-    while not env.failed.all():
-        env.step(torch.tensor([[3 / 7, 1.0, 3 / 7, 1.0]]).expand(4, 4), ~env.failed)
-    last = HumanoidExtendedKinematics.abstraction(env.state)
-    assert (last[:, 36] < first[:, 36] - 0.15).all()  # lower
-    assert (last[:, 34] > first[:, 34] + 0.3).all()  # before its feet
-    assert (last[:, 39] < -0.5).all()  # sinking
-
-
-def test_parameters_name_commands_and_delay() -> None:
-    plain, extended = HumanoidKinematics(1).parameters, HumanoidExtendedKinematics(1).parameters
-    assert plain["timestep_s"] == 0.015
-    assert extended == {**plain, "follow_s": 0.3}

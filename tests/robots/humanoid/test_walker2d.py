@@ -1,18 +1,91 @@
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from astra_data.pipeline.stages.pair import pair_steps
-from astra_data.robots.humanoid import walker2d
+from astra_data.core.arrays import Floats
 from astra_data.robots.humanoid.abstraction import humanoid_to_walker2d
-from astra_data.robots.humanoid.model import CommandRanges, Locomotion
+from astra_data.robots.humanoid.model import COMMANDED, CONTACT_M, CommandRanges, Locomotion, humanoid_model
 from astra_data.robots.humanoid.target import HumanoidEnv
-from astra_data.robots.humanoid.walker2d import HumanoidWalker2d, walker_model
-from astra_data.robots.registry import built, pairing_named
+from astra_data.robots.humanoid.walker2d import HumanoidWalker2d, sole_clearance, walker_model
+
+# The humanoid's velocities that the walker has: x, z, pitch, and the commanded joints.
+SHARED = [0, 2, 4, *(6 + joint for joint in COMMANDED)]
+
+
+def poses(count: int) -> tuple[Floats, Floats]:
+    """Return walkers (count, 7) in the air, and their velocities."""
+    rng = np.random.default_rng(0)
+    qpos, qvel = rng.uniform(-0.8, 0.0, (count, 7)), rng.normal(size=(count, 7))
+    qpos[:, 1] = 2.0
+    return qpos, qvel
+
+
+def humanoid_like(qpos: Floats, qvel: Floats) -> mujoco.MjData:
+    """Return the humanoid in the pose of a walker, other joints at zero."""
+    model = humanoid_model()
+    data = mujoco.MjData(model)
+    data.qpos[[0, 2]] = qpos[:2]
+    data.qpos[3], data.qpos[5] = np.cos(qpos[2] / 2), np.sin(qpos[2] / 2)
+    data.qpos[7 + np.array(COMMANDED)] = qpos[3:]
+    data.qvel[SHARED] = qvel
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_inertia_is_the_humanoids_seen_in_the_plane() -> None:
+    walker, humanoid = walker_model(), humanoid_model()
+    assert walker.body_mass.sum() == pytest.approx(humanoid.body_mass.sum())
+    data = mujoco.MjData(walker)
+    for qpos, qvel in zip(*poses(10), strict=True):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(walker, data)
+        other = humanoid_like(qpos, qvel)
+        ours, theirs = np.zeros((7, 7)), np.zeros((23, 23))
+        mujoco.mj_fullM(walker, data, ours)
+        mujoco.mj_fullM(humanoid, other, theirs)
+        np.testing.assert_allclose(ours, theirs[np.ix_(SHARED, SHARED)], atol=1e-6)
+        # Gravity, and the forces of the motion itself.
+        np.testing.assert_allclose(data.qfrc_bias, other.qfrc_bias[SHARED], atol=1e-6)
+        np.testing.assert_allclose(data.qfrc_passive, other.qfrc_passive[SHARED], atol=1e-9)
+
+
+def test_joints_are_driven_as_the_humanoids() -> None:
+    walker, humanoid = walker_model(), humanoid_model()
+    data = mujoco.MjData(walker)
+    limited = 0
+    for qpos, qvel in zip(*poses(10), strict=True):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, [0.3, -1.2, -0.8, -0.1]
+        mujoco.mj_forward(walker, data)
+        other = humanoid_like(qpos, qvel)
+        other.ctrl[list(COMMANDED)] = data.ctrl
+        mujoco.mj_forward(humanoid, other)
+        np.testing.assert_allclose(data.actuator_force, other.actuator_force[list(COMMANDED)], atol=1e-9)
+        limited += (np.abs(data.actuator_force) > 79.9).sum()
+    assert limited > 0
+    for ours, theirs in enumerate(COMMANDED):
+        np.testing.assert_array_equal(walker.jnt_range[3 + ours], humanoid.jnt_range[1 + theirs])
+
+
+def test_soles_touch_where_mujoco_says_so() -> None:
+    walker = walker_model()
+    data = mujoco.MjData(walker)
+    feet = np.flatnonzero(walker.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)
+    rng = np.random.default_rng(1)
+    qpos = rng.uniform(-0.4, 0.2, (200, 7))
+    qpos[:, 1] = rng.uniform(1.1, 1.35, 200)
+    clearance = sole_clearance(torch.from_numpy(qpos[:, 1:]))
+    for row in range(200):
+        data.qpos[:] = qpos[row]
+        mujoco.mj_forward(walker, data)
+        bottoms = data.geom_xpos[feet, 2] - walker.geom_size[feet, 0]
+        np.testing.assert_allclose(clearance[row], bottoms, atol=1e-12)
+        touching = [foot in data.contact.geom for foot in feet]
+        assert (clearance[row] < CONTACT_M).tolist() == touching
+    touched = (clearance < CONTACT_M).double().mean()
+    assert 0.2 < float(touched) < 0.8
+
 
 HELD = torch.tensor([3 / 7, 1.0, 3 / 7, 1.0])
 """Hips at zero, knees as straight as commands make them."""
@@ -30,47 +103,6 @@ def recorded(count: int, steps: int) -> tuple[Tensor, Tensor, Tensor]:
         rows.append((before, action, env.state))
     state, action, next_state = (torch.cat(parts) for parts in zip(*rows, strict=True))
     return state, action, next_state
-
-
-def test_it_starts_upright() -> None:
-    state = HumanoidWalker2d(2, num_threads=1).state
-    assert state.dtype == torch.float32
-    assert torch.equal(state[:, 0], torch.tensor([1.4, 1.4]))
-    assert not state[:, 1:].any()
-
-
-def test_it_shows_what_it_is_reset_to() -> None:
-    state, action, _ = recorded(4, 20)
-    abstract = humanoid_to_walker2d(state)
-    assert 0 < float(abstract[:, 13:].mean()) < 1
-    walker = HumanoidWalker2d(80, num_threads=1)
-    walker.reset_to(abstract)
-    assert torch.equal(walker.state, abstract)
-    walker.step(action)
-    kept = walker.state
-    walker.reset_to(abstract[:2], torch.tensor([3, 5]))
-    assert torch.equal(walker.state[[3, 5]], abstract[:2])
-    others = [row for row in range(80) if row not in (3, 5)]
-    assert torch.equal(walker.state[others], kept[others])
-    assert not torch.equal(kept[3], abstract[0])  # what was handed out earlier stays
-
-
-def test_it_can_be_paired() -> None:
-    pairing = pairing_named(f"{Path(walker2d.__file__)}:HumanoidWalker2d")
-    state, action, next_state = (values.numpy() for values in recorded(4, 20))
-    batch = built(pairing, 32)
-    columns, error = pair_steps(pairing, batch, state, action, next_state, tolerance=0.0)
-    assert error == 0.0
-    before, after, landed = (
-        columns[f"abstract.{name}"] for name in ("state", "next_state", "simulated_next_state")
-    )
-    assert landed.dtype == np.float32
-    # It foresees height, joints and all velocities, but not the pitch and its rate: of the humanoid, legs
-    # move the pelvis first.
-    foreseen = [0, 2, 3, 4, 5, 6, 7, *range(9, 13)]
-    wrong, still = (np.sqrt(np.square(guess - after)[:, foreseen].mean(0)) for guess in (landed, before))
-    assert (wrong < 0.6 * still).all()
-    assert (wrong > 1e-5).all()
 
 
 @pytest.mark.parametrize("num_threads", [1, 2])
@@ -139,16 +171,6 @@ def test_a_floor_stays_where_it_is_until_the_walker_is_set_anew() -> None:
     assert not walker.memory.any()
 
 
-def test_contacts_are_those_of_the_feet() -> None:
-    walker = HumanoidWalker2d(3, num_threads=1)
-    state = walker.state
-    # Gymnasium's humanoid starts 0.107 m above the floor.
-    state[:, 0] -= torch.tensor([0.0, 0.107, 0.107])
-    state[2, 2:4] = torch.tensor([-0.5, -1.0])  # the left leg lifted
-    walker.reset_to(state)
-    assert walker.step(HELD.expand(3, 4))[:, 13:].tolist() == [[0, 0], [1, 1], [0, 1]]
-
-
 def test_commands_bend_the_joints_they_name() -> None:
     walker = HumanoidWalker2d(5, num_threads=1)
     action = HELD.repeat(5, 1)
@@ -160,51 +182,6 @@ def test_commands_bend_the_joints_they_name() -> None:
     assert moved.abs().argmax(dim=1).tolist() == [0, 1, 2, 3]
     assert (moved.diagonal() < -0.2).all()
     assert (state[:4, 2:6].diagonal() > -1.25).all()
-
-
-def fall_steps(world: HumanoidEnv | HumanoidWalker2d) -> tuple[Tensor, Tensor]:
-    """Return after how many steps the torso leaves its healthy heights under `HELD`, and its last pitch."""
-    count = len(world.state)
-    steps, pitch = torch.zeros(count), torch.zeros(count)
-    for _ in range(160):
-        state = humanoid_to_walker2d(world.state) if isinstance(world, HumanoidEnv) else world.state
-        healthy = state[:, 0] > 1.0
-        steps += healthy
-        pitch = torch.where(healthy, state[:, 1], pitch)
-        world.step(HELD.expand(count, 4))
-    return steps, pitch
-
-
-def test_standing_still_it_falls_forward_as_soon_as_the_humanoid() -> None:
-    env = HumanoidEnv(Locomotion(), 12, seed=0, num_threads=2)
-    env.reset()
-    walker = HumanoidWalker2d(12, num_threads=2)
-    walker.reset_to(humanoid_to_walker2d(env.state))
-    theirs, _ = fall_steps(env)
-    ours, pitch = fall_steps(walker)
-    assert float(ours.max()) < 160
-    assert (pitch > 0.2).all()
-    assert float(ours.mean()) == pytest.approx(float(theirs.mean()), rel=0.15)
-
-
-def test_parameters_name_the_commands() -> None:
-    walker = HumanoidWalker2d(1, ranges=CommandRanges(hip_deg=(-25.0, 5.0)), num_threads=1)
-    assert walker.parameters == {
-        "timestep_s": 0.015,
-        "hip_low_deg": -25.0,
-        "hip_high_deg": 5.0,
-        "knee_low_deg": -70.0,
-        "knee_high_deg": -2.0,
-    }
-
-
-def test_other_ranges_give_commands_other_targets() -> None:
-    narrow, action = CommandRanges(hip_deg=(-25.0, 5.0)), torch.tensor([[1.0, 0.2, -1.0, 0.4]])
-    landed = HumanoidWalker2d(1, ranges=narrow, num_threads=1).step(action)
-    plain = HumanoidWalker2d(1, num_threads=1)
-    # 5 and -25 degrees are 55 and 25 of the 70 degrees from -50 to 20.
-    same = torch.tensor([[2 * 55 / 70 - 1, 0.2, 2 * 25 / 70 - 1, 0.4]])
-    torch.testing.assert_close(landed, plain.step(same), atol=1e-5, rtol=1e-5)
 
 
 def test_a_correction_says_what_touches_as_the_humanoids_feet_do() -> None:

@@ -1,5 +1,3 @@
-"""The bodies under targets written by hand: delays, the ankles' reflex, waiting, falling."""
-
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
+from astra_data.robots.ant.body import ant_model
 from astra_data.robots.nao.bodies import (
+    BALL_MASS_KG,
     MOTORS,
     STIFFNESS_NM_PER_RAD,
     SUBSTEPS,
@@ -17,13 +17,83 @@ from astra_data.robots.nao.bodies import (
     BatchedBodies,
     nao_model,
 )
-from astra_data.robots.nao.kinematics import HIP_OFFSET_Z_M, IDENTICAL, TO_MOTORS, Traits, leg_angles
+from astra_data.robots.nao.kicking import BALL_RADIUS_M
+from astra_data.robots.nao.kinematics import (
+    HIP_OFFSET_Z_M,
+    IDENTICAL,
+    LEG_JOINTS,
+    TO_MOTORS,
+    Traits,
+    leg_angles,
+)
 from astra_data.robots.nao.walk import Gait, StepPlanner, Targets, WalkEngine, WalkLimits, WalkStyle
+from astra_data.worlds.batched_mujoco import wall_geoms
+from astra_data.worlds.plane.mazes import U_MAZE
+
+
+def test_masses_are_the_published_ones() -> None:
+    model = nao_model()
+    # B-Human's calibration of the V6: torso, neck, head; arms of 93.0 + 157.8 + 64.8 + 77.6 + 185.3 g; legs.
+    fixed = 1.0496 + 0.0784 + 0.6594 + 2 * (0.0930 + 0.1578 + 0.0648 + 0.0776 + 0.1853)
+    leg = (0.0698, 0.1405, 0.3897, 0.3014, 0.1342, 0.1718)
+    assert model.body("Torso").mass[0] == pytest.approx(fixed)
+    for side in "LR":
+        np.testing.assert_allclose([model.body(side + name).mass[0] for name in LEG_JOINTS], leg)
+    assert model.body_mass.sum() == pytest.approx(5.36, abs=0.005)
+
+
+def test_the_robot_is_its_own_mirror_image() -> None:
+    model = nao_model()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.subtree_com[1][1] == pytest.approx(0.0, abs=1e-12)
+    for name in LEG_JOINTS:
+        left, right = model.joint(f"L{name}"), model.joint(f"R{name}")
+        mirrored = -right.range[::-1] if name.endswith("Roll") else right.range
+        np.testing.assert_allclose(left.range, mirrored)
+    np.testing.assert_allclose(np.degrees(model.joint("LHipYawPitch").range), [-65.62, 42.44])
+
+
+def test_walls_stand_where_the_ants_do() -> None:
+    ours, theirs = nao_model(U_MAZE), ant_model(U_MAZE)
+    walls = wall_geoms(ours)
+    assert walls is not None
+    assert walls[1] - walls[0] + 1 == len(U_MAZE.wall_cells())
+    for geom in range(walls[0], walls[1] + 1):
+        name = ours.geom(geom).name
+        np.testing.assert_allclose(ours.geom(name).pos[:2], theirs.geom(name).pos[:2])
+        np.testing.assert_allclose(ours.geom(name).size[:2], theirs.geom(name).size[:2])
+
+
+def test_the_ball_rolls_to_a_stop_at_the_published_rate() -> None:
+    model = nao_model(ball=True)
+    assert model.body("ball").mass[0] == pytest.approx(BALL_MASS_KG)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 5.0  # the robot is still falling
+    data.qvel[18:21], data.qvel[21:24] = [1.0, 0, 0], [0, 1.0 / BALL_RADIUS_M, 0]
+    speeds = []
+    for _ in range(round(0.9 / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        speeds.append(data.qvel[18])
+    middle = np.array(speeds[25:])
+    decelerations = -np.diff(middle) / model.opt.timestep
+    assert decelerations.mean() == pytest.approx(0.30, abs=0.003)
+
+
+@pytest.mark.parametrize("part", ["LShank", "RShank", "LFoot", "RFoot", "chest"])
+def test_shanks_and_feet_touch_the_ball_and_the_chest_does_not(part: str) -> None:
+    model = nao_model(ball=True)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 1.0
+    mujoco.mj_forward(model, data)
+    data.qpos[19:22] = data.geom(part).xpos
+    mujoco.mj_forward(model, data)
+    touched = {model.geom(int(geom)).name for pair in data.contact.geom for geom in pair}
+    assert (part in touched) == (part != "chest")
+
 
 STYLE = WalkStyle(gyro_gain=(0.0, 0.0))
-STANDING = leg_angles(WalkEngine(StepPlanner(np.ones(1)), STYLE).feet(Gait.standing(1, WalkLimits()))).angles[
-    0
-]
+STANDING = leg_angles(WalkEngine(StepPlanner(np.ones(1)), STYLE).feet(Gait.standing(1, WalkLimits())))[0]
 FIRST = 3  # the longest delay: so many angles are under way when a control step begins
 
 
@@ -69,16 +139,6 @@ def test_angles_arrive_after_their_delay() -> None:
     # The last ticks of this control step are the first of the next.
     robots.step(np.arange(3), targets(3), noise(3))
     np.testing.assert_allclose(robots.sent[:, :FIRST], np.tile(expected[-FIRST:], (3, 1, 1)))
-
-
-def test_servos_turn_joints_that_are_off_by_their_offset() -> None:
-    offset = np.zeros((1, 11))
-    offset[0, 3] = 0.05
-    robots = bodies(joint_offset_rad=offset)
-    robots.step(np.array([0]), targets(), noise())
-    moved = robots.sent[0, -1] - (STANDING + 1e-3 * TICKS)[TO_MOTORS]
-    assert moved[3] == pytest.approx(0.05) and np.abs(np.delete(moved, 3)).max() < 1e-12
-    np.testing.assert_array_equal(robots.held[0], robots.sent[0, -1])
 
 
 def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> None:
@@ -132,36 +192,6 @@ def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(
     assert (followed[0] < TICKS) == waits
 
 
-@pytest.mark.parametrize(("roll_rate", "waits"), [(-2.0, True), (2.0, False)])
-def test_a_foot_waits_as_soon_as_the_torso_turns_toward_it(roll_rate: float, waits: bool) -> None:
-    """An upright torso that is measured to roll to the left, over the left foot that is to be lifted."""
-    robots, measured, planned = bodies(height_m=1.0), noise(), targets()
-    measured[0, 0, 0] = roll_rate
-    planned.lifts_off[:, 0] = 1
-    followed = robots.step(np.array([0]), planned, measured)
-    assert (followed[0] < TICKS) == waits
-
-
-def test_a_robot_that_waits_stands_on_both_feet() -> None:
-    """Both ankles push against the rates that are measured then, whichever foot is planned to carry."""
-    style = replace(STYLE, gyro_gain=(0.1, 0.2), gyro_keep=0.0)
-    robots, measured, planned = bodies(height_m=1.0, style=style), noise(), targets(carries=(False, True))
-    measured[0, 0, :2] = [-2.0, 0.8]
-    planned.lifts_off[:, 0] = 1
-    followed = robots.step(np.array([0]), planned, measured)
-    assert followed[0] < TICKS
-    added = robots.sent[0, FIRST] - STANDING[TO_MOTORS]
-    assert added[[4, 5, 10, 11]] == pytest.approx([0.08, -0.4] * 2, abs=2e-3)
-
-
-def test_the_gyroscope_reads_the_last_rates_with_their_noise() -> None:
-    robots, measured = bodies(height_m=1.0), noise()
-    measured[0, :, 2] = 9.0
-    measured[0, -1] = [1.0, -2.0, 3.0]
-    robots.step(np.array([0]), targets(), measured)
-    assert robots.gyro[0] == pytest.approx([1.0, -2.0, 3.0], abs=0.2)
-
-
 def test_it_waits_only_so_long() -> None:
     robots = bodies(height_m=1.0, style=replace(STYLE, longest_wait_ticks=5))
     half = np.radians(-20) / 2
@@ -183,18 +213,3 @@ def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(
     robots.qpos[0, 4 + axis] = np.sin(half)
     robots.step(np.array([0]), targets(), noise())
     assert bool(robots.fallen[0]) == fallen
-
-
-def test_who_falls_stays_as_it_is_until_it_is_reset() -> None:
-    robots = bodies(2)
-    half = np.radians(44.0) / 2
-    robots.qpos[1, 3:7] = [np.cos(half), 0.0, np.sin(half), 0.0]
-    robots.qvel[1, 4] = 5.0
-    robots.step(np.arange(2), targets(2), noise(2))
-    assert robots.fallen.tolist() == [False, True]
-    lying = robots.state[1].copy()
-    followed = robots.step(np.arange(2), targets(2), noise(2))
-    assert followed.tolist() == [TICKS, 0]
-    np.testing.assert_array_equal(robots.state[1], lying)
-    robots.reset(np.array([1]), robots.qpos[:1], np.tile(STANDING[TO_MOTORS], (1, 1)))
-    assert not robots.fallen.any() and not robots.pressure[1].any()

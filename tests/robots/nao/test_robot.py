@@ -1,11 +1,10 @@
 import mujoco
 import numpy as np
 import pytest
-from nao_values import TOTAL_MASS_KG
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.robots.nao.kinematics import GRAVITY, IDENTICAL
+from astra_data.robots.nao.kinematics import IDENTICAL
 from astra_data.robots.nao.robot import BatchedNao
 from astra_data.worlds.plane.mazes import U_MAZE
 
@@ -43,18 +42,6 @@ def test_it_resumes_exactly() -> None:
         np.testing.assert_array_equal(getattr(other.senses, name), value)
 
 
-def test_without_a_command_it_stands() -> None:
-    nao = BatchedNao(3, seed=0, num_threads=1)
-    for _ in range(round(10 / 0.192)):
-        nao.step(np.zeros((3, 3)))
-    assert not nao.fallen.any()
-    assert np.abs(nao.pose).max() < 0.03
-    assert np.abs(nao.velocity).max() < 0.02
-    assert np.degrees(np.abs(nao.senses.tilt)).max() < 5
-    weight = TOTAL_MASS_KG * GRAVITY
-    np.testing.assert_allclose(nao.senses.pressure.sum(axis=(1, 2)), weight, rtol=0.02)
-
-
 @pytest.mark.parametrize(
     "command", [(0.2, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.15, 0.0), (0.0, 0.0, 0.8)]
 )
@@ -70,46 +57,6 @@ def test_it_walks_as_told(command: tuple[float, float, float]) -> None:
     else:
         np.testing.assert_allclose(moved[:2], command[:2], atol=0.3 * max(np.abs(command)))
     assert not nao.fallen.any()
-
-
-def test_it_stands_up_where_it_is_told_and_the_others_go_on() -> None:
-    nao = BatchedNao(3, seed=0, num_threads=1)
-    walk(nao, 3)
-    before = nao.bodies.state.copy()
-    nao.reset(np.array([1]), np.array([[2.0, -1.0, 0.5]]), np.random.default_rng(0))
-    np.testing.assert_allclose(nao.pose[1], [2.0, -1.0, 0.5])
-    np.testing.assert_array_equal(nao.bodies.state[[0, 2]], before[[0, 2]])
-    assert not nao.gait.walking[1]
-
-
-def test_inactive_robots_are_frozen() -> None:
-    nao = BatchedNao(3, seed=0, num_threads=1)
-    walk(nao, 3)
-    before = nao.state_dict()
-    nao.step(np.full((3, 3), 0.1), active=np.array([True, False, True]))
-    after = nao.state_dict()
-    for name in set(before) - {"seed", "steps"}:
-        np.testing.assert_array_equal(after[name][1], before[name][1])
-    assert (after["state"][0] != before["state"][0]).any()
-
-
-def test_traits_are_drawn_from_their_ranges() -> None:
-    traits = BatchedNao(200, seed=0).traits
-    assert np.degrees(traits.joint_offset_rad).std() == pytest.approx(0.35, abs=0.03)
-    for values, low, high in (
-        (traits.stiffness, 0.7, 1.0),
-        (traits.friction, 0.4, 0.8),
-        (traits.quality, 0.83, 1.0),
-    ):
-        assert low <= values.min() < low + 0.01 < high - 0.01 < values.max() <= high
-    assert set(traits.delay_ticks) == {2, 3}
-
-
-def test_measured_angles_hide_the_joints_offsets() -> None:
-    nao = BatchedNao(2, seed=0, num_threads=1)
-    walk(nao, 2)
-    true = nao.bodies.qpos[:, [7, *range(8, 13), *range(14, 19)]]
-    np.testing.assert_allclose(nao.senses.angles + nao.traits.joint_offset_rad, true)
 
 
 def turned(*roll_pitch_yaw: float) -> Floats:
@@ -135,32 +82,6 @@ def test_the_turn_of_a_leaning_robot_is_about_the_vertical() -> None:
     np.testing.assert_allclose(nao.velocity, [[0.2, -0.1, world[2]]])
 
 
-def test_gyroscopes_have_other_noise_in_every_step_and_the_same_from_the_same_seed() -> None:
-    nao = BatchedNao(2, seed=0, num_threads=1)
-
-    def standing() -> Floats:
-        nao.reset(np.arange(2), np.zeros((2, 3)), np.random.default_rng(0))
-        nao.reseed(7)
-        read = []
-        for _ in range(40):
-            nao.step(np.zeros((2, 3)))
-            read.append(nao.senses.gyro)
-        return np.array(read)
-
-    first = standing()
-    np.testing.assert_allclose(first[10:].std(axis=0), 0.05, rtol=0.5)
-    np.testing.assert_array_equal(standing(), first)
-
-
-def test_balls_lie_a_meter_ahead_unless_they_are_placed() -> None:
-    nao = BatchedNao(3, seed=0, ball=True, num_threads=1)
-    nao.reset(
-        EVERYONE, np.array([[1.0, 2.0, 0.0], [1.0, 2.0, np.pi / 2], [0, 0, -2.5]]), np.random.default_rng(0)
-    )
-    ahead = [[2.0, 2.0], [1.0, 3.0], [np.cos(2.5), -np.sin(2.5)]]
-    np.testing.assert_allclose(nao.ball, ahead, atol=1e-12)
-
-
 def test_walls_are_felt_and_stop_it() -> None:
     # The wall's face is at x = -6; the robot's toes are 0.1 m ahead of it.
     nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)
@@ -171,27 +92,6 @@ def test_walls_are_felt_and_stop_it() -> None:
         felt |= nao.touching
     assert felt.tolist() == [True, False]
     assert nao.pose[0, 0] > -5.95
-
-
-def test_a_touch_lasts_no_longer_than_the_step_that_felt_it() -> None:
-    nao = BatchedNao(3, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)
-    middle, wall = [-4.0, 4.0, np.pi], [-5.92, 4.0, np.pi]
-    nao.reset(EVERYONE, np.array([wall, wall, middle]), np.random.default_rng(0))
-    nao.step(np.zeros((3, 3)))
-    assert nao.touching.tolist() == [True, True, False]
-    nao.reset(np.array([0]), np.array([wall]), np.random.default_rng(0))
-    assert nao.touching.tolist() == [False, True, False]
-    nao.bodies.qpos[1, 0] += 1.0
-    nao.step(np.zeros((3, 3)))
-    assert nao.touching.tolist() == [True, False, False]
-
-
-def test_a_ball_at_a_wall_is_not_the_robot() -> None:
-    nao = BatchedNao(1, seed=0, maze=U_MAZE, ball=True, spread=IDENTICAL, num_threads=1)
-    nao.reset(np.array([0]), np.array([[-4.0, 4.0, 0.0]]), np.random.default_rng(0), np.array([[-5.96, 4.0]]))
-    nao.step(np.zeros((1, 3)))
-    assert nao.ball[0, 0] > -5.96  # the wall pushes it off
-    assert not nao.touching.any()
 
 
 def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
@@ -223,14 +123,6 @@ def test_a_kick_sends_the_ball_ahead() -> None:
     assert (speeds[True] > 0.7).all()
     assert (speeds[True] < 2.0).all()
     assert (speeds[True] > speeds[False] + 0.3).all()
-
-
-def test_a_ball_dead_ahead_is_kicked_too() -> None:
-    nao = BatchedNao(1, seed=0, ball=True, spread=IDENTICAL, num_threads=1)
-    nao.reset(np.arange(1), np.zeros((1, 3)), np.random.default_rng(0), np.array([[0.17, 0.0]]))
-    for _ in range(8):
-        nao.step(np.zeros((1, 3)), kick=np.array([True]))
-    assert nao.ball[0, 0] > 0.4
 
 
 @pytest.mark.parametrize("side", [1, -1])

@@ -33,28 +33,6 @@ def test_states_have_their_columns_and_abstractions(task: str) -> None:
     assert (abstract - one.truth).abs().max() < 0.5
 
 
-def test_robots_turn_to_where_they_are_to_go_and_go_there() -> None:
-    one = env(count=8, errors=NO_ERRORS)
-    start = one.position
-    for _ in range(25):
-        one.step(torch.tensor([[0.8, 0.0]]).expand(8, 2))
-    way = one.position - start
-    assert way[:, 0].min() > 0.3
-    assert (way[:, 1].abs() < 0.5 * way[:, 0]).all()
-    np.testing.assert_allclose(np.cos(one.robots.pose[:, 2]), 1.0, atol=0.1)
-
-
-def test_robots_with_a_ball_keep_facing_it() -> None:
-    one = env("nao-kick", 8, errors=NO_ERRORS)
-    away = torch.nn.functional.normalize(one.truth[:, :2] - one.truth[:, 4:6])
-    for _ in range(40):
-        one.step(torch.nn.functional.pad(0.5 * away, (0, 1)))
-    apart = one.robots.ball - one.robots.pose[:, :2]
-    assert np.linalg.norm(apart, axis=1).min() > 0.5
-    bearing = np.arctan2(apart[:, 1], apart[:, 0]) - one.robots.pose[:, 2]
-    np.testing.assert_allclose(np.cos(bearing), 1.0, atol=0.1)
-
-
 def test_robots_turn_to_their_ball_before_they_walk() -> None:
     one = env("nao-kick", 4, errors=NO_ERRORS)
     place, angle = np.zeros((4, 3)), np.array([0.0, np.pi / 4, np.pi / 2, -3.0])
@@ -104,45 +82,6 @@ def test_a_kick_reaches_a_foot_far_and_moves_no_robot() -> None:
     assert fastest[1::2].max() == pytest.approx(0.0, abs=0.02)
     assert np.abs(one.robots.pose[:, :2]).max() < 0.1
     assert not one.robots.fallen.any()
-
-
-def test_touching_a_wall_fails() -> None:
-    one = env(count=2)
-    for _ in range(60):
-        step = one.step(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
-        if step.terminated[0]:
-            break
-    assert one.failed.tolist() == [True, False]
-    assert one.wall_contact.tolist() == [True, False]
-    assert step.terminated.tolist() == [True, False]
-    assert float(step.reward[0]) == pytest.approx(one.objective.failure_reward, abs=0.3)
-
-
-def test_a_goal_succeeds_and_a_ball_beside_it_fails() -> None:
-    one = env("nao-kick", 2)
-    balls = np.array([[1.4, 0.0], [1.4, 1.2]])
-    one.robots.reset(
-        np.arange(2), np.column_stack([balls - [0.3, 0.0], [0.0, 0.0]]), np.random.default_rng(0), balls
-    )
-    one.localisation.reset(np.arange(2), one.robots.pose, np.random.default_rng(0))
-    ended = torch.zeros(2, dtype=torch.bool)
-    success = ended.clone()
-    for _ in range(40):
-        step = one.step(torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), ~ended)
-        success |= step.success & ~ended
-        ended |= step.terminated
-    assert ended.all()
-    assert success.tolist() == [True, False]
-
-
-def test_a_state_has_the_noise_that_comes_next() -> None:
-    one, action = env(), torch.tensor([[0.7, 0.2]] * 3)
-    one.step(action)
-    other = TASKS["nao-navigation"].target(3, seed=9, num_threads=1)
-    assert isinstance(other, NaoEnv)
-    other.reset()
-    other.load_state_dict(one.state_dict())
-    assert torch.equal(one.step(action).observation, other.step(action).observation)
 
 
 def test_robots_can_be_stood_where_a_state_believes_them() -> None:
@@ -196,36 +135,3 @@ def test_loads_are_those_of_the_left_and_of_the_right_foot() -> None:
     assert columns is not None
     left, right = columns.index("load_left"), columns.index("load_right")
     np.testing.assert_allclose(one.state[:, [left, right]], [[0.2, 2.0], [1.0, 0.5]])
-
-
-def test_true_velocities_are_those_of_the_way() -> None:
-    one = env(count=4, errors=NO_ERRORS)
-    for _ in range(8):
-        one.step(torch.tensor([[0.5, 0.0]]).expand(4, 2))
-    start, velocities = one.truth[:, :2], []
-    for _ in range(20):
-        one.step(torch.tensor([[0.5, 0.0]]).expand(4, 2))
-        velocities.append(one.truth[:, 2:4])
-    way = (one.truth[:, :2] - start) / (20 * 0.192)
-    assert way[:, 0].min() > 0.05
-    np.testing.assert_allclose(torch.stack(velocities).mean(0), way, atol=0.04)
-
-
-def test_a_fall_ends_the_episode() -> None:
-    one, half = env(count=2), np.radians(60) / 2
-    one.robots.bodies.qpos[0, 3:7] = [np.cos(half), 0.0, np.sin(half), 0.0]
-    step = one.step(torch.zeros(2, 2))
-    assert one.failed.tolist() == step.terminated.tolist() == [True, False]
-    assert float(step.reward[0]) == pytest.approx(one.objective.failure_reward, abs=0.3)
-    one.reset(step.terminated)
-    assert not one.failed.any() and not one.robots.fallen.any()
-
-
-def test_a_seed_repeats_starts_traits_errors_and_noise() -> None:
-    one, seen = env(), []
-    for seed in (4, 4, 5):
-        one.reseed(seed)
-        first = one.reset()
-        seen.append(torch.cat([first, one.step(torch.full((3, 2), 0.5)).observation], dim=1))
-    assert torch.equal(seen[0], seen[1])
-    assert (seen[0] != seen[2]).any(dim=1).all()

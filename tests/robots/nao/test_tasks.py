@@ -3,31 +3,8 @@ import pytest
 import torch
 
 from astra_data.dataset.columns import ACTION, GOAL, STATE
-from astra_data.robots.nao.tasks import KICK_RANGES, NAO_TASKS
+from astra_data.robots.nao.tasks import KICK, NAVIGATION
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.plane.mazes import FIELD, S_MAZE
-from astra_data.worlds.variation import WIDE_RANGES
-
-NAVIGATION, KICK = NAO_TASKS
-
-
-def columns(name: str) -> dict[str, object]:
-    return {column.name: column for column in TASKS[name].state_columns}
-
-
-def test_navigation_and_kicking() -> None:
-    assert [task.name for task in NAO_TASKS] == ["nao-navigation", "nao-kick"]
-    assert (NAVIGATION.maze, KICK.maze) == (S_MAZE, FIELD)
-    assert NAVIGATION.timestep_s == KICK.timestep_s == pytest.approx(0.192)
-    assert KICK.objective.horizon * KICK.timestep_s == pytest.approx(30.0, abs=0.1)
-    assert {task.facts["stand_in"] for task in NAO_TASKS} == {"mujoco"}
-
-
-def test_simulators_are_told_of_the_robot() -> None:
-    body = {"timestep_s": 0.192, "radius_m": 0.1, "speed_m_s": 0.25}
-    assert NAVIGATION.simulator(1).parameters == pytest.approx(body)
-    contact = {"reach_m": 0.22, "knock_m_s": 0.7, "kick_reach_m": 0.35, "kick_m_s": 1.0}
-    assert KICK.simulator(1).parameters == pytest.approx(body | contact)
 
 
 def test_a_ball_ends_states_and_a_wish_to_kick_ends_commands() -> None:
@@ -41,7 +18,7 @@ def test_a_ball_ends_states_and_a_wish_to_kick_ends_commands() -> None:
     assert state.names[29:] == ("ball_x", "ball_y", "ball_vx", "ball_vy", "ball_unseen")
 
 
-@pytest.mark.parametrize("task", NAO_TASKS, ids=lambda task: task.name)
+@pytest.mark.parametrize("task", [NAVIGATION, KICK], ids=lambda task: task.name)
 def test_abstract_states_keep_the_entries_of_their_names(task: object) -> None:
     task = TASKS[task.name]  # type: ignore[attr-defined]
     state, abstract = task.state_columns[0], task.abstract_state
@@ -57,10 +34,3 @@ def test_abstract_states_keep_the_entries_of_their_names(task: object) -> None:
         unit = "m/s" if name.endswith("m_s") else "m"
         assert [words["unit"][entry] for entry in entries] == [unit] * 2
         assert all(abstract.names[entry].startswith("ball") == name.startswith("ball") for entry in entries)
-
-
-def test_kicking_varies_what_walking_does_and_the_ball() -> None:
-    for name, ends in WIDE_RANGES.model_dump().items():
-        assert getattr(KICK_RANGES, name) == ends
-    assert NAVIGATION.varied.wide == WIDE_RANGES and KICK.varied.wide == KICK_RANGES
-    assert NAVIGATION.varied.randomized == KICK.varied.randomized

@@ -3,9 +3,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
+from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, FreeSpace, GoalDistance, Maze
 
 CORRIDOR = Maze(rows=("1111111", "1000001", "1111111"), scale=4.0, start=(1, 1), goal=(1, 5))
 
@@ -49,11 +50,6 @@ def test_around_the_grid_there_is_wall() -> None:
     assert (bare == np.minimum(ring[:, None], ring)).all()
 
 
-def test_clearance_in_the_middle_and_beside_a_wall() -> None:
-    points = np.array([[0.0, 4.0], [0.0, 5.5], [0.0, 4.0 + 1.75], [0.0, 0.0]])
-    assert U_MAZE.clearance(points) == pytest.approx([2.0, 0.5, 0.25, 0.0], abs=U_MAZE.fine_m)
-
-
 @pytest.mark.parametrize(
     ("start", "goal", "length"),
     [
@@ -74,12 +70,6 @@ def test_distance_around_the_u() -> None:
     assert shortest(U_MAZE, (-4.0, 4.0), (-4.0, -4.0)) == pytest.approx(length, rel=0.03)
 
 
-def test_distance_in_a_wall_grows_inward() -> None:
-    field = U_MAZE.distance_field(np.array([-4.0, -4.0]))
-    depths = [field[U_MAZE.fine_index(np.array([-8.0 + offset, -4.0]))] for offset in (1.95, 1.45, 0.95)]
-    assert depths == pytest.approx([2.05, 2.55, 3.05], rel=0.05)
-
-
 def test_a_disc_goes_around_corners_at_its_radius() -> None:
     # A tight string: a tangent to the circle about each corner, an arc, and the wall's end between them.
     apart = np.hypot(6.0, 2.0)
@@ -92,14 +82,6 @@ def test_a_disc_goes_around_corners_at_its_radius() -> None:
     assert field[U_MAZE.fine_index(np.array([0.0, -5.45]))] == pytest.approx(
         field[U_MAZE.fine_index(np.array([0.0, -4.95]))] + 0.5, abs=0.15
     )
-
-
-def test_a_margin_keeps_paths_away_from_corners() -> None:
-    goal, start = np.array([-4.0, -4.0]), U_MAZE.fine_index(np.array([-4.0, 4.0]))
-    wide = U_MAZE.distance_field(goal, margin=1.0)
-    # Past the corners at 1 m, a path is longer, and nowhere shorter than the free one.
-    assert wide[start] > 1.02 * U_MAZE.distance_field(goal)[start]
-    assert wide[start] < 2 * np.hypot(6.0, 3.0) + 6.0 + 1.0
 
 
 def test_who_goes_downhill_keeps_the_margin_all_the_way() -> None:
@@ -135,40 +117,111 @@ def test_a_maze_that_cannot_be_is_refused(changes: dict[str, Any], fault: str) -
         replace(CORRIDOR, **changes)
 
 
-@pytest.mark.parametrize("ends", [((1, 1), (1, 3)), ((1, 3), (1, 1))])
-def test_a_way_may_lead_down_and_up_again(ends: tuple[tuple[int, int], tuple[int, int]]) -> None:
-    rows = ("11111", "10101", "10001", "11111")
-    assert Maze(rows=rows, scale=1.0, start=ends[0], goal=ends[1]).walls.sum() == 15
-
-
-def test_every_fault_of_a_maze_is_told_at_once() -> None:
-    faults = r"maze: start: expected .* got \(0, 0\); goal: expected .* got \(9, 9\); fine_m: expected a half"
-    with pytest.raises(BadInputError, match=faults):
-        replace(CORRIDOR, start=(0, 0), goal=(9, 9), fine_m=3.0)
-
-
-@pytest.mark.parametrize(("scale", "fine_m"), [(0.0, 0.1), (-4.0, -0.1), (-4.0, 0.1)])
-def test_cells_have_a_size(scale: float, fine_m: float) -> None:
-    with pytest.raises(BadInputError, match="maze: fine_m: expected a half of the scale"):
-        replace(CORRIDOR, scale=scale, fine_m=fine_m)
-
-
 def test_cells_of_a_maze_that_is_not_square_are_where_they_are_drawn() -> None:
     assert CORRIDOR.half_extent.tolist() == [14.0, 6.0]
     assert (CORRIDOR.cell_center(0, 0), CORRIDOR.cell_center(1, 5)) == ((-12.0, 4.0), (8.0, 0.0))
     assert CORRIDOR.fine_walls.shape == (120, 280)
 
 
-def test_a_room_that_is_closed_off_is_as_far_as_a_wall() -> None:
-    maze = Maze(rows=("1111111", "1000101", "1111111"), scale=1.0, start=(1, 1), goal=(1, 1))
-    field = maze.distance_field(np.array(maze.cell_center(1, 1)))
-    row, columns = 15, np.array([35, 45, 55])  # middles of the last cell of the corridor, the wall, the room
-    assert np.isfinite(field).all()
-    # From the goal to the corridor's last cell, then straight on.
-    np.testing.assert_allclose(field[row, columns], [2.0, 3.0, 4.0], atol=0.11)
+ROOM = Maze(rows=("111", "101", "111"), scale=4.0, start=(1, 1), goal=(1, 1))
+"""One room, free in [-2, 2]²; with a radius of 0.1 m, in [-1.9, 1.9]²."""
+
+PILLAR = Maze(rows=("11111", "10001", "10101", "10001", "11111"), scale=2.0, start=(1, 1), goal=(3, 3))
+"""A corridor around a block that is closed in [-1.1, 1.1]² with a radius of 0.1 m."""
 
 
-def test_there_is_no_distance_to_a_goal_in_a_wall() -> None:
-    with pytest.raises(BadInputError, match=r"farther than 0.5 m from walls, got \(8.00, 1.60\)"):
-        CORRIDOR.distance_field(np.array([8.0, 1.6]), radius=0.5)
-    assert np.isfinite(CORRIDOR.distance_field(np.array([8.0, 1.6]), radius=0.3)).all()
+def slide(maze: Maze, start: list[float], end: list[float]) -> tuple[list[float], bool]:
+    rest, stopped = FreeSpace.of_maze(maze, radius_m=0.1).slide(torch.tensor([start]), torch.tensor([end]))
+    return rest[0].tolist(), bool(stopped[0])
+
+
+@pytest.mark.parametrize(
+    ("end", "rest"),
+    [
+        ([1.95, 0.0], [1.9, 0.0]),
+        ([-1.95, 0.0], [-1.9, 0.0]),
+        ([0.0, 1.95], [0.0, 1.9]),
+        ([0.0, -1.95], [0.0, -1.9]),
+        ([1.95, 1.95], [1.9, 1.9]),  # into a corner
+        ([-1.95, 1.5], [-1.9, 1.5]),  # slanted: only the blocked axis stops
+        ([1.5, -1.95], [1.5, -1.9]),
+    ],
+)
+def test_walls_stop_each_axis_by_itself(end: list[float], rest: list[float]) -> None:
+    # Starts within the last free cell, for a step does not look at the cells between its ends.
+    start = [float(np.clip(value, -1.85, 1.85)) for value in end]
+    reached, stopped = slide(ROOM, start, end)
+    assert reached == pytest.approx(rest, abs=2e-4)
+    assert stopped
+    free = FreeSpace.of_maze(ROOM, radius_m=0.1)
+    assert not free.blocked[free.cells(torch.tensor(reached))]
+
+
+def test_an_outer_corner_met_diagonally_lets_one_axis_pass() -> None:
+    # From below and left of the pillar's corner at (-1.1, -1.1): x goes first and is free, then y is stopped.
+    reached, stopped = slide(PILLAR, [-1.12, -1.12], [-1.08, -1.08])
+    assert reached == pytest.approx([-1.08, -1.1], abs=2e-4)
+    assert stopped
+
+
+@pytest.mark.parametrize(("fine_m", "radius_m"), [(0.1, 0.3), (0.1, 0.6), (0.05, 0.35), (0.25, 0.75)])
+def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float) -> None:
+    """Also where a radius is a hair less than its number of cells, as 0.3 / 0.1 is."""
+    free = FreeSpace.of_maze(replace(ROOM, fine_m=fine_m), radius_m=radius_m)
+    inside, outside = 2.0 - radius_m - fine_m / 2, 2.0 - radius_m + fine_m / 2
+    points = torch.tensor([[inside, 0.0], [0.0, -inside], [outside, 0.0], [0.0, -outside]])
+    assert free.blocked[free.cells(points)].tolist() == [False, False, True, True]
+
+
+def test_a_long_walk_never_leaves_the_free_space() -> None:
+    free = FreeSpace.of_maze(U_MAZE, radius_m=0.1)
+    generator = torch.Generator().manual_seed(0)
+    position = torch.tensor(U_MAZE.free_centers(), dtype=torch.float32).repeat(20, 1)
+    heading = torch.randn(position.shape, generator=generator)
+    for _ in range(100):
+        heading = heading + 0.1 * torch.randn(position.shape, generator=generator)
+        position, _ = free.slide(position, position + 0.08 * torch.nn.functional.normalize(heading))
+        assert not free.blocked[free.cells(position)].any()
+
+
+def test_a_start_in_a_blocked_cell_may_leave_but_not_go_deeper() -> None:
+    # x = 1.95 is closed; 1.85 is free, 2.05 is deeper.
+    reached, stopped = slide(ROOM, [1.95, 0.0], [1.85, 0.0])
+    assert reached == pytest.approx([1.85, 0.0])
+    assert not stopped
+    reached, stopped = slide(ROOM, [1.95, 0.0], [2.05, 0.05])
+    assert stopped
+    assert reached == pytest.approx([2.0, 0.05], abs=2e-4)
+    # Along the wall it is as deep everywhere.
+    reached, stopped = slide(ROOM, [1.95, 0.0], [1.95, 0.15])
+    assert reached == pytest.approx([1.95, 0.15])
+    assert not stopped
+    # Out of one wall it does not get into another, not even as deep.
+    reached, stopped = slide(ROOM, [1.95, 1.85], [1.85, 1.95])
+    assert stopped
+    assert reached == pytest.approx([1.85, 1.9], abs=2e-4)
+
+
+def test_goal_distance_is_bilinear() -> None:
+    # A field that is itself linear is reproduced exactly, between cell centers too.
+    height, width = ROOM.fine_walls.shape
+    half = torch.tensor(ROOM.half_extent, dtype=torch.float32)
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    x, y = x * ROOM.fine_m - half[0], y * ROOM.fine_m - half[1]
+    fields = torch.stack([2 * x - 3 * y, x + y])
+    distance = GoalDistance(fields, torch.tensor([[0.0, 0.0], [1.0, 1.0]]), half, ROOM.fine_m)
+    position = torch.rand(200, 2, generator=torch.Generator().manual_seed(0)) * 4 - 2
+    near = distance(position, torch.tensor([[0.2, 0.1]]).expand(200, 2))
+    torch.testing.assert_close(near, 2 * position[:, 0] - 3 * position[:, 1], atol=1e-4, rtol=0)
+    far = distance(position, torch.tensor([[0.8, 0.9]]).expand(200, 2))
+    torch.testing.assert_close(far, position.sum(-1), atol=1e-4, rtol=0)
+
+
+def test_goal_distance_follows_the_goal() -> None:
+    distance = GoalDistance.of_maze(U_MAZE, spacing_m=0.2)
+    goal = torch.tensor([[-4.0, -4.0], [-3.6, -4.0]])
+    position = torch.tensor([[0.0, -4.0], [0.0, -4.0]])
+    assert distance(position, goal).tolist() == pytest.approx([4.0, 3.6], abs=0.1)
+    # As far as three standard deviations of a goal that is drawn, to either side.
+    corners = torch.tensor([[-4.6, -4.6], [-3.4, -3.4]])
+    assert distance(corners, corners).tolist() == pytest.approx([0.0, 0.0], abs=0.1)

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,8 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
-from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.plane.navigation import Navigation, PlanarTarget
+from astra_data.worlds.protocols import Step
 
 TASK = Navigation(U_MAZE, horizon=700)
 
@@ -47,12 +49,6 @@ def test_policies_see_shares_of_the_mazes_half_extent_and_the_velocity() -> None
     torch.testing.assert_close(seen, expected.expand(2, 3, 8))
 
 
-def test_failure_costs_also_where_the_goal_is_reached() -> None:
-    goal = torch.tensor([[-4.0, -4.0]])
-    task = Navigation(U_MAZE, horizon=9, success_reward=3.0, failure_reward=-7.0)
-    assert float(task.reward(goal, goal, goal, torch.tensor([True]))) == pytest.approx(3.0 - 7.0)
-
-
 def test_starts_have_as_many_places_as_there_are_offsets() -> None:
     task = Navigation(U_MAZE, horizon=9, spread_m=0.01, start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.3)))
     starts = task.draw_starts(np.random.default_rng(0), 3000)
@@ -61,12 +57,6 @@ def test_starts_have_as_many_places_as_there_are_offsets() -> None:
     which = np.round(2 * offsets[:, 0]).astype(int)
     assert np.bincount(which).tolist() == pytest.approx([1000] * 3, abs=100)
     np.testing.assert_allclose(offsets[which == 2], np.tile([1.0, 0.3], ((which == 2).sum(), 1)), atol=0.04)
-
-
-def test_a_single_offset_moves_all_starts() -> None:
-    moved = TASK.draw_starts(np.random.default_rng(0), 3) + np.array([1.0, -0.5, 0.0, 0.0])
-    task = Navigation(U_MAZE, horizon=9, start_offsets_m=((1.0, -0.5),))
-    np.testing.assert_allclose(task.draw_starts(np.random.default_rng(0), 3), moved)
 
 
 def test_waves_tell_the_position_finely() -> None:
@@ -79,17 +69,6 @@ def test_waves_tell_the_position_finely() -> None:
     sines, cosines = seen[0, 8:12].tolist(), seen[0, 12:].tolist()
     assert sines == pytest.approx([1.0, 0.5**0.5, 0.0, 1.0], abs=1e-6)
     assert cosines == pytest.approx([0.0, 0.5**0.5, -1.0, 0.0], abs=1e-6)
-
-
-def test_a_meter_is_paid_as_the_task_says() -> None:
-    goal = torch.tensor([[-4.0, -4.0]])
-    before, after, failed = (
-        goal + torch.tensor([[2.0, 0.0]]),
-        goal + torch.tensor([[1.0, 0.0]]),
-        goal[:, 0] > 0,
-    )
-    task = Navigation(U_MAZE, horizon=700, meter_reward=4.0)
-    assert float(task.reward(before, after, goal, failed)) == pytest.approx(4.0, abs=0.1)
 
 
 @pytest.mark.parametrize("maze", [U_MAZE, LONG_MAZE])
@@ -117,11 +96,6 @@ def test_goals_have_to_be_within_their_cell() -> None:
     ]
 
 
-def test_the_way_to_the_farthest_goals_that_are_drawn_ends_at_them() -> None:
-    corners = torch.tensor([U_MAZE.cell_center(*U_MAZE.goal)]) + torch.tensor([[-0.6, -0.6], [0.6, -0.6]])
-    assert TASK.goal_distance(corners, corners).tolist() == pytest.approx([0.0, 0.0], abs=0.1)
-
-
 def test_paths_to_the_goal_keep_the_clearance() -> None:
     maze = replace(U_MAZE, scale=1.0, fine_m=0.05)
     distance = Navigation(maze, horizon=1, spread_m=0.05, path_clearance_m=0.25).goal_distance
@@ -143,28 +117,6 @@ def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -
     assert arms == pytest.approx(2 * 10.4 * 2.4 / (2 * 10.4 * 2.4 + 4 * 2.4), abs=0.03)
 
 
-def test_starts_anywhere_are_anywhere_in_the_cells_of_the_grid() -> None:
-    points = TASK.draw_anywhere(np.random.default_rng(0), 4000)[:, :2]
-    within = (points + U_MAZE.half_extent) / U_MAZE.fine_m % 1.0
-    # Uniform from 0 to 1, along both axes and without regard to each other.
-    assert within.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.02)
-    assert within.std(axis=0) == pytest.approx([12**-0.5] * 2, abs=0.01)
-    assert np.corrcoef(within.T)[0, 1] == pytest.approx(0.0, abs=0.05)
-
-
-def test_a_failure_is_paid_for_its_way_too() -> None:
-    goal = torch.tensor([[-4.0, -4.0]])
-    before, after = goal + torch.tensor([[3.0, 0.0]]), goal + torch.tensor([[2.0, 0.0]])
-    assert float(TASK.reward(before, after, goal, torch.tensor([True]))) == pytest.approx(
-        1.0 - 10.0, abs=0.02
-    )
-
-
-def test_draws_repeat() -> None:
-    first = TASK.draw_anywhere(np.random.default_rng(7), 5)
-    np.testing.assert_array_equal(first, TASK.draw_anywhere(np.random.default_rng(7), 5))
-
-
 def test_a_maze_too_narrow_for_starts_anywhere_is_told() -> None:
     narrow = Maze(rows=("11111", "10001", "11111"), scale=1.0, start=(1, 1), goal=(1, 3))
     with pytest.raises(
@@ -174,3 +126,74 @@ def test_a_maze_too_narrow_for_starts_anywhere_is_told() -> None:
     wider = Navigation(narrow, horizon=9, spread_m=0.05, start_clearance_m=0.4)
     starts = wider.draw_anywhere(np.random.default_rng(0), 100)
     assert (np.abs(starts[:, 1]) <= 0.1).all()  # along the middle
+
+
+class Straight(Navigation):
+    """Progress is paid as the crow flies."""
+
+    def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
+        return torch.pairwise_distance(before[:, :2], goal, eps=0) - torch.pairwise_distance(
+            after[:, :2], goal, eps=0
+        )
+
+
+STRAIGHT = Straight(U_MAZE, horizon=10)
+WALLED = Straight(U_MAZE, horizon=10, ends_at_walls=True)
+START, GOAL = (np.array(U_MAZE.cell_center(*cell)) for cell in (U_MAZE.start, U_MAZE.goal))
+
+
+class Dots(PlanarTarget):
+    """Robots [x, y], the first of which leans on a wall."""
+
+    place = torch.zeros(3, 2)
+
+    @property
+    def state(self) -> Tensor:
+        return self.place
+
+    @property
+    def wall_contact(self) -> Tensor:
+        return torch.tensor([True, False, False])
+
+
+def judged(
+    target: PlanarTarget, after: Sequence[Sequence[float]], fallen: Sequence[bool] = (False,) * 3
+) -> Step:
+    """Return the outcome of a step from the origin, whose goals are at (1, 0)."""
+    target.goal = torch.tensor([[1.0, 0.0]] * 3)
+    return target._judged(torch.zeros(3, 2), torch.tensor(after), np.array(fallen))
+
+
+def test_robots_start_and_aim_where_the_task_does() -> None:
+    target = Dots(STRAIGHT, 3)
+    target.reseed(5)
+    rows = np.array([2, 0])
+    starts = target._start(rows)
+    target._aim(rows)
+    assert starts.shape == (2, 4)
+    # Three standard deviations of 0.2 m at most.
+    assert (np.abs(starts[:, :2] - START) <= 0.6).all() and not starts[:, 2:].any()
+    assert (np.abs(target.goal[rows].numpy() - GOAL) <= 0.6).all()
+    assert target.goal[1].tolist() == [0.0, 0.0]  # who is not asked keeps its goal
+    target.reseed(5)
+    np.testing.assert_array_equal(target._start(rows), starts)
+    assert not np.array_equal(target._start(rows), starts)
+
+
+def test_an_episode_ends_at_the_goal_or_in_a_fall() -> None:
+    target = Dots(STRAIGHT, 3)
+    step = judged(target, [[0.9, 0.0], [0.2, 0.0], [0.3, 0.0]], (False, True, False))
+    assert step.success.tolist() == [True, False, False]
+    assert target.failed.tolist() == [False, True, False]
+    assert step.terminated.tolist() == [True, True, False]
+    # Meters closer to the goal, and 10 for reaching it or -10 for the fall.
+    torch.testing.assert_close(step.reward, torch.tensor([10.9, 0.2 - 10.0, 0.3]))
+    assert step.observation.tolist() == [[0.0, 0.0, 1.0, 0.0]] * 3
+
+
+@pytest.mark.parametrize(("objective", "failed"), [(STRAIGHT, [False] * 3), (WALLED, [True, False, False])])
+def test_walls_end_an_episode_where_the_objective_says_so(objective: Navigation, failed: list[bool]) -> None:
+    target = Dots(objective, 3)
+    step = judged(target, [[0.5, 0.0]] * 3)
+    assert target.failed.tolist() == step.terminated.tolist() == failed
+    torch.testing.assert_close(step.reward, 0.5 - 10.0 * torch.tensor(failed).float())

@@ -1,9 +1,151 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
+from astra_data.core.errors import BadInputError
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
-from astra_data.worlds.variation import PlanarVariation
+from astra_data.worlds.plane.point_mass import PlanarStates, PointMass, VariedPlanar
+from astra_data.worlds.variation import BallVariation, PlanarVariation
+
+HERE = torch.tensor([[-4.0, 5.85, 0.0, 0.0, 7.0]]).expand(3, 5)
+
+
+def planar(count: int, size: int) -> PlanarStates:
+    class Planar(PlanarStates):
+        state_size = size
+
+    return Planar(U_MAZE, count, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0)
+
+
+class Resting(PlanarStates):
+    """Remembers its commands, and stays where it is."""
+
+    def step(self, action: torch.Tensor) -> torch.Tensor:
+        self.action = action
+        return self.state
+
+
+def resting(count: int, size: int, variation: PlanarVariation) -> tuple[Resting, VariedPlanar]:
+    class Sized(Resting):
+        state_size = size
+
+    inner = Sized(U_MAZE, count, timestep_s=0.1, radius_m=0.1, speed_m_s=2.0)
+    return inner, VariedPlanar(inner, variation)
+
+
+def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
+    states = planar(3, 5)
+    states.reset_to(HERE)
+    handed_out = states.state
+    states.blocked[:] = True
+    states.reset_to(HERE[:1] + 1.0, torch.tensor([1]))
+    assert torch.equal(handed_out, HERE)
+    assert torch.equal(states.state[1], HERE[0] + 1.0)
+    assert states.blocked.tolist() == [True, False, True]
+    given = HERE.clone()
+    states.reset_to(given)
+    given.zero_()
+    assert torch.equal(states.state, HERE)
+
+
+@pytest.mark.parametrize(("fine_m", "radius_m"), [(0.25, 0.1), (0.1, 0.15), (0.1, 0.149), (0.1, 0.16)])
+def test_a_radius_between_the_cells_of_the_maze_is_refused(fine_m: float, radius_m: float) -> None:
+    expected = f"radius_m: expected a multiple of the maze's fine_m, {fine_m} m, got {radius_m}: take another"
+    with pytest.raises(BadInputError, match=expected):
+        PlanarStates(replace(U_MAZE, fine_m=fine_m), 1, timestep_s=0.1, radius_m=radius_m)
+
+
+def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() -> None:
+    """The wall's face is at 6 m; the disc's center comes as close as 0.1 m."""
+    states = planar(3, 5)
+    states.keep_clear(0.5)
+    start = HERE.clone()
+    start[:, 1] = 5.4
+    landed = start.clone()
+    landed[0, 1], landed[1, 1], landed[2, 0] = 5.7, 5.3, -3.5
+    states.reset_to(start)
+    settled = states.settle(start, landed)
+    torch.testing.assert_close(settled[:, 1], torch.tensor([5.5, 5.3, 5.4]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(settled[:, 0], torch.tensor([-4.0, -4.0, -3.5]))
+    assert states.blocked.tolist() == [True, False, False]
+    moved, stopped = states.free.slide(start[:, :2], landed[:, :2])
+    torch.testing.assert_close(moved, landed[:, :2])
+    assert not stopped.any()
+
+
+def test_a_wall_that_stopped_a_step_counts_after_its_correction_too() -> None:
+    states = planar(3, 5)
+    states.blocked[2] = True
+    states.settle(HERE, HERE)
+    assert states.blocked.tolist() == [False, False, True]
+
+
+def test_corrections_slide_along_walls_and_keep_all_else() -> None:
+    states = planar(3, 5)
+    landed = HERE.clone()
+    landed[0, 1], landed[1, 0], landed[:, 2:] = 5.95, -3.95, 0.5
+    settled = states.settle(HERE, landed)
+    assert states.blocked.tolist() == [True, False, False]
+    # The wall's face is at 6 m, the disc's center stays 0.1 m away.
+    assert 5.8 < settled[0, 1] < 5.9001
+    assert torch.equal(settled[1:], landed[1:])
+    assert torch.equal(settled[:, 2:], landed[:, 2:])
+    assert settled is states.state
+
+
+def test_commands_are_clipped_then_turned_then_scaled() -> None:
+    states = planar(2, 4)
+    command = torch.tensor([[3.0, 0.0], [0.5, -0.25]])
+    torch.testing.assert_close(states.commanded_velocity(command), torch.tensor([[2.0, 0.0], [1.0, -0.5]]))
+    plain = {"friction": 1.0, "action_scale": 0.0, "heading_bias_deg": 0.0, "timestep_scale": 1.0}
+    columns = {name: torch.full((2, 1), value) for name, value in plain.items()}
+    columns["friction"][1], columns["action_scale"][1], columns["heading_bias_deg"][0] = 0.5, 0.2, 90.0
+    columns["timestep_scale"][1] = 3.0
+    states.vary(columns)
+    torch.testing.assert_close(
+        states.commanded_velocity(command), torch.tensor([[0.0, 2.0], [0.6, -0.3]]), atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(states.period_s, torch.tensor([[0.1], [0.3]]))
+
+
+def test_sensors_show_other_states_than_the_true_ones() -> None:
+    torch.manual_seed(0)
+    noise = BallVariation(
+        position_noise_m=(0.1, 0.1),
+        velocity_noise_m_s=(0.2, 0.2),
+        ball_position_noise_m=(0.3, 0.3),
+        ball_velocity_noise_m_s=(0.4, 0.4),
+    )
+    inner, varied = resting(3, 8, noise)
+    here = torch.rand(3, 8)
+    varied.reset_to(here)
+    assert torch.equal(varied.state, here)
+    shown = torch.stack([varied.step(torch.zeros(3, 3)) for _ in range(500)]) - here
+    assert torch.equal(varied.true_state, here) and torch.equal(inner.state, here)
+    expected = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.4, 0.4])
+    torch.testing.assert_close(shown.amax((0, 1)), expected, atol=0, rtol=0.03)
+    torch.testing.assert_close(shown.amin((0, 1)), -expected, atol=0, rtol=0.03)
+    # A row that is set is shown as it is; the others as before.
+    before = varied.state
+    varied.reset_to(torch.zeros(1, 8), torch.tensor([1]))
+    assert torch.equal(varied.state, torch.stack([before[0], torch.zeros(8), before[2]]))
+    assert torch.equal(varied.true_state, torch.stack([here[0], torch.zeros(8), here[2]]))
+
+
+def test_a_correction_is_of_the_true_state_and_is_shown_as_it_is() -> None:
+    _, varied = resting(3, 4, PlanarVariation(position_noise_m=(0.1, 0.1)))
+    here = HERE[:, :4]
+    varied.reset_to(here)
+    varied.step(torch.zeros(3, 2))
+    landed = here.clone()
+    landed[0, 1] = 5.95
+    settled = varied.settle(here, landed)
+    assert varied.blocked.tolist() == [True, False, False]
+    assert torch.equal(varied.state, settled) and torch.equal(varied.true_state, settled)
+    varied.true_state = landed
+    assert torch.equal(varied.true_state, landed) and torch.equal(varied.state, settled)
+
 
 START = torch.tensor([[-4.0, 4.0, 0.0, 0.0]])
 ACTION = torch.tensor([[0.6, -0.8]])
@@ -21,12 +163,6 @@ def test_free_motion_integrates_the_command() -> None:
     assert state[0].tolist() == pytest.approx([-4.0 + 0.6, 4.0 - 0.8, 0.6, -0.8], abs=1e-4)
 
 
-def test_commands_are_clipped() -> None:
-    sim = point_mass(1)
-    sim.reset_to(torch.tensor([[-4.0, 4.0, 0.0, 0.0]]))
-    assert sim.step(torch.tensor([[5.0, -5.0]]))[0].tolist() == pytest.approx([-3.95, 3.95, 1, -1], abs=1e-4)
-
-
 def test_a_wall_stops_one_axis_and_its_velocity() -> None:
     sim = point_mass(1)
     sim.reset_to(torch.tensor([[-4.0, 4.0, 0.0, 0.0]]))
@@ -35,15 +171,6 @@ def test_a_wall_stops_one_axis_and_its_velocity() -> None:
     # The wall's face is at y = 6, its center may come to 0.1 m of it.
     assert state[0].tolist() == pytest.approx([-4.0 + 60 * 0.025, 5.9, 0.5, 0.0], abs=1e-3)
     assert bool(sim.blocked)
-
-
-def test_reset_to_round_trip() -> None:
-    sim = point_mass(3)
-    state = torch.rand(3, 4)
-    sim.reset_to(state)
-    assert torch.equal(sim.state, state)
-    sim.reset_to(torch.zeros(1, 4), torch.tensor([1]))
-    assert torch.equal(sim.state, torch.stack([state[0], torch.zeros(4), state[2]]))
 
 
 def test_states_handed_out_stay_as_they_were() -> None:
@@ -55,40 +182,11 @@ def test_states_handed_out_stay_as_they_were() -> None:
     assert torch.equal(state, kept)
 
 
-def test_a_batch_steps_as_its_rows_do() -> None:
-    generator = torch.Generator().manual_seed(0)
-    centers = torch.tensor(U_MAZE.free_centers(), dtype=torch.float32)
-    position = centers[torch.randint(len(centers), (64,), generator=generator)]
-    # Most of them close to a wall.
-    position = position + 1.89 * torch.tanh(3 * torch.randn(64, 2, generator=generator))
-    state = torch.cat([position, torch.zeros(64, 2)], dim=-1)
-    action = 2 * torch.rand(64, 2, generator=generator) - 1
-    together, single = point_mass(64), point_mass(1)
-    together.reset_to(state)
-    after = together.step(action)
-    for row in range(64):
-        single.reset_to(state[row : row + 1])
-        assert torch.equal(single.step(action[row : row + 1])[0], after[row])
-        assert bool(single.blocked[0]) == bool(together.blocked[row])
-    assert 0 < int(together.blocked.sum()) < 64
-
-
 def one_step(variation: PlanarVariation, count: int = 1, action: torch.Tensor = ACTION) -> VariedPlanar:
     simulator = VariedPlanar(point_mass(count), variation)
     simulator.reset_to(START.expand(count, 4))
     simulator.step(action.expand(count, 2))
     return simulator
-
-
-def test_plain_parameters_are_the_plain_point_mass_to_the_bit() -> None:
-    torch.manual_seed(0)
-    varied, plain = VariedPlanar(point_mass(50), PlanarVariation()), point_mass(50)
-    for simulator in (varied, plain):
-        simulator.reset_to(START.expand(50, 4))
-    for _ in range(200):
-        action = torch.randn(50, 2)
-        assert torch.equal(varied.step(action), plain.step(action))
-        assert torch.equal(varied.blocked, plain.blocked)
 
 
 def test_the_plain_point_mass_does_these_operations_in_this_order() -> None:
@@ -117,11 +215,6 @@ def test_each_parameter_does_what_its_name_says() -> None:
         state = one_step(variation).state[0]
         torch.testing.assert_close(state[2:], torch.tensor(velocity), atol=1e-4, rtol=0)
         torch.testing.assert_close(state[:2] - START[0, :2], torch.tensor(moved), atol=1e-5, rtol=0)
-
-
-def test_commands_are_cut_off_before_they_are_scaled() -> None:
-    state = one_step(PlanarVariation(action_scale=(0.1, 0.1)), action=torch.tensor([[3.0, 0.0]])).state
-    torch.testing.assert_close(state[0, 2:], torch.tensor([1.1, 0.0]), atol=1e-4, rtol=0)
 
 
 def test_noise_on_commands_moves_and_noise_of_sensors_only_shows() -> None:

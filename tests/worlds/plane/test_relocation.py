@@ -91,26 +91,6 @@ def test_turns_that_lengthen_a_command_beyond_its_limit_are_drawn_again() -> Non
     assert len({round(float(x), 3) for x, _ in turned}) == 20
 
 
-def test_any_turn_is_as_likely_as_any_other() -> None:
-    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
-    path.columns[ACTION][:] = 0.1
-    turns = np.array([change.rotation_rad for change, _ in draws(400, path, rotations="any")])
-    quarter = np.histogram(turns, np.linspace(-np.pi, np.pi, 5))[0]
-    assert quarter.tolist() == pytest.approx([100] * 4, abs=35)
-
-
-def test_without_translation_a_stretch_starts_where_it_did() -> None:
-    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
-    for change, steps in draws(10, path, translations=False):
-        np.testing.assert_allclose(moved(change, path)[steps.start], [-4.0, 4.0], atol=1e-6)
-
-
-def test_without_rotation_the_bearing_stays() -> None:
-    path = straight((-4.0, 4.0), (-3.5, 4.0), 20)
-    for change, _ in draws(10, path, rotations="none"):
-        assert change.rotation_rad == 0.0
-
-
 def test_what_fits_nowhere_is_given_up() -> None:
     # Nine meters fit into a corridor, but not at right angles to it where they start.
     path = straight((-4.5, 4.0), (4.5, 4.0), 60)
@@ -137,14 +117,6 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
     # The last step earns +10 or -10; all of them 0.1 m of progress.
     assert judged["next.reward"][-1] == pytest.approx(10.1 if success else -9.9, abs=0.02)
     assert judged["next.reward"][:-1].mean() == pytest.approx(0.1, abs=0.02)
-
-
-def test_who_topples_as_it_arrives_has_succeeded() -> None:
-    path = straight((AIM[0] + 2.0, AIM[1]), (AIM[0] - 1.0, AIM[1]), 30)
-    before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
-    judged = outcomes(TASK.objective, before, after, AIM, np.arange(30) == 15)
-    assert len(judged["next.success"]) == 16 and judged["next.success"][-1]
-    assert judged["next.reward"][-1] == pytest.approx(10.1, abs=0.02)
 
 
 def test_an_episode_that_just_stops_is_truncated() -> None:
@@ -229,11 +201,6 @@ def test_a_ball_begins_on_the_field_and_ends_the_copy_where_it_leaves_it() -> No
     assert min(ends.values()) > 10
 
 
-def test_a_ball_that_can_only_begin_in_the_goal_is_not_copied(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(type(KICKING.objective), "reached", lambda _, state, goal: state[:, 0] == state[:, 0])
-    assert kicks(3, kick(12, 0.1)) == []
-
-
 def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
     made = kicks(50, kick(12, 0.0, ends=True))
     assert {len(columns[TERMINATED]) for columns in made} == {11}
@@ -257,33 +224,3 @@ def test_a_topple_of_a_robot_without_a_ball_is_copied_and_its_arrival_is_not(arr
     assert copied.columns[TERMINATED].tolist() == (last & (not arrived)).tolist()
     assert copied.columns[TRUNCATED].tolist() == (last & arrived).tolist()
     assert copied.columns[REWARD][-1] == pytest.approx(0.0 if arrived else -10.0, abs=0.1)
-
-
-def test_the_shortest_stretch_has_as_many_steps_as_asked_for() -> None:
-    path = straight((-4.0, 4.0), (4.0, 4.0), 20)
-    assert relocation(min_steps=20).stretches(path) == [(0, 20)]
-    assert relocation(min_steps=21).stretches(path) == []
-
-
-def test_stretches_are_drawn_as_often_as_they_are_long() -> None:
-    path = straight((-4.0, 4.0), (4.0, 4.0), 100)
-    path.columns[STATE][69:75, 1] = 2.5
-    drawn = [
-        steps.start
-        for _, steps in relocation(rotations="none", tries=400).placements(path, np.random.default_rng(0))
-    ]
-    # 69 steps, and the 25 behind them.
-    assert set(drawn) == {0, 75}
-    assert np.mean(np.array(drawn) == 0) == pytest.approx(69 / 94, abs=0.07)
-
-
-def test_positions_are_those_of_the_abstract_state_wherever_they_stand() -> None:
-    def turned_round(states: Any) -> Any:  # noqa: ANN401
-        return states[..., [7, 1, 0]]
-
-    role = replace(
-        TASK.abstract_state, size=3, names=None, astra={"role": ["invariant", "position", "position"]}
-    )
-    task = replace(TASK, abstraction=turned_round, abstract_state=role)
-    states: Array = np.arange(58, dtype=np.float32).reshape(2, 29)
-    assert positions(task, states).tolist() == [[1, 0], [30, 29]]

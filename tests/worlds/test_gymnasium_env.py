@@ -14,7 +14,7 @@ from small_cart import TASK, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.commands import Commands
-from astra_data.worlds.gymnasium_env import Env, GymnasiumRobot, observed
+from astra_data.worlds.gymnasium_env import Env, GymnasiumRobot, GymnasiumSimulator, observed
 from astra_data.worlds.robot import RobotEnv, State
 
 
@@ -163,22 +163,6 @@ def test_an_end_at_the_goal_is_no_failure_without_a_word() -> None:
     assert env.failed.tolist() == step.terminated.tolist() == [True, False]
 
 
-@pytest.mark.parametrize(
-    ("fails", "success"), [(lambda state, _: state[0] < 0, True), (lambda _, end: end, False)]
-)
-def test_an_end_at_the_goal_is_what_failed_says(fails: Callable[[State, bool], bool], success: bool) -> None:
-    env = corridor(failed=fails)
-    step = env.step(torch.tensor([[0.0], [1.0]]))
-    assert step.success.tolist() == [False, success] and env.failed.tolist() == [False, not success]
-
-
-def test_an_environment_that_cannot_be_made_is_named() -> None:
-    with pytest.raises(BadInputError, match=r"gymnasium.make\('no_such_package:X-v0'\) fails with ModuleNot"):
-        GymnasiumRobot("no_such_package:X-v0")
-    with pytest.raises(BadInputError, match=r"gymnasium.make\('Pendulum-v77'\) fails with "):
-        GymnasiumRobot("Pendulum-v77")
-
-
 def test_commands_that_are_no_actions_are_refused() -> None:
     robot = GymnasiumRobot("Pendulum-v1")
     robot.check_commands(Commands({"torque": (-2.0, 2.0)}))
@@ -197,11 +181,62 @@ def test_commands_that_are_no_actions_are_refused() -> None:
         robot.step(np.array([3.0]))
 
 
-def test_a_function_of_commands_may_go_beyond_what_the_environment_clips() -> None:
-    robot = GymnasiumRobot("Pendulum-v1", command=torque)
-    robot.check_commands(Commands({"torque": (-9.0, 9.0)}))
-
-
 def test_an_observation_of_several_entries_needs_a_function_that_reads_it() -> None:
     with pytest.raises(BadInputError, match="the environment shows place, speed: give GymnasiumRobot a read"):
         observed(GymnasiumRobot("Pendulum-v1").env, {"place": np.zeros(2), "speed": np.zeros(1)})
+
+
+def read(env: Env) -> State:
+    state: State = env.state  # type: ignore[attr-defined]
+    return state
+
+
+def write(env: Env, state: State) -> None:
+    env.state = state  # type: ignore[attr-defined]
+
+
+make = partial(GymnasiumSimulator, size=2, read=read, write=write)
+
+
+def test_every_state_is_stepped_as_by_an_environment_of_its_own() -> None:
+    simulator = make(3, env_id="Pendulum-v1", parameters={"gravity": 10.0})
+    assert simulator.state.tolist() == [[0.0, 0.0]] * 3 and simulator.parameters == {"gravity": 10.0}
+    rng = np.random.default_rng(0)
+    states, commands = rng.normal(size=(3, 2)), rng.uniform(-2, 2, (250, 3, 1)).astype(np.float32)
+    simulator.reset_to(torch.from_numpy(states).float())
+    for command in commands:  # longer than the environment's own episodes
+        landed = simulator.step(torch.from_numpy(command))
+    for number, state in enumerate(states):
+        env = gymnasium.make("Pendulum-v1").unwrapped
+        env.reset(seed=number)
+        write(env, state)
+        for command in commands:
+            env.step(command[number])
+            write(env, np.asarray(read(env), np.float32))  # as the simulator keeps it
+        np.testing.assert_allclose(landed[number].numpy(), read(env), rtol=1e-3)
+
+
+def test_what_is_written_has_to_be_what_is_read() -> None:
+    """Entries in another order, say; after the first step nothing is read twice."""
+
+    def swapped(env: Env, state: State) -> None:
+        write(env, state[::-1])
+
+    def nothing(env: Env, state: State) -> None:
+        pass
+
+    for wrong in (swapped, nothing):
+        simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=read, write=wrong)
+        simulator.reset_to(torch.tensor([[0.5, 0.5], [1.0, 0.25]]))
+        with pytest.raises(BadInputError, match=r"^Pendulum-v1: after write\(.* expected the same"):
+            simulator.step(torch.zeros(2, 1))
+    reads = []
+
+    def noted(env: Env) -> State:
+        reads.append(0)
+        return read(env)
+
+    simulator = GymnasiumSimulator(2, env_id="Pendulum-v1", size=2, read=noted, write=write)
+    for expected in (3, 5):
+        simulator.step(torch.zeros(2, 1))
+        assert len(reads) == expected

@@ -1,0 +1,406 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from astra_data.core.errors import BadInputError
+from astra_data.robots.nao.kicking import (
+    ROLLING_M_S2,
+    BallAgent,
+    Kicking,
+    asks_to_kick,
+    kick_away,
+    knock,
+    roll,
+)
+from astra_data.worlds.plane.mazes import FIELD
+from astra_data.worlds.plane.point_mass import VariedPlanar
+from astra_data.worlds.variation import BallVariation
+
+
+def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
+    position, velocity = torch.zeros(1, 2), torch.tensor([[0.6, 0.8]])
+    for _ in range(10):
+        position, velocity = roll(position, velocity, 0.1, ROLLING_M_S2)
+    # v0 t - a t² / 2 after 1 s, along (0.6, 0.8).
+    assert position[0].tolist() == pytest.approx([0.6 * 0.85, 0.8 * 0.85], abs=1e-5)
+    assert velocity[0].tolist() == pytest.approx([0.6 * 0.7, 0.8 * 0.7], abs=1e-5)
+
+
+def test_a_ball_comes_to_rest_where_its_energy_ends() -> None:
+    position, velocity = roll(torch.zeros(1, 2), torch.tensor([[1.0, 0.0]]), 60.0, ROLLING_M_S2)
+    assert position[0].tolist() == pytest.approx([1.0 / (2 * 0.3), 0.0], abs=1e-5)
+    assert velocity.abs().max() == 0
+    again, _ = roll(position, velocity, 1.0, ROLLING_M_S2)
+    assert torch.equal(again, position)
+
+
+def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
+    before, after = torch.tensor([[0.0, 0.0]]), torch.tensor([[0.1, 0.0]])
+    ball = torch.tensor([[0.2, 0.1]])
+    place, velocity = knock(before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7)
+    diagonal = 0.5**0.5
+    assert velocity[0].tolist() == pytest.approx([0.7 * diagonal, 0.7 * diagonal], abs=1e-6)
+    assert place[0].tolist() == pytest.approx([0.1 + 0.19 * diagonal, 0.19 * diagonal], abs=1e-6)
+    beside, turned = knock(
+        before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7, turn_rad=torch.pi / 4
+    )
+    # It begins where the body touches it, whichever way it leaves.
+    assert torch.equal(beside, place)
+    assert turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
+
+
+def test_only_bodies_that_approach_knock_their_ball_wherever_they_are() -> None:
+    before = torch.tensor([[2.0, -1.0], [2.0, -1.0], [2.0, -1.0]])
+    after = before + torch.tensor([[0.02, 0.01], [-0.02, -0.01], [0.01, -0.02]])
+    ball = after + torch.tensor([[0.12, 0.06], [0.12, 0.06], [0.12, 0.07]])
+    _, velocity = knock(before, after, ball, torch.zeros(3, 2), reach_m=0.19, speed_m_s=0.7)
+    # Toward the ball; away from it; a little away, nearly across.
+    assert (velocity != 0).any(-1).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("after", "ball"),
+    [([0.1, 0.0], [0.4, 0.0]), ([0.1, 0.0], [-0.05, 0.0]), ([0.0, 0.0], [0.1, 0.0])],
+    ids=["out of reach", "behind", "standing"],
+)
+def test_other_balls_are_left_alone(after: list[float], ball: list[float]) -> None:
+    rolling = torch.tensor([[0.1, 0.2]])
+    place, velocity = knock(
+        torch.zeros(1, 2), torch.tensor([after]), torch.tensor([ball]), rolling, reach_m=0.19, speed_m_s=0.7
+    )
+    assert torch.equal(place, torch.tensor([ball]))
+    assert torch.equal(velocity, rolling)
+
+
+def test_a_ball_at_the_very_place_of_its_body_is_nowhere_undefined() -> None:
+    before, here, still = torch.tensor([[-0.1, 0.0]]), torch.zeros(1, 2), torch.zeros(1, 2)
+    place, velocity = knock(before, here, here, still, reach_m=0.19, speed_m_s=0.7)
+    asked = torch.ones(1, 1, dtype=torch.bool)
+    kicked = kick_away(here, here, still, asked, reach_m=0.35, speed_m_s=2.0)
+    for found in (place, velocity, kicked):
+        assert torch.equal(found, still)
+
+
+def test_a_kick_sends_balls_within_reach_straight_away() -> None:
+    bodies = torch.zeros(4, 2)
+    ball = torch.tensor([[0.18, 0.24], [0.18, 0.24], [0.3, 0.4], [-0.3, 0.0]])
+    rolling = torch.tensor([[0.1, 0.2]]).expand(4, 2)
+    asked = asks_to_kick(torch.tensor([[0.9, 0.9, 0.6], [0.9, 0.9, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
+    velocity = kick_away(bodies, ball, rolling, asked, reach_m=0.35, speed_m_s=2.0)
+    # Kicked; not asked to; out of reach; behind, which a body without a heading kicks as well.
+    torch.testing.assert_close(velocity, torch.tensor([[1.2, 1.6], [0.1, 0.2], [0.1, 0.2], [-2.0, 0.0]]))
+    turned = kick_away(
+        bodies, ball, rolling, asked, reach_m=0.35, speed_m_s=2.0, turn_rad=torch.full((4,), torch.pi / 2)
+    )
+    torch.testing.assert_close(turned[[0, 3]], torch.tensor([[-1.6, 1.2], [0.0, -2.0]]))
+
+
+def test_commands_without_a_wish_to_kick_are_refused() -> None:
+    with pytest.raises(BadInputError, match=r"expected commands of 3 values, .*, got 2: collect"):
+        asks_to_kick(torch.zeros(4, 2))
+
+
+OPTIONS: dict[str, Any] = {
+    "timestep_s": 0.2,
+    "radius_m": 0.2,
+    "speed_m_s": 0.25,
+    "reach_m": 0.19,
+    "knock_m_s": 1.0,
+    "kick_reach_m": 0.3,
+    "kick_m_s": 1.5,
+}
+AHEAD = torch.tensor([[1.0, 0.0, 0.0]])
+STAY = torch.zeros(1, 3)
+START = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.22, 0.0, 0.0, 0.0]])
+
+
+def one(count: int = 1) -> BallAgent:
+    simulator = BallAgent(FIELD, count, **OPTIONS)
+    simulator.reset_to(START.expand(count, 8))
+    return simulator
+
+
+def test_it_walks_into_its_ball() -> None:
+    simulator = one()
+    state = simulator.step(AHEAD)
+    # The ball leaves at 1 m/s from 0.19 m ahead of 0.05 m, and rolls for 0.2 s.
+    way = 1.0 * 0.2 - 0.3 * 0.2**2 / 2
+    expected = [0.05, 0.0, 0.25, 0.0, 0.05 + 0.19 + way, 0.0, 1.0 - 0.3 * 0.2, 0.0]
+    assert state[0].tolist() == pytest.approx(expected, abs=1e-5)
+    for _ in range(100):
+        state = simulator.step(STAY)
+    assert state[0, 4].item() == pytest.approx(0.24 + 1.0 / 0.6, abs=1e-4)
+    assert state[0, 6:].abs().max() == 0
+
+
+def test_it_stands_and_kicks() -> None:
+    simulator = one(2)
+    simulator.reset_to(torch.cat([START, START + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0])]))
+    state = simulator.step(torch.tensor([[1.0, 0.0, 1.0]]).expand(2, 3))
+    way = 1.5 * 0.2 - 0.3 * 0.2**2 / 2
+    assert state[0].tolist() == pytest.approx([0, 0, 0, 0, 0.22 + way, 0, 1.5 - 0.3 * 0.2, 0], abs=1e-5)
+    # Out of reach.
+    assert state[1].tolist() == pytest.approx([0, 0, 0, 0, 0.32, 0, 0, 0], abs=1e-5)
+
+
+def test_walls_stop_the_mass_but_not_the_ball() -> None:
+    simulator = one()
+    for _ in range(200):
+        state = simulator.step(AHEAD)
+    assert simulator.blocked.all()
+    # The room's inside ends at 2.5 m, 0.2 m before which the mass is stopped.
+    assert state[0, 0].item() == pytest.approx(2.3, abs=0.01)
+    assert state[0, 4].item() > 2.5
+    simulator.reset_to(START, torch.tensor([0]))
+    assert not simulator.blocked.any()
+
+
+def test_plain_parameters_are_the_plain_simulator() -> None:
+    torch.manual_seed(0)
+    varied, plain = VariedPlanar(one(50), BallVariation()), one(50)
+    for step in range(60):
+        before, action = plain.state, torch.randn(50, 3)
+        torch.testing.assert_close(varied.step(action), plain.step(action))
+        if step % 5 == 0:
+            landed = plain.state + 0.05 * torch.randn(50, 8)
+            both = []
+            for simulator in (varied, plain):
+                torch.manual_seed(step)  # what corrections cannot tell is drawn
+                both.append(simulator.settle(before, landed))
+            torch.testing.assert_close(*both)
+        assert torch.equal(varied.blocked, plain.blocked)
+
+
+@pytest.mark.parametrize(
+    ("variation", "entry", "expected"),
+    [
+        (BallVariation(ball_friction=(2.0, 2.0)), 6, 1.0 - 0.6 * 0.2),
+        (BallVariation(contact_direction_deg=(90.0, 90.0)), 7, 1.0 - 0.3 * 0.2),
+        (BallVariation(friction=(0.5, 0.5)), 2, 0.125),
+    ],
+    ids=["friction", "direction", "speed"],
+)
+def test_parameters_do_what_their_names_say(variation: BallVariation, entry: int, expected: float) -> None:
+    simulator = VariedPlanar(one(), variation)
+    simulator.reset_to(torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]))
+    state = simulator.step(AHEAD)
+    assert state[0, entry].item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_correction_moves_no_ball_that_lies_untouched() -> None:
+    simulator = one(3)
+    states = START.repeat(3, 1)
+    # The first is walked away from, the second rolls, the third is walked into.
+    states[1, 6] = 0.3
+    simulator.reset_to(states)
+    simulator.step(torch.cat([-AHEAD, -AHEAD, AHEAD]))
+    landed = torch.tensor([0.1, 0.1, 0.2, 0.2, 0.5, 0.5, 0.4, 0.4]).repeat(3, 1)
+    settled = simulator.settle(states, landed)
+    assert torch.equal(settled[:, :4], landed[:, :4])
+    assert torch.equal(settled[0, 4:], START[0, 4:])
+    torch.testing.assert_close(settled[1:, 6:].norm(dim=-1), landed[1:, 6:].norm(dim=-1))
+    assert torch.equal(simulator.state, settled)
+
+
+@pytest.mark.parametrize("friction", [1.0, 2.0])
+def test_a_ball_that_rolls_keeps_to_its_way_as_fast_as_corrected(friction: float) -> None:
+    simulator = VariedPlanar(one(), BallVariation(ball_friction=(friction, friction)))
+    rolling = torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 0.48, -0.36]])
+    simulator.reset_to(rolling)
+    simulator.step(STAY)
+    landed = torch.tensor([[0.1, 0.1, 0.2, 0.2, 3.0, 3.0, -0.3, 0.4]])
+    # From some speed to 0.5 m/s in 0.2 s.
+    way = 0.5 * 0.2 + 0.3 * friction * 0.2**2 / 2
+    expected = torch.tensor([[1.0 + 0.8 * way, 0.5 - 0.6 * way, 0.8 * 0.5, -0.6 * 0.5]])
+    torch.testing.assert_close(simulator.settle(rolling, landed)[:, 4:], expected)
+
+
+@pytest.mark.parametrize("before_m_s", [0.0, 0.1])
+@pytest.mark.parametrize("friction", [1.0, 2.0])
+def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_speed(
+    before_m_s: float, friction: float
+) -> None:
+    count = 20_000
+    simulator = VariedPlanar(one(count), BallVariation(ball_friction=(friction, friction)))
+    start = START.clone()
+    start[0, 7] = before_m_s  # an estimate of a ball that lies
+    simulator.reset_to(start.expand(count, 8))
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3))
+    landed = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.3, 0.1, 0.06, -0.08]]).expand(count, 8)
+    torch.manual_seed(0)
+    way, velocity = (simulator.settle(start.expand(count, 8), landed)[:, 4:] - START[:, 4:]).split(2, dim=-1)
+    speed = velocity.norm(dim=-1)
+    assert speed.mean().item() == pytest.approx(0.1, abs=0.003)
+    hit = speed > 0
+    # It leaves at 0.5 m/s, and is slowed by 0.3 m/s² in the 0.2 s that it rolls.
+    slowed = 0.3 * friction
+    torch.testing.assert_close(speed[hit], torch.full_like(speed[hit], 0.5 - slowed * 0.2))
+    rolled = torch.full_like(speed[hit], 0.5 * 0.2 - slowed * 0.2**2 / 2)
+    torch.testing.assert_close(way[hit].norm(dim=-1), rolled)
+    assert not way[~hit].any()
+
+
+def test_a_ball_that_is_hit_leaves_about_the_way_that_the_simulator_has_it_go() -> None:
+    torch.manual_seed(0)
+    count = 20_000
+    start = START.expand(count, 8).clone()
+    start[:, 4:6] = torch.tensor([0.0, 0.25])
+    simulator = one(count)
+    simulator.reset_to(start)
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3))
+    landed = start.clone()
+    landed[:, 6] = 0.8  # the correction expects it to go to the right, the simulator ahead
+    x, y, vx, vy = (simulator.settle(start, landed) - start)[:, 4:].T
+    turn_rad = torch.atan2(-vx, vy)
+    assert turn_rad.mean().item() == pytest.approx(0.0, abs=0.01)
+    assert turn_rad.std().item() == pytest.approx(0.4, abs=0.01)
+    torch.testing.assert_close(torch.atan2(-x, y), turn_rad)
+
+
+def kicked(simulator: BallAgent, speed_m_s: float) -> torch.Tensor:
+    """Kick balls that lie, and correct them to `speed_m_s`; return which roll (B,)."""
+    start = START.expand(simulator.num_envs, 8)
+    simulator.reset_to(start)
+    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(simulator.num_envs, 3))
+    landed = start.clone()
+    landed[:, 6] = speed_m_s
+    return simulator.settle(start, landed)[:, 6:].any(dim=-1)
+
+
+def test_kicking_on_from_too_far_does_not_help() -> None:
+    """A ball that is hit ends at 0.44 m/s: 0.055 says an eighth of a hit, and a half if said for long."""
+    torch.manual_seed(0)
+    simulator = one(4000)
+    needed = simulator.memory[:, 0].clone()
+    rolled = kicked(simulator, 0.055)
+    assert torch.equal(rolled, needed < 0.125)
+    for _ in range(60):
+        rolled |= kicked(simulator, 0.055)
+    assert torch.equal(rolled, needed < 0.5 - 1e-6)
+
+
+def test_a_new_lie_and_a_new_episode_are_drawn_for_anew() -> None:
+    torch.manual_seed(0)
+    simulator = one(1000)
+    needed = simulator.memory[:, 0].clone()
+    rolled = kicked(simulator, 0.22)
+    after = simulator.memory
+    assert torch.equal(after[~rolled, 0], needed[~rolled])
+    torch.testing.assert_close(after[~rolled, 1], torch.full_like(needed[~rolled], 0.5))
+    assert (after[rolled, 0] != needed[rolled]).all() and not after[rolled, 1].any()
+    simulator.reset_to(START.expand(2, 8), torch.tensor([3, 5]))
+    assert (simulator.memory[[3, 5], 0] != after[[3, 5], 0]).all() and not simulator.memory[[3, 5], 1].any()
+
+
+START_BALL_MEMORY = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.22, 0.0, 0.0, 0.0])
+
+
+def agents(count: int) -> BallAgent:
+    return BallAgent(
+        FIELD,
+        count,
+        timestep_s=0.2,
+        radius_m=0.2,
+        speed_m_s=0.25,
+        reach_m=0.19,
+        knock_m_s=1.0,
+        kick_reach_m=0.3,
+        kick_m_s=1.5,
+    )
+
+
+def test_a_correction_is_no_evidence_of_a_hit_where_nothing_touched_the_ball() -> None:
+    """The first two balls are out of reach; the third is kicked, so that the correction tells."""
+    agent, start = agents(3), START_BALL_MEMORY.repeat(3, 1)
+    start[:2, 4] = 1.0
+    agent.reset_to(start)
+    agent.memory[:, 0] = 0.75
+    landed = start.clone()
+    landed[:, 6] = 0.22
+    agent.step(torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    assert torch.equal(agent.settle(start, landed)[:, 4:], start[:, 4:])
+    # A ball that is hit ends at 0.44 m/s, having left at 0.5 m/s: half of that is half of a hit.
+    torch.testing.assert_close(agent.memory, torch.tensor([[0.75, 0.0], [0.75, 0.0], [0.75, 0.5]]))
+
+
+TASK = Kicking(FIELD, horizon=156)
+GOAL = torch.tensor([[1.5, 0.0]])
+
+
+def state(robot: tuple[float, float], ball: tuple[float, float]) -> torch.Tensor:
+    return torch.tensor([[*robot, 0.0, 0.0, *ball, 0.0, 0.0]])
+
+
+def test_starts_are_where_the_task_says() -> None:
+    starts = TASK.draw_starts(np.random.default_rng(0), 4000)
+    robot, ball = starts[:, :2], starts[:, 4:6]
+    assert starts.shape == (4000, 8)
+    assert (starts[:, 2:4] == 0).all()
+    assert (starts[:, 6:] == 0).all()
+    assert ball.min(axis=0) == pytest.approx([-0.5, -0.6], abs=0.01)
+    assert ball.max(axis=0) == pytest.approx([0.0, 0.6], abs=0.01)
+    assert (np.abs(robot) <= 1.9).all()
+    apart = np.linalg.norm(robot - ball, axis=1)
+    assert apart.min() >= 0.4 - 1e-9
+    assert apart.max() <= 1.0 + 1e-9
+    # All around the ball.
+    to_goal = np.array([1.5, 0.0]) - ball
+    ahead = ((robot - ball) * to_goal).sum(axis=1) > 0
+    assert ahead.mean() == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("ball", "reached", "missed"),
+    [
+        ((1.49, 0.0), False, False),
+        ((1.5, 0.74), True, False),
+        ((1.8, 0.76), False, True),
+        ((0.0, 2.01), False, True),
+        ((0.0, -2.01), False, True),
+        ((-2.01, 0.0), False, True),
+        ((-1.99, 1.99), False, False),
+        ((1.6, -0.74), True, False),
+        ((1.6, -0.76), False, True),
+        # Lines belong to the field, posts and goal line to the goal.
+        ((1.5, 0.75), True, False),
+        ((1.5, 1.0), False, True),
+        ((-2.0, 2.0), False, False),
+        ((0.0, -2.0), False, False),
+    ],
+)
+def test_a_ball_is_in_the_goal_in_the_field_or_out(
+    ball: tuple[float, float], reached: bool, missed: bool
+) -> None:
+    where = state((0.0, 0.0), ball)
+    assert bool(TASK.reached(where, GOAL)) == reached
+    assert bool(TASK.missed(where, GOAL)) == missed
+
+
+def test_rewards_are_meters_gained_and_the_outcome() -> None:
+    before, after = state((-1.0, 0.0), (0.0, 0.0)), state((-0.75, 0.0), (0.5, 0.0))
+    none = torch.zeros(1, dtype=torch.bool)
+    # The ball gains 0.5 m; the place behind it moved 0.5 m away, the robot 0.25 m on.
+    assert TASK.reward(before, after, GOAL, none).item() == pytest.approx(0.5 - 0.5 * 0.25, abs=1e-5)
+    assert TASK.reward(before, before, GOAL, ~none).item() == pytest.approx(-10.0)
+    scored = state((1.0, 0.0), (1.5, 0.0))
+    assert TASK.reward(scored, scored, GOAL, none).item() == pytest.approx(10.0)
+
+
+def test_they_see_it_in_these_units() -> None:
+    seen_from = torch.tensor([0.2, 0.4, 0.1, -0.1, 0.5, 0.0, 0.6, -0.2])
+    seen = TASK.observe(seen_from.expand(2, 3, 8), GOAL.expand(2, 3, 2))
+    # Half of positions and of the ball's way to the goal; four times the velocity; the ball's velocity; four
+    # times the way to the ball, and to the point 0.2 m behind it on the line from the goal.
+    expected = [0.1, 0.2, 0.25, 0.0, 0.5, 0.0, 0.4, -0.4, 0.6, -0.2, 4 * 0.3, 4 * -0.4, 4 * 0.1, 4 * -0.4]
+    torch.testing.assert_close(seen, torch.tensor(expected).expand(2, 3, 14))
+
+
+def test_the_point_behind_the_ball_attracts_the_robot() -> None:
+    none = torch.zeros(1, dtype=torch.bool)
+    # The ball at (0.5, 1) is sqrt(2) m from the goal; the point behind it 0.2 m further, up and to the left.
+    behind = (0.5 - 0.2 * 0.5**0.5, 1.0 + 0.2 * 0.5**0.5)
+    away = (behind[0] + 0.3, behind[1] + 0.4)
+    before, after = state(away, (0.5, 1.0)), state(behind, (0.5, 1.0))
+    assert TASK.reward(before, after, GOAL, none).item() == pytest.approx(0.5 * 0.5, abs=1e-5)
