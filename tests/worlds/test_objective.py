@@ -7,7 +7,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.robots.humanoid.tasks import JointWalking
 from astra_data.robots.nao.kicking import Kicking
 from astra_data.worlds.objective import RETURN, SUCCESS, SURVIVED_STEPS, Objective
 from astra_data.worlds.plane.mazes import FIELD, U_MAZE
@@ -74,11 +73,3 @@ def test_a_speed_limit_shortens_and_does_not_turn(objective: Objective) -> None:
     torch.testing.assert_close(limited, expected)
     assert torch.equal(objective.limit_command(action[:1], 2.0), action[:1])
     assert not objective.limit_command(action, 0.0)[:, :2].any()
-
-
-def test_planar_objectives_know_their_maze_and_their_bodies() -> None:
-    state = torch.arange(16.0).reshape(2, 8)
-    assert PLANAR["navigation"].layout is U_MAZE and PLANAR["kicking"].layout is FIELD
-    assert PLANAR["navigation"].places(state).tolist() == [[0, 1], [8, 9]]
-    assert PLANAR["kicking"].places(state).tolist() == [[0, 1, 4, 5], [8, 9, 12, 13]]
-    assert JointWalking(horizon=1).layout is None

@@ -41,20 +41,6 @@ def test_equals_the_function_by_hand() -> None:
     np.testing.assert_allclose(landed.numpy(), np.column_stack([z.real, z.imag]), atol=1e-6)
 
 
-def test_the_function_may_change_its_arguments() -> None:
-    """States that were handed out stay as they were, and so do the caller's commands."""
-
-    def push(state: Floats, command: Floats) -> Floats:
-        command *= 2.0
-        state += command
-        return state
-
-    simulator, command = NumpySimulator(1, function=push, size=1), torch.ones(1, 1)
-    before, first = simulator.state, simulator.step(command)
-    second = simulator.step(command)
-    assert [float(state) for state in (before, first, second, command)] == [0.0, 2.0, 4.0, 1.0]
-
-
 PENDULUM = """
 <mujoco>
   <option timestep="0.01"/>

@@ -127,14 +127,6 @@ WRONG: list[tuple[Task, str]] = [
         "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)",
     ),
     (
-        objective(reward=lambda self, before, after, goal, failed: failed / torch.zeros(3)),
-        "objective.reward(before, after, goal, failed): expected finite numbers, got nan",
-    ),
-    (
-        objective(reward=lambda self, before, after, goal, failed: 1.0 / (~failed).float()),
-        "objective.reward(before, after, goal, failed): expected finite numbers, got inf",
-    ),
-    (
         objective(reached=lambda self, state, goal: state[:, 0].clamp(0, 1)),
         "objective.reached(state, goal): expected torch.bool, got torch.float32",
     ),
@@ -147,18 +139,9 @@ WRONG: list[tuple[Task, str]] = [
         "objective.observe(state, goal): expected shape (3, any), got (3,)",
     ),
     (
-        objective(places=lambda self, state: state[..., 0]),
-        "objective.places(state): expected shape (3, any), got (3,)",
-    ),
-    (
         objective(places=lambda self, state: state.expand(-1, 3)),
         "objective.places(state): expected x and y of K bodies, shape (3, 2 K), got (3, 3)",
     ),
-    (
-        objective(places=lambda self, state: state.numpy().repeat(2, -1)),
-        "objective.places(state): expected a torch tensor, got a ndarray",
-    ),
-    (objective(places=lambda self, state: state[:, 7]), "objective.places(state) fails with IndexError: "),
     (
         objective(draw_starts=lambda self, rng, count: np.zeros(count)),
         "objective.draw_starts(rng, 3): expected shape (3, 1), got (3,)",
@@ -196,16 +179,10 @@ WRONG: list[tuple[Task, str]] = [
         replace(TASK, quantities={"x": (0,), "y": (0, 1), "z": (-2,)}),
         "quantities: y, z: expected indices below 1, of states",
     ),
-    (replace(TASK, quantities={"x": 0}), "quantities fails with TypeError: "),  # type: ignore[dict-item]
     (
         replace(TASK, beyond=lambda state: state[..., 0]),
         "beyond of states (3, 2): expected shape (3, any), got (3,)",
     ),
-    (
-        replace(TASK, beyond=lambda state: state[:1]),
-        "beyond of states (3, 2): expected shape (3, any), got (1, 2)",
-    ),
-    (replace(TASK, beyond=lambda state: state[..., 2]), "beyond of states (3, 2) fails with IndexError: "),
 ]
 
 
@@ -218,19 +195,6 @@ def starts_apart(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_wrong_piece_is_named_in_one_line(task: Task, line: str) -> None:
     faults = check_task(task)
     assert len(faults) == 1 and faults[0].startswith(line) and "\n" not in faults[0]
-
-
-def test_every_wrong_piece_is_named() -> None:
-    wrong = replace(
-        objective(draw_goals=lambda self, rng, count: np.zeros((count, 2))),
-        make_simulator=type("Own", (Rail,), {"step": Own.flat}),
-        robot=type("Own", (Cart,), {"reset": lambda self: 1.0}),
-    )
-    assert [fault.split()[0] for fault in check_task(wrong)] == [
-        "objective.draw_goals(rng,",
-        "reset",
-        "make_simulator:",
-    ]
 
 
 @pytest.mark.parametrize(

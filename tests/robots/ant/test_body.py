@@ -1,4 +1,3 @@
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -6,8 +5,6 @@ import gymnasium_robotics
 import mujoco
 import numpy as np
 import pytest
-import torch
-from safetensors.torch import save_file
 
 from astra_data.core.arrays import Floats
 from astra_data.robots.ant.body import (
@@ -154,15 +151,6 @@ def test_torques_to_body_undoes_the_view() -> None:
     np.testing.assert_allclose(data[0].qpos[:3], data[1].qpos[:3], atol=1e-9)
     np.testing.assert_allclose(feet(data[1].qpos), np.roll(feet(data[0].qpos), -1, axis=0), atol=1e-9)
     assert np.abs(data[0].qpos[7:] - qpos[7:]).max() > 0.1
-
-
-def test_another_controller_can_be_loaded(tmp_path: Path) -> None:
-    tensors = {"0.weight": torch.zeros(8, 28), "0.bias": torch.full((8,), 9.0)}
-    save_file(tensors | {"torque_scale": torch.tensor(0.25)}, tmp_path / "own.safetensors")
-    controller = VelocityController.load(tmp_path / "own.safetensors")
-    torques = controller(ant_model().qpos0[None], np.zeros((1, 14)), np.array([[1.0, 0.0]]))
-    # Hips, and ankles by the signs of their axes, of legs 4, 1, 2, 3.
-    np.testing.assert_allclose(torques, [[0.25, 0.25, 0.25, 0.25, 0.25, -0.25, 0.25, -0.25]], atol=1e-6)
 
 
 @pytest.mark.parametrize("command", [[0.8, 0.0], [0.0, -0.8], [-0.5, 0.5]])

@@ -67,23 +67,6 @@ def test_the_center_of_mass_moves_as_if_the_lower_foot_stood(bent: int) -> None:
     assert np.abs(way[[0, 2]]).min() > 1e-3
 
 
-def test_the_velocity_follows_late() -> None:
-    simulator = HumanoidExtendedKinematics(1, follow_s=0.3)
-    state = simulator.state.clone()
-    state[0, 34:40] = torch.tensor([0.2, 0.0, 0.9, 0.5, -0.1, -0.4])
-    # Joints that are where commands want them leave all to the velocity.
-    rest = CommandRanges().targets(torch.zeros(4))
-    state[0, COMMANDED] = rest
-    simulator.reset_to(state)
-    for _ in range(20):
-        after = simulator.step(torch.zeros(1, 4))[0]
-    slowed = math.exp(-20 * 0.015 / 0.3)
-    torch.testing.assert_close(after[37:40], slowed * state[0, 37:40], atol=1e-4, rtol=0)
-    torch.testing.assert_close(after[34:36], state[0, 34:36], atol=1e-5, rtol=0)
-    # About the integral of the falling velocity: 0.4 m/s for a time of 0.3 s times its lost share.
-    assert float(after[36]) == pytest.approx(0.9 - 0.4 * 0.3 * (1 - slowed), abs=0.003)
-
-
 def test_the_torso_turns_on_and_ever_slower() -> None:
     simulator = HumanoidExtendedKinematics(1, follow_s=0.3)
     state = simulator.state.clone()

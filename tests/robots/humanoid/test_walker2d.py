@@ -156,21 +156,6 @@ def test_walking_on_it_equals_mujoco_that_is_not_interrupted() -> None:
     assert np.max(apart) < 1e-3
 
 
-def test_a_floor_stays_where_it_is_until_the_walker_is_set_anew() -> None:
-    walker = HumanoidWalker2d(3, num_threads=1)
-    low = walker.state - torch.eye(15)[0] * torch.tensor([[0.0], [0.16], [0.2]])
-    walker.reset_to(low)
-    sunk = walker.memory.clone()
-    assert sunk[0] == 0.0
-    assert float(sunk[2] - sunk[1]) == pytest.approx(0.04, abs=1e-6)
-    walker.step(HELD.expand(3, 4))
-    assert torch.equal(walker.memory, sunk)
-    walker.reset_to(low[[2]], torch.tensor([1]))
-    assert torch.equal(walker.memory, sunk[[0, 2, 2]])
-    walker.settle(walker.state, low[[0, 0, 0]])
-    assert not walker.memory.any()
-
-
 def test_commands_bend_the_joints_they_name() -> None:
     walker = HumanoidWalker2d(5, num_threads=1)
     action = HELD.repeat(5, 1)

@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.ant.body import ant_model
 from astra_data.robots.nao.bodies import (
     BALL_MASS_KG,
     MOTORS,
@@ -27,8 +26,6 @@ from astra_data.robots.nao.kinematics import (
     leg_angles,
 )
 from astra_data.robots.nao.walk import Gait, StepPlanner, Targets, WalkEngine, WalkLimits, WalkStyle
-from astra_data.worlds.batched_mujoco import wall_geoms
-from astra_data.worlds.plane.mazes import U_MAZE
 
 
 def test_masses_are_the_published_ones() -> None:
@@ -40,29 +37,6 @@ def test_masses_are_the_published_ones() -> None:
     for side in "LR":
         np.testing.assert_allclose([model.body(side + name).mass[0] for name in LEG_JOINTS], leg)
     assert model.body_mass.sum() == pytest.approx(5.36, abs=0.005)
-
-
-def test_the_robot_is_its_own_mirror_image() -> None:
-    model = nao_model()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert data.subtree_com[1][1] == pytest.approx(0.0, abs=1e-12)
-    for name in LEG_JOINTS:
-        left, right = model.joint(f"L{name}"), model.joint(f"R{name}")
-        mirrored = -right.range[::-1] if name.endswith("Roll") else right.range
-        np.testing.assert_allclose(left.range, mirrored)
-    np.testing.assert_allclose(np.degrees(model.joint("LHipYawPitch").range), [-65.62, 42.44])
-
-
-def test_walls_stand_where_the_ants_do() -> None:
-    ours, theirs = nao_model(U_MAZE), ant_model(U_MAZE)
-    walls = wall_geoms(ours)
-    assert walls is not None
-    assert walls[1] - walls[0] + 1 == len(U_MAZE.wall_cells())
-    for geom in range(walls[0], walls[1] + 1):
-        name = ours.geom(geom).name
-        np.testing.assert_allclose(ours.geom(name).pos[:2], theirs.geom(name).pos[:2])
-        np.testing.assert_allclose(ours.geom(name).size[:2], theirs.geom(name).size[:2])
 
 
 def test_the_ball_rolls_to_a_stop_at_the_published_rate() -> None:
@@ -190,16 +164,6 @@ def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(
     planned.lifts_off[:, 0] = lifts_off
     followed = robots.step(np.array([0]), planned, noise())
     assert (followed[0] < TICKS) == waits
-
-
-def test_it_waits_only_so_long() -> None:
-    robots = bodies(height_m=1.0, style=replace(STYLE, longest_wait_ticks=5))
-    half = np.radians(-20) / 2
-    robots.qpos[0, 3:5] = np.cos(half), np.sin(half)
-    followed = robots.step(np.array([0]), targets(lifts_off=1), noise())
-    # Five ticks of waiting before each that is followed: in 16 ticks two are.
-    assert followed.tolist() == [2]
-    assert robots.waited.tolist() == [4]
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -28,14 +28,6 @@ def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
     assert velocity[0].tolist() == pytest.approx([0.6 * 0.7, 0.8 * 0.7], abs=1e-5)
 
 
-def test_a_ball_comes_to_rest_where_its_energy_ends() -> None:
-    position, velocity = roll(torch.zeros(1, 2), torch.tensor([[1.0, 0.0]]), 60.0, ROLLING_M_S2)
-    assert position[0].tolist() == pytest.approx([1.0 / (2 * 0.3), 0.0], abs=1e-5)
-    assert velocity.abs().max() == 0
-    again, _ = roll(position, velocity, 1.0, ROLLING_M_S2)
-    assert torch.equal(again, position)
-
-
 def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     before, after = torch.tensor([[0.0, 0.0]]), torch.tensor([[0.1, 0.0]])
     ball = torch.tensor([[0.2, 0.1]])
@@ -49,38 +41,6 @@ def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     # It begins where the body touches it, whichever way it leaves.
     assert torch.equal(beside, place)
     assert turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
-
-
-def test_only_bodies_that_approach_knock_their_ball_wherever_they_are() -> None:
-    before = torch.tensor([[2.0, -1.0], [2.0, -1.0], [2.0, -1.0]])
-    after = before + torch.tensor([[0.02, 0.01], [-0.02, -0.01], [0.01, -0.02]])
-    ball = after + torch.tensor([[0.12, 0.06], [0.12, 0.06], [0.12, 0.07]])
-    _, velocity = knock(before, after, ball, torch.zeros(3, 2), reach_m=0.19, speed_m_s=0.7)
-    # Toward the ball; away from it; a little away, nearly across.
-    assert (velocity != 0).any(-1).tolist() == [True, False, False]
-
-
-@pytest.mark.parametrize(
-    ("after", "ball"),
-    [([0.1, 0.0], [0.4, 0.0]), ([0.1, 0.0], [-0.05, 0.0]), ([0.0, 0.0], [0.1, 0.0])],
-    ids=["out of reach", "behind", "standing"],
-)
-def test_other_balls_are_left_alone(after: list[float], ball: list[float]) -> None:
-    rolling = torch.tensor([[0.1, 0.2]])
-    place, velocity = knock(
-        torch.zeros(1, 2), torch.tensor([after]), torch.tensor([ball]), rolling, reach_m=0.19, speed_m_s=0.7
-    )
-    assert torch.equal(place, torch.tensor([ball]))
-    assert torch.equal(velocity, rolling)
-
-
-def test_a_ball_at_the_very_place_of_its_body_is_nowhere_undefined() -> None:
-    before, here, still = torch.tensor([[-0.1, 0.0]]), torch.zeros(1, 2), torch.zeros(1, 2)
-    place, velocity = knock(before, here, here, still, reach_m=0.19, speed_m_s=0.7)
-    asked = torch.ones(1, 1, dtype=torch.bool)
-    kicked = kick_away(here, here, still, asked, reach_m=0.35, speed_m_s=2.0)
-    for found in (place, velocity, kicked):
-        assert torch.equal(found, still)
 
 
 def test_a_kick_sends_balls_within_reach_straight_away() -> None:
@@ -143,34 +103,6 @@ def test_it_stands_and_kicks() -> None:
     assert state[0].tolist() == pytest.approx([0, 0, 0, 0, 0.22 + way, 0, 1.5 - 0.3 * 0.2, 0], abs=1e-5)
     # Out of reach.
     assert state[1].tolist() == pytest.approx([0, 0, 0, 0, 0.32, 0, 0, 0], abs=1e-5)
-
-
-def test_walls_stop_the_mass_but_not_the_ball() -> None:
-    simulator = one()
-    for _ in range(200):
-        state = simulator.step(AHEAD)
-    assert simulator.blocked.all()
-    # The room's inside ends at 2.5 m, 0.2 m before which the mass is stopped.
-    assert state[0, 0].item() == pytest.approx(2.3, abs=0.01)
-    assert state[0, 4].item() > 2.5
-    simulator.reset_to(START, torch.tensor([0]))
-    assert not simulator.blocked.any()
-
-
-def test_plain_parameters_are_the_plain_simulator() -> None:
-    torch.manual_seed(0)
-    varied, plain = VariedPlanar(one(50), BallVariation()), one(50)
-    for step in range(60):
-        before, action = plain.state, torch.randn(50, 3)
-        torch.testing.assert_close(varied.step(action), plain.step(action))
-        if step % 5 == 0:
-            landed = plain.state + 0.05 * torch.randn(50, 8)
-            both = []
-            for simulator in (varied, plain):
-                torch.manual_seed(step)  # what corrections cannot tell is drawn
-                both.append(simulator.settle(before, landed))
-            torch.testing.assert_close(*both)
-        assert torch.equal(varied.blocked, plain.blocked)
 
 
 @pytest.mark.parametrize(
@@ -242,23 +174,6 @@ def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_spe
     assert not way[~hit].any()
 
 
-def test_a_ball_that_is_hit_leaves_about_the_way_that_the_simulator_has_it_go() -> None:
-    torch.manual_seed(0)
-    count = 20_000
-    start = START.expand(count, 8).clone()
-    start[:, 4:6] = torch.tensor([0.0, 0.25])
-    simulator = one(count)
-    simulator.reset_to(start)
-    simulator.step(torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3))
-    landed = start.clone()
-    landed[:, 6] = 0.8  # the correction expects it to go to the right, the simulator ahead
-    x, y, vx, vy = (simulator.settle(start, landed) - start)[:, 4:].T
-    turn_rad = torch.atan2(-vx, vy)
-    assert turn_rad.mean().item() == pytest.approx(0.0, abs=0.01)
-    assert turn_rad.std().item() == pytest.approx(0.4, abs=0.01)
-    torch.testing.assert_close(torch.atan2(-x, y), turn_rad)
-
-
 def kicked(simulator: BallAgent, speed_m_s: float) -> torch.Tensor:
     """Kick balls that lie, and correct them to `speed_m_s`; return which roll (B,)."""
     start = START.expand(simulator.num_envs, 8)
@@ -292,37 +207,6 @@ def test_a_new_lie_and_a_new_episode_are_drawn_for_anew() -> None:
     assert (after[rolled, 0] != needed[rolled]).all() and not after[rolled, 1].any()
     simulator.reset_to(START.expand(2, 8), torch.tensor([3, 5]))
     assert (simulator.memory[[3, 5], 0] != after[[3, 5], 0]).all() and not simulator.memory[[3, 5], 1].any()
-
-
-START_BALL_MEMORY = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.22, 0.0, 0.0, 0.0])
-
-
-def agents(count: int) -> BallAgent:
-    return BallAgent(
-        FIELD,
-        count,
-        timestep_s=0.2,
-        radius_m=0.2,
-        speed_m_s=0.25,
-        reach_m=0.19,
-        knock_m_s=1.0,
-        kick_reach_m=0.3,
-        kick_m_s=1.5,
-    )
-
-
-def test_a_correction_is_no_evidence_of_a_hit_where_nothing_touched_the_ball() -> None:
-    """The first two balls are out of reach; the third is kicked, so that the correction tells."""
-    agent, start = agents(3), START_BALL_MEMORY.repeat(3, 1)
-    start[:2, 4] = 1.0
-    agent.reset_to(start)
-    agent.memory[:, 0] = 0.75
-    landed = start.clone()
-    landed[:, 6] = 0.22
-    agent.step(torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
-    assert torch.equal(agent.settle(start, landed)[:, 4:], start[:, 4:])
-    # A ball that is hit ends at 0.44 m/s, having left at 0.5 m/s: half of that is half of a hit.
-    torch.testing.assert_close(agent.memory, torch.tensor([[0.75, 0.0], [0.75, 0.0], [0.75, 0.5]]))
 
 
 TASK = Kicking(FIELD, horizon=156)

@@ -74,16 +74,6 @@ def test_the_ball_is_seen_worse_from_afar(distance: float, spread: float) -> Non
     assert (sight.position - ball).std(axis=0) == pytest.approx([spread, spread], rel=0.06)
 
 
-def test_a_robot_that_turns_past_the_back_is_estimated_where_it_was_a_moment_ago() -> None:
-    exact = PerceptionErrors(white_m=0.0, drift_m=0.0, drift_rad=0.0, jumps_per_s=0.0, latency_s=0.05)
-    localisation, rng = Localisation(1, exact, 0.1), np.random.default_rng(0)
-    localisation.reset(np.array([0]), np.array([[0.0, 0.0, np.pi - 0.1]]), rng)
-    localisation.update(np.array([[0.2, 0.0, 0.1 - np.pi]]), rng, np.array([True]))
-    x, _, heading = localisation.pose[0]
-    assert x == pytest.approx(0.1)
-    assert abs(heading) == pytest.approx(np.pi)
-
-
 @pytest.mark.parametrize("heading", [0.0, 3.0, -3.0])
 @pytest.mark.parametrize(("bearing_deg", "seen"), [(99, True), (-99, True), (101, False), (-101, False)])
 def test_a_ball_is_seen_up_to_100_degrees_to_either_side(

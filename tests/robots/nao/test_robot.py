@@ -73,15 +73,6 @@ def test_a_lean_to_the_right_and_one_ahead_are_positive_and_tilts_see_no_heading
     np.testing.assert_allclose(nao.pose[:, 2], [0.0, 0.0, 2.5], atol=1e-12)
 
 
-def test_the_turn_of_a_leaning_robot_is_about_the_vertical() -> None:
-    nao = BatchedNao(1, seed=0, num_threads=1)
-    rates, world = np.array([0.3, -0.4, 1.0]), np.zeros(3)
-    nao.bodies.qpos[0, 3:7] = turned(-0.3, 0.5, 2.5)
-    nao.bodies.qvel[0, :6] = [0.2, -0.1, 0.5, *rates]  # MuJoCo tells rates of a free body in its own frame
-    mujoco.mju_rotVecQuat(world, rates, nao.bodies.qpos[0, 3:7].copy())
-    np.testing.assert_allclose(nao.velocity, [[0.2, -0.1, world[2]]])
-
-
 def test_walls_are_felt_and_stop_it() -> None:
     # The wall's face is at x = -6; the robot's toes are 0.1 m ahead of it.
     nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,21 +17,6 @@ def env(task: str = "nao-navigation", count: int = 3, **options: Any) -> NaoEnv:
     return made
 
 
-@pytest.mark.parametrize("task", ["nao-navigation", "nao-kick"])
-def test_states_have_their_columns_and_abstractions(task: str) -> None:
-    one = env(task)
-    columns = TASKS[task].state_columns
-    assert one.state.shape == (3, columns[0].size)
-    assert columns[0].names is not None
-    assert len(columns[0].names) == columns[0].size
-    assert one.reset().shape == (3, one.observation_size)
-    abstract = TASKS[task].abstraction(one.state)
-    assert abstract.shape == one.truth.shape == (3, TASKS[task].abstract_state.size)
-    assert TASKS[task].beyond(one.state).shape[1] == columns[0].size - abstract.shape[1]
-    # Beliefs are near the truth.
-    assert (abstract - one.truth).abs().max() < 0.5
-
-
 def test_robots_turn_to_their_ball_before_they_walk() -> None:
     one = env("nao-kick", 4, errors=NO_ERRORS)
     place, angle = np.zeros((4, 3)), np.array([0.0, np.pi / 4, np.pi / 2, -3.0])
@@ -46,23 +30,6 @@ def test_robots_turn_to_their_ball_before_they_walk() -> None:
     kicking = one._body_command(0 * ahead, np.ones(4, dtype=bool))
     assert (kicking[:, :2] == 0).all()
     np.testing.assert_array_equal(kicking[:, 2], command[:, 2])
-
-
-def test_a_robot_that_has_lost_its_ball_looks_around_until_it_sees_it() -> None:
-    one = env("nao-kick", 2, errors=NO_ERRORS)
-    place, ball = np.zeros((2, 3)), np.array([[-0.8, 0.0], [0.8, 0.0]])
-    one.robots.reset(np.arange(2), place, np.random.default_rng(0), ball)
-    one.localisation.reset(np.arange(2), place, np.random.default_rng(0))
-    # Both believe that it lies in front of them.
-    one.sight.reset(np.arange(2), ball[[1, 1]])
-    one.sight.errors = replace(NO_ERRORS, ball_seen_rad=np.pi / 2)
-    heading = []
-    for _ in range(40):
-        one.step(torch.zeros(2, 3))
-        heading.append(one.robots.pose[:, 2])
-    assert np.abs(heading)[:, 0].max() > np.pi / 2
-    assert np.abs(heading)[:, 1].max() < 0.2
-    np.testing.assert_allclose(one.sight.position, ball, atol=0.1)
 
 
 def test_a_kick_reaches_a_foot_far_and_moves_no_robot() -> None:
@@ -126,12 +93,3 @@ def test_states_tell_the_planned_velocity_in_the_world() -> None:
     planned = (0.12 - 0.08j) * np.exp(1j * heading)
     np.testing.assert_allclose(one.state[:, 4:6], np.column_stack([planned.real, planned.imag]), atol=1e-6)
     np.testing.assert_allclose(one.state[:, 26:29], np.tile([0.12, -0.08, 0.4], (3, 1)), atol=1e-6)
-
-
-def test_loads_are_those_of_the_left_and_of_the_right_foot() -> None:
-    one = env(count=2)
-    one.robots.bodies.pressure[:] = [[1, 2, 3, 4, 10, 20, 30, 40], [0, 0, 0, 50, 0, 0, 25, 0]]
-    columns = TASKS["nao-navigation"].state_columns[0].names
-    assert columns is not None
-    left, right = columns.index("load_left"), columns.index("load_right")
-    np.testing.assert_allclose(one.state[:, [left, right]], [[0.2, 2.0], [1.0, 0.5]])

@@ -3,7 +3,7 @@ import pytest
 from nao_values import foot_poses
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.kinematics import GRAVITY, HIP_OFFSET_Y_M, TICK_S
+from astra_data.robots.nao.kinematics import GRAVITY, TICK_S
 from astra_data.robots.nao.walk import (
     START,
     STOP,
@@ -141,23 +141,6 @@ def test_the_supporting_foot_moves_back_evenly_and_the_swinging_one_comes_forwar
     assert feet_at(0.25)[0][0] == pytest.approx(ahead - 0.02 + 0.04 * (1 - 0.5**0.5) / 2)
 
 
-def test_a_kick_swings_the_foot_beyond_its_step_and_back() -> None:
-    plain, kick = (feet_at(0.5, kicking=kicking) for kicking in (False, True))
-    assert kick[0, 0] - plain[0, 0] == pytest.approx(STYLE.kick_reach_m)
-    assert kick[1, 0] == plain[1, 0]
-    assert feet_at(1.0, kicking=True)[0, 0] == pytest.approx(feet_at(1.0)[0, 0], abs=1e-9)
-
-
-def test_turned_feet_stand_on_a_circle_around_the_torso() -> None:
-    spread = [[0.0, 0.0, 0.4]]
-    left, right = feet_at(0.0, before=spread, after=spread)
-    assert (left[5], right[5]) == pytest.approx((-0.2, 0.2))
-    sway = (left[1] + right[1]) / 2
-    for foot, side, yaw in ((left, 1, -0.2), (right, -1, 0.2)):
-        assert foot[0] + STYLE.torso_ahead_m == pytest.approx(-side * HIP_OFFSET_Y_M * np.sin(yaw))
-        assert foot[1] - sway == pytest.approx(side * HIP_OFFSET_Y_M * np.cos(yaw))
-
-
 def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
     rate = np.sqrt(GRAVITY / STYLE.pendulum_m)
     duration, dt = LIMITS.step_s, 1e-3
@@ -173,22 +156,6 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
     assert sway.min() > -0.05 and sway.max() < 0
     acceleration = (sway[0] - 2 * sway[1] + sway[2]) / dt**2
     np.testing.assert_allclose(acceleration, rate**2 * (sway[1] + STYLE.sway_foot_m), rtol=1e-3)
-
-
-def test_first_and_last_step_lead_from_rest_to_the_strides_speed_and_back() -> None:
-    dt = 1e-5
-
-    def speed(phase: float, **changes: object) -> float:
-        places = [-feet_at(phase + sign * dt, **changes)[:, 1].sum() / 2 for sign in (-1, 1)]
-        return float(places[1] - places[0]) / (2 * dt * LIMITS.step_s)
-
-    # A start step leans over the foot that the stride after it stands on the other side of.
-    start = [speed(phase, kind=START, left_swings=False) for phase in (dt, 1 - dt)]
-    stride = [speed(phase, left_swings=True) for phase in (dt, 1 - dt)]
-    stop = [speed(phase, kind=STOP, left_swings=False) for phase in (dt, 1 - dt)]
-    assert start[0] == pytest.approx(0.0, abs=1e-3) and stop[1] == pytest.approx(0.0, abs=1e-3)
-    assert start[1] == pytest.approx(stride[0], rel=1e-2)
-    assert stop[0] == pytest.approx(stride[1], rel=1e-2)
 
 
 def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:

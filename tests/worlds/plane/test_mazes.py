@@ -6,36 +6,13 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, FreeSpace, GoalDistance, Maze
+from astra_data.worlds.plane.mazes import U_MAZE, FreeSpace, GoalDistance, Maze
 
 CORRIDOR = Maze(rows=("1111111", "1000001", "1111111"), scale=4.0, start=(1, 1), goal=(1, 5))
 
 
 def shortest(maze: Maze, start: tuple[float, float], goal: tuple[float, float]) -> float:
     return float(maze.distance_field(np.array(goal))[maze.fine_index(np.array(start))])
-
-
-def test_the_long_maze_is_the_u_maze_twice() -> None:
-    assert LONG_MAZE.rows[:5] == (*U_MAZE.rows[:4], "10111")
-    assert LONG_MAZE.cell_center(*LONG_MAZE.start) == (-4.0, 8.0)
-    assert LONG_MAZE.cell_center(*LONG_MAZE.goal) == (4.0, -8.0)
-
-
-def test_cells_and_points_agree() -> None:
-    centers = U_MAZE.free_centers()
-    assert len(centers) == len(U_MAZE.free_cells()) == 7
-    assert (U_MAZE.clearance(centers) > 1.9).all()
-    walls = np.array([U_MAZE.cell_center(*cell) for cell in U_MAZE.wall_cells()])
-    assert len(walls) == 25 - 7
-    assert not U_MAZE.clearance(walls).any()
-    assert not U_MAZE.clearance(np.array([[100.0, 0.0], [0.0, -100.0]])).any()
-
-
-def test_the_fine_grid_repeats_the_walls() -> None:
-    points = np.random.default_rng(0).uniform(-9.9, 9.9, (500, 2))
-    centers = np.array([U_MAZE.cell_center(row, column) for row in range(5) for column in range(5)])
-    nearest = np.abs(points[:, None] - centers).max(axis=-1).argmin(axis=1)
-    assert (U_MAZE.fine_walls[U_MAZE.fine_index(points)] == U_MAZE.walls.ravel()[nearest]).all()
 
 
 def test_around_the_grid_there_is_wall() -> None:
@@ -117,17 +94,8 @@ def test_a_maze_that_cannot_be_is_refused(changes: dict[str, Any], fault: str) -
         replace(CORRIDOR, **changes)
 
 
-def test_cells_of_a_maze_that_is_not_square_are_where_they_are_drawn() -> None:
-    assert CORRIDOR.half_extent.tolist() == [14.0, 6.0]
-    assert (CORRIDOR.cell_center(0, 0), CORRIDOR.cell_center(1, 5)) == ((-12.0, 4.0), (8.0, 0.0))
-    assert CORRIDOR.fine_walls.shape == (120, 280)
-
-
 ROOM = Maze(rows=("111", "101", "111"), scale=4.0, start=(1, 1), goal=(1, 1))
 """One room, free in [-2, 2]²; with a radius of 0.1 m, in [-1.9, 1.9]²."""
-
-PILLAR = Maze(rows=("11111", "10001", "10101", "10001", "11111"), scale=2.0, start=(1, 1), goal=(3, 3))
-"""A corridor around a block that is closed in [-1.1, 1.1]² with a radius of 0.1 m."""
 
 
 def slide(maze: Maze, start: list[float], end: list[float]) -> tuple[list[float], bool]:
@@ -155,13 +123,6 @@ def test_walls_stop_each_axis_by_itself(end: list[float], rest: list[float]) -> 
     assert stopped
     free = FreeSpace.of_maze(ROOM, radius_m=0.1)
     assert not free.blocked[free.cells(torch.tensor(reached))]
-
-
-def test_an_outer_corner_met_diagonally_lets_one_axis_pass() -> None:
-    # From below and left of the pillar's corner at (-1.1, -1.1): x goes first and is free, then y is stopped.
-    reached, stopped = slide(PILLAR, [-1.12, -1.12], [-1.08, -1.08])
-    assert reached == pytest.approx([-1.08, -1.1], abs=2e-4)
-    assert stopped
 
 
 @pytest.mark.parametrize(("fine_m", "radius_m"), [(0.1, 0.3), (0.1, 0.6), (0.05, 0.35), (0.25, 0.75)])

@@ -49,16 +49,6 @@ def test_policies_see_shares_of_the_mazes_half_extent_and_the_velocity() -> None
     torch.testing.assert_close(seen, expected.expand(2, 3, 8))
 
 
-def test_starts_have_as_many_places_as_there_are_offsets() -> None:
-    task = Navigation(U_MAZE, horizon=9, spread_m=0.01, start_offsets_m=((0.0, 0.0), (0.5, 0.0), (1.0, 0.3)))
-    starts = task.draw_starts(np.random.default_rng(0), 3000)
-    assert (starts[:, 2:] == 0).all() and starts.shape == (3000, 4)
-    offsets = starts[:, :2] - np.array(U_MAZE.cell_center(*U_MAZE.start))
-    which = np.round(2 * offsets[:, 0]).astype(int)
-    assert np.bincount(which).tolist() == pytest.approx([1000] * 3, abs=100)
-    np.testing.assert_allclose(offsets[which == 2], np.tile([1.0, 0.3], ((which == 2).sum(), 1)), atol=0.04)
-
-
 def test_waves_tell_the_position_finely() -> None:
     goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
     state = torch.tensor([[5.0, 2.5, 0.0, 0.0], [-10.0, 10.0, 0.0, 0.0]])
@@ -117,17 +107,6 @@ def test_starts_anywhere_cover_the_free_space_evenly_and_keep_clear_of_walls() -
     assert arms == pytest.approx(2 * 10.4 * 2.4 / (2 * 10.4 * 2.4 + 4 * 2.4), abs=0.03)
 
 
-def test_a_maze_too_narrow_for_starts_anywhere_is_told() -> None:
-    narrow = Maze(rows=("11111", "10001", "11111"), scale=1.0, start=(1, 1), goal=(1, 3))
-    with pytest.raises(
-        BadInputError, match=r"start_clearance_m: expected less than 0\.5 m, the largest .*, got 0\.8$"
-    ):
-        Navigation(narrow, horizon=9, spread_m=0.05).draw_anywhere(np.random.default_rng(0), 2)
-    wider = Navigation(narrow, horizon=9, spread_m=0.05, start_clearance_m=0.4)
-    starts = wider.draw_anywhere(np.random.default_rng(0), 100)
-    assert (np.abs(starts[:, 1]) <= 0.1).all()  # along the middle
-
-
 class Straight(Navigation):
     """Progress is paid as the crow flies."""
 
@@ -162,22 +141,6 @@ def judged(
     """Return the outcome of a step from the origin, whose goals are at (1, 0)."""
     target.goal = torch.tensor([[1.0, 0.0]] * 3)
     return target._judged(torch.zeros(3, 2), torch.tensor(after), np.array(fallen))
-
-
-def test_robots_start_and_aim_where_the_task_does() -> None:
-    target = Dots(STRAIGHT, 3)
-    target.reseed(5)
-    rows = np.array([2, 0])
-    starts = target._start(rows)
-    target._aim(rows)
-    assert starts.shape == (2, 4)
-    # Three standard deviations of 0.2 m at most.
-    assert (np.abs(starts[:, :2] - START) <= 0.6).all() and not starts[:, 2:].any()
-    assert (np.abs(target.goal[rows].numpy() - GOAL) <= 0.6).all()
-    assert target.goal[1].tolist() == [0.0, 0.0]  # who is not asked keeps its goal
-    target.reseed(5)
-    np.testing.assert_array_equal(target._start(rows), starts)
-    assert not np.array_equal(target._start(rows), starts)
 
 
 def test_an_episode_ends_at_the_goal_or_in_a_fall() -> None:

@@ -74,13 +74,6 @@ def test_corrections_keep_as_clear_of_walls_as_they_are_told_and_steps_do_not() 
     assert not stopped.any()
 
 
-def test_a_wall_that_stopped_a_step_counts_after_its_correction_too() -> None:
-    states = planar(3, 5)
-    states.blocked[2] = True
-    states.settle(HERE, HERE)
-    assert states.blocked.tolist() == [False, False, True]
-
-
 def test_corrections_slide_along_walls_and_keep_all_else() -> None:
     states = planar(3, 5)
     landed = HERE.clone()
@@ -133,20 +126,6 @@ def test_sensors_show_other_states_than_the_true_ones() -> None:
     assert torch.equal(varied.true_state, torch.stack([here[0], torch.zeros(8), here[2]]))
 
 
-def test_a_correction_is_of_the_true_state_and_is_shown_as_it_is() -> None:
-    _, varied = resting(3, 4, PlanarVariation(position_noise_m=(0.1, 0.1)))
-    here = HERE[:, :4]
-    varied.reset_to(here)
-    varied.step(torch.zeros(3, 2))
-    landed = here.clone()
-    landed[0, 1] = 5.95
-    settled = varied.settle(here, landed)
-    assert varied.blocked.tolist() == [True, False, False]
-    assert torch.equal(varied.state, settled) and torch.equal(varied.true_state, settled)
-    varied.true_state = landed
-    assert torch.equal(varied.true_state, landed) and torch.equal(varied.state, settled)
-
-
 START = torch.tensor([[-4.0, 4.0, 0.0, 0.0]])
 ACTION = torch.tensor([[0.6, -0.8]])
 
@@ -171,15 +150,6 @@ def test_a_wall_stops_one_axis_and_its_velocity() -> None:
     # The wall's face is at y = 6, its center may come to 0.1 m of it.
     assert state[0].tolist() == pytest.approx([-4.0 + 60 * 0.025, 5.9, 0.5, 0.0], abs=1e-3)
     assert bool(sim.blocked)
-
-
-def test_states_handed_out_stay_as_they_were() -> None:
-    sim = point_mass(2)
-    state = sim.step(torch.ones(2, 2))
-    kept = state.clone()
-    sim.reset_to(torch.full((1, 4), 7.0), torch.tensor([0]))
-    sim.step(torch.ones(2, 2))
-    assert torch.equal(state, kept)
 
 
 def one_step(variation: PlanarVariation, count: int = 1, action: torch.Tensor = ACTION) -> VariedPlanar:

@@ -84,13 +84,6 @@ def test_quarter_turns_go_everywhere_that_is_free() -> None:
     assert (np.abs(ends[:, 0, 1]) < 2).any()
 
 
-def test_turns_that_lengthen_a_command_beyond_its_limit_are_drawn_again() -> None:
-    path = straight((-4.5, 4.0), (-4.4, 4.0), 20)
-    turned = [change.vectors(np.array([0.9, 0.9])) for change, _ in draws(20, path, rotations="any")]
-    assert np.abs(turned).max() <= 1 + 1e-6
-    assert len({round(float(x), 3) for x, _ in turned}) == 20
-
-
 def test_what_fits_nowhere_is_given_up() -> None:
     # Nine meters fit into a corridor, but not at right angles to it where they start.
     path = straight((-4.5, 4.0), (4.5, 4.0), 60)
@@ -117,14 +110,6 @@ def test_an_episode_ends_at_the_goal_or_where_it_topples(
     # The last step earns +10 or -10; all of them 0.1 m of progress.
     assert judged["next.reward"][-1] == pytest.approx(10.1 if success else -9.9, abs=0.02)
     assert judged["next.reward"][:-1].mean() == pytest.approx(0.1, abs=0.02)
-
-
-def test_an_episode_that_just_stops_is_truncated() -> None:
-    path = straight((4.0, 4.0), (3.0, 4.0), 10)
-    before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
-    judged = outcomes(TASK.objective, before, after, AIM, np.zeros(10, dtype=bool))
-    assert judged["next.truncated"].tolist() == judged["next.done"].tolist() == [False] * 9 + [True]
-    assert not judged["next.terminated"].any()
 
 
 def test_each_copy_has_a_goal_of_its_own_among_those_of_the_task() -> None:
@@ -206,21 +191,3 @@ def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
     assert {len(columns[TERMINATED]) for columns in made} == {11}
     assert not any(columns[TERMINATED].any() for columns in made)
     assert kicks(3, kick(5, 0.0, ends=True)) == []
-
-
-@pytest.mark.parametrize("arrived", [False, True])
-def test_a_topple_of_a_robot_without_a_ball_is_copied_and_its_arrival_is_not(arrived: bool) -> None:
-    path = straight((-4.0, 4.0), (-3.9, 4.0), 20)
-    last = np.arange(20) == 19
-    columns = {
-        **path.columns,
-        GOAL: np.tile(AIM, (20, 1)),
-        TERMINATED: last,
-        SUCCESS: last & arrived,
-    }
-    moving = [TASK.state, replace(TASK.state, name=NEXT_STATE), TASK.action]
-    copied = relocation().copied(Episode(0, columns), moving, np.random.default_rng(0))
-    assert copied is not None and copied.steps == slice(0, 20)
-    assert copied.columns[TERMINATED].tolist() == (last & (not arrived)).tolist()
-    assert copied.columns[TRUNCATED].tolist() == (last & arrived).tolist()
-    assert copied.columns[REWARD][-1] == pytest.approx(0.0 if arrived else -10.0, abs=0.1)
