@@ -1,4 +1,4 @@
-"""Commands in their own units, and as policies give them: ±1 along each axis."""
+"""Commands in their own units, and as policies give them, ±1 along each axis; simulators driven so."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Rotations and shifts of the planar frame, and what they do to the values of a column.
+"""Rotations of bodies in space; motions of the planar frame, and what they do to the values of a column.
 
 The dynamics of a robot on a level floor do not depend on where it is and which way it faces.
 """

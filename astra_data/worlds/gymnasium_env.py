@@ -1,4 +1,4 @@
-"""A robot that is an environment of Gymnasium, given by its id or its class."""
+"""Environments of Gymnasium as a task's robot or abstract simulator."""
 
 from collections.abc import Callable, Mapping
 from typing import Any

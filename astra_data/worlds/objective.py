@@ -1,4 +1,4 @@
-"""Measures by which methods are compared on a task."""
+"""Objectives of tasks, on abstract states: the same in target and simulator, so rewards compare; scores."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field

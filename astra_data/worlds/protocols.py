@@ -1,4 +1,12 @@
-"""Interfaces of abstract simulators, a user's `Simulator` among them, and of batched environments."""
+"""Interfaces of abstract simulators, a user's `Simulator` among them, and of batched environments.
+
+    observation = env.reset()                    (B, O)
+    step = env.step(action)                      action (B, A) -> Step, each field (B, ...)
+    observation = env.reset(step.terminated)     restarts the finished rows only
+
+`step.observation` is always the state that the action led to, also in the last step of an episode, so that
+learners can bootstrap from it. No row restarts by itself.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

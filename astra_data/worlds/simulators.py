@@ -1,4 +1,4 @@
-"""States of simulators without walls: any of them can be set, and any correction is taken over."""
+"""Abstract simulators of states without walls: of a NumPy function, or of a MuJoCo model."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence

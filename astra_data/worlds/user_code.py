@@ -1,4 +1,4 @@
-"""The user's code: "cart.py:TASK" in a file, "package.module:TASK" in a package; its digests and faults."""
+"""The user's code, as "cart.py:TASK" or "package.module:TASK": its objects, digests and faults."""
 
 import ast
 import hashlib

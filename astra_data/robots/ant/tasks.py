@@ -1,4 +1,4 @@
-"""AntMaze: Gymnasium's ant in a maze, driven by planar velocity commands through its low-level controller."""
+"""AntMaze: Gymnasium's ant in a maze, and a planar point mass as its abstract simulator (Section V-A)."""
 
 from functools import partial
 

@@ -1,6 +1,7 @@
-"""Forward kinematics of the humanoid: center of mass and feet, for batches of joint angles.
+"""φ of the humanoid, one function per abstract simulator, and the forward kinematics that it needs.
 
-Everything is in the torso's frame, in m.
+φ maps target states (..., 47), numpy in, numpy out, torch in, torch out, and drops the position on the floor,
+which the dynamics do not depend on. Kinematics are in the torso's frame, in m.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,7 @@
-"""The humanoid's MuJoCo model, with its own motors or with position control of every joint.
+"""The humanoid's MuJoCo model, the spreads of its states, and the rewards of walking.
 
-Four joints follow commands: hips and knees, each about one axis. All others are held at zero.
+Its own motors move it, or position control of every joint. Four joints follow commands: hips and knees, each
+about one axis. All others are held at zero.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""B humanoids under joint controls, with the rewards and ends of Gymnasium's Humanoid-v5."""
+"""Gymnasium's humanoid, driven by position commands for hips and knees; rewards and ends of Humanoid-v5."""
 
 import mujoco
 import numpy as np

@@ -1,8 +1,8 @@
-"""The objective of walking on each abstraction of the humanoid: the target's reward without its costs.
+"""The humanoid's tasks: walking of Gymnasium's humanoid, with three abstract simulators (Section V-B).
 
-All reward forward velocity and staying up, as `Locomotion` does; the costs of effort and contact forces,
-which are small in the target, are left out. There is no goal to reach: an episode that lasts to the horizon
-without a fall succeeds.
+The objectives reward forward velocity and staying up, as `Locomotion` does; the costs of effort and contact
+forces, which are small in the target, are left out. There is no goal to reach: an episode that lasts to the
+horizon without a fall succeeds.
 """
 
 import os

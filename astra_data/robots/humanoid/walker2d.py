@@ -1,6 +1,7 @@
-"""The planar walker's MuJoCo model: the humanoid's legs under one link for the rest, in the plane of x and z.
+"""The most abstract simulator of the humanoid: a walker in the plane of x and z, legs under one rigid link.
 
-Lengths, masses, joints and motors are read from the humanoid's model in its initial pose.
+Its MuJoCo model has the lengths, masses, joints and motors of the humanoid's in its initial pose, the same
+physics and position control. What it leaves out: docs/humanoid.md.
 """
 
 from collections.abc import Mapping

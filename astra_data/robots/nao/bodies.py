@@ -1,7 +1,11 @@
-"""The NAO's body as a MuJoCo model: twelve leg joints, rigid arms and head, primitive shapes.
+"""The NAO's body as a MuJoCo model, and B of them: physics, servos, ankle reflex, 16 ticks per control step.
 
-Only collisions that matter to walking are simulated: four points of each sole with the floor, both feet and
-the chest with the walls, feet and shanks with the ball. A fallen robot sinks into the floor.
+Twelve leg joints, rigid arms and head, primitive shapes. Only collisions that matter to walking are
+simulated: four points of each sole with the floor, both feet and the chest with the walls, feet and shanks
+with the ball. A fallen robot sinks into the floor.
+
+A robot's whole control step runs in one thread, so that results do not depend on the number of threads. The
+robot's own friction and stiffness are first written into the thread's copy of the model.
 """
 
 import copy

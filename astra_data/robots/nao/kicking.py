@@ -1,4 +1,10 @@
-"""A ball on a carpet: rolling, and contacts with bodies that kick it or walk into it. Batched torch."""
+"""Kicking: a rolling ball, the point mass with a ball that simulates it, and the objective.
+
+The paper prints no reward. Ours: meters by which the ball comes closer to the goal, plus half the meters by
+which the robot comes closer to the point behind the ball, +10 for a goal, -10 for a ball that leaves the
+field elsewhere and for falling. Lines and goal are those of RoboCup's Standard Platform League, at smaller
+distances.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

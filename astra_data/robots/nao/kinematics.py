@@ -1,9 +1,15 @@
-"""The NAO's links and joints in numbers: lengths, masses, centers of mass, inertias, limits, torques.
+"""The NAO's links and joints in numbers, its legs' angles in closed form, and how robots differ.
 
 Sources: Aldebaran's documentation of the NAO H25 (links, joints, masses); B-Human's published calibration of
 the V6 (masses, limits, soles; centers of mass from its calibration of the V4, whose links are the same).
 Frames are Aldebaran's: in the zero posture all are parallel, x forward, y to the left, z up. Only left limbs
 are listed; right ones are their mirror images.
+
+A foot's pose is that of its sole below the ankle, in the torso's frame: x, y, z in m, roll, pitch, yaw in rad
+(rotation Rz(yaw) Ry(pitch) Rx(roll)). Both legs share one motor that turns the hips about axes tilted by 45°
+(yaw and pitch at once), so there are eleven angles for twelve joints, and the feet's yaws depend on each
+other: the motor takes the mean of the angles that each foot alone would need; the other joints then keep the
+soles' positions and planes exact.
 """
 
 from dataclasses import dataclass

@@ -34,7 +34,7 @@ class Senses:
     """Sensor readings of B robots at the end of a control step.
 
     Attributes:
-        angles: measured joint angles, (B, 11) in rad (`worlds.nao.kinematics.JOINTS`). gyro: measured rates
+        angles: measured joint angles, (B, 11) in rad (`kinematics.JOINTS`). gyro: measured rates
         about x, y, z, (B, 3) in rad/s. tilt: roll and pitch of the torso, (B, 2) in rad. pressure: on the
         soles in N; left and right foot, front left, front right, back left, back right point, (B, 2, 4).
         phase: fraction of the step done, (B,). left_swings: which foot is in the air, (B,) bool. planned:

@@ -1,4 +1,4 @@
-"""φ of the NAO, with and without a ball, and the part of its state that it drops.
+"""NAOs, simulated stand-ins, that follow planar velocity commands in a maze or with a ball; their φ.
 
 φ maps target states (..., S) to abstract states (..., X), numpy in, numpy out, torch in, torch out.
 """

@@ -1,8 +1,13 @@
-"""Step planning of a walking NAO: commanded velocities in, landing positions of the feet out. No physics.
+"""The NAO's walk: commanded velocities in, landing positions of the feet and joint angles out. No physics.
 
 A step lasts from one landing to the next. When the swinging foot lands, it is half of the step's *spread*
 ahead of its place at rest beneath the torso, the supporting foot half of it behind; spread is (x, y, yaw) in
 m, m, rad. During a step, the torso therefore moves by the mean of the spreads before and after.
+
+In the style of Walk2014 (Hengst, UNSW 2014): the supporting foot moves back at constant speed beneath a torso
+of constant height, the swinging foot moves forward and is lifted; the torso sways over the supporting foot
+like a linear inverted pendulum. Angles do not depend on sensors, so many ticks are planned at once; only the
+ankles are corrected by the gyroscope when the angles are sent (`BatchedBodies`).
 """
 
 from dataclasses import dataclass, field, fields, replace

@@ -1,1 +1,1 @@
-"""Planar worlds: mazes, a point mass, a ball, and the objectives of navigation and kicking."""
+"""Planar worlds: mazes, a point mass, navigation, and episodes placed elsewhere."""

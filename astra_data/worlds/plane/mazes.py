@@ -1,7 +1,8 @@
-"""Maze grids: walls, free space, distance along the corridors; shared by targets and abstract simulators.
+"""Mazes: walls, free space, distances along the corridors; shared by targets and abstract simulators.
 
 Cells are indexed (row, column) from the top left; x grows with the column, y falls with the row, and the
-maze is centered on the origin, as in gymnasium-robotics.
+maze is centered on the origin, as in gymnasium-robotics. Fine grids have square cells of the maze's `fine_m`
+and are indexed [y, x] from the lower left corner.
 """
 
 from copy import copy

@@ -1,4 +1,4 @@
-"""The navigation objective: reach a goal in a maze.
+"""Objectives and simulated targets in a maze; navigation: reach a goal.
 
 The paper prints no reward. Ours: progress along the shortest free path to the goal, +10 for reaching it, and
 a negative reward for a failure.

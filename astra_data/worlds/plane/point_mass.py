@@ -1,4 +1,4 @@
-"""States among the walls of a maze, and planar simulators whose parameters and sensors vary."""
+"""The abstract simulator of navigation, a point mass that follows commands perfectly; its variations."""
 
 from collections.abc import Mapping
 
