@@ -7,7 +7,7 @@ import numpy as np
 from fake_runs import FakeRecipe
 
 from astra_data.pipeline.stages.report import ReportConfig, report
-from astra_data.reports.command_replay import CommandReplay
+from astra_data.reports.figures.motion import CommandReplay
 from astra_data.reports.results import Results, read_results
 from astra_data.worlds.objective import SUCCESS
 from astra_data.worlds.plane.mazes import U_MAZE

@@ -20,32 +20,18 @@ from itertools import cycle
 from pathlib import Path
 from typing import Annotated, Any
 
-import gymnasium
-import mujoco
 import numpy as np
 import torch
 import typer
 from dataset_peers import BATCH, COLUMNS, DRAWN, FPS, LENGTH, Hdf5, LeRobot, Minari, frames_of
-from mujoco.rollout import Rollout
 from rich.console import Console
 from rich.table import Table
 from timing import Candidates, Stretch, measure
 
-from astra_data.core.provenance import cores
-from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Column, Episode
+from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, DONE, REWARD, STATE, Array, Episode
 from astra_data.dataset.frames import Frames
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.pipeline.stages.pair import pair_steps
-from astra_data.policies.gymnasium import SeededSimulatorEnv, SingleEnv
-from astra_data.policies.simulator_env import SimulatorEnv
-from astra_data.robots.registry import TASKS, Pairing, pairing_named
-from astra_data.worlds.simulators import MujocoModel
-
-PAIRED = 32_768
-BATCH_OF_PAIRS = 4096
-TASK = "antmaze-umaze"
 
 
 def main(
@@ -125,8 +111,6 @@ def measurements(root: Path, data: list[Episode], lerobot: Any) -> Iterator[tupl
             "robomimic's HDF5": hdf5.transitions,
         },
     )
-    yield "transitions paired, point mass", point_mass_pairs()
-    yield "transitions paired, planar walker in MuJoCo", walker_pairs()
 
 
 def random_walks(episodes: int, steps: int) -> list[Episode]:
@@ -173,73 +157,6 @@ def drawing(batches: Any, count: int) -> Stretch:  # noqa: ANN401 - ours, or a D
         return sum(len(next(endless)[STATE]) for _ in range(count))
 
     return stretch
-
-
-def point_mass_pairs() -> Candidates:
-    """Pair transitions of the point mass: all at once, or in one environment of Gymnasium's."""
-    task = TASKS[TASK]
-    rng = np.random.default_rng(0)
-    centers = np.array(task.maze.free_centers(), dtype=np.float32)
-    size = next(column.size for column in task.state_columns if column.name == STATE)
-    state = rng.normal(size=(PAIRED, size)).astype(np.float32)
-    state[:, :2] = centers[rng.integers(len(centers), size=PAIRED)]
-    action = rng.uniform(-1, 1, size=(PAIRED, 2)).astype(np.float32)
-    pairing = pairing_named(TASK)
-    batch, simulator = pairing.simulator(BATCH_OF_PAIRS), task.simulator(1)
-    env = SingleEnv(SeededSimulatorEnv(SimulatorEnv(task.objective, EpisodeSimulator(simulator))))
-    env.reset(seed=0)
-    abstract = torch.from_numpy(np.ascontiguousarray(task.abstraction(state)))
-
-    def loop(count: int = 500) -> int:
-        for row in range(count):
-            simulator.reset_to(abstract[row : row + 1])
-            env.step(action[row])
-        return count
-
-    def ours() -> int:
-        columns, _ = pair_steps(pairing, batch, state, action, state, tolerance=1e-6)
-        return len(columns[ABSTRACT_STATE])
-
-    return {"ours": ours, "Gymnasium loop": loop}
-
-
-def walker_pairs() -> Candidates:
-    """Pair transitions of Gymnasium's planar walker, whose whole state is the abstract state."""
-    env: Any = gymnasium.make("Walker2d-v5").unwrapped
-    env.reset(seed=0)
-    model, substeps = env.model, env.frame_skip
-    size = model.nq + model.nv
-    rng = np.random.default_rng(0)
-    state = np.tile(np.concatenate([env.init_qpos, env.init_qvel]), (BATCH_OF_PAIRS, 1))
-    state = (state + 0.1 * rng.normal(size=state.shape)).astype(np.float32)
-    action = rng.uniform(-1, 1, size=(BATCH_OF_PAIRS, model.nu)).astype(np.float32)
-    pairing = Pairing(
-        "walker2d",
-        {},
-        None,
-        Column(ABSTRACT_STATE, size=size),
-        lambda values: values,
-        lambda count: MujocoModel(model, count, substeps=substeps),
-    )
-    batch = pairing.simulator(BATCH_OF_PAIRS)
-    rollout, data = Rollout(nthread=cores()), [mujoco.MjData(model) for _ in range(cores())]
-    initial = np.concatenate([np.zeros((BATCH_OF_PAIRS, 1)), state], axis=1)
-    control = np.repeat(action[:, None].astype(np.float64), substeps, axis=1)
-
-    def limit() -> int:
-        return len(rollout.rollout(model, data, initial, control)[0])
-
-    def loop(count: int = 500) -> int:
-        for row in range(count):
-            env.set_state(state[row, : model.nq].astype(float), state[row, model.nq :].astype(float))
-            env.step(action[row])
-        return count
-
-    def ours() -> int:
-        columns, _ = pair_steps(pairing, batch, state, action, state, tolerance=1e-6)
-        return len(columns[ABSTRACT_STATE])
-
-    return {"ours": ours, "mujoco.rollout alone": limit, "Gymnasium loop": loop}
 
 
 @contextmanager

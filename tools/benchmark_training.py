@@ -7,8 +7,7 @@
 Stable-Baselines3 and d3rlpy run in processes with environments of their own, which `uv` makes. The
 candidates take turns over the same stretch of time, each with one torch thread. Rates are told by the clock
 and by the processors' time, of all processes of a candidate together: the latter's ratios hold also on a
-machine that does other work. The bound is what `bare_work` does: the simulator and the passes through the
-networks, which candidates with the same updates share.
+machine that does other work.
 """
 
 import json
@@ -23,7 +22,6 @@ import gymnasium_robotics
 import numpy as np
 import torch
 import typer
-from bare_work import bare_iql, bare_ppo, bare_sac
 from timing import OURS, Candidates, Rate, Stretch, complain, measure, peer, print_rates
 
 from astra_data.core.config import load_recipe
@@ -34,9 +32,8 @@ from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.pipeline.recipe import Recipe
 from astra_data.policies.iql import Experience, Iql, IqlConfig
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
+from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo
-from astra_data.policies.sac import Sac, SacConfig
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import PpoTrainConfig
 from astra_data.robots.ant.body import POSITIONS, VelocityController
@@ -44,10 +41,8 @@ from astra_data.robots.registry import TASKS
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)
 TASK = TASKS[SETTINGS.task]
-WALKER = TASKS["humanoid-walker2d"]
 SHAPE = GroundingShape(state_size=4, action_size=2, goal_size=2)
 PEERS = Path(__file__).parent / "peers"
-BOUND = "bound: simulator and networks alone"
 GYMNASIUM_ID = "AntMaze_UMaze-v5"
 ANTS = 128
 TORCH = torch.__version__.partition("+")[0]
@@ -60,7 +55,6 @@ class Part(StrEnum):
 
     ppo = "ppo"
     recurrent = "recurrent"
-    sac = "sac"
     iql = "iql"
     target = "target"
 
@@ -97,7 +91,6 @@ def grounded_ppo(_quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
         "PPO in the grounded simulator, steps",
         {
             OURS: ppo_stretch(grounding, memory_size=0),
-            BOUND: bare_ppo(*ppo_parts(grounding, memory_size=0)),
             "Stable-Baselines3, one vector environment": stable_baselines(stack, "ppo", "vector"),
             "Stable-Baselines3, DummyVecEnv of 16": stable_baselines(stack, "ppo", "single"),
         },
@@ -110,7 +103,6 @@ def recurrent_ppo(_quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
         "PPO with a memory in the raw simulator, steps",
         {
             OURS: ppo_stretch(NO_GROUNDING, memory_size=SETTINGS.train.memory_size),
-            BOUND: bare_ppo(*ppo_parts(NO_GROUNDING, memory_size=SETTINGS.train.memory_size)),
             "sb3-contrib, LSTM, one vector environment": stable_baselines(stack, "recurrent_ppo", "vector"),
             "sb3-contrib, LSTM, DummyVecEnv of 16": stable_baselines(stack, "recurrent_ppo", "single"),
         },
@@ -141,30 +133,6 @@ def ppo_parts(grounding: Grounding, memory_size: int) -> tuple[SimulatorEnv, Act
         hidden_sizes=config.hidden_sizes,
     )
     return env, ActorCritic(shape), config
-
-
-def sac(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
-    """Train an actor without memory in an abstract simulator of the humanoid."""
-    count, updates, steps = 32, 8, 8 if quick else 64
-    env, bare = (SimulatorEnv(WALKER.objective, NO_GROUNDING.simulator(WALKER, count)) for _ in range(2))
-    actor = SoftActor(PolicyShape(env.observation_size, env.action_size, hidden_sizes=(256, 256)))
-    config = SacConfig(rollout_steps=steps, updates_per_step=updates, batch_size=256)
-    learner = Sac(env, actor, config, horizon=WALKER.objective.horizon, seed=0)
-
-    def ours() -> int:
-        learner.iterate()
-        return steps * updates
-
-    sizes = [str(size) for size in (count, updates, steps)]
-    command = ["--with", "stable-baselines3", "python", str(PEERS / "stable_baselines_sac.py"), *sizes]
-    return (
-        f"SAC in the walker, updates of 256 steps, {updates} for every {count} steps",
-        {
-            OURS: ours,
-            BOUND: bare_sac(bare, 256, updates, steps),
-            "Stable-Baselines3, one vector environment": peer(stack, *command),
-        },
-    )
 
 
 def stable_baselines(stack: ExitStack, *arguments: str) -> Stretch:
@@ -212,12 +180,11 @@ def iql(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
         return updates
 
     command = ["--no-project", "--python", "3.12", "--with", "d3rlpy", "--with", f"torch=={TORCH}", "python"]
-    command += [str(PEERS / "d3rlpy_iql.py"), "time", str(observation_size), str(action_size)]
+    command += [str(PEERS / "d3rlpy_iql.py"), str(observation_size), str(action_size)]
     return (
         "implicit Q-learning, updates of critics and policy",
         {
             OURS: ours,
-            BOUND: bare_iql(observation_size, action_size, 256, updates),
             "d3rlpy": peer(stack, *command),
         },
     )
@@ -270,7 +237,6 @@ class DrivenAnt(gymnasium.ActionWrapper[Any, Any, Any]):
 MEASUREMENTS = {
     Part.ppo: grounded_ppo,
     Part.recurrent: recurrent_ppo,
-    Part.sac: sac,
     Part.iql: iql,
     Part.target: target,
 }

@@ -196,8 +196,7 @@ def inspect(
         typer.echo(f"written: {json}")
     if plot is None:
         return
-    from astra_data.reports.figures.coverage import coverage
-    from astra_data.reports.figures.style import png
+    from astra_data.reports.figures.style import coverage, png
 
     maps = ((inspection.positions, "position", "m"), (inspection.velocities, "velocity", "m/s"))
     drawn = [(planar, label, unit) for planar, label, unit in maps if planar is not None]

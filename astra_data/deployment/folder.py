@@ -16,7 +16,7 @@ from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, write_graph
 from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.pipeline.trained_policy import trained_policy
 from astra_data.policies.running_policy import RunningPolicy
-from astra_data.reports.formatting import table
+from astra_data.reports.blocks import table
 from astra_data.worlds.user_code import file_of
 
 _PAGE = """\

@@ -20,19 +20,24 @@ from astra_data.pipeline.stages.select import select as judge_all
 from astra_data.pipeline.trained_policy import settings_of, task_of, trained_policy
 from astra_data.pipeline.user_code import add_all
 from astra_data.policies.episodes import in_target, started
-from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, read_judged, select_page
-from astra_data.reports.runs import Reported
-from astra_data.reports.trials import (
+from astra_data.reports.choice import (
+    FOLDER,
     PSEUDO_TRIALS,
+    SELECTED,
     TRIALS,
+    Candidate,
+    Judged,
     TrialRound,
     TrialsFile,
     Tried,
     halve,
     least_trials,
+    read_judged,
     read_trials,
+    select_page,
     widest_field,
 )
+from astra_data.reports.runs import Reported
 from astra_data.robots.registry import task_named
 
 _log = logging.getLogger(__name__)

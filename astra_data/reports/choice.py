@@ -1,7 +1,8 @@
-"""The choice of a policy without the target: who was judged how, and what the choice is worth there."""
+"""The choice of a policy without the target, what it is worth there, and trials in the target that end it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import ceil, log2
 from pathlib import Path
 from statistics import fmean
 
@@ -10,10 +11,128 @@ from pydantic import Field
 
 from astra_data.methods import method_title
 from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
-from astra_data.reports.blocks import Section, TableBlock, Text, markdown
-from astra_data.reports.formatting import interval
-from astra_data.reports.statistics import LEAST_SEEDS, Estimate, mean_interval, mean_rank_correlation
-from astra_data.reports.trials import TrialsFile, posterior
+from astra_data.reports.blocks import Section, TableBlock, Text, interval, markdown
+from astra_data.reports.statistics import LEAST_SEEDS, Estimate, mean_interval
+
+TRIALS = "trials.json"
+PSEUDO_TRIALS = 4
+"""Trials that a prediction counts as: as a Beta prior it is then off by 0.2 or so, as predictions are."""
+LEAST_TRIALS = 2
+"""Of a candidate in a round: with one, chance decides; with more, fewer candidates are tried at all."""
+
+Attempt = Callable[[int, tuple[int, ...], int], Sequence[int]]
+"""Given a round's number, its candidates and the trials of each, returns how many of these succeeded."""
+
+
+@dataclass(frozen=True)
+class Halving:
+    """What came of it.
+
+    Attributes:
+        rounds: the candidates of each round, and the trials of each of these.
+        chosen: the candidate that is left. mean: of its success, given the prediction and all of its trials.
+    """
+
+    rounds: tuple[tuple[tuple[int, ...], int], ...]
+    chosen: int
+    mean: float
+
+
+def least_trials(field: int) -> int:
+    """Return how many trials are needed to halve so many candidates until one is left."""
+    return 0 if field < 2 else LEAST_TRIALS * field + least_trials(ceil(field / 2))
+
+
+def widest_field(candidates: int, trials: int) -> int:
+    """Return how many of the candidates so many trials are enough for, at least 1."""
+    return max(field for field in range(1, candidates + 1) if least_trials(field) <= trials)
+
+
+def posterior(prior: float, successes: int, trials: int) -> float:
+    """Return the mean of the Beta posterior of a success that was predicted as `prior`."""
+    return (PSEUDO_TRIALS * prior + successes) / (PSEUDO_TRIALS + trials)
+
+
+def halve(priors: Sequence[float], trials: int, attempt: Attempt, *, field: int | None = None) -> Halving:
+    """Halve the candidates, by the posterior mean of their success, until one is left.
+
+    Rounds share the trials equally, as do the candidates of a round. Ties go to what the prediction prefers.
+
+    Args:
+        priors: the predicted success of each candidate, the preferred first; not necessarily descending.
+        trials: to spend at most; without any, the first is chosen.
+        attempt: tries candidates.
+        field: how many of the first are tried at all; by default as many as the trials are enough for.
+    """
+    left = tuple(range(widest_field(len(priors), trials) if field is None else field))
+    spent, successes = [0] * len(priors), [0] * len(priors)
+    rounds: list[tuple[tuple[int, ...], int]] = []
+
+    def mean(one: int) -> float:
+        return posterior(priors[one], successes[one], spent[one])
+
+    while len(left) > 1:
+        to_come = ceil(log2(len(left)))
+        each = max(LEAST_TRIALS, trials // to_come // len(left))
+        for one, count in zip(left, attempt(len(rounds), left, each), strict=True):
+            spent[one] += each
+            successes[one] += count
+        trials -= each * len(left)
+        rounds.append((left, each))
+        left = tuple(sorted(left, key=lambda one: (-mean(one), one))[: ceil(len(left) / 2)])
+    return Halving(tuple(rounds), left[0], mean(left[0]))
+
+
+class Tried(WrittenPart):
+    """A candidate in a round: 1 or 0 for each of its trials."""
+
+    row: str
+    seed: int
+    success: list[int]
+
+
+class TrialRound(WrittenPart):
+    """A round. All of its candidates meet the same starts and goals."""
+
+    trials: int
+    """Of each candidate."""
+    candidates: list[tuple[str, int]]
+    """Row and seed of each, as the prediction prefers them."""
+    tried: list[Tried] = Field(default_factory=list)
+    """Those that are finished."""
+
+
+class TrialsFile(Artifact):
+    """trials.json: trials of candidates in the target."""
+
+    trials: int
+    """That may be spent."""
+    field: int
+    """Candidates of the first round."""
+    percent: int | None = None
+    """Their size of the dataset, if there are several."""
+    pseudo_trials: int
+    """What the prediction counts as."""
+    rounds: list[TrialRound] = Field(default_factory=list)
+    chosen: tuple[str, int] | None = None
+    """Row and seed; None until all rounds are finished."""
+    mean: float | None = None
+    """Of its success, given the prediction and its trials."""
+
+    @property
+    def spent(self) -> int:
+        """The trials that were made."""
+        return sum(len(one.success) for round_ in self.rounds for one in round_.tried)
+
+
+def read_trials(path: Path) -> TrialsFile | None:
+    """Read trials.json; None if it is not there.
+
+    Raises:
+        BadInputError: it is malformed.
+    """
+    return read_json(TrialsFile, path) if path.is_file() else None
+
 
 FOLDER = "select"
 SELECTED = "select.json"
@@ -95,20 +214,16 @@ class Choice:
     Attributes:
         judged: what the judges found.
         candidates: best first; the first is chosen.
-        rank_correlation: Spearman's with the target, mean over methods; its interval resamples seeds.
         regret: success in the target of the best there, less that of the chosen.
         random_regret: the same of one drawn at random, on average.
         calibration: method → seeds, mean and mean absolute error of the predicted success.
-        missing: why a figure is None.
     """
 
     judged: Judged
     candidates: tuple[Ranked, ...]
-    rank_correlation: Estimate | None = None
     regret: float | None = None
     random_regret: float | None = None
     calibration: Mapping[str, tuple[int, float, float]] = field(default_factory=dict)
-    missing: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_judged(root: Path) -> Judged | None:
@@ -147,42 +262,17 @@ def _ranked(one: Candidate, episodes: int, target: float | None) -> Ranked:
 
 def _compared(choice: Choice, tested: Sequence[Ranked]) -> Choice:
     """Add what the choice is worth in the target, by the candidates that were tested there."""
-    missing = {}
     targets = [one.target for one in tested if one.target is not None]
     chosen = choice.candidates[0].target
-    if chosen is None:
-        missing["regret"] = "the chosen policy was not tested in the target"
-    correlation = within_rows(tested)
-    if correlation is None:
-        few = all(sum(one.row == row for one in tested) < LEAST_SEEDS for row in {one.row for one in tested})
-        missing["rank_correlation"] = (
-            f"no method has {LEAST_SEEDS} tested seeds" if few else "in no method do both sides vary"
-        )
     errors: dict[str, list[float]] = {}
     for one in tested:
         errors.setdefault(one.row, []).append(one.predicted.value - (one.target or 0.0))
     return replace(
         choice,
-        rank_correlation=correlation,
         regret=None if chosen is None else max(targets) - chosen,
         random_regret=max(targets) - fmean(targets),
         calibration={row: (len(of), fmean(of), fmean(map(abs, of))) for row, of in errors.items()},
-        missing=missing,
     )
-
-
-def within_rows(tested: Sequence[Ranked]) -> Estimate | None:
-    """Correlate ranks within methods of `LEAST_SEEDS` tested seeds or more (Spearman): the mean over these.
-
-    The interval resamples seeds, the same for all methods, since these share a seed's episodes. None if no
-    method has enough seeds, or one side does not vary in any.
-    """
-    keys = [(one.lower, one.predicted.value) for one in tested]
-    places = sorted(set(keys))
-    rows: dict[str, dict[int, tuple[float, float]]] = {}
-    for one, key in zip(tested, keys, strict=True):
-        rows.setdefault(one.row, {})[one.seed] = (places.index(key), one.target or 0.0)
-    return mean_rank_correlation(rows.values(), least=LEAST_SEEDS)
 
 
 def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | TableBlock]:
@@ -225,16 +315,16 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
         )
     if not choice.calibration:
         return blocks
-    found, missing = choice.rank_correlation, choice.missing
-    rank = (
-        interval(found.value, found.low, found.high) if found else f"unknown ({missing['rank_correlation']})"
+    regret = (
+        "unknown (the chosen policy was not tested there)"
+        if choice.regret is None
+        else f"{choice.regret:.2f}"
     )
-    regret = f"unknown ({missing['regret']})" if choice.regret is None else f"{choice.regret:.2f}"
     return [
         *blocks,
         Text(
             f"Regret of the chosen policy, in success in the target: {regret}; of a random policy: "
-            f"{choice.random_regret:.2f}. Rank correlation with the target within methods (Spearman): {rank}."
+            f"{choice.random_regret:.2f}."
         ),
         TableBlock(
             "Error of the predicted success, means over seeds",

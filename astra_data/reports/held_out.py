@@ -8,8 +8,7 @@ import numpy as np
 
 from astra_data.core.durable import write_file
 from astra_data.methods import method_title
-from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown
-from astra_data.reports.formatting import measured
+from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown, measured
 from astra_data.reports.predicted_failures import all_bins, failure_rates, predicted_failures
 from astra_data.reports.results import Results, judged_horizon
 from astra_data.reports.runs import read_errors, read_grounding
@@ -85,7 +84,7 @@ def write_held_out(
     figures = {}
     if rates := failure_rates(results):
         from astra_data.reports.figures.catalog import pictures
-        from astra_data.reports.figures.reliability import reliability
+        from astra_data.reports.figures.errors import reliability
         from astra_data.reports.figures.style import png
 
         write_file(root / RELIABILITY, png(reliability(rates)))

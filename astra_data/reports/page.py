@@ -11,10 +11,20 @@ import numpy as np
 
 from astra_data.core.naming import base_method, is_plus, reference_of
 from astra_data.methods import grounded_as, method_named, method_role, method_title
-from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, code
+from astra_data.reports.blocks import (
+    Block,
+    Code,
+    Section,
+    TableBlock,
+    Text,
+    code,
+    duration,
+    interval,
+    short,
+    spread,
+)
 from astra_data.reports.choice import choice_blocks
 from astra_data.reports.figures.catalog import pictures
-from astra_data.reports.formatting import duration, interval, short, spread
 from astra_data.reports.held_out import gap_blocks
 from astra_data.reports.results import (
     SIMULATED,

@@ -8,7 +8,7 @@ seeds in 93 % of the cases or more. Below three seeds there is no interval.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,47 +152,26 @@ def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: boo
         second: the other score, of the same shapes.
         ranks: correlate ranks.
     """
-    pairs = [np.stack(of) for of in zip(first, second, strict=True)]
-    counts, rng = [pair.shape[1] for pair in pairs], np.random.default_rng(0)
-    if sum(counts) < LEAST_SEEDS:
+    from scipy.stats import rankdata
+
+    def coefficient(pair: Floats) -> float:
+        if np.ptp(pair, axis=1).min() == 0:
+            return math.nan
+        return float(np.corrcoef(rankdata(pair, axis=1) if ranks else pair)[0, 1])
+
+    def drawn() -> Floats:
+        rows = [pairs[row] for row in rng.integers(len(pairs), size=len(pairs))]
+        return np.concatenate(
+            [pair[:, rng.integers(pair.shape[1], size=pair.shape[1])] for pair in rows], axis=1
+        )
+
+    pairs, rng = [np.stack(of) for of in zip(first, second, strict=True)], np.random.default_rng(0)
+    whole = np.concatenate(pairs, axis=1)
+    if whole.shape[1] < LEAST_SEEDS or math.isnan(value := coefficient(whole)):
         return None
-    # How often each row is drawn, and each of its seeds in all of these draws.
-    rows = rng.multinomial(len(pairs), [1 / len(pairs)] * len(pairs), size=REPLICATES)
-    weights = [rng.multinomial(rows[:, k] * count, [1 / count] * count) for k, count in enumerate(counts)]
-    drawn = np.concatenate(weights, axis=1).astype(np.float64)
-    return _correlated([np.concatenate(pairs, axis=1)], [drawn], ranks=ranks)
-
-
-def mean_rank_correlation(
-    rows: Collection[Mapping[int, tuple[float, float]]], *, least: int
-) -> Estimate | None:
-    """Correlate ranks (Spearman) within rows of `least` seeds or more, and take the mean over these rows.
-
-    The interval resamples seeds, the same for all rows, since rows share a seed's data. None where no row has
-    enough seeds, or in none do both sides vary.
-
-    Args:
-        rows: by seed, the two scores.
-        least: seeds of a row that counts, also in a resample.
-    """
-    seeds = sorted({seed for row in rows for seed in row})
-    known = [row for row in rows if len(row) >= least]
-    if not known:
-        return None
-    drawn = np.random.default_rng(0).multinomial(len(seeds), [1 / len(seeds)] * len(seeds), size=REPLICATES)
-    weights = []
-    for row in known:
-        of = drawn[:, [seeds.index(seed) for seed in row]]
-        weights.append((of * (of.sum(axis=1, keepdims=True) >= least)).astype(np.float64))
-    return _correlated([np.array([*row.values()]).T for row in known], weights, ranks=True)
-
-
-def share_interval(count: int, total: int) -> Ends:
-    """Return Wilson's 95 % interval of a share: `count` of `total` episodes of one policy."""
-    from scipy.stats import binomtest
-
-    found = binomtest(count, total).proportion_ci(confidence_level=CONFIDENCE, method="wilson")
-    return float(found.low), float(found.high)
+    tails = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
+    low, high = np.nanquantile([coefficient(drawn()) for _ in range(REPLICATES)], tails)
+    return Estimate(value, float(low), float(high))
 
 
 def _student(count: int) -> float:
@@ -227,50 +206,3 @@ def _score_interval(shares: Floats, trials: int) -> Ends:
     center = (mean + extra / 2) / (1 + extra)
     half = math.sqrt(drawn * extra + extra**2 / 4) / (1 + extra)
     return center - half, center + half
-
-
-def _correlated(pairs: Sequence[Floats], weights: Sequence[Floats], *, ranks: bool) -> Estimate | None:
-    """Return the mean correlation within pairs (2, N), with quantiles over resamples; None if none varies.
-
-    Args:
-        pairs: two scores each.
-        weights: how often each of a pair's scores is in each resample, (R, N).
-        ranks: correlate ranks.
-    """
-    whole = [np.ones((1, pair.shape[1])) for pair in pairs]
-    value, drawn = (
-        _mean_known([_coefficients(*of, ranks=ranks) for of in zip(pairs, each, strict=True)])
-        for each in (whole, weights)
-    )
-    if np.isnan(value[0]):
-        return None
-    low, high = np.nanquantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Estimate(float(value[0]), float(low), float(high))
-
-
-def _mean_known(found: Sequence[Floats]) -> Floats:
-    """Return the mean of arrays (R,) where they are numbers."""
-    stacked = np.stack(found)
-    known = ~np.isnan(stacked)
-    means: Floats = np.full(stacked.shape[1], np.nan)
-    np.divide(np.where(known, stacked, 0).sum(0), known.sum(0), out=means, where=known.any(0))
-    return means
-
-
-def _coefficients(pair: Floats, weights: Floats, *, ranks: bool) -> Floats:
-    """Correlate the rows of `pair` (2, N) by each line of weights (R, N): (R,), NaN where one is constant."""
-    centered, total = [], np.maximum(weights.sum(axis=1, keepdims=True), 1)
-    varies = np.ones(len(weights), dtype=bool)
-    for side in pair:
-        inside = np.where(weights > 0, side, np.nan)
-        varies &= np.nan_to_num(np.fmax.reduce(inside, axis=1) - np.fmin.reduce(inside, axis=1)) > 0
-        values = np.broadcast_to(side, weights.shape)
-        if ranks:
-            below, level = side < side[:, None], side == side[:, None]
-            values = weights @ below.T + (weights @ level.T + 1) / 2
-        centered.append(values - (weights * values).sum(axis=1, keepdims=True) / total)
-    one, other = centered
-    product = np.sqrt((weights * one**2).sum(axis=1) * (weights * other**2).sum(axis=1))
-    found: Floats = np.full(len(weights), np.nan)
-    np.divide((weights * one * other).sum(axis=1), product, out=found, where=varies)
-    return found

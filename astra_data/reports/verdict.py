@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from astra_data.methods import grounded_as, method_role, method_title
-from astra_data.reports.formatting import interval, listed
+from astra_data.reports.blocks import interval, listed
 from astra_data.reports.results import JUDGED, SIMULATED, WHOLE, Results, contenders, judged_horizon
 from astra_data.reports.statistics import LEAST_SEEDS, Summary, summarize
 

@@ -12,10 +12,8 @@ from astra_data.reports.statistics import (
     Summary,
     correlation,
     mean_interval,
-    mean_rank_correlation,
     paired_difference,
     probability_of_improvement,
-    share_interval,
     summarize,
 )
 
@@ -26,7 +24,6 @@ SEEDS: dict[str, Draw] = {
     "middling": lambda rng, size: rng.beta(10, 10, size),
     "good": lambda rng, size: rng.beta(18, 2, size),
     "good and scattered": lambda rng, size: rng.beta(4, 1, size),
-    "anything": lambda rng, size: rng.beta(1, 1, size),
     "bad": lambda rng, size: rng.beta(1, 9, size),
     "equal": lambda _, size: np.full(size, 0.99),
 }
@@ -39,7 +36,7 @@ def ends(values: Floats) -> Floats:
     return values[[len(values) // 40, -len(values) // 40]]
 
 
-@pytest.mark.parametrize("count", [3, 4, 5, 7, 10])
+@pytest.mark.parametrize("count", [3, 10])
 @pytest.mark.parametrize("seeds", SEEDS)
 def test_intervals_of_success_rates_cover_their_mean(seeds: str, count: int) -> None:
     """In 1,000 experiments a coverage of 0.95 comes out below 0.93 with a probability of 0.3 %."""
@@ -55,8 +52,8 @@ def test_intervals_of_success_rates_cover_their_mean(seeds: str, count: int) -> 
         assert np.mean((student[:, 0] <= mean) & (mean <= student[:, 1])) < 0.93
 
 
-@pytest.mark.parametrize("count", [3, 5, 10])
-@pytest.mark.parametrize("seeds", ["middling", "good", "equal"])
+@pytest.mark.parametrize("count", [3, 10])
+@pytest.mark.parametrize("seeds", ["good", "equal"])
 def test_intervals_of_differences_cover_them(seeds: str, count: int) -> None:
     rng = np.random.default_rng(0)
     sides = [rng.binomial(EPISODES, SEEDS[seeds](rng, (1000, count))) / EPISODES for _ in range(2)]
@@ -167,31 +164,3 @@ def test_what_does_not_vary_correlates_with_nothing() -> None:
     # Nor do the resamples in which chance left no variation.
     found = correlation(three, three)
     assert found is not None and [found.low, found.high] == pytest.approx([1.0, 1.0])
-
-
-@pytest.mark.parametrize(("count", "total"), [(64, 100), (0, 20), (7, 7), (1, 4)])
-def test_the_interval_of_a_share_is_wilsons(count: int, total: int) -> None:
-    share, z = count / total, stats.norm.ppf(0.975)
-    middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
-    half = z / (1 + z**2 / total) * np.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
-    assert share_interval(count, total) == pytest.approx((middle - half, middle + half), abs=1e-9)
-
-
-def test_ranks_are_correlated_within_rows_and_seeds_resampled_for_all_at_once() -> None:
-    rng = np.random.default_rng(0)
-    rows = [
-        {seed: (float(one), float(one + rng.normal())) for seed, one in enumerate(rng.normal(size=9))}
-        for _ in range(3)
-    ]
-    found = mean_rank_correlation(rows, least=3)
-    expected = np.mean([spearmanr(*np.array(list(row.values())).T).statistic for row in rows])
-    assert found is not None and found.value == pytest.approx(expected)
-    assert found.low is not None and found.high is not None and found.low < found.value < found.high
-    short = {seed: (float(seed), -float(seed)) for seed in (0, 1)}
-    again = mean_rank_correlation([*rows, short], least=3)
-    assert again is not None and again.value == found.value
-    level = {seed: (1.0, float(seed)) for seed in range(5)}
-    assert mean_rank_correlation([short, level], least=3) is None
-    # Two rows with the same scores are no more certain than one.
-    one, two = (mean_rank_correlation(rows[:1] * count, least=3) for count in (1, 2))
-    assert one == two

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from astra_data.reports import formatting
+from astra_data.reports import blocks as formatting
 
 _CODE = re.compile(r"(`[^`]*`)")
 

@@ -18,9 +18,8 @@ from astra_data.dataset.inspection import visited
 from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.loading import loading
 from astra_data.io.hub.notes import Notes
-from astra_data.reports.figures.coverage import coverage
-from astra_data.reports.figures.style import png
-from astra_data.reports.formatting import table
+from astra_data.reports.blocks import table
+from astra_data.reports.figures.style import coverage, png
 
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
 

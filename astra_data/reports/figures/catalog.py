@@ -11,14 +11,16 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from astra_data.reports.blocks import Picture
-from astra_data.reports.figures.coverage import coverage
+from astra_data.reports.figures.errors import (
+    open_loop_error,
+    predictive_validity,
+    reliability,
+    reliability_of,
+)
 from astra_data.reports.figures.motion import mismatch, strips, trajectories
-from astra_data.reports.figures.open_loop import open_loop_error
-from astra_data.reports.figures.reliability import reliability, reliability_of
 from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import data_efficiency, learning_curves, score_bars
-from astra_data.reports.figures.style import method_color, method_title, png
-from astra_data.reports.figures.validity import predictive_validity
+from astra_data.reports.figures.style import coverage, method_color, method_title, png
 from astra_data.reports.results import Results
 
 __all__ = [

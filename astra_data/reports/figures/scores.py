@@ -13,9 +13,16 @@ from astra_data.core.arrays import Floats
 from astra_data.core.naming import artifact_key, base_method, is_plus
 from astra_data.dataset.inspection import Map, visited
 from astra_data.dataset.reader import Dataset
-from astra_data.reports.figures.coverage import draw_visits
 from astra_data.reports.figures.scene import Scene
-from astra_data.reports.figures.style import FAINT, INK, method_color, method_title, score_axis, style
+from astra_data.reports.figures.style import (
+    FAINT,
+    INK,
+    draw_visits,
+    method_color,
+    method_title,
+    score_axis,
+    style,
+)
 from astra_data.reports.results import SIMULATED, TESTED, Results, titled
 
 CURVE_POINTS = 200

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 from astra_data.methods import METHODS
 from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import score_bars
-from astra_data.reports.figures.style import method_color, method_title, png, style
+from astra_data.reports.figures.style import coverage, method_color, method_title, png, style
 from astra_data.reports.results import TESTED, Line, Results
 from astra_data.robots.registry import TASKS
 
@@ -67,3 +67,17 @@ def test_a_palette_keeps_the_colors_of_methods() -> None:
     assert len(small) < 0.5 * len(everything.getvalue())
     drawn = imread(BytesIO(everything.getvalue()))[..., :3]
     np.testing.assert_allclose(imread(BytesIO(small))[..., :3], drawn, atol=0.07)
+
+
+def test_only_visited_cells_are_colored() -> None:
+    counts = np.array([[0, 3], [40, 0], [1, 0]])
+    figure = coverage(counts, (-1.0, 1.0, 0.0, 3.0), "position", "m")
+    axes = figure.axes[0]
+    (image,) = axes.images
+    shown = image.get_array()
+    assert isinstance(shown, np.ma.MaskedArray)
+    np.testing.assert_array_equal(shown.mask, counts == 0)
+    assert image.origin == "lower"
+    assert (axes.get_xlim(), axes.get_ylim()) == ((-1.0, 1.0), (0.0, 3.0))
+    assert axes.get_xlabel() == "x position (m)"
+    assert png(figure).startswith(b"\x89PNG")
