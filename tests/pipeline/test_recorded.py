@@ -1,0 +1,121 @@
+"""The tasks and methods of recorded walks and joints, in recipes/examples/recorded."""
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from toy_joints import FPS, positions, targets
+
+from astra_data.core.progress import silent
+from astra_data.dataset import Dataset
+from astra_data.grounding.fit import Fitting, GroundConfig
+from astra_data.grounding.open_loop import gap_report
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.io.importing import import_dataset
+from astra_data.pipeline.stages.label import label
+from astra_data.pipeline.stages.pair import pair
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+RECORDED = RECIPES / "examples/recorded"
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Any:  # noqa: ANN401 - modules of a user
+    monkeypatch.syspath_prepend(str(RECORDED))
+    return {name: importlib.import_module(name) for name in ("joints", "walker", "windows")}
+
+
+def test_a_walk_leads_back_to_its_poses(recorded: dict[str, Any]) -> None:
+    walker = recorded["walker"]
+    rng = np.random.default_rng(0)
+    pose = np.column_stack([rng.normal(size=(9, 2)).cumsum(0), 3.0 + rng.normal(0, 0.4, 9).cumsum()])
+    states = torch.from_numpy(walker.states(pose)).float()
+    simulator = walker.PlanarWalker(len(states) - 1)
+    simulator.reset_to(states[:-1])
+    after = simulator.step(torch.zeros(len(states) - 1, 4))
+    # Where the last motion leads does not depend on the command; the motion is all the command's.
+    torch.testing.assert_close(after[:, :4], states[1:, :4])
+    torch.testing.assert_close(after[:, 4:], walker.PlanarWalker.motion(torch.zeros(8 - 1, 4)))
+    turned = pose[1:, 2] - pose[0, 2]
+    np.testing.assert_allclose(states[1:, 2], np.cos(turned[:-1]), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        states[:, 4:6].norm(dim=1), np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1), rtol=1e-5
+    )
+
+
+def test_a_command_moves_the_walker_along_an_arc(recorded: dict[str, Any]) -> None:
+    motion = recorded["walker"].PlanarWalker.motion
+    ahead, back, left = motion(torch.tensor([[0.0, 0.5, 0, 1], [0, -1.0, 0, 1], [0, 0.0, 1.0, 0]])).unbind()
+    torch.testing.assert_close(ahead, torch.tensor([0.6 * 0.25 / 6, 0.0, 0.0]))
+    torch.testing.assert_close(back, torch.tensor([-0.5 * 0.15 / 6, 0.0, 0.0]))
+    torch.testing.assert_close(left, torch.tensor([0.0, 0.2 / 6, 0.0]))
+    angle = 0.6 * 2.094 / 6
+    radius = (0.25 / 6) / angle
+    arc = motion(torch.tensor([[1.0, 1.0, 0.0, 0.0]]))[0]
+    expected = torch.tensor([radius * np.sin(angle), radius * (1 - np.cos(angle)), angle])
+    torch.testing.assert_close(arc, expected.float())
+
+
+def test_jumps_and_carried_robots_are_left_out(recorded: dict[str, Any]) -> None:
+    state = np.zeros((400, 3))
+    state[:, 0] = 0.002 * np.arange(400)
+    state[100:, 0] += 0.1
+    state[200:, 2] = 0.3
+    state[300:340, 0] += 0.02 * np.arange(40)  # 1.2 m/s for 40 rows
+    state[340:, 0] += 0.8
+    found = [tuple(map(int, ends)) for ends in recorded["walker"].stretches(state, 60)]
+    assert found[:2] == [(0, 99), (100, 199)] and len(found) == 4
+    (begin, carried), (put_down, end) = found[2:]
+    assert (begin, end) == (200, 399) and 280 <= carried <= 290 and 350 <= put_down <= 360
+
+
+def test_ridge_learns_what_recorded_joints_do(
+    recorded: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    joints, windows = recorded["joints"], recorded["windows"]
+    rows = 4000
+    parts = [targets(rows, seed) for seed in range(4)]
+    log = {
+        "time": torch.arange(rows) / FPS,
+        "dof_pos": torch.from_numpy(np.concatenate([positions(part)[:-1] for part in parts], axis=1)).float(),
+        "des_dof_pos": torch.from_numpy(np.concatenate(parts, axis=1)).float(),
+    }
+    torch.save(log, tmp_path / "chirp_data.pt")
+    source = import_dataset([tmp_path / "chirp_data.pt"], RECIPES / "imports/pace_anymal.toml").root
+    joints.write_steps(joints.ANYMAL, source, states=joints.states, stretches=joints.stretches, rows=4)
+    steps = Dataset.open(tmp_path / "home/pace-joints-steps/data-1.0.0")
+    assert steps.info["fps"] == 100
+    first = next(iter(steps.episodes())).columns
+    np.testing.assert_allclose(first["observation.state"][1:], first["next.observation.state"][:-1])
+    # The first state is that after the first step of four rows, its action the mean of the next four.
+    begin = int(np.abs(log["dof_pos"].numpy() - first["observation.state"][0, :12]).sum(1).argmin())
+    np.testing.assert_allclose(first["action"][0], log["des_dof_pos"][begin : begin + 4].mean(0), atol=1e-6)
+    task = f"{RECORDED / 'joints.py'}:ANYMAL"
+    labeled = label(task, data=steps.root, out=tmp_path / "labeled")
+    paired = pair(task, dataset=labeled, out=tmp_path / "pairs")
+    episodes = PairedEpisodes.load(paired)
+    training, held_out = episodes.split(0.25, 0)
+    fitting = Fitting(
+        joints.ANYMAL, GroundConfig(updates=50), None, training, held_out, 0, "cpu", tmp_path, silent
+    )
+    for method in (windows.RIDGE, windows.NETWORK):
+        grounding, _ = method.fit(fitting)
+        written = windows.WindowGrounding.from_file(*grounding.to_file(), "cpu")
+        report = gap_report(joints.ANYMAL, written, held_out, seed=0)
+        raw, grounded = (report[name]["joints_rad"]["mean"][:2] for name in ("raw", "grounded"))
+        assert all(ours < 0.3 * theirs for ours, theirs in zip(grounded, raw, strict=True))
+
+
+def test_a_window_remembers_as_it_does_step_by_step(recorded: dict[str, Any]) -> None:
+    windows = recorded["windows"]
+    window = windows.Window([0, 1], 1, 3, is_network=False)
+    state, action = torch.randn(2, 7, 3), torch.randn(2, 7, 1)
+    of = type("Windows", (), {"state": state, "action": action})
+    before = windows.WindowGrounding(window).hidden_before(of)
+    assert not before[:, 0].any()
+    last = torch.cat([state[:, 1:6, :2], action[:, 1:6]], dim=-1).flatten(1)
+    torch.testing.assert_close(before[:, 6], last)
