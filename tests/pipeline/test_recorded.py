@@ -107,7 +107,7 @@ def test_ridge_learns_what_recorded_joints_do(
         written = windows.WindowGrounding.from_file(*grounding.to_file(), "cpu")
         report = gap_report(joints.ANYMAL, written, held_out, seed=0)
         raw, grounded = (report[name]["joints_rad"]["mean"][:2] for name in ("raw", "grounded"))
-        assert all(ours < 0.3 * theirs for ours, theirs in zip(grounded, raw, strict=True))
+        assert max(np.divide(grounded, raw)) < 0.5
 
 
 def test_a_window_remembers_as_it_does_step_by_step(recorded: dict[str, Any]) -> None:
