@@ -3,8 +3,8 @@
 from contextlib import suppress
 from pathlib import Path
 
+from astra_data.core.durable import atomic_folder
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.atomic import atomic_folder
 
 ROUNDS = 60
 

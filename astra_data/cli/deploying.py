@@ -29,7 +29,7 @@ def deploy(
     ] = None,
 ) -> None:
     """Export a trained policy as a folder that runs without this package."""
-    from astra_data.dataset.atomic import refuse_existing
+    from astra_data.core.durable import refuse_existing
     from astra_data.pipeline.points import refuse_unmade
 
     run_at(run)

@@ -1,4 +1,10 @@
-"""Folders that stages make: not there until they are finished, and gone on with after an interruption."""
+"""Folders that stages make: not there until they are finished, and gone on with after an interruption.
+
+The manifest of one says which files it has, with their sizes and sha256, and what it was made from:
+
+    {"files": {"policy.safetensors": {"bytes": 13948, "sha256": "…"}, …},
+     "made_from": {"dataset": "<content hash>", "grounding": "<sha256 of grounding.safetensors>"}}
+"""
 
 import json
 import os
@@ -32,11 +38,7 @@ MANIFEST = "manifest.json"
 
 
 def refuse_finished(out: Path) -> None:
-    """Refuse to make `out` once more.
-
-    Raises:
-        BadInputError: it exists.
-    """
+    """Refuse to make `out` once more, if it exists."""
     if out.exists():
         raise BadInputError(f"{out} is already finished: remove it to run the stage again")
 
@@ -165,11 +167,7 @@ class Manifest:
 
 
 def check_intact(path: Path) -> None:
-    """Refuse a file whose bytes are not those in the manifest beside it, if there is one.
-
-    Raises:
-        BadInputError: it was altered, or the manifest cannot be read.
-    """
+    """Refuse a file whose bytes are not those in the manifest beside it, if there is one."""
     manifest = _manifest_beside(path)
     if manifest and path.name in manifest.files and manifest.files[path.name][1] != file_digest(path):
         raise BadInputError(
@@ -179,15 +177,7 @@ def check_intact(path: Path) -> None:
 
 
 def check_made_from(made: Path, read: Mapping[str, str | None]) -> None:
-    """Refuse the artifact of a file `made` that was made from others than those that are `read` with it.
-
-    Args:
-        made: a file of the artifact.
-        read: name as in `made_from` → digest now; None where there is none.
-
-    Raises:
-        BadInputError: its manifest has another digest under one of these names.
-    """
+    """Refuse the artifact of a file `made` that was made from others than those that are `read` with it."""
     manifest = _manifest_beside(made)
     made_from = manifest.made_from if manifest else {}
     if others := [name for name, digest in read.items() if digest and made_from.get(name, digest) != digest]:
@@ -208,11 +198,7 @@ def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """Return the manifest of the artifact in `folder`; None if it has none.
-
-    Raises:
-        BadInputError: it cannot be read.
-    """
+    """Return the manifest of the artifact in `folder`; None if it has none."""
     path = folder / MANIFEST
     if not path.exists():
         return None

@@ -24,12 +24,7 @@ CHECKPOINT_SECONDS = 60.0
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write `tensors` and `metadata` (JSON values) to `path`; an existing file is replaced atomically.
-
-    Raises:
-        BadInputError: there are no tensors.
-        DiskError: it cannot be written; an existing file stays.
-    """
+    """Write `tensors` and `metadata` (JSON values) to `path`; an existing file is replaced atomically."""
     if not tensors:
         raise BadInputError(f"{path}: expected at least one tensor to save")
     # safetensors refuses tensors that share memory, such as tied weights or views.
@@ -70,12 +65,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def save_state(checkpoint: Path, state: Nested, metadata: Mapping[str, Any]) -> None:
-    """Write the state of a training and `metadata` (JSON values) to `checkpoint`, for `resumed`.
-
-    Raises:
-        BadInputError: the state has no tensors, or something that no training state has.
-        DiskError: as `save_tensors`.
-    """
+    """Write the state of a training and `metadata` (JSON values) to `checkpoint`, for `resumed`."""
     tensors: dict[str, Tensor] = {}
     apart = _taken_apart(state, tensors)
     save_tensors(checkpoint, tensors, {**metadata, "state": apart})
@@ -83,11 +73,7 @@ def save_state(checkpoint: Path, state: Nested, metadata: Mapping[str, Any]) -> 
 
 @contextmanager
 def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Yield the state and the metadata that `save_state` wrote; the block resumes from them.
-
-    Raises:
-        BadInputError: it cannot be read, or lacks something that the block needs, as one of an older version.
-    """
+    """Yield the state and the metadata that `save_state` wrote; the block resumes from them."""
     try:
         tensors, metadata = load_tensors(checkpoint)
     except BadInputError as error:
@@ -112,10 +98,6 @@ def understood(
         what: for messages, such as "a policy".
         kinds: accepted values of the metadata's "kind".
         device: torch device.
-
-    Raises:
-        BadInputError: the file cannot be read, is of another kind, has values that are not finite, or lacks
-            something that the block needs, as one of an older version.
     """
     tensors, metadata = load_tensors(path)
     kind = metadata.get("kind")
@@ -162,11 +144,7 @@ def _is_usable(name: str, tensor: Tensor) -> bool:
 
 
 def _taken_apart(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 - a JSON value
-    """Add the tensors of a training state to `tensors`; return all else of it as JSON, for `_put_together`.
-
-    Raises:
-        BadInputError: a value is of another type than a training state has, or a key is no str or int.
-    """
+    """Add the tensors of a training state to `tensors`; return all else as JSON, for `_put_together`."""
     match value:
         case Tensor():
             name = str(len(tensors))
@@ -213,9 +191,6 @@ class Logbook:
         Args:
             checkpoint: the file that `keep` writes; None to write none.
             go_on: restores a state that was passed to `keep`.
-
-        Raises:
-            BadInputError: the checkpoint cannot be read, or lacks something that `go_on` needs.
         """
         self._checkpoint = checkpoint
         self.points, spent = list[dict[str, Any]](), None

@@ -25,18 +25,12 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 _UNNAMED = ""
-_MOST_PARTS = 64
-"""Of a key in TOML, between dots."""
 _MOST_FAULTS = 5
 """Of a file that no user writes by hand."""
 
 
 def in_order(ends: tuple[float, float]) -> tuple[float, float]:
-    """Return the ends of a range; for annotations.
-
-    Raises:
-        ValueError: the upper end is first.
-    """
+    """Return the ends of a range, for annotations; raise a ValueError if the upper end is first."""
     if ends[0] > ends[1]:
         raise ValueError(f"expected the lower end first, got {list(ends)}")
     return ends
@@ -63,11 +57,7 @@ class Config(BaseModel):
 
 
 def own_settings[C: Config](given: Config | None, usual: C) -> C:
-    """Return the settings that a component was given, or its `usual` ones if it was given none.
-
-    Raises:
-        BadInputError: they are those of another component.
-    """
+    """Return the settings that a component was given, by default its `usual` ones, if they are its own."""
     if given is None:
         return usual
     if not isinstance(given, type(usual)):
@@ -89,7 +79,7 @@ def as_json(**settings: Config | str | int | None) -> str:
 def in_full(settings: object) -> Any:  # noqa: ANN401 - as json takes them
     """Return settings as JSON values by their present names, with what a record omits as usual, too."""
     if isinstance(settings, BaseModel):
-        known = {name: vars(settings)[name] for name in type(settings).model_fields}  # old keys warn
+        known = {name: vars(settings)[name] for name in type(settings).model_fields}
         return in_full(known | (settings.model_extra or {}))
     if isinstance(settings, dict):
         return {key: in_full(value) for key, value in settings.items()}
@@ -108,11 +98,7 @@ def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:
 
 
 def load_tables(path: Path) -> dict[str, Any]:
-    """Read the TOML file at `path` as it is.
-
-    Raises:
-        RecipeError: the file is missing or not TOML.
-    """
+    """Read the TOML file at `path` as it is, or raise a RecipeError."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors put a mark before the text
     except FileNotFoundError:
@@ -122,11 +108,6 @@ def load_tables(path: Path) -> dict[str, Any]:
         raise RecipeError(f"{path} is a folder: expected a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path} cannot be read as a text file: {error}") from None
-    for number, line in enumerate(text.splitlines(), 1):
-        # The parser takes time with the square of a key's parts.
-        keys = re.split(r"[,=\[\]{}]", line.replace(" ", "").replace("\t", ""))
-        if any(len(list(filter(None, key.split(".")))) > _MOST_PARTS for key in keys):
-            raise RecipeError(f"{path} line {number}: a key of more than {_MOST_PARTS} parts")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -138,11 +119,7 @@ def load_tables(path: Path) -> dict[str, Any]:
 
 
 def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: str) -> M:
-    """Read `tables`, which come from `origin`, into `model`; lists become tuples.
-
-    Raises:
-        RecipeError: `model` refuses them; one message holds every fault.
-    """
+    """Read `tables`, which come from `origin`, into `model` as `load_recipe` does."""
     try:
         return model.model_validate(_with_tuples(dict(tables)))
     except RecursionError:
@@ -163,11 +140,7 @@ def faults_of(error: ValidationError) -> str:
 
 
 def read_written[T](kind: type[T], path: Path, *, by: str, advice: str) -> T:
-    """Read the JSON file `path` that `by` writes, as `kind`.
-
-    Raises:
-        BadInputError: it holds something else; the message ends with the `advice`.
-    """
+    """Read the JSON file `path` that `by` writes, as `kind`; a BadInputError ends with the `advice`."""
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes())
     except ValidationError as error:
@@ -177,8 +150,7 @@ def read_written[T](kind: type[T], path: Path, *, by: str, advice: str) -> T:
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return a clause that names the closest of `known`, or lists them all when none is close."""
     known = list(known)
-    close = get_close_matches(name, known, n=1)
-    if close:
+    if close := get_close_matches(name, known, n=1):
         return f": did you mean '{close[0]}'?"
     return f"; known: {', '.join(known)}" if known else ""
 

@@ -21,30 +21,105 @@ from astra_data.core.errors import AstraDataError, BadInputError, DiskError
 
 NO_FSYNC = "ASTRA_DATA_NO_FSYNC"
 """Environment variable; unless it is empty, files survive a kill but perhaps not a power failure."""
+
 _HIDDEN = re.compile(r"\..+\.tmp-\d+(-\d+)?")
 """Names of what is being written."""
 _RESUMABLE = re.compile(r"\..+\.(staged|partial|pull-\d+\.\d+\.\d+)")
 """Names of folders with which a command goes on."""
+
+_PERMISSIONS = ("permission is denied", "change the permissions or choose another folder")
+_IN_THE_WAY = ("a file is where its folder would be", "choose another folder")
+_GONE = ("the disk is gone", "connect it again")
 _OF_THE_DISK = {
     errno.ENOSPC: ("the disk is full", "free space"),
     errno.EDQUOT: ("the quota is exceeded", "free space"),
     errno.EFBIG: ("a file would be larger than is allowed", "raise the limit (ulimit -f)"),
     errno.EROFS: ("the disk is read-only", "make it writable or choose another folder"),
     errno.EIO: ("the disk reports an error", "check it"),
-    errno.ENODEV: ("the disk is gone", "connect it again"),
-    errno.ENXIO: ("the disk is gone", "connect it again"),
-    errno.ESTALE: ("the disk is gone", "connect it again"),
+    **dict.fromkeys((errno.ENODEV, errno.ENXIO, errno.ESTALE), _GONE),
 }
 """Faults that are the disk's whatever was written: why, and what to do."""
 _OF_THE_PLACE = {
-    errno.EACCES: ("permission is denied", "change the permissions or choose another folder"),
-    errno.EPERM: ("permission is denied", "change the permissions or choose another folder"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), _PERMISSIONS),
+    **dict.fromkeys((errno.ENOTDIR, errno.EEXIST), _IN_THE_WAY),
     errno.ENOENT: ("its folder is gone", "check that its disk is there"),
-    errno.ENOTDIR: ("a file is where its folder would be", "choose another folder"),
-    errno.EEXIST: ("a file is where its folder would be", "choose another folder"),
     errno.EISDIR: ("a folder has its name", "choose another name"),
     errno.ENAMETOOLONG: ("its name is too long", "choose a shorter one"),
 }
+
+
+@contextmanager
+def writing(target: Path, *, place: bool = True) -> Iterator[None]:
+    """Raise a DiskError if the block fails because of the disk or, with `place`, of where `target` is."""
+    try:
+        yield
+    except Exception as error:
+        code = _code(error)
+        if code not in _OF_THE_DISK and not (place and code and _is_about(error, target)):
+            raise
+        raise DiskError(_report(f"{target} cannot be written", code)) from error
+
+
+def disk_error(error: Exception) -> DiskError | None:
+    """Return what to report of an error that nobody expected; None if it does not come from a disk."""
+    code = _code(error)
+    name = getattr(error, "filename", None)
+    if code is None or not (name or code in _OF_THE_DISK):
+        return None
+    subject = os.fsdecode(name) if isinstance(name, str | bytes) else "a file"
+    return DiskError(_report(f"{subject} cannot be read or written", code))
+
+
+def _report(fault: str, code: int) -> str:
+    known = _OF_THE_DISK | _OF_THE_PLACE
+    why, advice = known.get(code, (os.strerror(code).lower(), "choose another place"))
+    return f"{fault}: {why}. What was finished before is safe: {advice}, then run the same command again."
+
+
+def _code(error: Exception) -> int | None:
+    """Return the system's number of a fault, which HDF5 has in its text; None for errors of ours."""
+    if isinstance(error, AstraDataError):
+        return None
+    if isinstance(error, OSError) and error.errno:
+        return error.errno
+    found = re.search(r"\berrno = (\d+)", str(error))
+    return int(found[1]) if found else None
+
+
+def _is_about(error: Exception, target: Path) -> bool:
+    """Return whether `error` names `target`, a folder that it is in, or a hidden file or folder of it."""
+    name = getattr(error, "filename", None)
+    if not isinstance(name, str | bytes):
+        return False
+    path = Path(os.fsdecode(name))
+    hidden = str(target.parent / f".{target.name}.")
+    return path in (target, *target.parents) or target in path.parents or str(path).startswith(hidden)
+
+
+@contextmanager
+def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
+    """Hold the lock of `folder`, which the system releases when the process ends; yield whether it is held.
+
+    With `wait`, it is waited for while another process holds it.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would wait for a writer
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        yield False
+    else:
+        yield True
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Hold the lock of a run's folder; raise a BadInputError if another process holds it."""
+    with held(folder) as ours:
+        if not ours:
+            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
+        yield
 
 
 def sync(path: Path) -> None:
@@ -76,7 +151,7 @@ def make_folder(folder: Path) -> list[Path]:
 
     When this returns, the disk knows.
     """
-    missing = _missing(folder)
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for path in missing:
         sync(path.parent)
@@ -90,12 +165,20 @@ def remove_empty(folders: Iterable[Path]) -> None:
             folder.rmdir()
 
 
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write `path` atomically, replacing an older file; text becomes UTF-8.
+@contextmanager
+def folder_for(target: Path) -> Iterator[None]:
+    """Make the folder that `target` is in; if the block fails, remove what was made and holds nothing."""
+    missing = [path for path in target.parents if not path.exists()]
+    try:
+        make_folder(target.parent)
+        yield
+    except BaseException:
+        remove_empty(missing)
+        raise
 
-    Raises:
-        DiskError: it cannot be written; the older file stays.
-    """
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write `path` atomically, replacing an older file, which stays after a DiskError; text becomes UTF-8."""
     data = content.encode() if isinstance(content, str) else content
     if path.exists() and not path.is_file():  # such as /dev/stdout, which must not be replaced
         with writing(path):
@@ -113,19 +196,62 @@ def hidden_folder(target: Path) -> Iterator[Path]:
     """Yield an empty hidden folder beside `target`, which is removed when the block ends.
 
     After a kill it stays until the next call with the same target: the folder of a live process is locked.
-    If the block fails, folders made for `target` go, too.
-
-    Raises:
-        BadInputError: this process is writing `target` already.
-        DiskError: it cannot be written.
+    If the block fails, folders made for `target` go, too. While this process is writing `target` already, it
+    raises a BadInputError.
     """
     with writing(target), folder_for(target):
         sweep(target)
-        with _own_folder(target) as folder:
+        with _locked_folder(target) as folder:
             try:
                 yield folder
             finally:
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def atomic_folder(target: Path) -> Iterator[Path]:
+    """Yield an empty hidden folder beside `target`, which is renamed to `target` when the block ends.
+
+    Raises:
+        BadInputError: `target` exists, or this process is writing it already.
+        DiskError: it cannot be written.
+    """
+    refuse_existing(target)
+    with hidden_folder(target) as folder:
+        yield folder
+        publish(folder, target)
+
+
+@contextmanager
+def atomic_file(target: Path) -> Iterator[Path]:
+    """Yield the path of a file in a hidden folder, which is renamed to `target` as `atomic_folder` does."""
+    refuse_existing(target)
+    with hidden_folder(target) as folder:
+        path = folder / target.name
+        yield path
+        sync(path)
+        refuse_existing(target)
+        move(path, target)
+
+
+def publish(folder: Path, target: Path) -> None:
+    """Rename the finished `folder` to `target` beside it, unless that exists, once it is on the disk."""
+    with writing(target):
+        sync_tree(folder)
+        refuse_existing(target)
+        try:
+            os.replace(folder, target)
+        except OSError:
+            # Another process may have created it in between.
+            refuse_existing(target)
+            raise
+        sync(target.parent)
+
+
+def refuse_existing(target: Path) -> None:
+    """Raise a BadInputError if `target` exists, or is a link to nothing."""
+    if target.exists() or target.is_symlink():
+        raise BadInputError(f"{target} exists already; delete it or choose another folder.")
 
 
 def discard(folder: Path, target: Path) -> None:
@@ -196,29 +322,13 @@ def _remove_dead(path: Path) -> bool:
     return not path.exists()
 
 
-@contextmanager
-def folder_for(target: Path) -> Iterator[None]:
-    """Make the folder that `target` is in; if the block fails, remove what was made and holds nothing."""
-    missing = _missing(target.parent)
-    try:
-        make_folder(target.parent)
-        yield
-    except BaseException:
-        remove_empty(missing)
-        raise
-
-
-def _missing(folder: Path) -> list[Path]:
-    return [path for path in (folder, *folder.parents) if not path.exists()]
-
-
 def _hidden_names(target: Path) -> Iterator[Path]:
     for attempt in itertools.count():
         yield target.parent / f".{target.name}.tmp-{os.getpid()}{f'-{attempt}' if attempt else ''}"
 
 
 @contextmanager
-def _own_folder(target: Path) -> Iterator[Path]:
+def _locked_folder(target: Path) -> Iterator[Path]:
     """Make a hidden folder beside `target` and hold its lock."""
     for folder in _hidden_names(target):
         try:
@@ -238,95 +348,10 @@ def _own_folder(target: Path) -> Iterator[Path]:
                 return
 
 
-@contextmanager
-def writing(target: Path, *, place: bool = True) -> Iterator[None]:
-    """Report that `target` cannot be written, if the block fails because of the disk or of its place.
-
-    Args:
-        target: what is written.
-        place: also report what is wrong with its place, such as permissions, not the disk's faults alone.
-
-    Raises:
-        DiskError: says why, and what to do.
-    """
-    try:
-        yield
-    except Exception as error:
-        code = _code(error)
-        if code not in _OF_THE_DISK and not (place and code and _is_about(error, target)):
-            raise
-        raise DiskError(_report(f"{target} cannot be written", code)) from error
-
-
-def disk_error(error: Exception) -> DiskError | None:
-    """Return what to report of an error that nobody expected; None if it does not come from a disk."""
-    code = _code(error)
-    name = getattr(error, "filename", None)
-    if code is None or not (name or code in _OF_THE_DISK):
-        return None
-    subject = os.fsdecode(name) if isinstance(name, str | bytes) else "a file"
-    return DiskError(_report(f"{subject} cannot be read or written", code))
-
-
-def _report(fault: str, code: int) -> str:
-    known = _OF_THE_DISK | _OF_THE_PLACE
-    why, advice = known.get(code, (os.strerror(code).lower(), "choose another place"))
-    return f"{fault}: {why}. What was finished before is safe: {advice}, then run the same command again."
-
-
-def _code(error: Exception) -> int | None:
-    """Return the system's number of a fault; HDF5 has it in the text of errors of any type.
-
-    None where there is no number, or the error is one of ours, which says all there is to say.
-    """
-    if isinstance(error, AstraDataError):
-        return None
-    if isinstance(error, OSError) and error.errno:
-        return error.errno
-    found = re.search(r"\berrno = (\d+)", str(error))
-    return int(found[1]) if found else None
-
-
-def _is_about(error: Exception, target: Path) -> bool:
-    """Return whether `error` names `target`, a folder that it is in, or a hidden file or folder of it."""
-    name = getattr(error, "filename", None)
-    if not isinstance(name, str | bytes):
-        return False
-    path = Path(os.fsdecode(name))
-    hidden = str(target.parent / f".{target.name}.")
-    return path in (target, *target.parents) or target in path.parents or str(path).startswith(hidden)
-
-
-@contextmanager
-def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
-    """Hold the lock of `folder`, which the system releases when the process ends; yield whether it is held.
-
-    Args:
-        folder: an existing folder.
-        wait: wait while another process holds the lock, instead of yielding False.
-    """
-    handle = os.open(folder, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would wait for a writer
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        yield False
-    else:
-        yield True
-    finally:
-        os.close(handle)
-
-
-@contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Hold the lock of a run's folder.
-
-    Raises:
-        BadInputError: another process holds it.
-    """
-    with held(folder) as ours:
-        if not ours:
-            raise BadInputError(f"{folder} is in use by another run: wait until it ends, or stop it")
-        yield
+def file_digest(path: Path) -> str:
+    """Return the sha256 of the file at `path` in hex; it is read in pieces."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def files_below(folder: Path) -> list[Path]:
@@ -349,9 +374,3 @@ def files_below(folder: Path) -> list[Path]:
         links = [link for link in links if not root.is_relative_to(link.resolve())]
         todo += sorted(links, key=lambda link: (link.name.startswith("."), link))
     return sorted(found)
-
-
-def file_digest(path: Path) -> str:
-    """Return the sha256 of the file at `path` in hex; it is read in pieces."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,19 +1,10 @@
-"""The exceptions that the toolkit raises.
-
-AstraDataError          all expected errors; the command line prints one line and exits with 1
-├── BadInputError       a value, file or column is not what was expected
-├── RecipeError         a recipe is missing, malformed or contradicts itself
-├── MissingStageError   an earlier stage has not been run yet
-├── CorruptDatasetError a dataset on disk is incomplete or was altered
-├── SharingError        a remote storage cannot be reached, refuses, or holds something else
-└── DiskError           a disk is full, read-only, failing or gone
-"""
+"""The exceptions that the toolkit raises; all expected ones are AstraDataErrors."""
 
 from astra_data.core.naming import printable, shortened
 
 
 class AstraDataError(Exception):
-    """Any expected error; the command line prints it without a traceback."""
+    """Any expected error; the command line prints one line, without a traceback, and exits with 1."""
 
 
 class BadInputError(AstraDataError):

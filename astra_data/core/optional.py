@@ -36,11 +36,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 def optional(module: str) -> Any:  # noqa: ANN401 - a module
-    """Import `module` of a package in `EXTRAS`.
-
-    Raises:
-        BadInputError: it is not installed; the message says how to install it.
-    """
+    """Import `module` of a package in `EXTRAS`."""
     try:
         return import_module(module)
     except ImportError as error:

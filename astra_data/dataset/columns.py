@@ -87,11 +87,7 @@ class Column:
     astra: Mapping[str, list[str]] | None = None
 
     def __post_init__(self) -> None:
-        """Validate the column.
-
-        Raises:
-            BadInputError: it contradicts itself; lists every fault.
-        """
+        """Validate the column."""
         faults = []
         if "/" in self.name or not 1 <= len(self.name.encode(errors="replace")) <= MOST_NAME_BYTES:
             faults.append(f"the name must have 1 to {MOST_NAME_BYTES} bytes, without '/'")
@@ -148,11 +144,7 @@ class Column:
 
     @classmethod
     def from_feature(cls, name: str, feature: Mapping[str, Any]) -> "Column":
-        """Rebuild a column from its entry in LeRobot's `features`.
-
-        Raises:
-            BadInputError: the entry is not what was expected.
-        """
+        """Rebuild a column from its entry in LeRobot's `features`."""
         try:
             astra = dict(feature.get("astra") or {})
             return cls(

@@ -156,9 +156,6 @@ def lineage(dataset: Dataset) -> Ancestor:
     """Return `dataset` with all its ancestors, looked up in `versions.home()`, beside it, and in its run.
 
     An ancestor is found where name, version and content hash are those that its descendant lists.
-
-    Raises:
-        CorruptDatasetError: a dataset is named among its own ancestors.
     """
     places = _Places(dataset.root.resolve().parent)
     described: dict[_Key, _Described | None] = {_key(dataset.identity): (dataset.root, dataset.description)}

@@ -62,11 +62,7 @@ class Contents:
 
 
 def read_contents(root: Path) -> Contents:
-    """Read the metadata of the dataset in folder `root`, and the footers of its data files.
-
-    Raises:
-        CorruptDatasetError: files are missing or contradict each other; lists every fault.
-    """
+    """Read the metadata of the dataset in folder `root`, and the footers of its data files."""
     missing = [path for path in (layout.DATASET_PATH, *SEALED) if not (root / path).is_file()]
     if missing:
         raise CorruptDatasetError(f"{', '.join(missing)} missing")
@@ -159,9 +155,6 @@ def read_values(
     """Yield `columns` of `episodes`, ascending indices, in blocks of whole episodes, and the indices of each.
 
     Row groups of our files are whole episodes; files that another tool rewrote may have any.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read, or has other rows than when the dataset was opened.
     """
     if not columns:
         return
@@ -204,11 +197,7 @@ def _converted(
 
 
 def measure(contents: Contents) -> tuple[str, Digests]:
-    """Return the content hash and the digests of all values, as the files have them now.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read, or has other rows than when the dataset was opened.
-    """
+    """Return the content hash and the digests of all values, as the files have them now."""
     columns = [Column.from_feature(name, feature) for name, feature in contents.info["features"].items()]
     content_hash = ContentHash()
     parts: list[Digests] = []

@@ -56,9 +56,6 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         description: "name" and "stage", and optionally "version" (by default 1.0.0), "parents" (see
             `Dataset.identity`), "config", "seeds", "environment" and "simulator" (ids with parameters).
-
-    Raises:
-        BadInputError: lists every key that is missing, unknown or not plain JSON.
     """
     full = _DEFAULTS | dict(description)
     faults = [f"unknown key {key!r}, expected {', '.join(_DEFAULTS)}" for key in full.keys() - _DEFAULTS]
@@ -190,11 +187,7 @@ class _Subsets(_Open):
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Return meta/info.json of the dataset in folder `root`; its features are valid columns.
-
-    Raises:
-        CorruptDatasetError: it is missing or malformed; lists every fault.
-    """
+    """Return meta/info.json of the dataset in folder `root`; its features are valid columns."""
     info = _read(root / INFO_PATH, INFO_PATH, _Info)
     faults = []
     for name, feature in info["features"].items():
@@ -208,11 +201,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def read_description(root: Path) -> dict[str, Any]:
-    """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more.
-
-    Raises:
-        CorruptDatasetError: it is missing, malformed or altered; lists every fault.
-    """
+    """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more."""
     description = _read(root / DATASET_PATH, DATASET_PATH, _Description)
     if not is_description_sealed(description):
         raise CorruptDatasetError(f"{DATASET_PATH} was altered")
@@ -220,11 +209,7 @@ def read_description(root: Path) -> dict[str, Any]:
 
 
 def read_subsets(root: Path) -> dict[str, Any]:
-    """Return meta/astra/subsets.json: "seed" and "uids".
-
-    Raises:
-        CorruptDatasetError: it is missing or malformed; lists every fault.
-    """
+    """Return meta/astra/subsets.json: "seed" and "uids"."""
     return _read(root / SUBSETS_PATH, SUBSETS_PATH, _Subsets)
 
 

@@ -88,11 +88,7 @@ def share(percent: int, episodes: int) -> int:
 
 
 def check_uids(dataset: Dataset, uids: Sequence[int]) -> None:
-    """Check that `dataset` has the episodes `uids`.
-
-    Raises:
-        BadInputError: it lacks some.
-    """
+    """Raise a BadInputError unless `dataset` has the episodes `uids`."""
     known = _uids(dataset)
     if unknown := sorted(set(uids) - set(known)):
         raise BadInputError(
@@ -152,13 +148,8 @@ def filter_episodes(
         }
         for key, (low, high) in ranges.items()
     ]
-    config = only_given(
-        success=success,
-        min_return=min_return,
-        max_return=max_return,
-        min_length=min_length,
-        max_length=max_length,
-    )
+    given = {"success": success, "min_return": min_return, "max_return": max_return}
+    config = only_given(**given, min_length=min_length, max_length=max_length)
     return _write(source, set.intersection(*met), stage="filter", config=config, name=name, out=out)
 
 
@@ -205,16 +196,8 @@ def merge(
     tasks = list(dict.fromkeys(task for source in sources for task in _tasks(source)))
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
-    with next_version(
-        first,
-        "episodes",
-        stage="merge",
-        config=config,
-        name=name,
-        out=out,
-        others=others,
-        task=" / ".join(tasks),
-    ) as writer:
+    task, described = " / ".join(tasks), {"stage": "merge", "config": config, "name": name, "out": out}
+    with next_version(first, "episodes", others=others, task=task, **described) as writer:
         for source, named in zip(sources, names, strict=True):
             for episode in source.episodes():
                 metadata = renamed_metadata(episode.uid, episode.metadata, named)

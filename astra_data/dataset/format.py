@@ -68,14 +68,9 @@ def stored_columns(columns: Sequence[Column]) -> list[Column]:
 
 
 def reserved_values(steps: int, *, uid: int, episode: int, start: int, fps: float) -> dict[str, Array]:
-    """Return the uid and LeRobot's own columns of an episode, (T,) each, in the order of the file.
+    """Return the uid and LeRobot's own columns of an episode of `steps`, (T,) each, in the file's order.
 
-    Args:
-        steps: T.
-        uid: the episode's uid.
-        episode: its index.
-        start: index of its first step in the dataset.
-        fps: steps per second.
+    `start` is the index of its first step in the dataset.
 
     Returns:
         ints, and timestamps in s as float64.

@@ -1,8 +1,7 @@
 """Columns of chosen episodes as tensors, from which training draws windows and transitions."""
 
-import math
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,20 +12,89 @@ import torch
 from torch import Tensor
 from torch.utils import data
 
-from astra_data.core.durable import held
+from astra_data.core.durable import atomic_folder, held
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.provenance import memory_bytes
 from astra_data.core.seeding import generator
-from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.reader import Dataset
 
 Padding = Literal["valid", "edge"]
 MEMORY_SHARE = 0.5
 """Columns that take more than this share of the machine's memory are memory-mapped."""
+IS_PAD = "is_pad"
 Batch = dict[str, Tensor]
 """Column name to (B, ...)."""
-IS_PAD = "is_pad"
+
+
+class Order:
+    """Indices of `count` samples, batch by batch, reshuffled each epoch.
+
+    An epoch's order depends on (seed, epoch) alone. Iterating yields the batches (B,) that are left of the
+    current epoch; the next iteration continues from there. An `Order` also serves a `DataLoader` as
+    batch_sampler; its workers draw a few batches ahead.
+
+    Attributes:
+        epoch: the epoch of the next batch.
+        batch: its number in that epoch.
+    """
+
+    def __init__(
+        self, count: int, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False
+    ) -> None:
+        """Start with the first batch of epoch 0; with `drop_last`, a smaller last batch is left out.
+
+        Raises:
+            BadInputError: there would be no batches.
+        """
+        whole, rest = divmod(count, max(batch_size, 1))
+        self._batches = whole + (rest > 0 and not drop_last)
+        if batch_size < 1 or self._batches < 1:
+            raise BadInputError(f"batches of {batch_size} out of {count} samples: expected 1 to {count}")
+        self._settings = {
+            "count": count,
+            "batch_size": batch_size,
+            "seed": seed,
+            "shuffle": shuffle,
+            "drop_last": drop_last,
+        }
+        self.epoch = self.batch = 0
+
+    def __len__(self) -> int:
+        """Return the number of batches in an epoch."""
+        return self._batches
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """Yield the batches (B,) that are left of this epoch."""
+        epoch, count, size = self.epoch, self._settings["count"], self._settings["batch_size"]
+        order = torch.arange(count)
+        if self._settings["shuffle"]:
+            numbers = generator(self._settings["seed"], f"order of epoch {epoch}")
+            order = torch.from_numpy(numbers.permutation(count))
+        for batch in range(self.batch, len(self)):
+            # Set before yielding, so that a state saved inside the loop names the next batch.
+            self.epoch, self.batch = (epoch, batch + 1) if batch + 1 < len(self) else (epoch + 1, 0)
+            yield order[batch * size : (batch + 1) * size]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the settings and the next batch: plain numbers, for `load_state_dict`."""
+        return {**self._settings, "epoch": self.epoch, "batch": self.batch}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            BadInputError: it belongs to another order, or names a batch that does not exist.
+        """
+        epoch, batch = state.get("epoch"), state.get("batch")
+        settings = {key: state.get(key) for key in self._settings}
+        is_batch = type(epoch) is int and epoch >= 0 and type(batch) is int and 0 <= batch < len(self)
+        if settings != self._settings or not is_batch:
+            raise BadInputError(
+                f"the state is of another order of samples: expected {self._settings} and a batch of 0 to "
+                f"{len(self) - 1}, got {state}"
+            )
+        self.epoch, self.batch = state["epoch"], state["batch"]
 
 
 class Samples(data.Dataset[Batch]):
@@ -38,9 +106,7 @@ class Samples(data.Dataset[Batch]):
 
     def __init__(self, first: Tensor, gather: Callable[[Tensor], Batch], device: torch.device) -> None:
         """Hold samples that begin at rows `first` (M,); `gather` reads those at rows (B,), for `device`."""
-        self._first = first
-        self._gather = gather
-        self._device = device
+        self._first, self._gather, self._device = first, gather, device
 
     def __len__(self) -> int:
         """Return the number of samples M."""
@@ -67,6 +133,22 @@ class Samples(data.Dataset[Batch]):
     ) -> "Batches":
         """Draw batches; the arguments are those of `Order`."""
         return Batches(self, Order(len(self), batch_size, seed=seed, shuffle=shuffle, drop_last=drop_last))
+
+
+class Batches:
+    """Batches of `samples` in `order`, one epoch per iteration."""
+
+    def __init__(self, samples: Samples, order: Order) -> None:
+        self.samples, self.order = samples, order
+        self.state_dict, self.load_state_dict = order.state_dict, order.load_state_dict
+
+    def __len__(self) -> int:
+        """Return the number of batches in an epoch."""
+        return len(self.order)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield the batches that are left of this epoch."""
+        return map(self.samples.__getitems__, self.order)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,7 +200,7 @@ class Frames:
             episodes: indices of the episodes, by default all; they come in the dataset's order.
             device: torch device of the batches.
             memory_share: 0 to memory-map always.
-            cache: folder of the raw files, by default `column_files.cache_folder()`.
+            cache: folder of the raw files, by default $ASTRA_DATA_CACHE, or else ~/.cache/astra-data.
 
         Raises:
             BadInputError: a column or an episode does not exist, or an episode is listed twice.
@@ -129,7 +211,8 @@ class Frames:
         lengths = dataset.lengths[chosen]
         step_bytes = sum(column.size * np.dtype(column.dtype).itemsize for column in dataset.specs(names))
         if step_bytes * int(lengths.sum()) > memory_share * memory_bytes():
-            arrays = mapped_columns(dataset, names, cache or cache_folder())
+            home = os.environ.get("ASTRA_DATA_CACHE", Path.home() / ".cache" / "astra-data")
+            arrays = mapped_columns(dataset, names, cache or Path(home))
             starts = dataset.starts[chosen]
         else:
             arrays = dataset.columns(names, episodes)
@@ -185,132 +268,49 @@ class Frames:
         if faults:
             raise BadInputError(f"Windows: {'; '.join(faults)}.")
         if padding == "edge":
-            gather = partial(padded, self.columns, self.starts, self.starts + self.lengths, past, length)
-            return Samples(every(stride, self.starts - past, self.lengths), gather, self.device)
-        views = {name: rolled(values, length) for name, values in self.columns.items()}
-        first = every(stride, self.starts, (self.lengths - length + 1).clamp_min(0))
-        return Samples(first, partial(inside, self.columns, views, length), self.device)
+            first = _every(stride, self.starts - past, self.lengths)
+            return Samples(first, partial(self._padded, past, length), self.device)
+        views = {}
+        for name, values in self.columns.items():
+            # Row i holds steps i to i + L - 1, side by side as in memory.
+            size = values[0].numel()
+            views[name] = values.as_strided((len(values) - length + 1, length * size), (size, 1))
+        first = _every(stride, self.starts, (self.lengths - length + 1).clamp_min(0))
+        return Samples(first, partial(self._inside, views, length), self.device)
 
     def transitions(self) -> Samples:
         """Return single steps; the step's outcome is in its columns `next.*`."""
-        steps = torch.arange(len(self), device=self.starts.device)
-        before = self.lengths.cumsum(0) - self.lengths
-        rows = steps + (self.starts - before).repeat_interleave(self.lengths)
-        return Samples(rows, partial(_rows, self.columns), self.device)
+        return Samples(_every(1, self.starts, self.lengths), self._rows, self.device)
 
+    def _rows(self, rows: Tensor) -> Batch:
+        return {name: take(values, rows) for name, values in self.columns.items()}
 
-def _rows(columns: dict[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    return {name: take(values, rows) for name, values in columns.items()}
-
-
-def _fits(columns: dict[str, Tensor], device: torch.device) -> bool:
-    """Return whether columns take at most half of the device's free memory."""
-    if device.type != "cuda":
-        return True
-    free, _ = torch.cuda.mem_get_info(device)
-    return sum(values.nbytes for values in columns.values()) <= free // 2
-
-
-class Order:
-    """Indices of `count` samples, batch by batch, reshuffled each epoch.
-
-    An epoch's order depends on (seed, epoch) alone. Iterating yields the batches (B,) that are left of the
-    current epoch; the next iteration continues from there. An `Order` also serves a `DataLoader` as
-    batch_sampler; its workers draw a few batches ahead.
-
-    Attributes:
-        epoch: the epoch of the next batch.
-        batch: its number in that epoch.
-    """
-
-    def __init__(
-        self, count: int, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False
-    ) -> None:
-        """Start with the first batch of epoch 0.
-
-        Args:
-            count: number of samples.
-            batch_size: B.
-            seed: of all epochs.
-            shuffle: False to keep the samples' order.
-            drop_last: leave out an epoch's last batch if it is smaller than the others.
-
-        Raises:
-            BadInputError: there would be no batches.
-        """
-        whole, rest = divmod(count, max(batch_size, 1))
-        self._batches = whole + (rest > 0 and not drop_last)
-        if batch_size < 1 or self._batches < 1:
-            raise BadInputError(f"batches of {batch_size} out of {count} samples: expected 1 to {count}")
-        self._settings = {
-            "count": count,
-            "batch_size": batch_size,
-            "seed": seed,
-            "shuffle": shuffle,
-            "drop_last": drop_last,
+    def _inside(self, views: dict[str, Tensor], length: int, first: Tensor) -> Batch:
+        """Return the windows at rows `first` (B,), all inside their episode."""
+        shape = (len(first), length)
+        batch = {
+            name: take(values, first).view(*shape, *self.columns[name].shape[1:])
+            for name, values in views.items()
         }
-        self.epoch = 0
-        self.batch = 0
+        return batch | {IS_PAD: first.new_zeros(shape, dtype=torch.bool)}
 
-    def __len__(self) -> int:
-        """Return the number of batches in an epoch."""
-        return self._batches
-
-    def __iter__(self) -> Iterator[Tensor]:
-        """Yield the batches (B,) that are left of this epoch."""
-        epoch, count, size = self.epoch, self._settings["count"], self._settings["batch_size"]
-        order = torch.arange(count)
-        if self._settings["shuffle"]:
-            numbers = generator(self._settings["seed"], f"order of epoch {epoch}")
-            order = torch.from_numpy(numbers.permutation(count))
-        for batch in range(self.batch, len(self)):
-            # Set before yielding, so that a state saved inside the loop names the next batch.
-            self.epoch, self.batch = (epoch, batch + 1) if batch + 1 < len(self) else (epoch + 1, 0)
-            yield order[batch * size : (batch + 1) * size]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the settings and the next batch: plain numbers, for `load_state_dict`."""
-        return {**self._settings, "epoch": self.epoch, "batch": self.batch}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state`.
-
-        Raises:
-            BadInputError: it belongs to another order, or names a batch that does not exist; lists every
-                fault.
-        """
-        faults = [
-            f"{key} is {state.get(key)!r}, expected {value!r}"
-            for key, value in self._settings.items()
-            if state.get(key) != value
-        ]
-        ranges = {"epoch": (math.inf, "0 or more"), "batch": (len(self), f"0 to {len(self) - 1}")}
-        faults += [
-            f"{key} is {state.get(key)!r}, expected {expected}"
-            for key, (end, expected) in ranges.items()
-            if type(state.get(key)) is not int or not 0 <= state[key] < end
-        ]
-        if faults:
-            raise BadInputError(f"the state is of another order of samples: {'; '.join(faults)}")
-        self.epoch, self.batch = state["epoch"], state["batch"]
+    def _padded(self, past: int, length: int, first: Tensor) -> Batch:
+        """Return the windows at rows `first` (B,), which may lie outside; step `past` is in the episode."""
+        episode = torch.searchsorted(self.starts, first + past, right=True) - 1
+        wanted = first[:, None] + torch.arange(length, device=first.device)
+        ends = self.starts + self.lengths
+        rows = wanted.clamp(self.starts[episode, None], ends[episode, None] - 1)
+        batch = self._rows(rows.view(-1))
+        shaped = {name: values.view(*rows.shape, *values.shape[1:]) for name, values in batch.items()}
+        return shaped | {IS_PAD: rows != wanted}
 
 
-class Batches:
-    """Batches of `samples` in `order`, one epoch per iteration."""
-
-    def __init__(self, samples: Samples, order: Order) -> None:
-        self.samples = samples
-        self.order = order
-        self.state_dict = order.state_dict
-        self.load_state_dict = order.load_state_dict
-
-    def __len__(self) -> int:
-        """Return the number of batches in an epoch."""
-        return len(self.order)
-
-    def __iter__(self) -> Iterator[Batch]:
-        """Yield the batches that are left of this epoch."""
-        return map(self.samples.__getitems__, self.order)
+def _every(stride: int, begins: Tensor, counts: Tensor) -> Tensor:
+    """Return every `stride`-th of the `counts` (E,) rows from each of `begins` (E,) on."""
+    counts = (counts + stride - 1).div(stride, rounding_mode="floor")
+    number = torch.arange(int(counts.sum()), device=begins.device)
+    number -= (counts.cumsum(0) - counts).repeat_interleave(counts)
+    return number.mul_(stride).add_(begins.repeat_interleave(counts))
 
 
 def take(values: Tensor, rows: Tensor) -> Tensor:
@@ -321,49 +321,12 @@ def take(values: Tensor, rows: Tensor) -> Tensor:
     return torch.from_numpy(values.numpy().take(rows.numpy(), axis=0))
 
 
-def inside(columns: Mapping[str, Tensor], views: Mapping[str, Tensor], length: int, first: Tensor) -> Batch:
-    """Return the windows at rows `first` (B,), all inside their episode, from `rolled` views of `columns`."""
-    shape = (len(first), length)
-    batch = {
-        name: take(values, first).view(*shape, *columns[name].shape[1:]) for name, values in views.items()
-    }
-    return batch | {IS_PAD: first.new_zeros(shape, dtype=torch.bool)}
-
-
-def padded(
-    columns: Mapping[str, Tensor], starts: Tensor, ends: Tensor, past: int, length: int, first: Tensor
-) -> Batch:
-    """Return the windows at rows `first` (B,), which may lie outside; step `past` is in the episode.
-
-    Episodes are the rows from `starts` (E,) to `ends` (E,).
-    """
-    episode = torch.searchsorted(starts, first + past, right=True) - 1
-    wanted = first[:, None] + torch.arange(length, device=first.device)
-    rows = wanted.clamp(starts[episode, None], ends[episode, None] - 1)
-    batch = {
-        name: take(values, rows.view(-1)).view(*rows.shape, *values.shape[1:])
-        for name, values in columns.items()
-    }
-    return batch | {IS_PAD: rows != wanted}
-
-
-def every(stride: int, begins: Tensor, counts: Tensor) -> Tensor:
-    """Return every `stride`-th of the `counts` (E,) rows from each of `begins` (E,) on."""
-    counts = (counts + stride - 1).div(stride, rounding_mode="floor")
-    number = torch.arange(int(counts.sum()), device=begins.device)
-    number -= (counts.cumsum(0) - counts).repeat_interleave(counts)
-    return number.mul_(stride).add_(begins.repeat_interleave(counts))
-
-
-def rolled(values: Tensor, length: int) -> Tensor:
-    """View `values` (N, ...) so that row i holds steps i to i + L - 1, side by side as in memory."""
-    size = values[0].numel()
-    return values.as_strided((len(values) - length + 1, length * size), (size, 1))
-
-
-def cache_folder() -> Path:
-    """Return the folder of the raw files: $ASTRA_DATA_CACHE, by default ~/.cache/astra-data."""
-    return Path(os.environ.get("ASTRA_DATA_CACHE", Path.home() / ".cache" / "astra-data"))
+def _fits(columns: dict[str, Tensor], device: torch.device) -> bool:
+    """Return whether columns take at most half of the device's free memory."""
+    if device.type != "cuda":
+        return True
+    free, _ = torch.cuda.mem_get_info(device)
+    return sum(values.nbytes for values in columns.values()) <= free // 2
 
 
 def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[str, Array]:
@@ -371,32 +334,28 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
 
     The files are <cache>/<content hash>/<column>/values.npy. Changes of the arrays stay in this process. One
     process at a time writes a dataset's files; the others wait.
-
-    Raises:
-        BadInputError: a column does not exist.
-        CorruptDatasetError: the dataset or a raw file cannot be read.
     """
     specs = dataset.specs(names)
     parent = cache / dataset.content_hash
     parent.mkdir(parents=True, exist_ok=True)
     with held(parent, wait=True):
         for column in specs:
-            folder = parent / column.name
-            if not folder.exists():
-                _write(dataset, column, folder)
+            if not (parent / column.name).exists():
+                _write_raw(dataset, column, parent / column.name)
     columns: dict[str, Array] = {}
     for name in names:
-        folder = parent / name
         try:
-            columns[name] = np.load(folder / "values.npy", mmap_mode="c")
+            columns[name] = np.load(parent / name / "values.npy", mmap_mode="c")
         except (OSError, ValueError) as error:
-            raise CorruptDatasetError(f"{folder} was altered ({error}); delete it and try again.") from error
+            raise CorruptDatasetError(
+                f"{parent / name} was altered ({error}); delete it and try again."
+            ) from error
     for name in dataset.altered(columns):
         raise CorruptDatasetError(f"{parent / name} was altered (other values); delete it and try again.")
     return columns
 
 
-def _write(dataset: Dataset, column: Column, folder: Path) -> None:
+def _write_raw(dataset: Dataset, column: Column, folder: Path) -> None:
     shape = (int(dataset.lengths.sum()), column.size)[: 1 + (column.size > 1)]
     header = {"descr": np.dtype(column.dtype).str, "fortran_order": False, "shape": shape}
     # Not as a memory map: where the disk is full, that would end the process with a bus error.

@@ -116,11 +116,7 @@ class Inspection:
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Summarize `dataset`, reading one episode at a time.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read.
-    """
+    """Summarize `dataset`, reading one episode at a time."""
     spreads = _empty_spreads(dataset, dataset.schema)
     maps = {role: _empty_map(spreads, role) for role in ("position", "vector")}
     endings = Endings() if TERMINATED in dataset.features else None
@@ -147,11 +143,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
 
 
 def visited(dataset: Dataset, role: str = "position") -> Map | None:
-    """Map the robot's positions, or another planar `role` of its state; None if the state has none.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read.
-    """
+    """Map the robot's positions, or another planar `role` of its state; None if the state has none."""
     states = [column for column in dataset.schema if column.name == STATE]
     found = _empty_map(_empty_spreads(dataset, states), role)
     if found is None:
@@ -213,11 +205,7 @@ def _visit(planar: Map, points: Array) -> None:
 
 
 def endings_of(dataset: Dataset) -> Endings:
-    """Return how the episodes of `dataset` end, reading one at a time.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read.
-    """
+    """Return how the episodes of `dataset` end, reading one at a time."""
     found = Endings()
     for episode in dataset.episodes([name for name in NEEDED if name in dataset.features]):
         found.add(episode.columns)

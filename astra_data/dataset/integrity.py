@@ -87,17 +87,7 @@ def write_digests(root: Path, digests: Mapping[str, ArrayLike]) -> None:
 def read_digests(
     root: Path, sums: Mapping[str, str], columns: Collection[str], episodes: int | None = None
 ) -> dict[str, NDArray[np.uint64]]:
-    """Return the digests of `columns`.
-
-    Args:
-        root: folder of the dataset.
-        sums: those of its description, see `seal`; empty if they are not known.
-        columns: names of all stored columns.
-        episodes: their number, if it is known.
-
-    Raises:
-        CorruptDatasetError: the file is missing, was altered, or has other columns or rows.
-    """
+    """Return the digests of `columns`."""
     path = root / DIGESTS_PATH
     table = read_small_table(path)
     if isinstance(table, str):

@@ -17,6 +17,7 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.naming import first_few
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
+from astra_data.dataset import plain
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
 from astra_data.dataset.description import ContentHash, complete_description, permutation
@@ -32,17 +33,6 @@ from astra_data.dataset.lerobot_rows import (
     robot_of,
 )
 from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.plain import (
-    Run,
-    data_files,
-    flag_faults,
-    missing_files,
-    read_object,
-    read_places,
-    read_tasks,
-    run_faults,
-    runs,
-)
 
 MOST_FAULTS = 8
 """Faults that a message lists."""
@@ -62,18 +52,13 @@ class Found(NamedTuple):
 
 
 def open_recording(root: Path) -> Contents:
-    """Return the contents of the LeRobot dataset in folder `root`: check every value, log what is left out.
-
-    Raises:
-        BadInputError: it has no state or action of numbers, episodes share a uid, or its format is older.
-        CorruptDatasetError: it is incomplete or was altered; lists the first faults.
-    """
-    info, tasks = read_object(root / layout.INFO_PATH), read_tasks(root)
+    """Return the contents of the LeRobot dataset in `root`: check every value, log what is left out."""
+    info, tasks = plain.read_object(root / layout.INFO_PATH), plain.read_tasks(root)
     if isinstance(info, str) or isinstance(tasks, str):
         path = layout.INFO_PATH if isinstance(info, str) else layout.TASKS_PATH
         raise CorruptDatasetError(f"{path} {info if isinstance(info, str) else tasks}")
-    places, _ = read_places(root, info)
-    if lost := missing_files(root, places):
+    places, _ = plain.read_places(root, info)
+    if lost := plain.missing_files(root, places):
         raise CorruptDatasetError(f"{first_few(lost, MOST_FAULTS)} missing")
     stored, specs, fps = declared_columns(root, info)
     if missing := lacking(specs):
@@ -110,7 +95,7 @@ def open_recording(root: Path) -> Contents:
         order=[order[uid] for uid in permutation(uids, 0)],
         subset_seed=0,
         task=" / ".join(tasks[index] for index in sorted(tasks)),
-        paths=data_files(root),
+        paths=plain.data_files(root),
         file_starts=np.zeros(1, dtype=np.int64),
         recorded=RecordedFiles(
             rows=rows,
@@ -132,10 +117,10 @@ def _survey(
     faults: list[str] = []
     parts: dict[str, list[NDArray[np.uint64]]] = {spec.name: [] for spec in specs}
     content, row, kept, steps = ContentHash(), 0, 0, 0
-    tables = read_blocks(data_files(root), [column.name for column in stored])
-    for number, run in enumerate(runs(root / "data", tables, stored)):
-        faults += [fault for _, fault in run_faults(run, number=number, row=row, fps=rows.fps)]
-        faults += flag_faults(replace(run, columns={name: run.columns[name] for name in ends}), number)
+    tables = read_blocks(plain.data_files(root), [column.name for column in stored])
+    for number, run in enumerate(plain.runs(root / "data", tables, stored)):
+        faults += [fault for _, fault in plain.run_faults(run, number=number, row=row, fps=rows.fps)]
+        faults += plain.flag_faults(replace(run, columns={name: run.columns[name] for name in ends}), number)
         if len(faults) >= MOST_FAULTS:
             break
         uid = int(run.columns.get(names.EPISODE_UID, run.columns[names.EPISODE_INDEX])[0])
@@ -167,13 +152,13 @@ def _survey(
     return found, content.hexdigest(), digests
 
 
-def found_in(run: Run, rows: Rows, tasks: Mapping[int, str], *, row: int, uid: int) -> Found:
+def found_in(run: plain.Run, rows: Rows, tasks: Mapping[int, str], *, row: int, uid: int) -> Found:
     """Return the episode of the rows `run`, which begins in the given row of the files."""
     ends = rows.lost_success(run), rows.lost_reward(run), rows.is_done_early(run)
     return Found(uid, row, len(run) - rows.dropped, _facts(run, tasks), *ends)
 
 
-def _facts(run: Run, tasks: Mapping[int, str]) -> dict[str, Scalar]:
+def _facts(run: plain.Run, tasks: Mapping[int, str]) -> dict[str, Scalar]:
     """Return the metadata of an episode, of all its rows."""
     facts: dict[str, Scalar] = {}
     if names.SUCCESS in run.columns:

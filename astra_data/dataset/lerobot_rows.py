@@ -64,15 +64,7 @@ class Rows:
         return [column for name, column in self.stored.items() if name in sources]
 
     def values(self, spec: Column, run: Run, episode: int, start: int, uid: int) -> Array:
-        """Return the column `spec` of one episode, (T,) or (T, size).
-
-        Args:
-            spec: the column.
-            run: its rows in the files, T + `dropped`.
-            episode: its index.
-            start: index of its first step.
-            uid: its uid.
-        """
+        """Return the column `spec` of one episode, (T,) or (T, size)."""
         steps = len(run) - self.dropped
         reserved = reserved_values(steps, uid=uid, episode=episode, start=start, fps=self.fps)
         if spec.name in reserved:
@@ -183,11 +175,7 @@ def _typed(column: Column) -> Column:
 
 
 def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:
-    """Return from info.json the columns of numbers as stored, the ones of ours for their values, and the fps.
-
-    Raises:
-        CorruptDatasetError: it lacks LeRobot's own columns, or a whole number of frames per second.
-    """
+    """Return from info.json the columns of numbers as stored, ours for their values, and the fps."""
     features, fps = info.get("features"), info.get("fps")
     columns = plain_columns(features)[0] if isinstance(features, dict) else []
     found = {column.name: column for column in columns}

@@ -36,11 +36,7 @@ def to_lists(values: Array) -> pa.ListArray:
 
 
 def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
-    """Copy an Arrow column of n rows to a contiguous array (n,), or (n, size) if `size` > 1.
-
-    Raises:
-        CorruptDatasetError: rows are missing values, or are no numbers.
-    """
+    """Copy an Arrow column of n rows to a contiguous array (n,), or (n, size) if `size` > 1."""
     parts = [chunk.flatten() if size > 1 else chunk for chunk in column.chunks]
     if any(part.null_count for part in parts) or sum(map(len, parts)) != len(column) * size:
         raise CorruptDatasetError(f"expected {size} values in every row, some are missing")
@@ -55,12 +51,7 @@ def to_numpy(column: pa.ChunkedArray, size: int, dtype: str) -> Array:
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
-    """Open the parquet file at `path`, which is closed by `with`.
-
-    Raises:
-        OSError: it cannot be read, or is a device or a pipe, for which one would wait without end.
-        ValueError: it is damaged, or two of its columns have the same name.
-    """
+    """Open the parquet file at `path`, which is closed by `with`."""
     if path.exists() and not path.is_file():
         raise OSError("it is a folder, a device or a pipe, expected a file")
     file = pq.ParquetFile(path)
@@ -84,9 +75,6 @@ def read_blocks(
         names: the columns, by default all.
         wanted: mask over all rows of all files, by default all; row groups without a wanted row are skipped.
         most_rows: rows of a block, rounded up to whole row groups; by default `BLOCK_ROWS`.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read.
     """
     end, enough = 0, most_rows or BLOCK_ROWS
     for path in paths:
@@ -114,14 +102,7 @@ def read_blocks(
 def rows_of(
     chosen: NDArray[np.int64], starts: NDArray[np.int64], lengths: NDArray[np.int64], total: int
 ) -> NDArray[np.bool_] | None:
-    """Return the mask (total,) of the rows of episodes, as `read_blocks` takes it; None for all.
-
-    Args:
-        chosen: indices of the episodes, (n,).
-        starts: first row of each episode, (E,).
-        lengths: rows of each episode, (E,).
-        total: rows of all files.
-    """
+    """Return the mask (total,) of the rows of episodes `chosen`, as `read_blocks` takes it; None for all."""
     if len(chosen) == len(starts):
         return None
     wanted = np.zeros(total, dtype=bool)

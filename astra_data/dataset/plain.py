@@ -13,16 +13,8 @@ import pyarrow as pa
 
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
+from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array
-from astra_data.dataset.format import (
-    CHUNK_SIZE,
-    INFO_PATH,
-    STATS_PATH,
-    STORED_STATISTICS,
-    TASKS_PATH,
-    arrow_type,
-    reserved_values,
-)
 from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks, to_numpy
 
 TIMESTAMP_TOLERANCE_S = 1e-4
@@ -62,7 +54,7 @@ class PlainColumn:
     @property
     def arrow_type(self) -> pa.DataType:
         """The type of one step: a scalar, or a list of fixed size."""
-        return arrow_type(self.dtype, self.size)
+        return layout.arrow_type(self.dtype, self.size)
 
     def fits(self, kind: pa.DataType) -> bool:
         """Return whether a file may store it as `kind`; LeRobot's merge writes lists of variable size."""
@@ -130,7 +122,7 @@ def read_object(path: Path) -> dict[str, Any] | str:
 
 def read_statistics(root: Path) -> dict[str, dict[str, Any]] | str:
     """Return meta/stats.json, column to statistic to values, or what is wrong with it."""
-    found = read_object(root / STATS_PATH)
+    found = read_object(root / layout.STATS_PATH)
     if isinstance(found, str):
         return found
     strange = [name for name, statistics in found.items() if not isinstance(statistics, dict)]
@@ -139,7 +131,7 @@ def read_statistics(root: Path) -> dict[str, dict[str, Any]] | str:
 
 def is_format_2(root: Path) -> bool:
     """Return whether the metadata in folder `root` are those of LeRobot's formats 2.0 and 2.1."""
-    info = read_object(root / INFO_PATH)
+    info = read_object(root / layout.INFO_PATH)
     return isinstance(info, dict) and str(info.get("codebase_version")).startswith("v2.")
 
 
@@ -152,18 +144,13 @@ def is_data_path(pattern: object) -> bool:
 
 
 def read_places(root: Path, info: Mapping[str, Any]) -> tuple[dict[int, Place], list[str]]:
-    """Return where the metadata have each episode, as far as they can be read, and what is wrong with them.
-
-    Args:
-        root: folder of the dataset.
-        info: its meta/info.json.
-    """
+    """Return where the metadata have each episode, as far as they can be read, and their faults."""
     places: dict[int, Place] = {}
     if is_format_2(root):
         rows = _read_lines(root / _FORMAT_2["episodes"])
         if isinstance(rows, str):
             return places, [f"{_FORMAT_2['episodes']} {rows}"]
-        first, chunk = 0, _whole(info.get("chunks_size")) or CHUNK_SIZE
+        first, chunk = 0, _whole(info.get("chunks_size")) or layout.CHUNK_SIZE
         for row in rows:
             number, length = (_whole(row.get(key)) for key in ("episode_index", "length"))
             if number is None or length is None:
@@ -227,7 +214,7 @@ def read_tasks(root: Path) -> dict[int, str] | str:
         ):
             return f"is not there in format 2, and {name} has no text for each task_index"
         return {row["task_index"]: row["task"] for row in rows}
-    table = read_small_table(root / TASKS_PATH)
+    table = read_small_table(root / layout.TASKS_PATH)
     if isinstance(table, str):
         return table
     numbers = [field.name for field in table.schema if pa.types.is_integer(field.type)]
@@ -281,11 +268,7 @@ def episodes_files(root: Path) -> list[Path]:
 
 
 def episode_rows(root: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of meta/episodes.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read.
-    """
+    """Yield the rows of meta/episodes."""
     for path in episodes_files(root):
         try:
             with open_parquet(path) as file:
@@ -301,9 +284,6 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
 
     A single wrong value of either splits nothing, and `run_faults` finds it. Memory holds the longest run and
     a block.
-
-    Raises:
-        CorruptDatasetError: the file cannot be read, or values are missing.
     """
     rest: dict[str, Array] = {}
     row = 0
@@ -340,7 +320,7 @@ def statistics_faults(
 
     Quantiles, which early files of the format lack, and statistics of what is no number are not required.
     """
-    known = {f"stats/{feature}/{kind}" for feature in features for kind in STORED_STATISTICS}
+    known = {f"stats/{feature}/{kind}" for feature in features for kind in layout.STORED_STATISTICS}
     needed = [f"stats/{column.name}/{kind}" for column in columns for kind in PLAIN_STATISTICS]
     yield from (f"lacks column {name}" for name in needed if name not in schema.names)
     for name in schema.names:
@@ -349,11 +329,7 @@ def statistics_faults(
 
 
 def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, Array]:
-    """Return `columns` of `table` by name, (n,) or (n, size).
-
-    Raises:
-        CorruptDatasetError: values are missing.
-    """
+    """Return `columns` of `table` by name, (n,) or (n, size)."""
     return {column.name: _values(table.column(column.name), column) for column in columns}
 
 
@@ -368,16 +344,12 @@ def _values(stored: pa.ChunkedArray, column: PlainColumn) -> Array:
 
 
 def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple[str, str]]:
-    """Yield (column, sentence) for each column of a run with wrong values.
+    """Yield (column, sentence) for each column with wrong values of a run that is to be episode `number`.
 
-    Args:
-        run: the rows.
-        number: index of the episode that they should be.
-        row: index of its first row in the dataset.
-        fps: steps per second.
+    `row` is the index of its first row in the dataset.
     """
     uid = run.columns.get(names.EPISODE_UID, [0])[0]
-    expected = reserved_values(len(run), uid=uid, episode=number, start=row, fps=fps)
+    expected = layout.reserved_values(len(run), uid=uid, episode=number, start=row, fps=fps)
     del expected[names.TASK_INDEX]  # LeRobot's datasets may have several tasks
     for name, values in run.columns.items():
         wrong = ~np.isfinite(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)

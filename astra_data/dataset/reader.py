@@ -125,20 +125,12 @@ class Dataset(Contents):
     def blocks(
         self, names: Sequence[str], episodes: Collection[int] | None = None
     ) -> Iterator[dict[str, Array]]:
-        """Yield the values of the columns `names` in blocks of whole episodes; memory stays bounded.
-
-        Raises:
-            CorruptDatasetError: a file cannot be read, or values of the block differ from their digests.
-        """
+        """Yield the values of the columns `names` in blocks of whole episodes; memory stays bounded."""
         for block, _ in self._verified(self.specs(names), self.selected(episodes)):
             yield block
 
     def selected(self, episodes: Collection[int] | None) -> NDArray[np.int64]:
-        """Return the episode indices `episodes`, by default all, in the dataset's order.
-
-        Raises:
-            BadInputError: one does not exist or is listed twice; lists every fault.
-        """
+        """Return the episode indices `episodes`, by default all, in the dataset's order."""
         if episodes is None:
             return np.arange(len(self))
         chosen, counts = np.unique(np.array(list(episodes), dtype=np.int64), return_counts=True)
@@ -227,11 +219,7 @@ class Dataset(Contents):
         return faults
 
     def require_whole(self) -> None:
-        """Read every value, for what states something of all of them.
-
-        Raises:
-            CorruptDatasetError: a value was altered.
-        """
+        """Read every value, for what states something of all of them."""
         for _ in self.blocks(list(self.features)):
             pass
 
@@ -268,11 +256,7 @@ class Dataset(Contents):
                 yield block, indices
 
     def specs(self, names: Sequence[str]) -> list[Column]:
-        """Return the columns `names`.
-
-        Raises:
-            BadInputError: one does not exist.
-        """
+        """Return the columns `names`."""
         if isinstance(names, str):
             raise BadInputError(f"expected a list of columns, got the text '{names}': write ['{names}']")
         unknown = [name for name in names if name not in self.features]
@@ -363,9 +347,6 @@ def to_huggingface(root: Path) -> "datasets.Dataset":
     """Return the rows as a `datasets.Dataset` in memory, with the features that lerobot gives them.
 
     It is read from the same files, and nothing is written.
-
-    Raises:
-        BadInputError: datasets is not installed.
     """
     library = optional("datasets")
     rows: datasets.Dataset = library.Dataset(pa.concat_tables(map(pq.read_table, data_files(root))))
@@ -379,9 +360,6 @@ def to_lerobot(root: Path, name: str, **options: Any) -> "LeRobotDataset":  # no
         root: the dataset's folder.
         name: that lerobot shows.
         options: of `LeRobotDataset`, such as `delta_timestamps`.
-
-    Raises:
-        BadInputError: lerobot is not installed.
     """
     library = optional("lerobot.datasets.lerobot_dataset")
     opened: LeRobotDataset = library.LeRobotDataset(f"local/{name}", root=root, **options)

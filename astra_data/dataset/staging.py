@@ -20,6 +20,7 @@ from astra_data.core.durable import (
     held,
     make_folder,
     move,
+    refuse_existing,
     remove_empty,
     sweep,
     sync,
@@ -28,7 +29,6 @@ from astra_data.core.durable import (
 )
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, in_short
 from astra_data.dataset import format as layout
-from astra_data.dataset.atomic import refuse_existing
 from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import changed_values
 from astra_data.dataset.integrity import digest_of
@@ -115,13 +115,7 @@ class StagedWriter:
         self._is_open = False
 
     def __enter__(self) -> "StagedWriter":
-        """Start or resume the recording.
-
-        Raises:
-            BadInputError: what was staged belongs to another recording, or to one that is going on.
-            CorruptDatasetError: a staged episode is damaged.
-            DiskError: the folder cannot be written.
-        """
+        """Start or resume the recording."""
         if self._holds_work() and not self._resume and not self.root.exists():
             raise BadInputError(
                 f"{self.root}: an interrupted recording left {self._left()}; "
@@ -204,11 +198,7 @@ class StagedWriter:
         self.staged[place], self.lengths[place] = episode.metadata, len(episode)
 
     def drop(self, position: int) -> None:
-        """Leave out the staged episode at `position`; its uid stays taken.
-
-        Raises:
-            DiskError: it cannot be removed.
-        """
+        """Leave out the staged episode at `position`; its uid stays taken."""
         with writing(self._path(position)):
             self._path(position).unlink()
         del self.staged[position], self.lengths[position]
@@ -239,7 +229,10 @@ class StagedWriter:
         try:
             dataset = Dataset.open(self.root)
             if not paths:
-                return all(dataset.description.get(key) == value for key, value in self._described().items())
+                settings = read_object(self.folder / _SETTINGS)
+                before = settings.get("description") if isinstance(settings, dict) else None
+                described = before if isinstance(before, dict) else self._settings["description"]
+                return all(dataset.description.get(key) == value for key, value in described.items())
             staged = {episode.uid: path for path in paths for episode in [load_staged(path, self._columns)]}
             for stored in dataset.episodes([column.name for column in self._columns]):
                 path = staged.pop(stored.uid, None)
@@ -248,12 +241,6 @@ class StagedWriter:
         except AstraDataError:
             return False
         return not staged
-
-    def _described(self) -> Mapping[str, Any]:
-        """Return the description of the recording that was interrupted, by default of this one."""
-        settings = read_object(self.folder / _SETTINGS)
-        found = settings.get("description") if isinstance(settings, dict) else None
-        return found if isinstance(found, dict) else self._settings["description"]
 
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"
@@ -294,11 +281,7 @@ def _is_same(one: Episode, other: Episode) -> bool:
 
 
 def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:
-    """Write the columns of `schema`, with their digests, uid and metadata.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the columns of `schema`, with their digests, uid and metadata."""
     facts = {
         "uid": episode.uid,
         "metadata": dict(episode.metadata),
@@ -311,11 +294,7 @@ def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:
 
 
 def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
-    """Return the episode in the file at `path`.
-
-    Raises:
-        CorruptDatasetError: the file cannot be read, or has other values than were written.
-    """
+    """Return the episode in the file at `path`."""
     try:
         if not path.is_file():
             raise OSError("it is no file")

@@ -59,11 +59,6 @@ def global_statistics(
     Quantiles are exact, so that at least one index of one column is in memory as a whole. Above
     `BLOCK_VALUES` frames, memory grows with their number: an index and two float64 copies take 20 bytes per
     frame of float32 (2 GB for 100 million frames), whatever the number of columns.
-
-    Args:
-        columns: all stored columns.
-        frames: number of rows.
-        paths: the data files in order.
     """
     indices = [(column, index) for column in columns for index in range(column.size)]
     parts: dict[str, list[NDArray[np.float64]]] = {column.name: [] for column in columns}

@@ -43,11 +43,7 @@ class Version:
 
     @classmethod
     def parse(cls, text: str) -> "Version":
-        """Read "1.2.0".
-
-        Raises:
-            BadInputError: it is not three numbers.
-        """
+        """Read "1.2.0"."""
         if not VERSION.fullmatch(text):
             raise BadInputError(f"version '{shortened(text, 80)}': expected three numbers such as 1.2.0")
         return cls(*map(int, text.split(".")))
@@ -97,20 +93,12 @@ def home_of(description: Mapping[str, Any]) -> Path:
 
 
 def names_at_home() -> list[str]:
-    """Return the names of the datasets at home.
-
-    Raises:
-        BadInputError: the home folder is none.
-    """
+    """Return the names of the datasets at home."""
     return sorted(folder.name for folder in _home_folder().glob("*") if versions_at_home(folder.name))
 
 
 def versions_at_home(name: str) -> list[Version]:
-    """Return the versions of dataset `name` at home, the oldest first.
-
-    Raises:
-        BadInputError: the home folder is none.
-    """
+    """Return the versions of dataset `name` at home, the oldest first."""
     folders = (folder for folder in (_home_folder() / name).glob("data-*") if folder.is_dir())
     return sorted(version for folder in folders if (version := Version.from_tag(folder.name)))
 
@@ -209,41 +197,25 @@ def next_version(
     source: Dataset,
     change: Change,
     *,
-    stage: str,
-    config: Mapping[str, Any],
-    name: str | None = None,
-    out: Path | None = None,
     more: Sequence[Column] = (),
     subset_seed: int | None = None,
     others: Iterable[Dataset] = (),
     task: str | None = None,
-    **changed: Any,  # noqa: ANN401 - JSON
+    **described: Any,  # noqa: ANN401 - as `successor` takes it
 ) -> DatasetWriter:
     """Prepare to write the version that follows `source`; its folder is the writer's `root`.
 
     Args:
         source: its first parent; columns, fps, task and description are carried over.
-        change: see `successor`, as for `stage`, `config`, `name` and `out`.
-        stage: the stage that writes it.
-        config: the stage's settings.
-        name: of a new dataset.
-        out: its folder, by default its place at home.
+        change: see `successor`.
         more: columns besides those of `source`.
         subset_seed: of the permutation of the subsets, by default that of `source`.
         others: further parents.
         task: of its episodes, by default that of `source`.
-        changed: keys of the description that differ from those of `source`.
+        described: `stage`, `config`, `name`, `out` and keys of the description, as `successor` takes them.
     """
-    description, folder = successor(
-        source.description,
-        change,
-        stage=stage,
-        config=config,
-        name=name,
-        out=out,
-        parents=[other.identity for other in others],
-        **changed,
-    )
+    parents = [other.identity for other in others]
+    description, folder = successor(source.description, change, parents=parents, **described)
     return DatasetWriter(
         folder,
         [*source.schema, *more],

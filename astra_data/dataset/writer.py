@@ -13,10 +13,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from astra_data.core.durable import atomic_folder
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
-from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import DONE, TERMINATED, TRUNCATED, Array, Column, Episode, Scalar
 from astra_data.dataset.description import ContentHash, complete_description, permutation
 from astra_data.dataset.format import METADATA_KEYS
@@ -222,26 +222,17 @@ class Admission:
         self.metadata_types: dict[str, type] = {}
 
     def admit(self, episode: Episode) -> None:
-        """Accept `episode`, or refuse it.
-
-        Raises:
-            BadInputError: it does not fit; lists every fault.
-        """
+        """Accept `episode`, or refuse it with a BadInputError that lists every fault."""
         self.check(episode)
         self._uids.add(episode.uid)
         self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
 
     def check(self, episode: Episode) -> None:
-        """Refuse `episode` as `admit` does, without accepting it otherwise.
-
-        Raises:
-            BadInputError: it does not fit; lists every fault.
-        """
+        """Refuse `episode` as `admit` does, without accepting it otherwise."""
         if not isinstance(episode, Episode):
             kind = type(episode).__name__
             raise BadInputError(f"expected an Episode, made with Episode(uid, columns), got a {kind}")
-        faults = self._faults(episode)
-        if faults:
+        if faults := self._faults(episode):
             raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
 
     def _faults(self, episode: Episode) -> list[str]:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from astra_data.core.artifact import write_manifest
-from astra_data.core.durable import file_digest
+from astra_data.core.durable import atomic_folder, file_digest, refuse_existing
 from astra_data.core.provenance import origin
-from astra_data.dataset.atomic import atomic_folder, refuse_existing
 from astra_data.dataset.columns import Column
 from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, write_graph
 from astra_data.deployment.lerobot.files import write_lerobot_files

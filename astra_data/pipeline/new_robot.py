@@ -17,8 +17,8 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.config import did_you_mean
+from astra_data.core.durable import atomic_folder
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.atomic import atomic_folder
 from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TERMINATED
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset

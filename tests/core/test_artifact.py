@@ -1,7 +1,7 @@
 import errno
+import hashlib
+import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
@@ -9,7 +9,14 @@ import pytest
 import torch
 from failing_disk import failing
 
-from astra_data.core.artifact import CHECKPOINT, MANIFEST, finished_folder, read_manifest
+from astra_data.core.artifact import (
+    CHECKPOINT,
+    MANIFEST,
+    Manifest,
+    finished_folder,
+    read_manifest,
+    write_manifest,
+)
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.errors import BadInputError, DiskError
 
@@ -34,15 +41,6 @@ def test_a_finished_folder_says_what_it_was_made_from_and_has_no_checkpoints(tmp
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"weights", MANIFEST}
 
 
-def test_an_interrupted_folder_is_found_again(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), finished_folder(tmp_path / "out") as folder:
-        (folder / "checkpoint").touch()
-        raise KeyboardInterrupt
-    assert not (tmp_path / "out").exists()
-    with finished_folder(tmp_path / "out") as folder:
-        assert (folder / "checkpoint").exists()
-
-
 def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt), finished_folder(out, config="1") as folder:
@@ -65,20 +63,9 @@ def test_a_failure_before_anything_is_made_leaves_nothing(
     tmp_path: Path, config: str | None, error: BaseException
 ) -> None:
     (tmp_path / "train").mkdir()
-    with (
-        pytest.raises(type(error)),
-        finished_folder(tmp_path / "train" / "astra" / "seed_0", config=config),
-    ):
+    with pytest.raises(type(error)), finished_folder(tmp_path / "train" / "astra" / "seed_0", config=config):
         raise error
     assert [path.name for path in tmp_path.rglob("*")] == ["train"]
-
-
-def test_what_was_only_begun_with_other_settings_is_begun_anew(tmp_path: Path) -> None:
-    (tmp_path / ".out.partial").mkdir()
-    (tmp_path / ".out.partial/config.json").write_text("1")
-    with finished_folder(tmp_path / "out", config="2"):
-        pass
-    assert (tmp_path / "out/config.json").read_text() == "2"
 
 
 @pytest.mark.parametrize("replace", [False, True])
@@ -92,49 +79,6 @@ def test_what_another_is_making_is_left_to_it(tmp_path: Path, replace: bool) -> 
         ):
             pytest.fail("it was yielded twice")
     assert sorted(path.name for path in out.iterdir()) == ["config.json", "model"]
-
-
-def test_what_another_finished_while_the_lock_was_awaited_is_not_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The folder that it locks may be the other's, which by then has its name."""
-    out = tmp_path / "out"
-
-    @contextmanager
-    def late(folder: Path) -> Iterator[bool]:
-        (folder / "model").touch()
-        folder.rename(out)
-        yield True
-
-    monkeypatch.setattr("astra_data.core.artifact.held", late)
-    with pytest.raises(BadInputError, match="already finished"), finished_folder(out):
-        pytest.fail("it was made again")
-    assert [path.name for path in out.iterdir()] == ["model"]
-
-
-def test_a_folder_without_a_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(BadInputError, match="already finished"), finished_folder(Path(".")):
-        pass
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_is_gone_hides_no_error(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="the true error"), finished_folder(tmp_path / "out") as folder:
-        folder.rmdir()
-        raise ValueError("the true error")
-
-
-def test_a_folder_begun_without_a_config_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), finished_folder(tmp_path / "out") as folder:
-        (folder / "checkpoint").touch()
-        raise KeyboardInterrupt
-    with (
-        pytest.raises(BadInputError, match="started with other"),
-        finished_folder(tmp_path / "out", config="1"),
-    ):
-        pass
-    assert [path.name for path in folder.iterdir()] == ["checkpoint"]
 
 
 def test_a_finished_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
@@ -221,25 +165,6 @@ def test_a_disk_that_fails_at_any_operation_leaves_a_folder_to_go_on_with(
     assert at > 15
 
 
-def test_a_disk_that_fails_while_a_folder_is_replaced_leaves_the_old_one_or_the_new_one(
-    tmp_path: Path,
-) -> None:
-    out = tmp_path / "out"
-    (out / "first").mkdir(parents=True)
-    for at in count():
-        with (
-            failing("rename replace", at, OSError(errno.EIO, "fault")) as calls,
-            suppress(DiskError),
-            finished_folder(out, replace=True) as folder,
-        ):
-            (folder / f"{at}").touch()
-        assert len(list(out.iterdir())) == 1
-        if len(calls) <= at:
-            break
-    assert [path.name for path in out.iterdir()] == [str(at)]
-    assert at > 1
-
-
 def test_what_a_kill_left_in_the_working_folder_is_not_published(tmp_path: Path) -> None:
     partial = tmp_path / ".out.partial"
     (partial / ".checkpoint.safetensors.tmp-7").mkdir(parents=True)
@@ -258,11 +183,51 @@ def test_the_disk_has_what_a_folder_holds_before_its_name(tmp_path: Path, disk_o
     assert sorted(before) == ["fsync .out.partial", "fsync model"]
 
 
-def test_a_linked_folder_in_what_is_replaced_is_unlinked_alone(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data/file").touch()
-    (tmp_path / ".out.partial").mkdir()
-    (tmp_path / ".out.partial/link").symlink_to(tmp_path / "data")
-    with finished_folder(tmp_path / "out", replace=True) as folder:
-        assert not list(folder.iterdir())
-    assert (tmp_path / "data/file").exists()
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "weights").write_bytes(b"abc")
+    (tmp_path / "plots/one.png").write_bytes(b"")
+    write_manifest(tmp_path, {"dataset": "d1", "grounding": None})
+    return tmp_path
+
+
+def read(folder: Path) -> Manifest:
+    manifest = read_manifest(folder)
+    assert manifest is not None
+    return manifest
+
+
+def test_a_manifest_holds_sizes_sums_and_what_was_read(folder: Path) -> None:
+    assert json.loads((folder / MANIFEST).read_text()) == {
+        "files": {
+            "plots/one.png": {"bytes": 0, "sha256": hashlib.sha256(b"").hexdigest()},
+            "weights": {"bytes": 3, "sha256": hashlib.sha256(b"abc").hexdigest()},
+        },
+        "made_from": {"dataset": "d1"},
+    }
+    assert read(folder).faults(folder, verify=True) == read(folder).foreign(folder) == []
+
+
+def test_damage_is_found(folder: Path) -> None:
+    manifest = read(folder)
+    (folder / "weights").write_bytes(b"abd")
+    assert manifest.faults(folder, verify=False) == []
+    assert manifest.faults(folder, verify=True) == ["weights was altered"]
+    (folder / "weights").write_bytes(b"")
+    (folder / "plots/one.png").unlink()
+    faults = ["plots/one.png is missing", "weights has 0 bytes, expected 3"]
+    assert manifest.faults(folder, verify=False) == manifest.faults(folder, verify=True) == faults
+    (folder / "plots/notes").touch()
+    assert manifest.foreign(folder) == ["plots/notes"]
+
+
+def test_a_folder_without_a_manifest_has_none(tmp_path: Path) -> None:
+    assert read_manifest(tmp_path) is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"files": {"a": 3}, "made_from": {}}', "\udcff"])
+def test_a_manifest_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / MANIFEST).write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(BadInputError, match=r"^manifest\.json cannot be read"):
+        read_manifest(tmp_path)

@@ -1,5 +1,7 @@
 import errno
 import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from itertools import count
 from pathlib import Path
 
@@ -8,17 +10,23 @@ from failing_disk import Killed, failing
 
 from astra_data.core.durable import (
     NO_FSYNC,
+    alone_in,
+    atomic_file,
+    atomic_folder,
     begun_beside,
     clean,
     discard,
+    disk_error,
+    files_below,
     held,
     hidden_folder,
     made_in,
     make_folder,
     sync_tree,
     write_file,
+    writing,
 )
-from astra_data.core.errors import DiskError
+from astra_data.core.errors import BadInputError, DiskError
 
 pytestmark = pytest.mark.usefixtures("fsync")
 MUTATING = "mkdir rename replace unlink rmdir fsync"
@@ -145,15 +153,6 @@ def test_a_failure_removes_the_folders_that_were_made_for_it_alone(tmp_path: Pat
     assert [path.name for path in (home / "walks").iterdir()] == ["notes.txt"]
 
 
-def test_a_folder_that_another_process_removed_is_made_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place = tmp_path / "walks/data-1.0.0"
-    monkeypatch.setattr("astra_data.core.durable.sweep", lambda target: target.parent.rmdir())
-    with hidden_folder(place) as folder:
-        assert folder.parent == place.parent
-
-
 def test_what_a_command_goes_on_with_is_beside_its_target(tmp_path: Path) -> None:
     for name in (
         ".set.staged",
@@ -230,12 +229,161 @@ def test_what_a_kill_left_beside_a_name_with_brackets_is_removed(tmp_path: Path)
     assert names(tmp_path) == ["walks[1].json"]
 
 
-def test_ctrl_c_removes_the_folders_that_were_made(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), hidden_folder(tmp_path / "home/walks/data-1.0.0"):
-        raise KeyboardInterrupt
-    assert names(tmp_path) == []
+@pytest.mark.parametrize(
+    ("code", "why", "advice"),
+    [
+        (errno.ENOSPC, "the disk is full", "free space"),
+        (errno.EFBIG, "a file would be larger than is allowed", "ulimit -f"),
+    ],
+)
+def test_what_the_disk_refuses_is_one_line(code: int, why: str, advice: str) -> None:
+    with pytest.raises(DiskError) as caught, writing(Path("a/set")):
+        raise OSError(code, os.strerror(code))
+    message = str(caught.value)
+    assert message.startswith(f"a/set cannot be written: {why}. What was finished before is safe: ")
+    assert advice in message
+    assert message.endswith(", then run the same command again.")
+    assert "\n" not in message
 
 
-def test_pipes_among_files_are_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    sync_tree(tmp_path)
+def test_the_fault_that_hdf5_hides_in_its_text_is_found() -> None:
+    text = "Can't decrement id ref count (file write failed: time = Mon\n, filename = 'x', errno = 28, error"
+    with (
+        pytest.raises(DiskError, match=r"out\.hdf5 cannot be written: the disk is full"),
+        writing(Path("out.hdf5")),
+    ):
+        raise RuntimeError(text)
+    assert "a file cannot be read or written: the disk is full" in str(disk_error(RuntimeError(text)))
+
+
+@pytest.mark.parametrize(
+    ("name", "is_ours"),
+    [
+        ("a/set", True),
+        ("a", True),
+        ("a/set/meta/info.json", True),
+        ("a/.set.tmp-12/data", True),
+        ("a/.set.staged/000000.arrow", True),
+        ("a/setting", False),
+        ("b/source.parquet", False),
+    ],
+)
+def test_only_faults_of_what_is_written_are_blamed_on_it(name: str, is_ours: bool) -> None:
+    error = PermissionError(errno.EACCES, "no", name)
+    expected = pytest.raises(DiskError, match="set cannot be written: permission is denied")
+    with expected if is_ours else pytest.raises(PermissionError), writing(Path("a/set")):
+        raise error
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("a bug"),
+        OSError("without a number"),
+        KeyError("errno = x"),
+        BadInputError("log.h5 cannot be read (errno = 5)"),
+    ],
+)
+def test_other_errors_pass(error: Exception) -> None:
+    with pytest.raises(type(error)) as caught, writing(Path("a/set")):
+        raise error
+    assert caught.value is error
+    assert disk_error(error) is None
+
+
+def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
+    with held(tmp_path) as first, held(tmp_path) as second, held(tmp_path / "..") as other:
+        assert (first, second, other) == (True, False, True)
+    with held(tmp_path) as again:
+        assert again
+
+
+def test_a_run_is_alone_in_its_folder_or_told_what_to_do(tmp_path: Path) -> None:
+    with (
+        alone_in(tmp_path),
+        pytest.raises(BadInputError, match=f"^{tmp_path} is in use by another run: wait"),
+        alone_in(tmp_path),
+    ):
+        pytest.fail("two are in the folder")
+    with alone_in(tmp_path):
+        pass
+
+
+def _file(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("")
+    return path
+
+
+def test_linked_folders_are_entered_and_linked_files_are_files(tmp_path: Path) -> None:
+    """Both keep the path by which they were found."""
+    _file(tmp_path / "elsewhere/day/log")
+    single = _file(tmp_path / "single")
+    here = tmp_path / "here"
+    here.mkdir()
+    (here / "linked").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    (here / "file").symlink_to(single)
+    assert files_below(here) == [here / "file", here / "linked/day/log"]
+
+
+def test_a_folder_with_two_names_is_entered_once(tmp_path: Path) -> None:
+    """Its own path counts before a link, whichever is first in the alphabet; of two links the first does."""
+    own = _file(tmp_path / "here/own/log")
+    (tmp_path / "here/again").symlink_to(own.parent, target_is_directory=True)
+    assert files_below(tmp_path / "here") == [own]
+    _file(tmp_path / "elsewhere/log")
+    for name in ("y", "x"):
+        (tmp_path / "here" / name).symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    assert files_below(tmp_path / "here") == [own, tmp_path / "here/x/log"]
+
+
+def test_a_link_back_up_has_an_end(tmp_path: Path) -> None:
+    """Neither to the folder itself nor to one around it."""
+    log = _file(tmp_path / "here/day/log")
+    _file(tmp_path / "beside")
+    (tmp_path / "here/day/self").symlink_to(tmp_path / "here", target_is_directory=True)
+    (tmp_path / "here/day/up").symlink_to(tmp_path, target_is_directory=True)
+    assert files_below(tmp_path / "here") == [log]
+
+
+def test_an_error_inside_is_not_swallowed_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_folder(tmp_path / "set"):
+        raise FileNotFoundError
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("writing", [atomic_folder, atomic_file])
+def test_nothing_is_overwritten(
+    tmp_path: Path, writing: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    target = tmp_path / "set"
+
+    def write(path: Path, text: str) -> None:
+        (path / "file" if path.is_dir() else path).write_text(text)
+
+    with writing(target) as path:
+        write(path, "first")
+        assert path.relative_to(tmp_path).parts[0].startswith(".set.tmp-")
+        assert not target.exists()
+    with pytest.raises(BadInputError, match="exists already"), writing(target):
+        raise AssertionError("refused before anything is written")
+    other = tmp_path / "other"
+    with pytest.raises(BadInputError, match="exists already"), writing(other) as path:
+        write(path, "second")
+        other.mkdir()
+        (other / "file").write_text("third")
+    assert (other / "file").read_text() == "third"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "set"]
+
+
+def test_a_folder_that_another_process_made_meanwhile_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(_folder: Path, target: Path) -> None:
+        (target / "theirs").mkdir(parents=True)
+        raise OSError(errno.ENOTEMPTY, "Directory not empty")
+
+    monkeypatch.setattr(os, "replace", late)
+    with pytest.raises(BadInputError, match="set exists already"), atomic_folder(tmp_path / "set"):
+        pass
+    assert [path.name for path in tmp_path.rglob("*")] == ["set", "theirs"]

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.core.optional import EXTRAS, missing_extra, optional
+from astra_data.core.optional import EXTRAS, optional
 
 DISTRIBUTIONS = {
     "PIL": "pillow",
@@ -26,16 +26,6 @@ def test_a_missing_package_is_one_error_that_says_how_to_install_it(monkeypatch:
     with pytest.raises(BadInputError, match=f"not installed: pip install {packages}$"):
         optional("nosuch.inner")
     assert optional("json").loads("1") == 1
-
-
-def test_a_module_of_an_extra_is_explained_and_others_are_not() -> None:
-    reported = missing_extra(ModuleNotFoundError("No module named 'torch'", name="torch.nn"))
-    assert reported is not None
-    assert "uv sync --extra sim" in str(reported)
-    assert (
-        missing_extra(ModuleNotFoundError("No module named 'astra_data.nosuch'", name="astra_data.nosuch"))
-        is None
-    )
 
 
 def test_every_package_is_in_the_extra_that_is_named() -> None:

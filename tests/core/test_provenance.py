@@ -1,5 +1,6 @@
-import shutil
+import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -47,17 +48,6 @@ def test_only_changed_code_makes_it_dirty(checkout: Path, changed: str, ending: 
     assert git_commit() == git(checkout, "rev-parse", "HEAD") + ending
 
 
-def test_without_a_checkout_there_is_no_commit(checkout: Path) -> None:
-    shutil.rmtree(checkout / ".git")
-    assert git_commit() is None
-
-
-def test_a_hook_of_another_repository_is_not_asked(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = git(checkout, "rev-parse", "HEAD")
-    monkeypatch.setenv("GIT_DIR", str(checkout / "another/.git"))
-    assert git_commit() == first
-
-
 def test_a_gpu_is_named_where_the_networks_are_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU {device}")
     assert origin("cuda:1")["machine"]["gpu"] == "GPU cuda:1"
@@ -73,3 +63,11 @@ def test_the_memory_is_what_a_container_has_of_it(tmp_path: Path, monkeypatch: p
         limit.write_text(text)
         assert provenance.memory_bytes() == expected
         assert provenance.machine()["memory_gib"] == round(expected / 2**30, 1)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system has no affinity")
+def test_only_the_cores_that_the_process_may_use_count() -> None:
+    code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+    code += "from astra_data.core.provenance import cores; print(cores())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"

@@ -5,7 +5,17 @@ import pytest
 from fake_dataset import COLUMNS, fake_columns
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import ACTION, REWARD, STATE, Array, Column, Episode
+from astra_data.dataset.columns import (
+    ACTION,
+    REWARD,
+    STATE,
+    Array,
+    Column,
+    Episode,
+    in_blocks,
+    new_uid,
+    renamed_metadata,
+)
 
 
 def test_a_column_survives_the_way_through_features() -> None:
@@ -27,16 +37,6 @@ def test_a_column_that_contradicts_itself_is_refused_with_every_fault() -> None:
     message = str(caught.value)
     for part in ("'/'", "float16", "1 names for 2", "1 words in astra's unit", "unknown role pos", "has 'x'"):
         assert part in message
-
-
-def test_an_episode_shows_its_shapes() -> None:
-    episode = Episode(
-        3, {STATE: np.zeros((4, 2), np.float32), REWARD: np.zeros(4, np.float32)}, {"return": 1.0}
-    )
-    assert len(episode) == 4
-    assert repr(episode) == (
-        "Episode(uid=3, observation.state (4, 2) float32, next.reward (4,) float32, metadata={'return': 1.0})"
-    )
 
 
 def test_an_episode_makes_its_columns_contiguous_and_its_metadata_plain() -> None:
@@ -116,23 +116,34 @@ def test_a_damaged_entry_of_features_is_bad_input(change: dict[str, object]) -> 
         Column.from_feature("x", {"dtype": "float32", "shape": [1], "names": None} | change)
 
 
-def test_masked_values_are_refused_and_a_mask_without_any_is_not() -> None:
-    values = np.ma.array(np.arange(6, dtype=np.float32).reshape(3, 2))  # type: ignore[no-untyped-call]
-    assert np.array_equal(Episode(0, {"action": values}).columns["action"], values.data)
-    values[1, 0] = np.ma.masked
-    with pytest.raises(BadInputError, match="action: masked values, expected a value for every step"):
-        Episode(0, {"action": values})
+def _episodes(*lengths: int) -> list[Episode]:
+    return [Episode(uid, {"action": np.zeros(length, np.float32)}) for uid, length in enumerate(lengths)]
 
 
-@pytest.mark.parametrize(
-    ("column", "told"),
-    [
-        ({"name": "x" * 201}, "the name must have 1 to 200 bytes"),
-        ({"name": "\u4e16" * 67}, "the name must have 1 to 200 bytes"),
-        ({"name": "x", "size": 2**30}, "size 1073741824, expected 1 to 1048576"),
-    ],
-)
-def test_a_column_too_large_for_files_or_memories_is_refused(column: dict[str, Any], told: str) -> None:
-    with pytest.raises(BadInputError, match=told):
-        Column(**column)
-    Column("x" * 200, size=2**20)
+def test_a_block_ends_with_the_episode_that_fills_it() -> None:
+    """None is left out or split, and the last is there though it isn't full."""
+    blocks = in_blocks(_episodes(3, 2, 9, 1, 4, 1), rows=5)
+    assert [[episode.uid for episode in block] for block in blocks] == [[0, 1], [2], [3, 4], [5]]
+
+
+def test_a_uid_that_is_taken_is_replaced_by_one_that_is_free_and_fits_a_column() -> None:
+    """It is 64 bits with a sign, and depends on where the episode comes from."""
+    new = new_uid(7, b"origin", {7})
+    assert new != 7
+    assert 0 <= new < 2**63
+    assert new == new_uid(7, b"origin", {7})
+    assert new != new_uid(7, b"another", {7})
+    assert new_uid(7, b"origin", {7, new}) not in {7, new}
+
+
+def test_metadata_name_the_episodes_by_their_new_uids() -> None:
+    """What a copy was made from is renamed with it; the uid that an episode had is kept beside."""
+    names = {1: 11, 2: 2}
+    assert renamed_metadata(1, {"angle": 0.5, "source_episode": 1}, names) == {
+        "angle": 0.5,
+        "source_episode": 11,
+        "merged_uid": 1,
+    }
+    assert renamed_metadata(2, {"source_episode": 1}, names) == {"source_episode": 11}
+    assert renamed_metadata(2, {"source_episode": 5}, names) == {"source_episode": 5}
+    assert renamed_metadata(2, {}, names) == {}

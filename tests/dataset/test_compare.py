@@ -1,10 +1,25 @@
+import json
 from pathlib import Path
 
+import numpy as np
+import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, fake_columns, fake_episode, write_fake, writer
 
-from astra_data.dataset.columns import STATE, Column, Episode
-from astra_data.dataset.compare import Differences, differences
-from astra_data.dataset.reader import Dataset
+from astra_data.core.errors import CorruptDatasetError
+from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset.columns import ACTION, STATE, Column, Episode
+from astra_data.dataset.compare import (
+    Differences,
+    column_faults,
+    differences,
+    lineage,
+    names_apart,
+    recordings_of,
+    tree_lines,
+)
+from astra_data.dataset.edit import delete, merge, subset
+from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.integrity import sealed
 
 
 def test_equal_datasets_do_not_differ(tmp_path: Path) -> None:
@@ -52,3 +67,110 @@ def test_long_lists_of_the_provenance_are_counted(tmp_path: Path) -> None:
     ):
         other = made(str(len(recordings)), recordings)
         assert differences(long, other).description == [f"config.recordings: {told}"]
+
+
+pytestmark = pytest.mark.usefixtures("home")
+
+
+def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
+    first = write_fake(tmp_path / "home/fake/data-1.0.0")
+    left = Dataset.open(delete(first, [13], out=tmp_path / "left"))
+    right = Dataset.open(subset(left, episodes=2, seed=4, out=tmp_path / "right"))
+    both = Dataset.open(merge([left, right], new_uids=True, out=tmp_path / "both"))
+    prints = [dataset.content_hash[:8] for dataset in (both, left, first, right)]
+    assert list(tree_lines(lineage(both))) == [
+        f"fake@data-1.2.0  {prints[0]}  merge: "
+        "datasets ['fake@data-1.1.0', 'fake@data-1.2.0'], new_uids True",
+        f"├── fake@data-1.1.0  {prints[1]}  delete: episodes [13]",
+        f"│   └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
+        f"└── fake@data-1.2.0  {prints[3]}  subset: episodes 2, seed 4",
+        f"    └── fake@data-1.1.0  {prints[1]}  delete: episodes [13]  (its parents: see above)",
+    ]
+
+
+@pytest.mark.parametrize("place", ["pair/seed_0", "subset/percent_050/seed_0"])
+def test_ancestors_are_found_in_the_run(tmp_path: Path, place: str) -> None:
+    """In the folders of its other stages, wherever there is a run."""
+    first = write_fake(tmp_path / "run/label/seed_0")
+    made = Dataset.open(delete(first, [13], out=tmp_path / "run" / place))
+    found = f"└── fake@data-1.0.0  {first.content_hash[:8]}  "
+    assert list(tree_lines(lineage(made)))[1:] == [f"{found}(not found here)"]
+    (tmp_path / "run/recipe.json").write_text("{}")
+    assert list(tree_lines(lineage(made)))[1:] == [f"{found}collect: episodes 5, noise_m 0.1"]
+
+
+def test_an_ancestor_is_known_by_its_hash(tmp_path: Path) -> None:
+    first = write_fake(tmp_path / "elsewhere/first")
+    made = Dataset.open(delete(first, [13, 4], out=tmp_path / "made"))
+    delete(made, [0], out=tmp_path / "home/fake/data-1.0.0")
+    [line] = list(tree_lines(lineage(made)))[1:]
+    assert line == f"└── fake@data-1.0.0  {first.content_hash[:8]}  (not found here)"
+
+
+def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) -> None:
+    sources = {3: None, 8: 3, 5: 3, 9: 7, 7: None}
+    columns = fake_episode(0, 3).columns
+    with writer(tmp_path / "set") as open_writer:
+        for uid, source in sources.items():
+            open_writer.add(Episode(uid, columns, {} if source is None else {"source_episode": source}))
+    assert recordings_of(Dataset.open(tmp_path / "set")).tolist() == [0, 0, 0, 1, 1]
+    assert recordings_of(write_fake(tmp_path / "plain")).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path) -> None:
+    first = write_fake(tmp_path / "home/fake/data-1.0.0")
+    made = Dataset.open(delete(first, [13], out=tmp_path / "made"))
+    changed = sealed(first.root, first.description | {"parents": [made.identity]})
+    (first.root / DATASET_PATH).write_text(json.dumps(changed))
+    with pytest.raises(CorruptDatasetError, match=r"fake@data-1\.1\.0 is among its own ancestors"):
+        lineage(made)
+
+
+def recorded(folder: Path, names: tuple[str, ...] | None, units: list[str] | None = None) -> Dataset:
+    astra = None if units is None else {"unit": units}
+    columns = [Column(STATE, size=2, names=names, astra=astra), Column(ACTION, names=("throttle",))]
+    description = {"name": "logs", "stage": "import"}
+    with DatasetWriter(folder, columns, fps=10, task="drive", description=description) as writer:
+        writer.add(Episode(0, {STATE: np.zeros((3, 2), np.float32), ACTION: np.zeros(3, np.float32)}))
+    return Dataset.open(folder)
+
+
+@pytest.mark.parametrize(
+    ("expected", "faults"),
+    [
+        (Column(STATE, size=2, names=("x", "v"), astra={"unit": ["m", "m/s"]}), []),
+        (Column(STATE, size=2, names=("a", "b")), []),
+        (Column(STATE, size=3), ["observation.state has 2 values, expected those of cart: 3"]),
+        (Column("force"), ["has no column force"]),
+        (
+            Column(STATE, size=2, names=("v", "x")),
+            ["has the values x, v in observation.state, expected the order v, x"],
+        ),
+        (
+            Column(STATE, size=2, names=("x", "v"), astra={"unit": ["mm", "m/s"]}),
+            ["has x of observation.state in m, expected mm: scale it on import"],
+        ),
+    ],
+)
+def test_what_contradicts_a_column_is_a_fault(tmp_path: Path, expected: Column, faults: list[str]) -> None:
+    logs = recorded(tmp_path / "logs", ("x", "v"), ["m", "m/s"])
+    assert column_faults(logs, expected, "cart") == faults
+
+
+@pytest.mark.parametrize(
+    ("names", "expected", "told"),
+    [
+        (("heading", "north"), ("x", "v"), "heading, north"),
+        (("heading", "x"), ("x", "v"), ""),
+        (("heading", "north"), None, ""),
+        (None, ("x", "v"), "values without names"),
+        (None, None, ""),
+    ],
+)
+def test_names_of_which_none_agrees_are_told(
+    tmp_path: Path, names: tuple[str, ...] | None, expected: tuple[str, ...] | None, told: str
+) -> None:
+    logs = recorded(tmp_path / "logs", names)
+    columns = [Column(STATE, size=2, names=expected), Column(ACTION, names=("throttle",))]
+    text = f"logs@data-1.0.0: takes {told} of observation.state as x, v of cart: check that they are, "
+    assert names_apart(logs, columns, "cart") == (f"{text}in this order" if told else "")

@@ -14,12 +14,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, EPISODES
 from fake_dataset import write_fake
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from nested import places
 
@@ -132,9 +131,7 @@ def test_hostile_values_are_told(kind: str) -> None:
 
 
 edits = st.lists(
-    st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.booleans()),
-    min_size=1,
-    max_size=4,
+    st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.booleans()), min_size=1, max_size=4
 )
 """Where, as a share of the file, bytes are overwritten or, if true, everything from there on is cut off."""
 
@@ -175,48 +172,4 @@ def test_json_with_a_hostile_value(name: str, share: float, value: object) -> No
             inner = inner[key]
         inner[last] = value
         (root / name).write_text(json.dumps(content))
-        read(root)
-
-
-TYPES = (
-    *(pa.int8(), pa.int64(), pa.uint64(), pa.float16(), pa.float64(), pa.bool_(), pa.string(), pa.null()),
-    *(pa.list_(pa.float32()), pa.list_(pa.int64(), 3), pa.struct([("x", pa.int64())]), pa.timestamp("ns")),
-)
-
-
-@given(
-    name=st.sampled_from(PARQUET),
-    share=st.floats(0, 1, exclude_max=True),
-    change=st.sampled_from(["retyped", "doubled", "dropped", "renamed", "nulls", "rows", "order"]),
-    kind=st.sampled_from(TYPES),
-    seed=st.integers(0, 60),
-)
-@example(EPISODES, 0.0, "retyped", pa.bool_(), 0)
-@example(PARQUET[3], 0.0, "retyped", pa.int8(), 0)
-@fuzzed
-def test_tables_of_other_columns(name: str, share: float, change: str, kind: pa.DataType, seed: int) -> None:
-    with copied() as root:
-        table = pq.read_table(root / name)
-        at = int(share * table.num_columns)
-        field, column = table.schema.field(at), table.column(at)
-        if change == "retyped":
-            try:
-                values = column.cast(kind)
-            except pa.ArrowException:
-                values = pa.nulls(len(column), kind)
-            table = table.set_column(at, pa.field(field.name, kind), values)
-        elif change == "doubled":
-            table = table.append_column(field, column)
-        elif change == "dropped":
-            table = table.remove_column(at)
-        elif change == "renamed":
-            names = ["x" * 300 if index == at else known for index, known in enumerate(table.column_names)]
-            table = table.rename_columns(names)
-        elif change == "nulls":
-            table = table.set_column(at, field, pa.nulls(len(column), field.type))
-        elif change == "rows":
-            table = table.slice(seed % (len(table) + 1))
-        else:
-            table = table.take([(row + seed) % len(table) for row in range(len(table))])
-        pq.write_table(table, root / name)
         read(root)

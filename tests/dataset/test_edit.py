@@ -1,7 +1,5 @@
 import itertools
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -80,30 +78,8 @@ def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int
         assert uids(direct) == uids(stepwise) < uids(made.root)
 
 
-def test_with_another_seed_the_shares_are_those_of_the_source(forty: Dataset, tmp_path: Path) -> None:
-    third = Dataset.open(filter_episodes(forty, max_return=6.0, out=tmp_path / "third"))  # uids 0 to 12
-    part = Dataset.open(subset(third, episodes=8, stratify="success", out=tmp_path / "part"))
-    assert part.description["config"]["strata"] == {"False": 7, "True": 6}
-    again = Dataset.open(subset(part, episodes=2, stratify="success", seed=9, out=tmp_path / "again"))
-    assert again.description["config"]["strata"] == {"False": 4, "True": 4}
-
-
 def test_shares_are_rounded_half_up() -> None:
     assert [share(percent, 5) for percent in (9, 10, 29, 30, 150)] == [0, 1, 1, 2, 8]
-
-
-def test_every_stratified_subset_is_as_close_to_the_shares_as_it_can_be(tmp_path: Path) -> None:
-    with writer(tmp_path / "set") as open_writer:
-        for uid in (*range(0, 16, 2), *range(1, 7, 2)):  # 8 failures, 3 successes
-            open_writer.add(fake_episode(uid, 1))
-    whole = Dataset.open(tmp_path / "set")
-    order = [int(whole.uids[row]) for row in whole.order]
-    for count in range(1, 12):
-        taken = uids(subset(whole, episodes=count, stratify="success", out=tmp_path / f"{count}"))
-        successes = [uid for uid in order if uid % 2]
-        chosen = [uid for uid in successes if uid in taken]
-        assert abs(len(chosen) - count * 3 / 11) <= 0.5
-        assert chosen == successes[: len(chosen)]
 
 
 def test_percent_is_of_a_given_number_and_nothing_is_repeated(forty: Dataset, tmp_path: Path) -> None:
@@ -229,11 +205,7 @@ def test_datasets_that_differ_are_told_apart(tmp_path: Path) -> None:
         open_writer.add(episode.__class__(1, values))
     with pytest.raises(BadInputError) as caught:
         merge([a, Dataset.open(tmp_path / "b")], out=tmp_path / "all")
-    for part in (
-        "column mode: only in",
-        "column other: only in",
-        "fps: 20, then 10",
-    ):
+    for part in ("column mode: only in", "column other: only in", "fps: 20, then 10"):
         assert part in str(caught.value)
     assert "an import of its files" not in str(caught.value)
     with pytest.raises(BadInputError, match="two datasets or more"):
@@ -256,17 +228,3 @@ def test_datasets_of_different_tasks_are_merged(tmp_path: Path) -> None:
     part = Dataset.open(delete(more, [1], out=tmp_path / "part"))
     both = Dataset.open(merge([parts[1], part], out=tmp_path / "both"))
     assert (both.task, both.metadata["task"]) == ("walk / run / stand", ["walk", "run", "run", "stand"])
-
-
-@pytest.mark.parametrize("differs", ["robot_type", "meaning"])
-def test_what_differs_by_its_origin_alone_is_told_a_way_out(tmp_path: Path, differs: str) -> None:
-    first, *others = COLUMNS
-    changes: dict[str, dict[str, Any]] = {
-        "robot_type": {"description": {**DESCRIPTION, "environment": {"robot_type": "arm"}}},
-        "meaning": {"columns": [replace(first, meaning="another"), *others]},
-    }
-    parts = [write_fake(tmp_path / "a"), write_fake(tmp_path / "b", **changes[differs])]
-    with pytest.raises(
-        BadInputError, match=f"{differs}: .*\n.*by an import of its files: `astra-data import"
-    ):
-        merge(parts, new_uids=True, out=tmp_path / "all")

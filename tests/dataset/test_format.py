@@ -1,16 +1,18 @@
-"""What we write, seen by lerobot: its loader opens it, and the constants that we repeat are its own."""
-
 import json
 from dataclasses import asdict
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from fake_dataset import COLUMNS
+from fake_dataset import COLUMNS, LENGTHS
 
+from astra_data.dataset import Dataset, parquet
 from astra_data.dataset import format as layout
-from astra_data.dataset import parquet
-from astra_data.dataset.reader import Dataset
+from astra_data.dataset.columns import ACTION, REWARD, STATE
+from astra_data.dataset.frames import Frames
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
@@ -73,3 +75,71 @@ def test_the_tasks_table_is_a_pandas_frame_with_the_task_as_index() -> None:
     frame = layout.tasks_table("walk").to_pandas()
     assert (frame.index.name, frame.index.tolist()) == ("task", ["walk"])
     assert frame["task_index"].tolist() == [0]
+
+
+@pytest.fixture(scope="module")
+def reference(lerobot: SimpleNamespace, fake: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same values, written by lerobot itself."""
+    root = tmp_path_factory.mktemp("reference") / "set"
+    columns = [*COLUMNS, layout.EPISODE_UID_COLUMN]
+    features = {column.name: column.feature() | {"shape": (column.size,)} for column in columns}
+    written = lerobot.dataset.LeRobotDataset.create("a/b", 20, features, root=root, use_videos=False)
+    for episode in fake.episodes():
+        for frame in range(len(episode)):
+            values = {name: np.atleast_1d(column[frame]) for name, column in episode.columns.items()}
+            written.add_frame({**values, "episode_uid": np.array([episode.uid]), "task": "run"})
+        written.save_episode()
+    written.finalize()
+    return root
+
+
+def test_files_equal_those_that_lerobot_writes(fake: Dataset, reference: Path) -> None:
+    def strip(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{key: row[key] for key in row if not key.startswith("stats/")} for row in rows]
+
+    assert json.loads((reference / "meta/info.json").read_text()) == fake.info
+    for name in ("data", "meta/episodes"):
+        path = f"{name}/chunk-000/file-000.parquet"
+        ours, theirs = pq.read_table(fake.root / path), pq.read_table(reference / path)
+        assert ours.schema.remove_metadata().equals(theirs.schema.remove_metadata().empty_table().schema)
+        assert strip(ours.to_pylist()) == strip(theirs.to_pylist())
+    theirs, ours = (pq.read_table(root / "meta/tasks.parquet").to_pandas() for root in (reference, fake.root))
+    assert ours.equals(theirs)
+    assert ours.index.name == theirs.index.name == "task"
+
+
+def test_statistics_agree_with_lerobots_where_its_own_are_exact(fake: Dataset, reference: Path) -> None:
+    ours, theirs = (json.loads((root / "meta/stats.json").read_text()) for root in (fake.root, reference))
+    assert set(ours) == set(theirs)
+    for name, stats in theirs.items():
+        assert set(stats) == set(ours[name])
+        for key in ("min", "max", "mean", "count"):
+            np.testing.assert_allclose(ours[name][key], stats[key], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(ours[ACTION]["std"], theirs[ACTION]["std"], rtol=1e-4)
+
+
+def test_lerobots_loader_sees_every_value(lerobot: SimpleNamespace, fake: Dataset) -> None:
+    loaded = lerobot.dataset.LeRobotDataset("a/b", root=fake.root, video_backend="pyav")
+    assert (loaded.num_episodes, loaded.num_frames, loaded.fps) == (len(LENGTHS), sum(LENGTHS), 20)
+    ours = fake.columns(list(fake.features))
+    items = [loaded[index] for index in range(len(loaded))]
+    assert {item["task"] for item in items} == {"run"}
+    for name, values in ours.items():
+        np.testing.assert_array_equal(np.stack([item[name].numpy() for item in items]), values)
+    assert loaded.meta.features[STATE]["astra"]["role"] == ["position", "position", "heading"]
+
+
+@pytest.mark.parametrize("episodes", [None, [1, 2, 4]])
+def test_windows_are_lerobots(lerobot: SimpleNamespace, fake: Dataset, episodes: list[int] | None) -> None:
+    names = (STATE, ACTION, REWARD)
+    deltas = {name: [offset / 20 for offset in (-2, -1, 0, 1, 2, 3)] for name in names}
+    loaded = lerobot.dataset.LeRobotDataset(
+        "a/b", root=fake.root, episodes=episodes, delta_timestamps=deltas, video_backend="pyav"
+    )
+    windows = Frames.load(fake, names, episodes=episodes).windows(6, padding="edge", past=2)
+    assert len(windows) == len(loaded)
+    for index in range(len(loaded)):
+        item, window = loaded[index], windows[index]
+        for name in names:
+            np.testing.assert_array_equal(window[name].numpy(), item[name].numpy())
+            np.testing.assert_array_equal(window["is_pad"].numpy(), item[f"{name}_is_pad"].numpy())

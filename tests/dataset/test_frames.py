@@ -3,14 +3,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from failing_disk import small_files
 from fake_dataset import COLUMNS, LENGTHS, concatenated
 from fake_frames import NAMES, assert_equal, everything
-from gpu import needs_cuda
+from torch.utils.data import DataLoader
 
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, DiskError
+from astra_data.dataset import Dataset
 from astra_data.dataset.columns import INDEX, STATE
-from astra_data.dataset.frames import Frames
-from astra_data.dataset.reader import Dataset
+from astra_data.dataset.frames import Frames, Order, Padding
 
 
 def test_columns_are_the_datasets(fake: Dataset) -> None:
@@ -55,22 +56,6 @@ def test_columns_are_mapped_where_their_share_of_the_memory_is_too_small(
     assert list(tmp_path.rglob("values.npy"))
 
 
-@needs_cuda
-@pytest.mark.parametrize("fits", [True, False])
-def test_batches_come_to_the_device(
-    fake: Dataset, frames: Frames, monkeypatch: pytest.MonkeyPatch, fits: bool
-) -> None:
-    if not fits:
-        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (0, 0))
-    moved = Frames.load(fake, NAMES, device="cuda")
-    assert {values.is_cuda for values in moved.columns.values()} == {fits}
-    for padding in ("valid", "edge"):
-        batch = everything(moved.windows(6, padding=padding))
-        assert all(values.is_cuda for values in batch.values())
-        expected = everything(frames.windows(6, padding=padding))
-        assert_equal({name: values.cpu() for name, values in batch.items()}, expected)
-
-
 def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
     with pytest.raises(BadInputError, match="length 0, expected at least 1; stride -1, expected at least 1"):
         frames.windows(0, stride=-1)
@@ -92,3 +77,150 @@ def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
         Frames.load(fake, [STATE], episodes=[])
     with pytest.raises(BadInputError, match=r"has no column speed; it has observation\.state"):
         Frames.load(fake, ["speed"])
+
+
+@pytest.mark.parametrize(("workers", "padding"), [(0, "valid"), (0, "edge"), (2, "edge")])
+def test_a_data_loader_draws_the_same_batches(frames: Frames, workers: int, padding: Padding) -> None:
+    windows = frames.windows(6, padding=padding)
+    expected = list(windows.batches(8, seed=3))
+    order = windows.batches(8, seed=3).order
+    loader = DataLoader(windows, batch_sampler=order, collate_fn=windows.collate, num_workers=workers)  # type: ignore[arg-type]
+    found = list(loader)
+    assert len(found) == len(expected) == len(loader)
+    for ours, theirs in zip(expected, found, strict=True):
+        assert_equal(theirs, ours)
+
+
+def test_an_interrupted_epoch_goes_on_where_it_was_left(frames: Frames) -> None:
+    transitions = frames.transitions()
+    uninterrupted = transitions.batches(10, seed=5)
+    expected = [batch for _ in range(3) for batch in uninterrupted]
+    first = transitions.batches(10, seed=5)
+    found = list(first)
+    for batch in first:
+        found.append(batch)
+        state = first.state_dict()
+        if len(found) == 8:
+            break
+    second = transitions.batches(10, seed=5)
+    second.load_state_dict(state)
+    found += [*second, *second]
+    assert len(found) == len(expected) == 18
+    for ours, theirs in zip(found, expected, strict=True):
+        assert_equal(ours, theirs)
+
+
+def epoch(order: Order) -> list[int]:
+    return torch.cat(list(order)).tolist()
+
+
+def test_an_epoch_holds_every_sample_once_in_an_order_of_its_own() -> None:
+    order = Order(1000, 32, seed=1)
+    epochs = [epoch(order) for _ in range(3)]
+    assert all(sorted(indices) == list(range(1000)) for indices in epochs)
+    assert epochs[0] != epochs[1] != epochs[2] != epochs[0]
+    same, other = Order(1000, 7, seed=1), Order(1000, 32, seed=2)
+    assert epoch(same) == epochs[0]
+    assert epoch(other) != epochs[0]
+    assert abs(np.corrcoef(epochs[0], epochs[1])[0, 1]) < 0.2
+
+
+def test_without_shuffling_the_order_is_the_samples() -> None:
+    order = Order(10, 4, shuffle=False)
+    assert [batch.tolist() for batch in order] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    dropped = Order(10, 4, shuffle=False, drop_last=True)
+    assert [batch.tolist() for batch in dropped] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert (len(order), len(dropped)) == (3, 2)
+
+
+@pytest.mark.parametrize("seen", [1, 4, 6])
+def test_a_state_names_the_next_batch(seen: int) -> None:
+    reference = Order(20, 5, seed=4)
+    expected = [batch.tolist() for _ in range(3) for batch in reference]
+    order = Order(20, 5, seed=4)
+    found: list[list[int]] = []
+    while len(found) < seen:
+        for batch in order:
+            found.append(batch.tolist())
+            if len(found) == seen:
+                break
+    resumed = Order(20, 5, seed=4)
+    resumed.load_state_dict(order.state_dict())
+    while len(found) < len(expected):
+        found += [batch.tolist() for batch in resumed]
+    assert found == expected
+
+
+def test_a_state_of_another_order_is_refused() -> None:
+    state = Order(20, 5, seed=4).state_dict()
+    for other in (
+        state | {"count": 21},
+        state | {"seed": 0},
+        state | {"batch": 4},
+        state | {"epoch": -1},
+        {},
+    ):
+        with pytest.raises(BadInputError, match="the state is of another order of samples: expected"):
+            Order(20, 5, seed=4).load_state_dict(other)
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_valid_windows_are_all_that_lie_inside_an_episode(fake: Dataset, frames: Frames, stride: int) -> None:
+    expected = [
+        range(start + first, start + first + 6)
+        for start, length in zip(fake.starts.tolist(), LENGTHS, strict=True)
+        for first in range(0, length - 5, stride)
+    ]
+    windows = frames.windows(6, stride=stride)
+    batch = everything(windows)
+    assert batch[INDEX].tolist() == [list(rows) for rows in expected]
+    assert not batch["is_pad"].any()
+    for name in NAMES:
+        np.testing.assert_array_equal(batch[name].numpy(), fake.columns([name])[name][batch[INDEX].numpy()])
+
+
+@pytest.mark.parametrize(("length", "stride", "past"), [(6, 1, 0), (6, 4, 5), (40, 1, 20), (1, 2, 0)])
+def test_edge_windows_repeat_the_first_and_last_step(
+    fake: Dataset, frames: Frames, length: int, stride: int, past: int
+) -> None:
+    rows, is_pad = [], []
+    for start, steps in zip(fake.starts, LENGTHS, strict=True):
+        for step in range(0, steps, stride):
+            wanted = np.arange(step - past, step - past + length)
+            rows.append(start + np.clip(wanted, 0, steps - 1))
+            is_pad.append((wanted < 0) | (wanted >= steps))
+    batch = everything(frames.windows(length, stride=stride, padding="edge", past=past))
+    np.testing.assert_array_equal(batch[INDEX].numpy(), rows)
+    np.testing.assert_array_equal(batch["is_pad"].numpy(), is_pad)
+    np.testing.assert_array_equal(batch[STATE].numpy(), fake.columns([STATE])[STATE][np.array(rows)])
+
+
+def test_mapped_columns_equal_loaded_ones(
+    fake: Dataset, frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_CACHE", str(tmp_path))
+    mapped = Frames.load(fake, NAMES, memory_share=0.0)
+    assert_equal(everything(mapped.windows(5)), everything(frames.windows(5)))
+    files = sorted(path.relative_to(tmp_path).parts for path in tmp_path.rglob("*") if path.is_file())
+    assert files == [(fake.content_hash, name, "values.npy") for name in sorted(NAMES)]
+    # The second time the raw files serve, and what is written to the tensors stays out of them.
+    monkeypatch.setattr(Dataset, "blocks", None)
+    mapped.columns[STATE].zero_()
+    again = Frames.load(fake, NAMES, memory_share=0.0)
+    assert torch.equal(again.columns[STATE], frames.columns[STATE])
+
+
+def test_another_value_in_a_raw_file_is_told(fake: Dataset, tmp_path: Path) -> None:
+    Frames.load(fake, NAMES, memory_share=0.0, cache=tmp_path)
+    path = tmp_path / fake.content_hash / STATE / "values.npy"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(CorruptDatasetError, match=f"{STATE} was altered .other values.; delete"):
+        Frames.load(fake, NAMES, memory_share=0.0, cache=tmp_path)
+
+
+def test_a_full_disk_ends_with_an_error_and_no_raw_file(fake: Dataset, tmp_path: Path) -> None:
+    with small_files(200), pytest.raises(DiskError, match=f"{STATE} cannot be written: a file would be"):
+        Frames.load(fake, [STATE], memory_share=0.0, cache=tmp_path)
+    assert not list(tmp_path.rglob("*.npy"))

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import lerobot_recordings
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from damaged import DATA, alter_rows
 from fake_dataset import fake_columns, write_fake, writer
@@ -19,6 +18,7 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import Dataset
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -27,20 +27,14 @@ from astra_data.dataset.columns import (
     STATE,
     SUCCESS,
     TERMINATED,
-    TIMESTAMP,
     TRUNCATED,
     Array,
     Episode,
 )
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
-from astra_data.dataset.edit import filter_episodes, merge, subset
-from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.lerobot_rows import RECORDED_TASK
-from astra_data.dataset.reader import Dataset
-from astra_data.io.exporters import EXPORTERS, export
 from astra_data.io.hub.push import push
-from astra_data.io.importing import import_dataset
 
 KEPT = (0, 2, 3)
 """Episodes of `arm` with a next state."""
@@ -112,27 +106,6 @@ def test_next_states_are_those_of_the_following_rows(arm: Dataset) -> None:
     assert arm.description["environment"] == {"robot_type": "so101"}
 
 
-def test_parts_of_it_are_parts_of_the_whole(arm: Dataset) -> None:
-    names = [TIMESTAMP, NEXT_STATE, DONE, "index", "episode_uid"]
-    whole = arm.columns(names)
-    rows = np.r_[0:5, 13:16]
-    for name, array in arm.columns(names, episodes=[2, 0]).items():
-        np.testing.assert_array_equal(array, whole[name][rows], err_msg=name)
-    assert whole["episode_uid"].tolist() == [0] * 5 + [2] * 8 + [3] * 3
-    assert whole["index"].tolist() == list(range(16))
-
-
-def test_where_it_does_not_fit_others_merge_says_how_it_is_imported(
-    arm: Dataset, recorded: Path, tmp_path: Path
-) -> None:
-    other = Dataset.open(recorded / "a")
-    for sources in ([other, arm], [arm, other]):
-        with pytest.raises(BadInputError, match=r"import FOLDER/data/\*/\*\.parquet --mapping FILE`"):
-            merge(sources, out=tmp_path / "all")
-    with pytest.raises(BadInputError, match=r"fps: 20, then 10$"):
-        merge([other, write_fake(tmp_path / "slow", fps=10)], out=tmp_path / "all")
-
-
 def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.LogCaptureFixture) -> None:
     Dataset.open(recorded / "arm")
     [line] = caplog.messages
@@ -147,90 +120,6 @@ def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.Log
     assert "; force is float32 here, recorded as float64; " in line
 
 
-def test_a_success_that_no_step_takes_over_is_told_with_what_to_do(
-    recorded: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    shutil.copytree(recorded / "arm", tmp_path / "set")
-    alter_rows(tmp_path / "set" / DATA, DONE, dict.fromkeys(range(20), False))
-    arm = Dataset.open(tmp_path / "set")
-    [line] = caplog.messages
-    assert "3 of these last rows are the only ones that succeeded, so next.success is lost" in line
-    assert "is lost unless next.done or next.terminated is set there" in line
-    assert not arm.columns([SUCCESS])[SUCCESS].any()
-
-
-def test_an_episode_that_is_done_before_its_last_row_is_told(
-    recorded: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    shutil.copytree(recorded / "arm", tmp_path / "set")
-    # Of rows 0 to 5, 6, 7 to 15 and 16 to 19, the last ones are done.
-    alter_rows(tmp_path / "set" / DATA, DONE, {9: True, 18: True})
-    arm = Dataset.open(tmp_path / "set")
-    [line] = caplog.messages
-    assert "next.done is set before the last row of 2 episodes (2, 3), which go on there" in line
-    assert arm.lengths.tolist() == [5, 8, 3]
-    caplog.clear()
-    Dataset.open(recorded / "arm")
-    assert "next.done" not in caplog.text
-
-
-def test_lineage_names_what_was_read_by_its_hash(arm: Dataset, tmp_path: Path) -> None:
-    whole = Dataset.open(subset(arm, percent=100, out=tmp_path / "whole"))
-    assert whole.description["parents"] == [arm.identity]
-    # The hash of what was read is that of the same values, written by us.
-    assert whole.content_hash == arm.content_hash
-    assert check(whole.root).faults == []
-    assert arm.verify() == []
-
-
-def test_edits_take_it(arm: Dataset, tmp_path: Path) -> None:
-    assert len(Dataset.open(subset(arm, episodes=2, out=tmp_path / "two"))) == 2
-    won = Dataset.open(filter_episodes(arm, success=True, out=tmp_path / "won"))
-    assert won.uids.tolist() == [0, 3]
-    twice = Dataset.open(merge([arm, arm], new_uids=True, out=tmp_path / "twice"))
-    assert len(twice) == 6
-
-
-def test_inspection_shows_it(arm: Dataset) -> None:
-    inspection = inspect_dataset(arm)
-    assert (inspection.success, inspection.lengths.sum()) == (2, 16)
-    states = np.concatenate([values("arm", number)[STATE][:-1] for number in KEPT])
-    [spread] = [spread for spread in inspection.spreads if spread.column.name == STATE]
-    for found, expected in zip(
-        (spread.low, spread.high, spread.mean), (states.min(0), states.max(0), states.mean(0)), strict=True
-    ):
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
-    assert spread.counts.sum(axis=1).tolist() == [16] * 3
-
-
-@pytest.mark.parametrize("format", sorted(EXPORTERS))
-@pytest.mark.parametrize("case", ["arm", "ant"])
-def test_it_is_exported_and_comes_back(recorded: Path, tmp_path: Path, case: str, format: str) -> None:
-    recording = Dataset.open(recorded / case)
-    out = tmp_path / ("set-v0" if format == "minari" else "set.hdf5")
-    export(recording, out, format=format)
-    import_dataset([out], out=tmp_path / "back")
-    assert Dataset.open(tmp_path / "back").content_hash == recording.content_hash
-
-
-def test_the_commands_take_it(recorded: Path, tmp_path: Path) -> None:
-    (tmp_path / "glider.py").write_text(GLIDER)
-    source, pairs = str(recorded / "arm"), tmp_path / "pairs"
-    commands = [
-        ["inspect", source],
-        ["card", source, "--out", str(tmp_path / "card.md")],
-        ["pair", source, "--simulator", f"{tmp_path / 'glider.py'}:Glider", "--out", str(pairs)],
-        ["validate", str(pairs)],
-    ]
-    for command in commands:
-        result = CliRunner().invoke(app, command, catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-    assert "3 episodes, 16 steps at 10 Hz" in (tmp_path / "card.md").read_text()
-    columns = Dataset.open(pairs).columns([STATE, ACTION, NEXT_STATE, "abstract.simulated_next_state"])
-    expected = columns[STATE][:, :2] + np.float32(0.1) * columns[ACTION]
-    np.testing.assert_allclose(columns["abstract.simulated_next_state"], expected, rtol=1e-6)
-
-
 def test_repaired_it_is_as_it_was_opened(arm: Dataset, recorded: Path, tmp_path: Path) -> None:
     notes = repair(arm.root, out=tmp_path / "whole").notes
     whole = Dataset.open(tmp_path / "whole")
@@ -240,42 +129,6 @@ def test_repaired_it_is_as_it_was_opened(arm: Dataset, recorded: Path, tmp_path:
     [note] = [note for note in notes if note.startswith("next states are those of the following rows")]
     assert "the last row of each episode, 4 of 20 rows; 1 of them in episodes of a single row" in note
     assert check(whole.root).faults == []
-
-
-def test_what_is_whole_of_it_is_paired_and_merged(recorded: Path, tmp_path: Path) -> None:
-    """A frame of its third episode is NaN."""
-    shutil.copytree(recorded / "arm", tmp_path / "broken")
-    alter_rows(tmp_path / "broken" / DATA, ACTION, {10: [float("nan"), 0.0]})
-    repair(tmp_path / "broken", out=tmp_path / "repaired")
-    (tmp_path / "glider.py").write_text(GLIDER)
-    pairs, simulator = tmp_path / "pairs", f"{tmp_path / 'glider.py'}:Glider"
-    command = ["pair", str(tmp_path / "repaired"), "--simulator", simulator, "--out", str(pairs)]
-    result = CliRunner().invoke(app, command, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert Dataset.open(pairs).lengths.tolist() == [5, 3]
-    parts = [Dataset.open(recorded / "arm"), Dataset.open(tmp_path / "repaired")]
-    assert Dataset.open(merge(parts, new_uids=True, out=tmp_path / "all")).lengths.tolist() == [5, 8, 3, 5, 3]
-
-
-def test_it_is_grounded(recorded: Path, tmp_path: Path) -> None:
-    from small_run import GROUND  # noqa: PLC0415 - torch
-
-    from astra_data.pipeline.stages.ground import ground  # noqa: PLC0415
-    from astra_data.pipeline.stages.pair import pair  # noqa: PLC0415
-
-    pairs = pair("antmaze-umaze", dataset=recorded / "ant", out=tmp_path / "pairs")
-    few = GROUND.model_copy(update={"updates": 2})
-    ground("antmaze-umaze", "nas", few, dataset=pairs, out=tmp_path / "nas")
-    assert (tmp_path / "nas/grounding.safetensors").is_file()
-    with pytest.raises(BadInputError, match=r"no next\.reward, which the method predicts: .*such as nas"):
-        ground("antmaze-umaze", "astra", few, dataset=pairs, out=tmp_path / "astra")
-
-
-def test_augmenting_needs_roles_and_says_so(recorded: Path, tmp_path: Path) -> None:
-    from astra_data.pipeline.stages.augment import augment  # noqa: PLC0415 - torch
-
-    with pytest.raises(BadInputError, match=r"no column next\.reward.*it has no roles"):
-        augment("antmaze-umaze", dataset=recorded / "ant", out=tmp_path / "more")
 
 
 def test_what_cannot_be_is_one_line(recorded: Path, tmp_path: Path) -> None:
@@ -306,22 +159,6 @@ def test_damage_is_found_before_anything_is_made_of_it(
     alter_rows(tmp_path / "set" / DATA, column, changes)
     with pytest.raises(CorruptDatasetError, match=fault):
         Dataset.open(tmp_path / "set")
-
-
-def test_rows_that_are_missing_are_found(recorded: Path, tmp_path: Path) -> None:
-    shutil.copytree(recorded / "ant", tmp_path / "set")
-    table = pq.read_table(tmp_path / "set" / DATA)
-    pq.write_table(table.slice(0, 110), tmp_path / "set" / DATA)
-    with pytest.raises(CorruptDatasetError, match="2 episodes of 110 rows, expected 3 of 150"):
-        Dataset.open(tmp_path / "set")
-
-
-def test_files_altered_after_opening_are_told(recorded: Path, tmp_path: Path) -> None:
-    shutil.copytree(recorded / "ant", tmp_path / "set")
-    dataset = Dataset.open(tmp_path / "set")
-    pq.write_table(pq.read_table(tmp_path / "set" / DATA).slice(0, 140), tmp_path / "set" / DATA)
-    with pytest.raises(CorruptDatasetError, match="its files were altered while they were read"):
-        dataset.columns([STATE])
 
 
 def test_a_dataset_of_ours_without_its_metadata_keeps_uids_and_next_states(tmp_path: Path) -> None:
@@ -363,11 +200,3 @@ def test_a_merge_of_lerobot_keeps_every_episode_under_new_uids(recorded: Path, t
     assert saved.description["parents"] == [source.identity for source in sources]
     repair(recorded / "merged", out=tmp_path / "again", like=sources, new_uids=True)
     assert Dataset.open(tmp_path / "again").uids.tolist() == uids
-
-
-def test_metadata_of_a_merge_is_never_that_of_another_dataset(recorded: Path, tmp_path: Path) -> None:
-    like = Dataset.open(recorded / "b")
-    result = repair(recorded / "merged", out=tmp_path / "set", like=like, new_uids=True)
-    saved = Dataset.open(tmp_path / "set")
-    assert saved.metadata["return"] == [None] * 5 + [-1.0, -1.0]
-    assert "5 episodes have no metadata: they are not among the known ones" in result.notes

@@ -1,12 +1,15 @@
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
-from astra_data.dataset.columns import Array, Column
-from astra_data.dataset.lerobot_rows import RECORDED_TASK, Rows, our_columns
+from astra_data.dataset.columns import STATE, Array, Column
+from astra_data.dataset.format import DEFAULT_COLUMNS
+from astra_data.dataset.lerobot_rows import RECORDED_TASK, Rows, declared_columns, name_of
 from astra_data.dataset.plain import PlainColumn, Run
 
 More = Mapping[str, Array] | None
@@ -87,47 +90,6 @@ def test_a_terminated_row_that_is_left_out_hands_its_flags_to_the_step_before() 
     assert values(names.SUCCESS, "bool", more=with_next).tolist() == [False, False, False, True]
 
 
-def test_an_episode_that_ends_at_its_time_limit_too_keeps_both_flags() -> None:
-    last = np.arange(STEPS) == STEPS - 1
-    both: dict[str, Array] = {names.TERMINATED: last, names.TRUNCATED: last}
-    with_next = both | {names.NEXT_STATE: np.ones((STEPS, 2), np.float32)}
-    for name in (names.TERMINATED, names.TRUNCATED, names.DONE):
-        np.testing.assert_array_equal(values(name, "bool", more=with_next), last)
-    # The step before a row that is left out is terminated, and no longer cut off by the end of the rows.
-    assert values(names.TERMINATED, "bool", more=both).tolist() == [False, False, True]
-    assert values(names.TRUNCATED, "bool", more=both).tolist() == [False, False, False]
-    earlier: dict[str, Array] = {names.TERMINATED: last, names.TRUNCATED: np.arange(STEPS) == STEPS - 2}
-    assert values(names.TERMINATED, "bool", more=earlier).tolist() == [False, False, True]
-    assert values(names.TRUNCATED, "bool", more=earlier).tolist() == [False, False, True]
-
-
-def test_only_the_columns_that_are_needed_are_read() -> None:
-    rows, _ = rows_and_run({names.FRAME_INDEX: np.arange(STEPS), "force": np.ones(STEPS)})
-
-    def read(name: str) -> set[str]:
-        return {column.name for column in rows.stored_for([name])} - {names.EPISODE_INDEX, names.FRAME_INDEX}
-
-    assert read(names.NEXT_STATE) == read(names.STATE) == {names.STATE}
-    assert read(RECORDED_TASK) == {names.TASK_INDEX}
-    assert read(names.TIMESTAMP) == set()
-    assert read("force") == {"force"}
-    rows, _ = rows_and_run({names.TERMINATED: np.zeros(STEPS), names.SUCCESS: np.zeros(STEPS)})
-    assert read(names.SUCCESS) == {names.SUCCESS, names.TERMINATED}
-    rows, _ = rows_and_run({names.DONE: np.zeros(STEPS), names.SUCCESS: np.zeros(STEPS)})
-    assert read(names.SUCCESS) == {names.SUCCESS, names.DONE}
-    rows, _ = rows_and_run({names.TERMINATED: np.zeros(STEPS), names.TRUNCATED: np.zeros(STEPS)})
-    assert read(names.TERMINATED) == read(names.DONE) == {names.TERMINATED, names.TRUNCATED}
-
-
-def test_columns_of_ours_have_our_types() -> None:
-    recorded = [Column(names.STATE, size=2), Column(names.ACTION, "int64"), Column(names.SUCCESS, "float32")]
-    found = {column.name: column for column in our_columns(recorded, has_tasks=False)}
-    assert (found[names.ACTION].dtype, found[names.SUCCESS].dtype) == ("float32", "bool")
-    assert found[names.NEXT_STATE].meaning == "the state, one step later"
-    assert RECORDED_TASK not in found
-    assert RECORDED_TASK in {column.name for column in our_columns(recorded, has_tasks=True)}
-
-
 def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_over() -> None:
     last = np.arange(STEPS) == STEPS - 1
     for more, lost in (
@@ -145,3 +107,72 @@ def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_ove
     assert rows.lost_reward(run) == STEPS - 1
     rows, run = rows_and_run({names.REWARD: np.ones(STEPS), names.NEXT_STATE: np.ones((STEPS, 2))})
     assert rows.lost_reward(run) == 0.0
+
+
+WHOLE = "expected a whole number of frames per second"
+LACKING = (
+    "lacks the columns episode_index, frame_index, index, task_index, timestamp, which are LeRobot's own"
+)
+OWN = {column.name: column.feature() for column in DEFAULT_COLUMNS}
+
+
+def declared(**features: Any) -> list[Column]:  # noqa: ANN401 - JSON
+    return declared_columns(Path("set"), {"fps": 10.0, "features": OWN | features})[1]
+
+
+@pytest.mark.parametrize(
+    ("labels", "expected"),
+    [
+        (["x", "y"], ("x", "y")),
+        ({"motors": ["x", "y"]}, ("x", "y")),
+        ({"motors": ["x"]}, None),
+        ({"a": ["x", "y"], "b": []}, None),
+        (["x", 1], None),
+        (None, None),
+    ],
+)
+def test_names_are_taken_where_there_is_one_per_value(
+    labels: object, expected: tuple[str, ...] | None
+) -> None:
+    feature = {"dtype": "float64", "shape": [2], "names": labels}
+    assert declared(**{STATE: feature}) == [Column(STATE, "float32", 2, expected)]
+
+
+def test_only_lists_of_numbers_are_columns() -> None:
+    features = {
+        "observation.images.top": {"dtype": "video", "shape": [8, 8, 3], "names": None},
+        "text": {"dtype": "string", "shape": [1], "names": None},
+        "grid": {"dtype": "float32", "shape": [2, 2], "names": None},
+        "count": {"dtype": "uint8", "shape": [1], "names": None},
+    }
+    assert declared(**features) == [Column("count", "int64")]
+
+
+@pytest.mark.parametrize(
+    ("info", "faults"),
+    [
+        ({"fps": 10, "features": {}}, [LACKING]),
+        ({"fps": 9.5, "features": OWN}, [f"has fps 9.5, {WHOLE}"]),
+        ({"fps": 0.5, "features": OWN}, [f"has fps 0.5, {WHOLE}"]),
+        ({"fps": 2**31, "features": OWN}, [f"has fps 2147483648, {WHOLE}"]),
+        (
+            {"fps": 10, "features": OWN | {"index": {"dtype": "float64", "shape": [2]}}},
+            ["has no single number a step as index"],
+        ),
+        ({}, [LACKING, f"has fps None, {WHOLE}"]),
+    ],
+)
+def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(
+    info: dict[str, Any], faults: list[str]
+) -> None:
+    with pytest.raises(CorruptDatasetError) as refused:
+        declared_columns(Path("set"), info)
+    assert str(refused.value) == f"set: meta/info.json {' and '.join(faults)}"
+
+
+def test_a_folder_gives_a_valid_name() -> None:
+    assert [name_of(Path(name)) for name in ("walks", "my set (2)", "-._")] == [
+        "walks",
+        "my-set-2-",
+        "repaired",
+    ]

@@ -7,8 +7,8 @@ import pytest
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import parquet
-from astra_data.dataset.columns import Array, Column
-from astra_data.dataset.parquet import RotatingWriter, read_arrays, read_blocks, to_arrow, to_lists, to_numpy
+from astra_data.dataset.columns import Array
+from astra_data.dataset.parquet import RotatingWriter, read_blocks, to_arrow, to_lists, to_numpy
 
 
 @pytest.mark.parametrize(
@@ -70,18 +70,6 @@ def test_blocks_are_whole_row_groups_of_one_file(
     tables = list(read_blocks(paths))
     assert [len(table) for table in tables] == blocks
     assert [x for table in tables for x in table.column("x").to_pylist()] == list(range(15))
-
-
-def test_blocks_of_wide_columns_have_fewer_rows(paths: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "BLOCK_VALUES", 5)
-    blocks = list(read_arrays(paths, [Column("x", "int64")]))
-    assert [len(block["x"]) for block in blocks] == [8, 2, 5]
-    monkeypatch.setattr(parquet, "BLOCK_VALUES", 0)
-    assert [len(block["x"]) for block in read_arrays(paths, [Column("x", "int64")])] == [4, 4, 2, 4, 1]
-    wide = to_arrow(np.zeros((6, 4), np.float32), pa.list_(pa.float32(), 4))
-    pq.write_table(pa.table({"y": wide}), paths[0].with_name("wide.parquet"), row_group_size=2)
-    monkeypatch.setattr(parquet, "BLOCK_VALUES", 8)
-    assert len(list(read_arrays([paths[0].with_name("wide.parquet")], [Column("y", size=4)]))) == 3
 
 
 @pytest.mark.parametrize("block_rows", [1, 5, 100])

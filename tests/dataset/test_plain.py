@@ -5,26 +5,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA
 
-from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, TIMESTAMP, Array
 from astra_data.dataset.plain import (
-    TIMESTAMP_TOLERANCE_S,
     PlainColumn,
     Run,
-    episode_rows,
     flag_faults,
-    open_end_faults,
     plain_columns,
-    read_footer,
-    read_object,
-    read_statistics,
     read_tasks,
     run_faults,
     runs,
 )
-from astra_data.dataset.reader import Dataset
 
 
 def test_only_rows_of_numbers_are_plain_columns() -> None:
@@ -56,32 +47,6 @@ def test_a_column_fits_lists_with_and_without_their_size() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ('{"a": [1]}', {"a": [1]}),
-        ("[1]", "is no JSON object but list"),
-        ("{", "is no JSON object ("),
-        ("[" * 100_000, "is no JSON object ("),
-        (None, "is missing"),
-    ],
-)
-def test_json_is_an_object_or_a_fault(tmp_path: Path, text: str | None, found: object) -> None:
-    path = tmp_path / "info.json"
-    if text is not None:
-        path.write_text(text)
-    read = read_object(path)
-    assert read.startswith(found) if isinstance(found, str) and isinstance(read, str) else read == found
-
-
-def test_statistics_are_objects_per_column(tmp_path: Path) -> None:
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta/stats.json").write_text('{"a": {"min": [0]}, "b": 1, "c": []}')
-    assert read_statistics(tmp_path) == "has no JSON object for b, c"
-    (tmp_path / "meta/stats.json").write_text('{"a": {"min": [0]}}')
-    assert read_statistics(tmp_path) == {"a": {"min": [0]}}
-
-
-@pytest.mark.parametrize(
     ("table", "found"),
     [
         ({"task_index": [0, 2], "task": ["walk", "run"]}, {0: "walk", 2: "run"}),
@@ -101,22 +66,6 @@ def test_tasks_are_texts_by_their_index(
     pq.write_table(pa.table(table), tmp_path / "meta/tasks.parquet")
     read = read_tasks(tmp_path)
     assert found in read if isinstance(found, str) and isinstance(read, str) else read == found
-
-
-def test_a_footer_holds_rows_and_schema(fake: Dataset, tmp_path: Path) -> None:
-    footer = read_footer(fake.root / DATA)
-    assert not isinstance(footer, str)
-    assert footer[0] == 55
-    assert footer[1].field("action").type == pa.list_(pa.float32(), 2)
-    assert read_footer(tmp_path / "none.parquet") == "is missing"
-    (tmp_path / "cut.parquet").write_bytes((fake.root / DATA).read_bytes()[:-10])
-    cut = read_footer(tmp_path / "cut.parquet")
-    assert isinstance(cut, str)
-    assert cut.startswith("is truncated or no parquet file (")
-
-
-def test_rows_of_episodes_come_in_order(fake: Dataset) -> None:
-    assert [row["length"] for row in episode_rows(fake.root)] == fake.lengths.tolist()
 
 
 COLUMNS = [PlainColumn(EPISODE_INDEX, "int64", 1), PlainColumn(FRAME_INDEX, "int64", 1)]
@@ -147,12 +96,6 @@ def test_rows_are_split_where_episodes_begin(block: int) -> None:
     assert split([0, 9, 0, 1], [0, 1, 2, 0], block) == [([0, 9, 0], [0, 1, 2]), ([1], [0])]
     assert split([0, 0, 0, 1], [0, 0, 2, 0], block) == [([0, 0, 0], [0, 0, 2]), ([1], [0])]
     assert split([], [], block) == []
-
-
-def test_columns_of_another_type_are_refused() -> None:
-    table = pa.table({EPISODE_INDEX: [0.5], "more": [1]})
-    with pytest.raises(CorruptDatasetError, match=r"lacks column frame_index; has episode_index as double"):
-        list(runs(Path("data/file.parquet"), iter([table]), COLUMNS))
 
 
 def a_run(**changes: Array) -> Run:
@@ -190,40 +133,6 @@ def test_wrong_values_of_a_run_are_found(
     assert sentence in fault
 
 
-def test_a_timestamp_may_be_rounded() -> None:
-    rounded = np.array([0, 0.1, 0.20009, 0.3])
-    assert list(run_faults(a_run(**{TIMESTAMP: rounded}), number=3, row=20, fps=10)) == []
-
-
-def test_long_episodes_are_as_exact_as_float32() -> None:
-    """Two hours: float32 rounds by up to 0.24 ms there, 30 times a second."""
-    frame = np.arange(2 * 3600 * 30)
-    stored = (frame / 30).astype(np.float32)
-    assert np.abs(stored - frame / 30).max() > TIMESTAMP_TOLERANCE_S
-
-    def faults(times: Array) -> list[tuple[str, str]]:
-        return list(
-            run_faults(
-                Run(Path("file"), 0, {EPISODE_INDEX: np.zeros_like(frame), TIMESTAMP: times}),
-                number=0,
-                row=0,
-                fps=30,
-            )
-        )
-
-    assert faults(stored) == []
-    late = stored.copy()
-    late[-1] += 0.001
-    assert len(faults(late)) == 1
-
-
-def test_further_wrong_values_are_counted() -> None:
-    [(_, fault)] = run_faults(a_run(**{INDEX: np.array([20, 9, 9, 9])}), number=3, row=20, fps=10)
-    assert fault.endswith("expected 21 (3 values are wrong)")
-    [(_, fault)] = run_faults(a_run(**{INDEX: np.array([20, 9, 9, 23])}), number=3, row=20, fps=10)
-    assert fault.endswith("expected 21 (2 values are wrong)")
-
-
 @pytest.mark.parametrize(
     ("terminated", "truncated", "done", "faults"),
     [
@@ -245,17 +154,3 @@ def test_flags_end_the_last_step_only_and_agree(
     for sentence, (name, part) in zip(found, faults, strict=True):
         assert sentence.startswith(f"next.{name} is ")
         assert part in sentence
-
-
-def test_a_flag_alone_may_end_the_last_step() -> None:
-    # Plain LeRobot datasets may have next.done and no others: there is nothing to compare it with.
-    assert list(flag_faults(a_run(**{"next.done": np.array([False, False, False, True])}), 3)) == []
-    [fault] = flag_faults(a_run(**{"next.done": np.array([False, True, False, True])}), 3)
-    assert fault == "next.done is True in episode 3 frame 1, before the last frame 3"
-
-
-def test_an_episode_that_is_not_done_in_its_last_step_has_no_end() -> None:
-    [fault] = open_end_faults(a_run(**{"next.done": np.zeros(4, bool)}), 3)
-    assert fault == "next.done is False in episode 3 frame 3, expected True: it ends there"
-    assert list(open_end_faults(a_run(**{"next.done": np.arange(4) == 3}), 3)) == []
-    assert list(open_end_faults(a_run(), 3)) == []

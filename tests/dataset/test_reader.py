@@ -1,20 +1,21 @@
 import itertools
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import datasets
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from damaged import truncate
 from fake_dataset import COLUMNS, LENGTHS, concatenated, fake_columns, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import parquet
-from astra_data.dataset.columns import STATE, TIMESTAMP, Episode
+from astra_data.dataset import Dataset, parquet
+from astra_data.dataset.columns import ACTION, STATE, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.doctor.repair import repair
-from astra_data.dataset.reader import Dataset
 
 
 @pytest.mark.parametrize("block_rows", [1, 2**16])
@@ -26,13 +27,6 @@ def test_columns_come_back_whole(fake: Dataset, monkeypatch: pytest.MonkeyPatch,
         assert values.dtype == expected.dtype
         assert values.flags.c_contiguous
         np.testing.assert_array_equal(values, expected)
-
-
-def test_starts_and_lengths_cut_columns_into_episodes(fake: Dataset) -> None:
-    assert fake.lengths.tolist() == list(LENGTHS)
-    assert fake.starts.tolist() == [0, 7, 8, 20, 50]
-    frame = fake.columns([TIMESTAMP])[TIMESTAMP]
-    assert (frame[fake.starts] == 0).all()
 
 
 @pytest.mark.parametrize("block_rows", [1, 10, 2**16])
@@ -47,19 +41,6 @@ def test_episodes_come_back_one_by_one(
             assert found.columns[name].flags.writeable
             np.testing.assert_array_equal(found.columns[name], values)
     assert [list(episode.columns) for episode in fake.episodes([STATE])] == [[STATE]] * len(LENGTHS)
-
-
-@pytest.mark.parametrize("rows", [3, 1000])
-def test_files_cut_without_regard_for_episodes_read_the_same(tmp_path: Path, rows: int) -> None:
-    dataset = write_fake(tmp_path / "set")
-    [path] = dataset.paths
-    pq.write_table(pq.read_table(path), path, row_group_size=rows, compression="zstd")
-    again = Dataset.open(dataset.root)
-    assert again.verify() == []
-    for found, expected in zip(again.episodes(), fake_episodes(), strict=True):
-        np.testing.assert_array_equal(found.columns[STATE], expected.columns[STATE])
-    chosen = [*range(7, 8), *range(20, 50)]
-    np.testing.assert_array_equal(again.columns([STATE], [3, 1])[STATE], concatenated(STATE)[chosen])
 
 
 def test_only_the_row_groups_of_chosen_episodes_are_read(
@@ -165,14 +146,6 @@ def test_a_folder_of_versions_is_no_dataset(tmp_path: Path) -> None:
         Dataset.open(tmp_path / "fake")
 
 
-def test_damage_behind_an_open_dataset_is_told_too(tmp_path: Path) -> None:
-    dataset = write_fake(tmp_path / "set")
-    truncate("data/chunk-000/file-000.parquet")(dataset.root)
-    with pytest.raises(CorruptDatasetError, match="cannot be read"):
-        dataset.columns([STATE])
-    assert "cannot be read" in dataset.verify()[0]
-
-
 def test_verify_finds_altered_values(tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "set")
     [path] = dataset.paths
@@ -220,3 +193,28 @@ def test_a_folder_of_logs_is_no_dataset_yet(tmp_path: Path) -> None:
     assert len(Dataset.open(written)) > 0
     with pytest.raises(BadInputError, match=r"contains logs \(Drive\.CSV and so on\): .*`astra-data import`"):
         Dataset.open(tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+def test_the_rows_are_those_of_lerobots_object(fake: Dataset, lerobot: SimpleNamespace) -> None:
+    rows, opened = fake.to_huggingface(), fake.to_lerobot()
+    assert isinstance(rows, datasets.Dataset)
+    assert isinstance(opened, lerobot.dataset.LeRobotDataset)
+    assert rows.features == opened.hf_dataset.features
+    assert rows.with_format("arrow")[:].equals(opened.hf_dataset.with_format("arrow")[:])
+    for name, values in fake.columns(list(rows.features)).items():
+        np.testing.assert_array_equal(np.array(rows[:][name]), values)
+    assert (opened.num_episodes, len(opened)) == (len(fake), len(rows))
+
+
+@pytest.mark.usefixtures("lerobot")  # its cache, and no network
+def test_altered_values_are_not_handed_on(fake: Dataset, tmp_path: Path) -> None:
+    root = shutil.copytree(fake.root, tmp_path / "altered")
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    moved = table.column(ACTION).combine_chunks().take([len(table) - 1, *range(len(table) - 1)])
+    pq.write_table(table.set_column(table.schema.get_field_index(ACTION), table.field(ACTION), moved), path)
+    altered = Dataset.open(root)
+    for convert in (altered.to_huggingface, altered.to_lerobot):
+        with pytest.raises(CorruptDatasetError):
+            convert()

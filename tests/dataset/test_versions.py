@@ -73,18 +73,6 @@ def test_a_missing_dataset_is_refused(home: Path, name: str, fault: str) -> None
         locate(name)
 
 
-def test_a_folder_without_a_dataset_hides_none_of_the_same_name(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    at_home = write_fake(home / "fake/data-1.0.0").root
-    (tmp_path / "fake").mkdir()
-    assert locate("fake") == at_home
-    assert locate(tmp_path / "fake") == tmp_path / "fake"
-    (tmp_path / "fake/meta").mkdir()
-    assert locate("fake") == Path("fake")
-
-
 def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) -> None:
     source = write_fake(tmp_path / "first")
     description, folder = successor(source.description, "episodes", stage="subset", config={"count": 2})
@@ -128,14 +116,6 @@ def test_a_successor_of_another_name_begins_anew(home: Path, tmp_path: Path) -> 
     folder.mkdir(parents=True)
     assert successor(source.description, "episodes", **asked)[0]["version"] == "1.1.0"
     assert names_at_home() == ["half"]
-
-
-def test_a_name_too_long_for_a_file_is_refused(home: Path, tmp_path: Path) -> None:
-    for name in ("x" * 300, str(tmp_path / ("x" * 300))):
-        with pytest.raises(BadInputError, match="no such folder"):
-            locate(name)
-    with pytest.raises(BadInputError, match="expected up to 200 letters"):
-        write_fake(tmp_path / "set", description={"name": "x" * 201, "stage": "collect"})
 
 
 def test_a_name_that_means_a_subset_says_so(home: Path, caplog: pytest.LogCaptureFixture) -> None:

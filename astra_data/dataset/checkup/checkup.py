@@ -70,15 +70,7 @@ class Checkup:
 
 
 def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
-    """Look at all episodes of `dataset`, one at a time.
-
-    Args:
-        dataset: any.
-        called: how commands are to call it, by default its name and version.
-
-    Raises:
-        CorruptDatasetError: a file cannot be read.
-    """
+    """Look at all episodes of `dataset`, one at a time; commands call it `called`."""
     called = called or dataset.reference
     fps, successes = int(dataset.info["fps"]), dataset.successes()
     columns = {column.name: column for column in dataset.schema}
@@ -94,8 +86,7 @@ def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     for episode in dataset.episodes(names or list(columns)):
         for part in parts:
             part.add(episode)
-    mcap = _is_of_mcap(dataset)
-    findings = [finding for clock in clocks for finding in clock.findings(called, mcap=mcap)]
+    findings = [finding for clock in clocks for finding in clock.findings(called)]
     findings += _of_import(dataset) + repeats.findings()
     findings += angles.findings() if angles else []
     findings += continuity.findings() + duplicates.findings(called)
@@ -116,15 +107,6 @@ def _of_import(dataset: Dataset) -> list[Finding]:
     return [
         Finding("warning", f"at import, {note}", "correct the mapping and import again") for note in found
     ]
-
-
-def _is_of_mcap(dataset: Dataset) -> bool | None:
-    """Return whether all episodes were imported from MCAP, by their files' names; None if it is not known."""
-    if dataset.description.get("config", {}).get("format") == "mcap":
-        return True
-    sources = [source for source in dataset.metadata.get("source", ()) if isinstance(source, str)]
-    kinds = {source.lower().endswith(".mcap") for source in sources}
-    return kinds.pop() if len(kinds) == 1 and len(sources) == len(dataset) else None
 
 
 class GivenCommands:

@@ -97,18 +97,18 @@ class Clock:
         jitter = f"jitter {100 * self.jitter:.1f} % of a period"
         return f"{self._fps} Hz declared, {rate}; gaps within episodes: {self.gaps}{missing}, {jitter}"
 
-    def findings(self, called: str, *, mcap: bool | None = None) -> list[Finding]:
-        """Tell a wrong rate, gaps, jitter, and where time stands still or goes back.
-
-        Args:
-            called: how commands are to call the dataset.
-            mcap: whether it was imported from MCAP; None if that is not known.
-        """
+    def findings(self, called: str) -> list[Finding]:
+        """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""
         found = []
         period_s = self.period_s
         if self._standing:
             what = f"{self._name} stands still or goes back between steps"
-            remedy = self._standing_remedy(mcap)
+            remedy = "store it as seconds since the start (`offset`) or as int64"
+            if self._whole:
+                remedy = (
+                    "look for duplicate rows in the log or a clock that was set back, and in MCAP for an "
+                    "`fps` that is too high or a topic that drops out (`gap_s`)"
+                )
             advice = f"{remedy}, or leave the episodes out: {deletion(called, self._standing)}"
             found.append(Finding("warning", what, advice, tuple(self._standing)))
         if not self._has_rate:
@@ -127,7 +127,7 @@ class Clock:
         if self.gaps:
             longest = np.array(self._longest_s)
             uids = np.array(self._uids)[longest * self._fps * FINE >= self._first_gap() - 0.5]
-            advice = self._gap_remedy(mcap)
+            advice = self._gap_remedy()
             what = f"steps of over {GAP:g} periods: {self.gaps}, the longest {longest.max():.3g} s"
             found.append(Finding("warning", what, f"{advice} and import again", tuple(uids.tolist())))
         if self.jitter > JITTERY:
@@ -137,23 +137,15 @@ class Clock:
             found.append(Finding("note", what, advice))
         return found
 
-    def _standing_remedy(self, mcap: bool | None) -> str:
-        if not self._whole:
-            return "store it as seconds since the start (`offset`) or as int64"
-        if mcap:
-            own = f'[columns."{self._name}"]'
-            return f"rows repeat a message: lower `fps`, or set `gap_s` in {own} where the topic drops out"
-        return "look for duplicate rows in the log, or a clock that was set back"
-
-    def _gap_remedy(self, mcap: bool | None) -> str:
-        split = f"`time`, and `gap_s = {GAP * self.period_s:.3g}` in [split], of the mapping"
-        own = f'`gap_s = {HELD * self.period_s:.3g}` in [columns."{self._name}"]'
-        keys = f"{own} of the mapping" if mcap else split if mcap is False else f"{split}; for MCAP, {own}"
-        remedy = f"begin new episodes there ({keys})"
+    def _gap_remedy(self) -> str:
+        remedy = (
+            f"begin new episodes there (`time`, and `gap_s = {GAP * self.period_s:.3g}` in [split], of the "
+            f'mapping; for MCAP, `gap_s = {HELD * self.period_s:.3g}` in [columns."{self._name}"])'
+        )
         # Many gaps are a recording of another rate, of which splits would leave crumbs.
         if self.gaps < MANY_GAPS * self._bins.sum():
             return remedy
-        return f"{'take an `fps` that divides its rate' if mcap else 'resample the recording'}, or {remedy}"
+        return f"resample the recording (of MCAP, take an `fps` that divides its rate), or {remedy}"
 
     @property
     def _has_rate(self) -> bool:

@@ -13,51 +13,16 @@ from numpy.typing import NDArray
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
+from astra_data.dataset import format as layout
+from astra_data.dataset import plain
 from astra_data.dataset.columns import Column
 from astra_data.dataset.description import ContentHash, permutation, read_description, read_subsets
-from astra_data.dataset.format import (
-    CODEBASE_VERSION,
-    DATA_PATH,
-    DATASET_PATH,
-    DEFAULT_COLUMNS,
-    INFO_PATH,
-    METADATA_PATH,
-    POLICY_PATH,
-    STATISTICS,
-    STATS_PATH,
-    SUBSETS_PATH,
-    TASKS_PATH,
-)
 from astra_data.dataset.integrity import SEALED, Digests, altered_files, read_digests, run_alterations
 from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.plain import (
-    MOST_FPS,
-    PLAIN_STATISTICS,
-    PlainColumn,
-    Run,
-    data_files,
-    episode_rows,
-    episodes_files,
-    flag_faults,
-    is_data_path,
-    missing_files,
-    open_end_faults,
-    plain_columns,
-    read_footer,
-    read_object,
-    read_places,
-    read_small_table,
-    read_statistics,
-    read_tasks,
-    run_faults,
-    runs,
-    schema_faults,
-    statistics_faults,
-)
 from astra_data.dataset.reader import Dataset, format_fault, refuse_run, refuse_versions
 from astra_data.dataset.statistics import episode_statistics, global_statistics, side_by_side
 
-_META_FILES = (*SEALED, DATASET_PATH, POLICY_PATH)
+_META_FILES = (*SEALED, layout.DATASET_PATH, layout.POLICY_PATH)
 MOST = 5
 """Findings of one kind that are kept; further ones are only counted."""
 EXACT = 1e-6
@@ -139,17 +104,17 @@ def check(root: Path) -> Report:
         raise BadInputError(f"{root}: found no dataset; expected a folder with meta/ and data/")
     report = Report()
     if fault := format_fault(root):
-        report.fault(INFO_PATH, fault)
+        report.fault(layout.INFO_PATH, fault)
         return report
-    info = read_object(root / INFO_PATH)
+    info = plain.read_object(root / layout.INFO_PATH)
     if isinstance(info, str):
-        report.fault(INFO_PATH, f"{INFO_PATH} {info}: nothing else was checked")
+        report.fault(layout.INFO_PATH, f"{layout.INFO_PATH} {info}: nothing else was checked")
         return report
-    is_ours = (root / DATASET_PATH).exists()
-    if not is_ours and any((root / DATASET_PATH).parent.glob("*")):
-        report.fault("origin", f"{DATASET_PATH} is missing: the dataset is incomplete; copy it again")
+    is_ours = (root / layout.DATASET_PATH).exists()
+    if not is_ours and any((root / layout.DATASET_PATH).parent.glob("*")):
+        report.fault("origin", f"{layout.DATASET_PATH} is missing: the dataset is incomplete; copy it again")
     elif not is_ours:
-        report.note("origin", f"no {DATASET_PATH}: a plain LeRobot dataset of unknown provenance")
+        report.note("origin", f"no {layout.DATASET_PATH}: a plain LeRobot dataset of unknown provenance")
     columns = _info_faults(info, report)
     if columns and _files_are_readable(root, info, columns, report):
         description = _description(root, report) if is_ours else {}
@@ -173,22 +138,27 @@ def check(root: Path) -> Report:
     return report
 
 
-def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
+def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainColumn]:
     """Check meta/info.json; return the columns whose values can be checked, none if some are missing."""
     version, fps, features = info.get("codebase_version"), info.get("fps"), info.get("features")
-    if version != CODEBASE_VERSION:
-        report.fault(INFO_PATH, f"{INFO_PATH}: the format is {version}, expected {CODEBASE_VERSION}")
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < MOST_FPS:
-        report.fault(INFO_PATH, f"{INFO_PATH}: fps is {fps!r}, expected a positive number below 2^31")
+    if version != layout.CODEBASE_VERSION:
+        report.fault(
+            layout.INFO_PATH,
+            f"{layout.INFO_PATH}: the format is {version}, expected {layout.CODEBASE_VERSION}",
+        )
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < plain.MOST_FPS:
+        report.fault(
+            layout.INFO_PATH, f"{layout.INFO_PATH}: fps is {fps!r}, expected a positive number below 2^31"
+        )
         return []
     if not isinstance(features, dict):
-        report.fault(INFO_PATH, f"{INFO_PATH}: features is {features!r}, expected an object")
+        report.fault(layout.INFO_PATH, f"{layout.INFO_PATH}: features is {features!r}, expected an object")
         return []
-    if not is_data_path(data_path := info.get("data_path")):
-        expected = f"expected a path inside the folder such as {DATA_PATH}"
-        report.fault(INFO_PATH, f"{INFO_PATH}: data_path is {data_path!r}, {expected}")
+    if not plain.is_data_path(data_path := info.get("data_path")):
+        expected = f"expected a path inside the folder such as {layout.DATA_PATH}"
+        report.fault(layout.INFO_PATH, f"{layout.INFO_PATH}: data_path is {data_path!r}, {expected}")
         return []
-    columns, others = plain_columns(features)
+    columns, others = plain.plain_columns(features)
     if others:
         report.note("features", f"not checked, because they are not numeric: {', '.join(others)}")
     for column in columns:
@@ -198,7 +168,7 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
         if "/" in column.name:
             report.fault("names", f"{column.name}: a column's name must not contain '/'")
     declared = {column.name: column for column in columns}
-    for default in DEFAULT_COLUMNS:
+    for default in layout.DEFAULT_COLUMNS:
         found = declared.get(default.name)
         if found is None or (found.dtype, found.size) != (default.dtype, default.size):
             report.fault("features", f"{default.name}: expected in features as one {default.dtype} per step")
@@ -207,31 +177,31 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[PlainColumn]:
 
 
 def _files_are_readable(
-    root: Path, info: Mapping[str, Any], columns: list[PlainColumn], report: Report
+    root: Path, info: Mapping[str, Any], columns: list[plain.PlainColumn], report: Report
 ) -> bool:
     """Check which files there are, the footers of all parquet files, and their schemas."""
     _strangers(root, report)
     before, rows = report.fault_count, 0
-    for kind, files in (("data", data_files(root)), ("meta/episodes", episodes_files(root))):
+    for kind, files in (("data", plain.data_files(root)), ("meta/episodes", plain.episodes_files(root))):
         if not files:
             report.fault("files", f"{kind} has no parquet file")
         for path in files:
             name = path.relative_to(root)
-            footer = read_footer(path)
+            footer = plain.read_footer(path)
             if isinstance(footer, str):
                 report.fault("files", f"{name} {footer}")
             elif kind == "data":
                 rows += footer[0]
                 schema = footer[1]
                 unknown = sorted(set(schema.names) - info["features"].keys())
-                faults = schema_faults(schema, columns)
+                faults = plain.schema_faults(schema, columns)
                 for fault in [*faults, *(f"has an unknown column {column}" for column in unknown)]:
                     report.fault("columns", f"{name} {fault}")
             else:
-                for fault in statistics_faults(footer[1], columns, info["features"]):
+                for fault in plain.statistics_faults(footer[1], columns, info["features"]):
                     report.note("statistics", f"{name} {fault}")
     if not isinstance(total := info.get("total_frames"), int) or rows < total:
-        for missing in missing_files(root, read_places(root, info)[0]):
+        for missing in plain.missing_files(root, plain.read_places(root, info)[0]):
             report.fault("files", f"{missing} is missing")
     if report.fault_count > before:
         report.note("values", "values were not checked, because not all files could be read as declared")
@@ -241,24 +211,26 @@ def _files_are_readable(
 
 def _strangers(root: Path, report: Report) -> None:
     """Report unknown files: in data/ as faults, in meta/, where other tools may add some, as notes."""
-    known = {root / path for path in _META_FILES} | {*data_files(root), *episodes_files(root)}
+    known = {root / path for path in _META_FILES} | {*plain.data_files(root), *plain.episodes_files(root)}
     for path in sorted([*(root / "data").rglob("*"), *(root / "meta").rglob("*")]):
         if not path.is_dir() and path not in known:
             add = report.fault if path.is_relative_to(root / "data") else report.note
             add("files", f"{path.relative_to(root)} does not belong to it")
 
 
-def _global_statistics(root: Path, columns: list[PlainColumn], report: Report) -> None:
-    stored = read_statistics(root)
+def _global_statistics(root: Path, columns: list[plain.PlainColumn], report: Report) -> None:
+    stored = plain.read_statistics(root)
     if isinstance(stored, str):
-        report.fault(STATS_PATH, f"{STATS_PATH} {stored}")
+        report.fault(layout.STATS_PATH, f"{layout.STATS_PATH} {stored}")
         return
     ours = [Column(column.name, column.dtype, column.size) for column in columns]
-    for name, expected in global_statistics(ours, report.frames, data_files(root)).items():
+    for name, expected in global_statistics(ours, report.frames, plain.data_files(root)).items():
         for key, values in expected.items():
             found = stored.get(name, {}).get(key)
             if not is_close(found, values, EXACT):
-                report.fault(STATS_PATH, f"{STATS_PATH}: {key} of {name} is {found}, expected {values}")
+                report.fault(
+                    layout.STATS_PATH, f"{layout.STATS_PATH}: {key} of {name} is {found}, expected {values}"
+                )
 
 
 class EpisodeChecks:
@@ -274,7 +246,7 @@ class EpisodeChecks:
         self,
         root: Path,
         info: Mapping[str, Any],
-        columns: Sequence[PlainColumn],
+        columns: Sequence[plain.PlainColumn],
         digests: Digests,
         is_ours: bool,
         report: Report,
@@ -296,23 +268,21 @@ class EpisodeChecks:
         self._total = _Total()
 
     def run(self) -> None:
-        """Check every episode.
-
-        Raises:
-            CorruptDatasetError: a file cannot be read.
-        """
+        """Check every episode."""
         every = (
             run
-            for path in data_files(self._root)
-            for run in runs(path, read_blocks([path], [c.name for c in self._columns]), self._columns)
+            for path in plain.data_files(self._root)
+            for run in plain.runs(path, read_blocks([path], [c.name for c in self._columns]), self._columns)
         )
-        for number, (run, row) in enumerate(zip_longest(every, episode_rows(self._root))):
+        for number, (run, row) in enumerate(zip_longest(every, plain.episode_rows(self._root))):
             if run is None:
                 self._report.fault("meta/episodes", f"meta/episodes has episode {number}, the data has not")
                 continue
-            for name, fault in run_faults(run, number=number, row=self._report.frames, fps=self._info["fps"]):
+            for name, fault in plain.run_faults(
+                run, number=number, row=self._report.frames, fps=self._info["fps"]
+            ):
                 self._report.fault(name, fault)
-            for fault in (*flag_faults(run, number), *open_end_faults(run, number)):
+            for fault in (*plain.flag_faults(run, number), *plain.open_end_faults(run, number)):
                 (self._report.fault if self._is_ours else self._report.note)("flags", fault)
             tasks = np.unique(run.columns[names.TASK_INDEX])
             unknown = [task for task in tasks.tolist() if task not in self._tasks]
@@ -345,13 +315,13 @@ class EpisodeChecks:
             self._check_global()
 
     def _read_tasks(self) -> dict[int, str]:
-        tasks = read_tasks(self._root)
+        tasks = plain.read_tasks(self._root)
         if isinstance(tasks, str):
-            self._report.fault("tasks", f"{TASKS_PATH} {tasks}")
+            self._report.fault("tasks", f"{layout.TASKS_PATH} {tasks}")
             return {}
         return tasks
 
-    def _check_row(self, number: int, run: Run, row: Mapping[str, Any]) -> None:
+    def _check_row(self, number: int, run: plain.Run, row: Mapping[str, Any]) -> None:
         start = self._report.frames
         expected: dict[str, object] = {
             "episode_index": number,
@@ -376,11 +346,11 @@ class EpisodeChecks:
             self._report.fault("meta/episodes", fault)
         self._check_statistics(number, run, row)
 
-    def _check_statistics(self, number: int, run: Run, row: Mapping[str, Any]) -> None:
+    def _check_statistics(self, number: int, run: plain.Run, row: Mapping[str, Any]) -> None:
         table = episode_statistics(run.columns.values())
-        found = dict(zip(STATISTICS, table, strict=True))
+        found = dict(zip(layout.STATISTICS, table, strict=True))
         self._total.add(found, len(run))
-        for kind in STATISTICS if self._is_ours else PLAIN_STATISTICS[:-1]:
+        for kind in layout.STATISTICS if self._is_ours else plain.PLAIN_STATISTICS[:-1]:
             stored = [row.get(f"stats/{column.name}/{kind}") for column in self._columns]
             if _joined(stored, self._columns) == found[kind].tolist():  # to the bit, as most are
                 continue
@@ -392,14 +362,14 @@ class EpisodeChecks:
             )
 
     def _check_global(self) -> None:
-        stored = read_statistics(self._root)
+        stored = plain.read_statistics(self._root)
         if isinstance(stored, str):
-            self._report.fault("statistics", f"{STATS_PATH} {stored}")
+            self._report.fault("statistics", f"{layout.STATS_PATH} {stored}")
             return
         found = self._total.statistics()
         for column, part in side_by_side(self._columns) if found else ():
             one = stored.get(column.name, {})
-            for kind in PLAIN_STATISTICS[:-1]:
+            for kind in plain.PLAIN_STATISTICS[:-1]:
                 self._compare(kind, column.name, one.get(kind), found, part)
             self._compare_count(column.name, one.get("count"), self._total.rows)
 
@@ -428,22 +398,24 @@ def _astra_faults(root: Path, description: Mapping[str, Any], checks: EpisodeChe
     if description and (content := checks.hash.hexdigest()) != (stored := description["content_hash"]):
         report.fault("origin", f"the content hash is {content}, expected {stored}")
     _policy_faults(root, description.get("behavior"), report)
-    table = read_small_table(root / METADATA_PATH)
+    table = plain.read_small_table(root / layout.METADATA_PATH)
     if isinstance(table, str):
-        report.fault(METADATA_PATH, f"{METADATA_PATH} {table}")
+        report.fault(layout.METADATA_PATH, f"{layout.METADATA_PATH} {table}")
     else:
         listed = [(row.get("episode_uid"), row.get("length")) for row in table.to_pylist()]
         present = zip(checks.uids, checks.lengths, strict=True)
         for episode, (found, expected) in enumerate(zip_longest(listed, present)):
             if found != expected:
                 fault = f"{found} as uid and length of episode {episode}, expected {expected}"
-                report.fault(METADATA_PATH, f"{METADATA_PATH} has {fault}")
+                report.fault(layout.METADATA_PATH, f"{layout.METADATA_PATH} has {fault}")
     try:
         subsets = read_subsets(root)
         if subsets["uids"] != permutation(checks.uids, subsets["seed"]):
-            report.fault(SUBSETS_PATH, f"{SUBSETS_PATH}: the uids are not in the order of their seed")
+            report.fault(
+                layout.SUBSETS_PATH, f"{layout.SUBSETS_PATH}: the uids are not in the order of their seed"
+            )
     except CorruptDatasetError as error:
-        report.fault(SUBSETS_PATH, str(error))
+        report.fault(layout.SUBSETS_PATH, str(error))
 
 
 def _description(root: Path, report: Report) -> Mapping[str, Any]:
@@ -459,7 +431,7 @@ def _description(root: Path, report: Report) -> Mapping[str, Any]:
 
 
 def _digests(
-    root: Path, description: Mapping[str, Any], columns: list[PlainColumn], report: Report
+    root: Path, description: Mapping[str, Any], columns: list[plain.PlainColumn], report: Report
 ) -> Digests:
     try:
         return read_digests(root, description.get("sums", {}), [column.name for column in columns])
@@ -473,10 +445,10 @@ def _policy_faults(root: Path, behavior: object, report: Report) -> None:
     expected = behavior.get("policy_sha256") if isinstance(behavior, dict) else None
     if expected is None:
         return
-    policy = root / POLICY_PATH
+    policy = root / layout.POLICY_PATH
     found = file_digest(policy) if policy.is_file() else "not there"
     if found != expected:
-        report.fault("origin", f"{POLICY_PATH} is {found}, expected the sha256 {expected}")
+        report.fault("origin", f"{layout.POLICY_PATH} is {found}, expected the sha256 {expected}")
 
 
 class _Total:
@@ -521,7 +493,7 @@ def is_estimate(
     return bool((np.abs(found - expected) <= error).all())
 
 
-def _joined(stored: Sequence[object], columns: Sequence[PlainColumn]) -> list[object] | None:
+def _joined(stored: Sequence[object], columns: Sequence[plain.PlainColumn]) -> list[object] | None:
     """Return the lists in `stored` as one, None where one is not of its column's size."""
     joined: list[object] = []
     for one, column in zip(stored, columns, strict=True):

@@ -39,13 +39,6 @@ def compare_with_lerobot(root: Path, report: Report) -> None:
     """Open the dataset with `LeRobotDataset` and compare windows of observations and actions with the files.
 
     Works offline and leaves no cache behind; importing lerobot takes seconds and 0.8 GB.
-
-    Args:
-        root: the dataset's folder, without faults.
-        report: of `check`; differences are added to it.
-
-    Raises:
-        BadInputError: lerobot is not installed.
     """
     os.environ["HF_HUB_OFFLINE"] = "1"
     optional("lerobot")

@@ -11,19 +11,10 @@ import numpy as np
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
+from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array, Column, Episode, Scalar, new_uid, renamed_metadata
 from astra_data.dataset.description import read_description
 from astra_data.dataset.doctor.salvage import whole_runs
-from astra_data.dataset.format import (
-    CODEBASE_VERSION,
-    DATASET_PATH,
-    INFO_PATH,
-    METADATA_PATH,
-    OUR_FOLDER,
-    POLICY_PATH,
-    SUBSETS_PATH,
-    TASKS_PATH,
-)
 from astra_data.dataset.integrity import Digests, altered_files, read_digests
 from astra_data.dataset.lerobot_recording import Found, found_in, left_out
 from astra_data.dataset.lerobot_rows import (
@@ -35,24 +26,17 @@ from astra_data.dataset.lerobot_rows import (
     our_columns,
     robot_of,
 )
-from astra_data.dataset.plain import (
-    PlainColumn,
-    Run,
-    is_format_2,
-    read_object,
-    read_small_table,
-    read_tasks,
-)
+from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 
 _LOST = "success, return and the like of the episodes are lost"
 _IF_ALTERED = {
-    INFO_PATH: "names, units and fps may be wrong",
-    TASKS_PATH: "the task may be wrong",
-    METADATA_PATH: _LOST,
-    SUBSETS_PATH: "the order of the subsets is that of seed 0",
+    layout.INFO_PATH: "names, units and fps may be wrong",
+    layout.TASKS_PATH: "the task may be wrong",
+    layout.METADATA_PATH: _LOST,
+    layout.SUBSETS_PATH: "the order of the subsets is that of seed 0",
 }
 """What follows for the new dataset; statistics are rebuilt, and digests have notes of their own."""
 
@@ -161,7 +145,7 @@ def repair(
                 f"the {len(tasks)} tasks were merged into one; each episode's own is in its metadata 'task'"
             )
         writer.made = {"repaired": result.notes}
-        writer.policy = policy if (policy := folder / POLICY_PATH).is_file() else None
+        writer.policy = policy if (policy := folder / layout.POLICY_PATH).is_file() else None
         if not result.episodes:
             raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
     return result
@@ -210,7 +194,7 @@ def _losses(remains: Remains, episodes: int, content_hash: str) -> Iterator[str]
     """Say what of the dataset is not among the episodes saved, and whether their values are those written."""
     counted = remains.info.get("total_episodes")
     if isinstance(counted, int) and counted > episodes:
-        yield f"{counted - episodes} of the {counted} episodes that {INFO_PATH} counts are lost"
+        yield f"{counted - episodes} of the {counted} episodes that {layout.INFO_PATH} counts are lost"
     is_all = counted == episodes and len(remains.columns) == len(remains.info["features"])
     if is_all and remains.old and remains.old["content_hash"] != content_hash:
         yield (
@@ -235,13 +219,7 @@ class Joined(NamedTuple):
 def join(
     episodes: Iterable[tuple[int, Mapping[str, Array]]], columns: Sequence[Column], sources: Sequence[Dataset]
 ) -> list[Joined]:
-    """Return the uid and the metadata of each of `episodes`, as the source had it that holds the same values.
-
-    Args:
-        episodes: stored uid and columns of each; only the first with a uid keeps it.
-        columns: their columns.
-        sources: the datasets that were merged, those that are known.
-    """
+    """Return uid and metadata of each of `episodes`, as the source had it that holds the same values."""
     shared = [c for c in columns if all(c.name in source.features for source in sources)]
     known: dict[tuple[int, bytes], tuple[int | None, Mapping[str, Scalar]]] = {}
     for number, source in enumerate(sources):
@@ -279,20 +257,12 @@ def _digest(values: Mapping[str, Array], columns: Sequence[Column]) -> bytes:
 
 
 def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Remains:
-    """Read what `folder` still tells; add to `notes` what is lost or changed.
-
-    Args:
-        folder: the damaged dataset.
-        sources: the datasets from which LeRobot's tools made it, dropping our metadata; empty otherwise.
-        notes: a sentence is added for each loss and change.
-
-    Raises:
-        CorruptDatasetError: meta/info.json is missing.
-        BadInputError: there are `sources`, and no column that joins it with them.
-    """
-    info = read_object(folder / INFO_PATH)
+    """Read what `folder` still tells; add to `notes` what is lost or changed."""
+    info = read_object(folder / layout.INFO_PATH)
     if isinstance(info, str):
-        raise CorruptDatasetError(f"{folder}: {INFO_PATH} {info}; without it columns and fps are unknown")
+        raise CorruptDatasetError(
+            f"{folder}: {layout.INFO_PATH} {info}; without it columns and fps are unknown"
+        )
     columns, specs, fps = declared_columns(folder, info)
     if sources and names.EPISODE_UID not in info["features"]:
         raise BadInputError(
@@ -303,10 +273,10 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     if rows:
         specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
-        notes.append(f"LeRobot's format {info['codebase_version']} became {CODEBASE_VERSION}")
+        notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
     notes += _conversions(info, columns, specs)
     if isinstance(tasks, str):
-        notes.append(f"{TASKS_PATH} {tasks}: the task is unknown")
+        notes.append(f"{layout.TASKS_PATH} {tasks}: the task is unknown")
         tasks = {}
     # Of what LeRobot's tools made, our metadata is no longer true, where they left it.
     old = {} if sources else _old_description(folder, notes)
@@ -331,7 +301,7 @@ def _recorded_rows(
 ) -> Rows | None:
     """Return how rows become ours that LeRobot recorded without next states, None for other datasets."""
     rows = Rows({column.name: column for column in columns}, fps)
-    is_ours = names.EPISODE_UID in rows.stored or (folder / OUR_FOLDER).is_dir()
+    is_ours = names.EPISODE_UID in rows.stored or (folder / layout.OUR_FOLDER).is_dir()
     return None if is_ours or not rows.dropped or lacking(specs) else rows
 
 
@@ -355,7 +325,7 @@ def _old_description(folder: Path, notes: list[str]) -> Mapping[str, Any]:
     try:
         return read_description(folder)
     except CorruptDatasetError as error:
-        if (folder / DATASET_PATH).exists():
+        if (folder / layout.DATASET_PATH).exists():
             notes.append(f"{error}: the origin is unknown")
         return {}
 
@@ -371,7 +341,7 @@ def _altered_files(folder: Path, old: Mapping[str, Any], notes: list[str]) -> It
 def _digests(
     folder: Path, old: Mapping[str, Any], columns: Sequence[PlainColumn], notes: list[str]
 ) -> Digests:
-    if not (folder / OUR_FOLDER).is_dir():
+    if not (folder / layout.OUR_FOLDER).is_dir():
         return {}
     try:
         return read_digests(folder, old.get("sums", {}), [column.name for column in columns])
@@ -382,11 +352,11 @@ def _digests(
 
 def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[int, dict[str, Scalar]]:
     """Return the episodes' metadata by uid, empty where there is none to rely on."""
-    if METADATA_PATH in altered or not (folder / OUR_FOLDER).is_dir():
+    if layout.METADATA_PATH in altered or not (folder / layout.OUR_FOLDER).is_dir():
         return {}
-    table = read_small_table(folder / METADATA_PATH)
+    table = read_small_table(folder / layout.METADATA_PATH)
     if isinstance(table, str):
-        notes.append(f"{METADATA_PATH} {table}: {_LOST}")
+        notes.append(f"{layout.METADATA_PATH} {table}: {_LOST}")
         return {}
     columns = table.to_pydict()
     uids = columns.pop(names.EPISODE_UID, [])
@@ -397,7 +367,7 @@ def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[
         if isinstance(uid, int)
     }
     if not found:
-        notes.append(f"{METADATA_PATH} has no uids: {_LOST}")
+        notes.append(f"{layout.METADATA_PATH} has no uids: {_LOST}")
     return found
 
 
@@ -409,22 +379,17 @@ def _description(
         first, *others = sources
         old, parents = first.description, [other.identity for other in others]
     if not old:
-        return {
-            "name": name_of(folder),
-            "stage": "repair",
-            "config": config,
-            "environment": robot_of(info),
-        }
+        return {"name": name_of(folder), "stage": "repair", "config": config, "environment": robot_of(info)}
     return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]
 
 
 def _subset_seed(folder: Path, altered: Collection[str], notes: list[str]) -> int:
     """Return the seed of the subsets' order, 0 where there is none to rely on."""
-    if SUBSETS_PATH in altered or not (folder / OUR_FOLDER).is_dir():
+    if layout.SUBSETS_PATH in altered or not (folder / layout.OUR_FOLDER).is_dir():
         return 0
-    subsets = read_object(folder / SUBSETS_PATH)
+    subsets = read_object(folder / layout.SUBSETS_PATH)
     if isinstance(subsets, dict) and isinstance(seed := subsets.get("seed"), int):
         return seed
     fault = subsets if isinstance(subsets, str) else "has no whole number as its seed"
-    notes.append(f"{SUBSETS_PATH} {fault}: {_IF_ALTERED[SUBSETS_PATH]}")
+    notes.append(f"{layout.SUBSETS_PATH} {fault}: {_IF_ALTERED[layout.SUBSETS_PATH]}")
     return 0

@@ -2,7 +2,6 @@
 
 import io
 import mmap
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,23 +13,10 @@ import pyarrow.parquet as pq
 
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
+from astra_data.dataset import plain
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.integrity import Digests, run_alterations
 from astra_data.dataset.parquet import UNREADABLE
-from astra_data.dataset.plain import (
-    PlainColumn,
-    Run,
-    block_values,
-    data_files,
-    flag_faults,
-    missing_files,
-    read_footer,
-    read_object,
-    read_places,
-    run_faults,
-    runs,
-    schema_faults,
-)
 
 _DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3
 _DETAILS = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}
@@ -44,39 +30,32 @@ _HEADER = 1000
 _SNAPPY, _ZSTD = 1, 6
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
-_LONGEST = 63
-"""Bits of the longest number but its last seven."""
 Struct = dict[int, tuple[int, Any]]
 
 
 def whole_runs(
     folder: Path,
-    columns: Sequence[PlainColumn],
+    columns: Sequence[plain.PlainColumn],
     digests: Digests,
     fps: int,
     notes: list[str],
     *,
     repeated: bool = False,
-) -> Iterator[tuple[int, Run]]:
+) -> Iterator[tuple[int, plain.Run]]:
     """Yield the uid and the rows of each intact episode; add to `notes` which were left out, and why.
+
+    Without `digests` altered episodes cannot be told from whole ones. With `repeated`, episodes whose uid an
+    earlier one has are yielded, too.
 
     An episode after rows that are lost is known by its own number and rows, where they agree with
     meta/episodes or, without that, where both are greater than those that should follow.
-
-    Args:
-        folder: the damaged dataset.
-        columns: the columns to read, LeRobot's own among them.
-        digests: those of the values, empty if they are not known; they tell altered episodes from whole ones.
-        fps: steps per second.
-        notes: a sentence is added for each loss.
-        repeated: also yield episodes whose uid an earlier one has.
     """
-    info = read_object(folder / INFO_PATH)
-    places, faults = read_places(folder, info if isinstance(info, dict) else {})
+    info = plain.read_object(folder / INFO_PATH)
+    places, faults = plain.read_places(folder, info if isinstance(info, dict) else {})
     notes += [f"meta/episodes was rebuilt from the data: {fault}" for fault in faults]
     if not places and not faults:
         notes.append("meta/episodes was missing and was rebuilt from the data")
-    notes += [f"{name} is missing" for name in missing_files(folder, places)]
+    notes += [f"{name} is missing" for name in plain.missing_files(folder, places)]
     counted = info.get("total_episodes") if isinstance(info, dict) else None
     most = len(next(iter(digests.values()))) if digests else counted if isinstance(counted, int) else 2**31
     episode = row = 0
@@ -98,12 +77,12 @@ def whole_runs(
         if is_known and number > episode:
             notes.append(_lost(episode, number - 1))
             episode, row = number, first
-        faults = [fault for _, fault in run_faults(run, number=episode, row=row, fps=fps)]
+        faults = [fault for _, fault in plain.run_faults(run, number=episode, row=row, fps=fps)]
         if (place := places.get(episode)) and place.length != len(run):
             faults.append(f"it has {len(run)} frames, expected {place.length}")
         if episode >= most and digests:
             faults.append(f"expected {most} episodes")
-        faults += [*flag_faults(run, episode), *run_alterations(run, episode, digests)]
+        faults += [*plain.flag_faults(run, episode), *run_alterations(run, episode, digests)]
         uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
         if uid < 0 or (uid in uids and not repeated):
             faults.append(f"its uid {uid} is taken or negative")
@@ -117,7 +96,7 @@ def whole_runs(
         notes.append(_lost(episode, max(places)))
 
 
-def _claimed(run: Run) -> tuple[int, int, int]:
+def _claimed(run: plain.Run) -> tuple[int, int, int]:
     """Return the episode, the first row in the dataset and the first frame that most rows of `run` tell."""
     steps = np.arange(len(run))
     columns = run.columns
@@ -136,11 +115,13 @@ def _name(path: Path) -> str:
     return "/".join(path.parts[-3:])
 
 
-def _every_run(folder: Path, columns: Sequence[PlainColumn], notes: list[str]) -> Iterator[tuple[Run, bool]]:
+def _every_run(
+    folder: Path, columns: Sequence[plain.PlainColumn], notes: list[str]
+) -> Iterator[tuple[plain.Run, bool]]:
     """Yield each run, and whether the rows after it cannot be read."""
-    for path in data_files(folder):
+    for path in plain.data_files(folder):
         try:
-            if isinstance(read_footer(path), str):
+            if isinstance(plain.read_footer(path), str):
                 yield from ((run, False) for run in _footerless_runs(path, columns, notes))
             else:
                 yield from _footered_runs(path, columns, notes)
@@ -149,8 +130,8 @@ def _every_run(folder: Path, columns: Sequence[PlainColumn], notes: list[str]) -
 
 
 def _footered_runs(
-    path: Path, columns: Sequence[PlainColumn], notes: list[str]
-) -> Iterator[tuple[Run, bool]]:
+    path: Path, columns: Sequence[plain.PlainColumn], notes: list[str]
+) -> Iterator[tuple[plain.Run, bool]]:
     """Yield the runs of a file with a footer, and whether the rows after each cannot be read."""
     with pq.ParquetFile(path) as file:
         counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
@@ -158,9 +139,9 @@ def _footered_runs(
         while group < len(counts):
             rows: list[int] = []
             faults: list[str] = []
-            held: Run | None = None
+            held: plain.Run | None = None
             first = sum(counts[:group])
-            for run in runs(path, _row_groups(file, columns, group, rows, faults), columns):
+            for run in plain.runs(path, _row_groups(file, columns, group, rows, faults), columns):
                 if held is not None:
                     yield held, False
                 held = replace(run, row=first + run.row)
@@ -175,13 +156,15 @@ def _footered_runs(
             group += len(rows) + 1
 
 
-def _footerless_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str]) -> Iterator[Run]:
+def _footerless_runs(
+    path: Path, columns: Sequence[plain.PlainColumn], notes: list[str]
+) -> Iterator[plain.Run]:
     schema = pa.schema([(column.name, column.arrow_type) for column in columns])
     metadata = rebuilt_metadata(path, schema)
     rows: list[int] = []
-    held: Run | None = None
+    held: plain.Run | None = None
     with pq.ParquetFile(path, metadata=metadata) as file:
-        for run in runs(path, _row_groups(file, columns, 0, rows, []), columns):
+        for run in plain.runs(path, _row_groups(file, columns, 0, rows, []), columns):
             if held is not None:
                 yield held
             held = run
@@ -196,11 +179,7 @@ def _footerless_runs(path: Path, columns: Sequence[PlainColumn], notes: list[str
 
 
 def _row_groups(
-    file: pq.ParquetFile,
-    columns: Sequence[PlainColumn],
-    first: int,
-    rows: list[int],
-    faults: list[str],
+    file: pq.ParquetFile, columns: Sequence[plain.PlainColumn], first: int, rows: list[int], faults: list[str]
 ) -> Iterator[pa.Table]:
     """Yield row groups from `first` up to an unreadable one.
 
@@ -209,8 +188,8 @@ def _row_groups(
     for group in range(first, file.num_row_groups):
         try:
             table = file.read_row_group(group, columns=[column.name for column in columns], use_threads=False)
-            if not schema_faults(table.schema, columns):
-                block_values(table, columns)
+            if not plain.schema_faults(table.schema, columns):
+                plain.block_values(table, columns)
         except (*UNREADABLE, CorruptDatasetError) as error:
             faults.append(in_short(error))
             return
@@ -249,15 +228,8 @@ class _Leaf:
 def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     """Rebuild the metadata of the parquet file at `path`, which then reads with `ParquetFile(metadata=...)`.
 
-    Args:
-        path: a file without footer, compressed with snappy or zstd.
-        schema: its columns, numbers or lists of fixed size, none of them null.
-
     Returns:
         the metadata of all whole row groups.
-
-    Raises:
-        CorruptDatasetError: there is no whole row group, or a column is of another kind.
     """
     leaves = [_leaf(field) for field in schema]
     pages = _pages(path)
@@ -392,14 +364,12 @@ def _values(pages: Sequence[_Page]) -> int:
 
 
 class Reader:
-    """Reads structs from bytes; `position` moves along.
+    """Reads structs of Thrift's compact protocol; `position` moves along; ValueError if they are none.
 
-    Raises:
-        ValueError: the bytes end early or are no thrift.
+    A struct is a dict of field number to (type, value), a list is (type, values).
     """
 
     def __init__(self, data: bytes | memoryview, position: int = 0) -> None:
-        """Start at `position`."""
         self.data = data
         self.position = position
 
@@ -410,31 +380,23 @@ class Reader:
         while header := self._take(1)[0]:
             step, kind = header >> 4, header & 15
             number = number + step if step else self._signed()
-            fields[number] = (kind, self._value(kind, kind == TRUE))
+            fields[number] = (kind, kind == TRUE if kind in (TRUE, FALSE) else self._value(kind))
         return fields
 
-    def _value(self, kind: int, is_true: bool = False) -> Any:  # noqa: ANN401 - any thrift value
-        if kind in (TRUE, FALSE):
-            return is_true
-        if kind == BYTE:
+    def _value(self, kind: int) -> Any:  # noqa: ANN401 - any thrift value
+        if kind in (TRUE, FALSE, BYTE):  # in a list, unlike in a struct, a truth value is a byte of its own
             return self._take(1)[0]
         if kind in (I16, I32, I64):
             return self._signed()
-        if kind == DOUBLE:
-            return struct.unpack("<d", self._take(8))[0]
         if kind == BINARY:
             return bytes(self._take(self._unsigned()))
-        if kind in (LIST, SET):
+        if kind == LIST:
             header = self._take(1)[0]
             size = header >> 4 if header >> 4 < 15 else self._unsigned()
-            return header & 15, [self._element(header & 15) for _ in range(size)]
+            return header & 15, [self._value(header & 15) for _ in range(size)]
         if kind == STRUCT:
             return self.struct()
         raise ValueError(f"thrift type {kind}")
-
-    def _element(self, kind: int) -> Any:  # noqa: ANN401 - any thrift value
-        # In a list, unlike in a struct, a truth value is a byte of its own.
-        return self._value(kind, self._take(1)[0] == TRUE if kind in (TRUE, FALSE) else False)
 
     def _take(self, count: int) -> bytes | memoryview:
         taken = self.data[self.position : self.position + count]
@@ -444,15 +406,13 @@ class Reader:
         return taken
 
     def _unsigned(self) -> int:
-        number = shift = 0
-        while True:
+        number = 0
+        for shift in range(0, 70, 7):
             byte = self._take(1)[0]
             number |= (byte & 127) << shift
             if byte < 128:
                 return number
-            shift += 7
-            if shift > _LONGEST:
-                raise ValueError("a number does not end")
+        raise ValueError("a number does not end")
 
     def _signed(self) -> int:
         number = self._unsigned()
@@ -463,28 +423,24 @@ def encode(fields: Struct) -> bytes:
     """Return the bytes of a struct."""
     out = bytearray()
     for number, (kind, value) in sorted(fields.items()):
-        written = (TRUE if value else FALSE) if kind in (TRUE, FALSE) else kind
-        out += bytes([written]) + _signed(number)
-        if kind not in (TRUE, FALSE):
-            out += _encoded(kind, value)
+        is_truth = kind in (TRUE, FALSE)
+        out += bytes([(TRUE if value else FALSE) if is_truth else kind]) + _signed(number)
+        out += b"" if is_truth else _encoded(kind, value)
     return bytes(out) + b"\0"
 
 
 def _encoded(kind: int, value: Any) -> bytes:  # noqa: ANN401 - any thrift value
-    if kind in (TRUE, FALSE):
-        return bytes([TRUE if value else FALSE])
-    if kind == BYTE:
+    if kind in (TRUE, FALSE, BYTE):
         return bytes([value])
     if kind in (I16, I32, I64):
         return _signed(value)
-    if kind == DOUBLE:
-        return struct.pack("<d", value)
     if kind == BINARY:
         return _unsigned(len(value)) + bytes(value)
-    if kind in (LIST, SET):
+    if kind == LIST:
         element, values = value
-        header = bytes([len(values) << 4 | element]) if len(values) < 15 else bytes([15 << 4 | element])
-        length = b"" if len(values) < 15 else _unsigned(len(values))
+        is_short = len(values) < 15
+        header = bytes([len(values) << 4 | element]) if is_short else bytes([15 << 4 | element])
+        length = b"" if is_short else _unsigned(len(values))
         return header + length + b"".join(_encoded(element, each) for each in values)
     return encode(value)
 

@@ -12,8 +12,8 @@ from types import ModuleType
 from typing import NamedTuple
 
 from astra_data.core.config import did_you_mean
+from astra_data.core.durable import atomic_file, atomic_folder
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset.atomic import atomic_file, atomic_folder
 from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.dataset.reader import Dataset
 from astra_data.io.export_record import read_record, restored

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from astra_data.core.arrays import as_column, as_rows
-from astra_data.core.durable import make_folder
+from astra_data.core.durable import make_folder, refuse_existing
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
-from astra_data.dataset.atomic import refuse_existing
 from astra_data.dataset.checkup.findings import Continuity
 from astra_data.dataset.columns import (
     DONE,

@@ -98,28 +98,6 @@ def test_time_must_go_on(step_s: float, found: bool) -> None:
     assert [finding.episodes for finding in findings] == [(1,)] * found
 
 
-@pytest.mark.parametrize(("still", "told"), [(99, True), (100, False)])
-def test_time_that_stands_in_half_of_the_steps_has_no_rate(still: int, told: bool) -> None:
-    timed = clock([*REGULAR, *[0.0] * still])
-    assert ("Hz by time" in str(timed)) is told
-
-
-@pytest.mark.parametrize(("regular", "is_many"), [(198, True), (199, False)])
-def test_two_gaps_in_two_hundred_steps_are_many(regular: int, is_many: bool) -> None:
-    timed = clock([0.1] * regular + [0.3] * 2)
-    (finding,) = timed.findings("walks")
-    assert finding.advice.startswith("resample") is is_many
-    assert ("2 (1 % of the steps: rows are missing)" in str(timed)) is is_many
-
-
-def test_a_step_of_a_hundred_periods_is_another_unit() -> None:
-    timed = clock(np.full(50, 100.0))
-    (finding,) = timed.findings("walks")
-    assert "100 periods or more" in finding.what
-    (slow,) = clock(np.full(50, 9.8)).findings("walks")
-    assert "at 0.102 Hz" in slow.what
-
-
 def test_a_step_of_next_to_no_time_is_another_unit() -> None:
     """Seconds that are called microseconds."""
     timed = Clock.of(Column("Stamp_US"), 20)
@@ -133,14 +111,10 @@ def test_a_step_of_next_to_no_time_is_another_unit() -> None:
     assert "at 1e+04 Hz" in fast.findings("walks")[0].what
 
 
-@pytest.mark.parametrize(
-    ("mcap", "of_topics", "of_files"), [(True, True, False), (False, False, True), (None, True, True)]
-)
-def test_the_keys_that_split_at_gaps_are_those_of_the_format(
-    mcap: bool | None, of_topics: bool, of_files: bool
-) -> None:
-    (finding,) = clock([*REGULAR * 3, 0.3]).findings("walks", mcap=mcap)
-    assert ('[columns."time"]' in finding.advice, "[split]" in finding.advice) == (of_topics, of_files)
+def test_the_keys_that_split_at_gaps_are_those_of_files_and_of_topics() -> None:
+    (finding,) = clock([*REGULAR * 3, 0.3]).findings("walks")
+    assert "`gap_s = 0.15` in [split]" in finding.advice
+    assert '`gap_s = 0.075` in [columns."time"]' in finding.advice
 
 
 def test_time_that_never_goes_on_has_no_rate() -> None:

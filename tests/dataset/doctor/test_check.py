@@ -8,15 +8,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, EPISODES, alter, drop, edit, reseal, retype, truncate, write
-from fake_dataset import fake_columns, write_fake, writer
+from damaged import DATA, EPISODES, alter, drop, edit, retype, truncate, write
+from fake_dataset import concatenated, fake_columns, fake_episodes, write_fake, writer
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import parquet
+from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import Episode
-from astra_data.dataset.doctor.check import MOST, check
+from astra_data.dataset.doctor.check import MOST, EpisodeChecks, Report, check
 from astra_data.dataset.format import POLICY_PATH
-from astra_data.dataset.reader import Dataset
+from astra_data.dataset.integrity import Digests
+from astra_data.dataset.plain import plain_columns
 
 
 def change_statistics(root: Path) -> None:
@@ -61,81 +62,37 @@ def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
     assert check(root).faults == []
 
 
-def test_counts_are_compared_whatever_their_size(tmp_path: Path) -> None:
-    with writer(tmp_path / "set") as open_writer:
-        for uid in range(30):
-            open_writer.add(Episode(uid, fake_columns(10, uid)))
-    report = check(tmp_path / "set")
-    assert (report.faults, report.frames) == ([], 300)
-
-
-def test_statistics_that_only_together_are_right_are_found(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    table = pq.read_table(root / EPISODES)
-    names = ["stats/next.reward/min", "stats/next.terminated/min"]  # side by side
-    reward, terminated = (table.column(name)[0].as_py() for name in names)
-    alter(EPISODES, names[0], 0, [])(root)
-    alter(EPISODES, names[1], 0, [*reward, *terminated])(root)
-    faults = "\n".join(check(root).faults)
-    assert "statistics: min of next.reward in episode 0 is [], expected" in faults
-    assert "statistics: min of next.terminated in episode 0 is [" in faults
-
-
 @pytest.mark.parametrize(
     ("damage", "parts"),
     [
         (alter(DATA, "frame_index", 9, 7), ["frame_index is 7 in episode 2 frame 1, expected 1"]),
-        (alter(DATA, "index", 8, 70), ["index is 70 in episode 2 frame 0, expected 8"]),
         (alter(DATA, "episode_index", 30, 9), ["episode_index is 9 in episode 3 frame 10, expected 3"]),
         (alter(DATA, "timestamp", 10, 0.2), ["timestamp is 0.2", "in episode 2 frame 2, expected 0.1"]),
         (alter(DATA, "task_index", 8, 3), ["episode 2 has the unknown tasks [3]"]),
-        (alter(DATA, "episode_uid", 9, 5), ["episode_uid is 5 in episode 2 frame 1"]),
-        (
-            alter(DATA, "next.done", 9, True),
-            [
-                "next.done is True in episode 2 frame 1, before the last frame 11",
-                "next.done is True in episode 2 frame 1, expected False: terminated or truncated",
-            ],
-        ),
+        (alter(DATA, "next.done", 9, True), ["next.done is True in episode 2 frame 1, before the last"]),
         (alter(DATA, "next.done", 19, False), ["next.done is False in episode 2 frame 11, expected True"]),
-        (alter(DATA, "next.truncated", 9, True), ["next.truncated is True in episode 2 frame 1, before"]),
         (
             alter(DATA, "observation.state", 10, [0, np.nan, 0]),
             ["observation.state is nan in episode 2 frame 2 index 1, expected a finite number"],
         ),
         (alter(DATA, "action", 10, [0, 0]), ["mean of action in episode 2 is", "the content hash is"]),
         (alter(EPISODES, "length", 1, 2), ["length of episode 1 is 2, expected 1"]),
-        (alter(EPISODES, "dataset_to_index", 1, 9), ["dataset_to_index of episode 1 is 9, expected 8"]),
         (alter(EPISODES, "dataset_from_index", 1, 9), ["dataset_from_index of episode 1 is 9, expected 7"]),
         (
             alter(EPISODES, "data/file_index", 1, 4),
             ["the file of episode 1 is data/chunk-000/file-004.parquet, expected file-000.parquet"],
         ),
-        (
-            drop_last_row(DATA),
-            ["total_frames is 55, expected 54"],
-        ),
+        (drop_last_row(DATA), ["total_frames is 55, expected 54"]),
         (retype(EPISODES, "tasks", 7), ["tasks of episode 0 are 7, expected {'run'}"]),
-        (retype(EPISODES, "tasks", [["run"]]), ["tasks of episode 0 are [['run']], expected {'run'}"]),
-        (alter(EPISODES, "tasks", 0, ["walk"]), ["tasks of episode 0 are ['walk'], expected {'run'}"]),
         (alter(EPISODES, "stats/mode/max", 2, [5.0]), ["max of mode in episode 2 is [5.0]"]),
         (change_statistics, ["meta/stats.json: q99 of action is"]),
         (write("meta/stats.json", b'{"action": 1}'), ["meta/stats.json has no JSON object for action"]),
-        (write("meta/stats.json", b"[]"), ["meta/stats.json is no JSON object but list"]),
-        (drop("meta/stats.json"), ["meta/stats.json is missing"]),
-        (
-            drop("meta/tasks.parquet"),
-            ["meta/tasks.parquet is missing", "episode 0 has the unknown tasks [0]"],
-        ),
-        (alter("meta/tasks.parquet", "task", 0, None), ["expected one text per task_index"]),
-        (drop("meta/astra/subsets.json"), ["meta/astra/subsets.json is missing"]),
+        (drop("meta/tasks.parquet"), ["meta/tasks.parquet is missing"]),
         (drop(DATA), ["data has no parquet file"]),
-        (drop(EPISODES), ["meta/episodes has no parquet file"]),
         (truncate(DATA), ["file-000.parquet is truncated or no parquet file"]),
         (truncate("meta/info.json"), ["meta/info.json is no JSON object"]),
         (write("data/chunk-000/left.tmp", b""), ["data/chunk-000/left.tmp does not belong to it"]),
         (edit("meta/astra/subsets.json", uids=[13, 4]), ["not in the order of their seed"]),
-        (edit("meta/astra/subsets.json", seed=7), ["not in the order of their seed"]),
         (edit("meta/astra/dataset.json", content_hash="0"), ["meta/astra/dataset.json was altered"]),
         (
             edit("meta/info.json", total_frames=1, total_episodes=2, total_tasks=3, codebase_version="v2.1"),
@@ -146,24 +103,11 @@ def test_statistics_that_only_together_are_right_are_found(tmp_path: Path) -> No
                 "total_tasks is 3",
             ],
         ),
-        (
-            edit("meta/astra/dataset.json", parents=[{"name": "x"}], stage=""),
-            ["dataset.json has 3 errors: parents.0.version: expected a value", "parents.0.hash", "stage: "],
-        ),
-        (write("meta/astra/dataset.json", b"{}"), ["dataset.json has 12 errors: name: expected a value"]),
-        (edit("meta/astra/subsets.json", seed="0"), ["subsets.json: seed: expected a whole number"]),
-        (edit("meta/info.json", data_path="/etc/file.parquet"), ["expected a path inside the folder"]),
         (edit("meta/info.json", data_path="../file.parquet"), ["expected a path inside the folder"]),
-        (edit("meta/info.json", data_path="{file_index:99999999d}"), ["expected a path inside the folder"]),
         (edit("meta/info.json", fps="20"), ["fps is '20', expected a positive number"]),
-        (edit("meta/info.json", fps=True), ["fps is True, expected a positive number"]),
-        (edit("meta/info.json", fps=0), ["fps is 0, expected a positive number"]),
         (edit("meta/info.json", fps=2**31), ["expected a positive number below 2^31"]),
-        (edit("meta/info.json", features=[]), ["features is [], expected an object"]),
         (declare("action", names=["x"]), ["action: 1 names for 2 values"]),
-        (declare("index", shape=[2]), ["index: expected in features as one int64 per step"]),
         (alter("meta/astra/episodes.parquet", "length", 3, 4), ["(6, 4) as uid and length of episode 3"]),
-        (drop_last_row("meta/astra/episodes.parquet"), ["None as uid and length of episode 4"]),
     ],
 )
 def test_damage_is_found(tmp_path: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
@@ -232,27 +176,6 @@ def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
     assert "timestamp: and 7 more of this kind" in faults
 
 
-def test_notes_are_counted_apart_from_faults(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    for number in range(8):
-        (root / f"meta/{number}.txt").touch()
-    (root / "data/one.txt").touch()
-    report = check(root)
-    assert report.faults == ["data/one.txt does not belong to it"]
-    assert report.fault_count == 1
-    assert report.notes[-1] == "files: and 3 more of this kind"
-
-
-def test_an_unreadable_file_stops_the_check_of_values_also_after_many_faults(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    for number in range(8):
-        (root / f"data/{number}.txt").touch()
-    truncate(DATA)(root)
-    report = check(root)
-    assert report.notes == ["values were not checked, because not all files could be read as declared"]
-    assert (len(report.faults), report.fault_count) == (MOST + 1, 9)
-
-
 def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
     table = pq.read_table(root / DATA)
@@ -313,22 +236,6 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
     assert "index is 70 in episode 2 frame 0, expected 8" in check(root).faults
 
 
-def test_ours_has_no_columns_of_other_types(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    table = pq.read_table(root / DATA)
-    at = table.column_names.index("next.reward")
-    wide = table.column("next.reward").cast(pa.float64())
-    pq.write_table(table.set_column(at, "next.reward", wide), root / DATA)
-    features = json.loads((root / "meta/info.json").read_text())["features"]
-    features["next.reward"]["dtype"] = "float64"
-    edit("meta/info.json", features=features)(root)
-    reseal(root)
-    with pytest.raises(
-        CorruptDatasetError, match=r"next\.reward\.dtype: expected 'float32', 'int64' or 'bool'"
-    ):
-        Dataset.open(root)
-
-
 def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
     for path in (root / "meta/astra").iterdir():
@@ -345,3 +252,105 @@ def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> No
 def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="found no dataset"):
         check(tmp_path)
+
+
+def test_only_the_first_findings_of_a_kind_are_kept_and_all_are_counted() -> None:
+    report = Report()
+    for number in range(MOST + 3):
+        report.fault("files", f"file {number} is broken")
+    report.fault("counts", "one episode is missing")
+    report.note("files", "a note")
+    assert report.faults == [
+        *(f"file {number} is broken" for number in range(MOST)),
+        "files: and 3 more of this kind",
+        "one episode is missing",
+    ]
+    assert report.fault_count == MOST + 4
+    assert report.notes == ["a note"]
+
+
+def checked(root: Path, is_ours: bool = True, digests: Digests | None = None) -> tuple[EpisodeChecks, Report]:
+    info = json.loads((root / "meta/info.json").read_text())
+    report = Report()
+    checks = EpisodeChecks(root, info, plain_columns(info["features"])[0], digests or {}, is_ours, report)
+    checks.run()
+    checks.totals()
+    return checks, report
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_fake(tmp_path / "set").root
+
+
+def test_statistics_of_ours_are_compared_exactly_and_others_loosely(root: Path) -> None:
+    found = json.loads((root / "meta/stats.json").read_text())["mode"]["max"][0]
+    number = next(
+        number for number, episode in enumerate(fake_episodes()) if episode.columns["mode"].max() == found
+    )
+    alter(EPISODES, "stats/mode/max", number, [found * (1 + 1e-4)])(root)
+    _, report = checked(root)
+    assert len(report.faults) == 1
+    assert f"max of mode in episode {number} is" in report.faults[0]
+    _, report = checked(root, is_ours=False)
+    assert (report.faults, report.notes) == ([], [])
+    alter(EPISODES, "stats/mode/max", number, [found * 1.01])(root)
+    alter(EPISODES, "stats/mode/std", number, [1.0])(root)
+    alter(EPISODES, "stats/mode/count", number, [3])(root)
+    alter(EPISODES, "stats/mode/q50", number, [1.0])(root)  # an estimate of lerobot's: not compared
+    _, report = checked(root, is_ours=False)
+    assert report.faults == []
+    assert any(f"q50 of mode in episode {number} is [1.0]" in fault for fault in checked(root)[1].faults)
+    what = f"of mode in episode {number} is"
+    assert [f"statistics: {kind} {what}" for kind in ("max", "std", "count")] == [
+        note[: note.index(" is ") + 3] for note in report.notes
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "change"),
+    [
+        ("action", "min", -0.5),
+        ("action", "mean", 0.01),
+        ("action", "std", 0.01),
+        ("observation.state", "mean", 0.1),
+        ("mode", "count", 1),
+    ],
+)
+def test_the_statistics_of_a_plain_dataset_are_compared(
+    root: Path, name: str, kind: str, change: float
+) -> None:
+    path = root / "meta/stats.json"
+    stats = json.loads(path.read_text())
+    assert checked(root, is_ours=False)[1].notes == []
+    stats[name][kind][-1] += change
+    path.write_text(json.dumps(stats))
+    assert checked(root)[1].notes == []
+    [note] = checked(root, is_ours=False)[1].notes
+    assert note.startswith(f"statistics: {kind} of {name} is ")
+
+
+def test_rounding_of_float32_is_not_told_of_a_plain_dataset(root: Path) -> None:
+    """LeRobot sums values and squares in float32, which loses a small spread far from zero."""
+    path = root / "meta/stats.json"
+    stats = json.loads(path.read_text())
+    state = concatenated("observation.state")
+    with np.errstate(invalid="ignore"):
+        square = np.mean(state**2, axis=0) - np.mean(state, axis=0) ** 2
+    stats["observation.state"]["std"] = np.sqrt(np.maximum(0, square)).tolist()
+    stats["observation.state"]["mean"] = np.mean(state, axis=0).tolist()
+    path.write_text(json.dumps(stats))
+    assert checked(root, is_ours=False)[1].notes == []
+
+
+def test_rows_and_episodes_without_each_other_are_found(root: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(root, other)
+    shutil.copy(root / DATA, other / "data/chunk-000/file-001.parquet")
+    _, report = checked(other)
+    assert "meta/episodes lacks episode 5" in report.faults
+    assert "total_episodes is 5, expected 10" in report.faults
+    assert "episodes 0 and 5 have the same uid 13" in report.faults
+    drop(DATA)(root)
+    _, report = checked(root)
+    assert "meta/episodes has episode 4, the data has not" in report.faults

@@ -1,4 +1,3 @@
-import logging
 import sys
 from pathlib import Path
 
@@ -50,28 +49,6 @@ def test_other_boundaries_of_episodes_are_found(
     for name in ("observation.state", "action"):
         for other in ("values", "padding"):
             assert f"lerobot's window of {name} around row {row} has other {other}" in faults
-
-
-def test_lerobots_messages_do_not_change_how_ours_are_shown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from lerobot.datasets import lerobot_dataset  # noqa: PLC0415 - slow
-
-    def talkative(*arguments: object, **options: object) -> None:
-        logging.debug("a version")  # as lerobot does while it is imported: the root logger gets a handler
-        raise ValueError
-
-    handlers: list[logging.Handler] = []
-    monkeypatch.setattr(logging.getLogger(), "handlers", handlers)
-    monkeypatch.setattr(lerobot_dataset, "LeRobotDataset", talkative)
-    assert compared(write_fake(tmp_path / "set").root) == ["lerobot cannot open it: ValueError: "]
-    assert logging.getLogger().handlers == []
-
-
-def test_other_counts_are_found(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    assert compared(root, episodes=6) == ["lerobot sees 5 episodes, 55 frames, not 6, 55"]
-    assert compared(root, frames=50) == ["lerobot sees 5 episodes, 55 frames, not 5, 50"]
 
 
 def test_what_lerobot_cannot_open_is_a_fault(tmp_path: Path) -> None:

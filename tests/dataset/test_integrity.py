@@ -1,3 +1,4 @@
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -5,16 +6,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import xxhash
-from damaged import DATA, alter
+from damaged import DATA, EPISODES, alter, edit
 from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import parquet
+from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import ACTION, REWARD, STATE
-from astra_data.dataset.edit import delete
-from astra_data.dataset.format import DIGESTS_PATH
-from astra_data.dataset.integrity import altered_columns, digests_of, read_digests
-from astra_data.dataset.reader import Dataset
+from astra_data.dataset.description import read_description
+from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH
+from astra_data.dataset.integrity import SEALED, altered_columns, altered_files, digests_of, read_digests
 
 
 def test_the_file_holds_a_digest_of_each_episode_and_column(fake: Dataset) -> None:
@@ -66,18 +66,6 @@ def test_an_altered_value_is_refused_before_it_is_seen(
         np.testing.assert_array_equal(found, expected.columns[REWARD])
 
 
-def test_the_row_is_that_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "FILE_SIZE_LIMIT", 2_000)
-    dataset = write_fake(tmp_path / "set")
-    path = dataset.paths[-1].relative_to(dataset.root)
-    rows = pq.read_metadata(dataset.root / path).num_rows
-    assert rows < dataset.lengths.sum()
-    alter(str(path), REWARD, rows - 1, 9.0)(dataset.root)
-    where = rf"{path} rows {rows - 5} to {rows - 1} \(episode 4\)"
-    with pytest.raises(CorruptDatasetError, match=where):
-        Dataset.open(dataset.root).columns([REWARD])
-
-
 def test_a_file_that_shrinks_while_it_is_open_is_refused(tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "set")
     table = pq.read_table(dataset.root / DATA)
@@ -85,14 +73,6 @@ def test_a_file_that_shrinks_while_it_is_open_is_refused(tmp_path: Path) -> None
         pq.write_table(rows, dataset.root / DATA)
         with pytest.raises(CorruptDatasetError, match="other rows than when the dataset was opened"):
             dataset.columns([REWARD])
-
-
-def test_an_altered_episode_can_be_deleted(tmp_path: Path) -> None:
-    root = write_fake(tmp_path / "set").root
-    alter(DATA, REWARD, 25, 9.0)(root)
-    saved = Dataset.open(delete(Dataset.open(root), [6], out=tmp_path / "saved"))
-    assert saved.uids.tolist() == [13, 4, 2**53 + 1, 0]
-    assert saved.verify() == []
 
 
 @pytest.mark.parametrize(
@@ -109,3 +89,33 @@ def test_digests_that_do_not_fit_are_refused(tmp_path: Path, table: pa.Table) ->
     pq.write_table(table, tmp_path / DIGESTS_PATH)
     with pytest.raises(CorruptDatasetError, match="has other columns or episodes than the data"):
         read_digests(tmp_path, {}, [REWARD, ACTION], 5)
+
+
+def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    sums = dict(dataset.description["sums"])
+    sums.pop(DATASET_PATH)
+    assert sums == {
+        path: hashlib.sha256((dataset.root / path).read_bytes()).hexdigest() for path in (*SEALED, EPISODES)
+    }
+    assert list(altered_files(dataset.root, dataset.description)) == []
+
+
+@pytest.mark.parametrize("path", [*SEALED, EPISODES])
+def test_every_sealed_file_is_known_when_altered_or_missing(path: str, tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    with (dataset.root / path).open("ab") as file:
+        file.write(b" ")
+    assert list(altered_files(dataset.root, dataset.description)) == [path]
+    (dataset.root / path).unlink()
+    assert list(altered_files(dataset.root, dataset.description)) == [path]
+
+
+@pytest.mark.parametrize("change", [{"seeds": {}}, {"content_hash": "0" * 64}, {"more": 1}])
+def test_the_description_seals_itself(change: dict[str, object], tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    edit(DATASET_PATH, **change)(root)
+    with pytest.raises(CorruptDatasetError, match=r"^meta/astra/dataset\.json was altered$"):
+        read_description(root)
+    with pytest.raises(CorruptDatasetError, match=r"dataset\.json was altered.*Restore it from a copy"):
+        Dataset.open(root)
