@@ -196,8 +196,8 @@ def merge(
     tasks = list(dict.fromkeys(task for source in sources for task in _tasks(source)))
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
-    task, described = " / ".join(tasks), {"stage": "merge", "config": config, "name": name, "out": out}
-    with next_version(first, "episodes", others=others, task=task, **described) as writer:
+    described: dict[str, Any] = {"stage": "merge", "config": config, "name": name, "out": out}
+    with next_version(first, "episodes", others=others, task=" / ".join(tasks), **described) as writer:
         for source, named in zip(sources, names, strict=True):
             for episode in source.episodes():
                 metadata = renamed_metadata(episode.uid, episode.metadata, named)
