@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.dataset import atomic
+from astra_data.core import durable as atomic
 from astra_data.dataset.columns import (
     ACTION,
     DONE,

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.durable import folder_for, held
+from astra_data.core.durable import folder_for, held, publish
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, SharingError
 from astra_data.core.progress import Progress, silent
-from astra_data.dataset.atomic import publish
 from astra_data.dataset.description import NAME
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
