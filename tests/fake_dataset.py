@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core import durable as atomic
+from astra_data.core import durable
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -107,7 +107,7 @@ if __name__ == "__main__":
     # Write a dataset and be killed on the way.
     target, moment = Path(sys.argv[1]), sys.argv[2]
     if moment == "renaming":
-        atomic.os.replace = _die  # type: ignore[attr-defined]
+        durable.os.replace = _die  # type: ignore[attr-defined]
     if moment == "validating":
         Dataset.verify = _die  # type: ignore[assignment, method-assign]
     with writer(target) as killed_writer:
