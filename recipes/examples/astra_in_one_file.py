@@ -28,8 +28,7 @@ from astra_data import Dataset
 # ---- Paired episodes: beside (s_i, a_i, s_{i+1}), where the abstract simulator lands from φ(s_i) under a_i
 def load_episodes(folder, task):
     """Return the paired episodes, each column padded to (E, T, ...); `mask` (E, T) is 1 on real steps."""
-    dataset = Dataset.open(folder)
-    names = {"target_state": "observation.state", "action": "action"}
+    dataset, names = Dataset.open(folder), {"target_state": "observation.state", "action": "action"}
     names |= {"state": "abstract.state", "next_state": "abstract.next_state"}  # φ(s_i), φ(s_{i+1})
     names |= {"simulated_next": "abstract.simulated_next_state"}  # the simulator's from φ(s_i) under a_i
     names |= {name: f"next.{name}" for name in ("reward", "terminated", "success")}
@@ -40,14 +39,12 @@ def load_episodes(folder, task):
     columns = {}
     for name, column in names.items():
         values = torch.tensor(steps[column]).float()
-        if not column.startswith("next."):
-            values = values.reshape(len(values), -1)
+        values = values if column.startswith("next.") else values.reshape(len(values), -1)
         values = task.limits.normal(values) if name == "action" else values  # ±1 along each axis
         columns[name] = nn.utils.rnn.pad_sequence(values.split(lengths.tolist()), batch_first=True)
     mask = (torch.arange(int(lengths.max())) < lengths[:, None]).float()
     columns.setdefault("goal", torch.zeros(*mask.shape, 0))
-    start = torch.zeros_like(columns["action"][:, :1])
-    columns["previous_action"] = torch.cat([start, columns["action"][:, :-1]], dim=1)  # a_{i-1}
+    columns["previous_action"] = nn.functional.pad(columns["action"][:, :-1], (0, 0, 1, 0))  # a_{i-1}
     # Simulators see themselves that a goal is reached, and pay for it: there R_pred has nothing to learn.
     # Elsewhere, a policy is paid the task's own reward on abstract states, plus a predicted residual.
     flat = [columns[name].flatten(0, 1) for name in ("state", "next_state", "goal")]
@@ -79,9 +76,7 @@ def draw_windows(episodes, count, length):
 
 # ---- Networks
 def mlp(*sizes):
-    layers = []
-    for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), nn.ELU()]
+    layers = [layer for pair in pairwise(sizes) for layer in (nn.Linear(*pair), nn.ELU())]
     return nn.Sequential(*layers[:-1])
 
 
@@ -89,9 +84,8 @@ def normalized(values, mean, std):
     return ((values - mean) / std).clamp(-5.0, 5.0)
 
 
+# ψ: a GRU, whose layer-normalized hidden state is the latent: L_trans would shrink it without limit.
 class Encoder(nn.Module):
-    """ψ: a GRU, whose layer-normalized hidden state is the latent: L_trans would shrink it without limit."""
-
     def __init__(self, input_size, latent_size, embedding_size=64):
         super().__init__()
         self.embedding = nn.Linear(input_size, embedding_size)
@@ -103,7 +97,6 @@ class Encoder(nn.Module):
         return self.latent(hidden), hidden
 
     def step(self, inputs, hidden):
-        """Return the next hidden state (B, Z), after inputs (B, I)."""
         (weights,) = self.recurrence.all_weights
         return torch.gru_cell(nn.functional.elu(self.embedding(inputs)), hidden, *weights)
 
@@ -111,13 +104,15 @@ class Encoder(nn.Module):
         return nn.functional.layer_norm(hidden, hidden.shape[-1:])
 
 
+# An encoder of histories (state, goal, previous action), of abstract or of target states.
 class HistoryModel(nn.Module):
-    """An encoder of histories (state, goal, previous action), of abstract or of target states."""
-
     def __init__(self, state_size, goal_size, action_size, latent_size=64):
         super().__init__()
         self.encoder = Encoder(state_size + goal_size + action_size, latent_size)
-        for name, size in {"state": state_size, "goal": goal_size}.items():
+        self.add_scales(state=state_size, goal=goal_size)
+
+    def add_scales(self, **sizes):
+        for name, size in sizes.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
 
@@ -132,9 +127,8 @@ class HistoryModel(nn.Module):
         return torch.cat([state, normalized(goal, self.goal_mean, self.goal_std), previous_action], dim=-1)
 
 
+# ψ^s, P_lat, R_pred and f_abs on one backbone (Section IV-A).
 class Grounding(HistoryModel):
-    """ψ^s, P_lat, R_pred and f_abs on one backbone (Section IV-A)."""
-
     def __init__(self, state_size, goal_size, action_size, latent_size=64):
         super().__init__(state_size, goal_size, action_size, latent_size)
         given = latent_size + action_size
@@ -144,16 +138,17 @@ class Grounding(HistoryModel):
         for parameter in self.correction[-1].parameters():  # untrained, it is the raw simulator
             nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
-        for name, size in {"correction": state_size, "reward": 2}.items():
-            self.register_buffer(f"{name}_mean", torch.zeros(size))
-            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.add_scales(correction=state_size, reward=2)
         self.register_buffer("reward_shrinkage", torch.ones(()))
 
     def set_scales(self, episodes):
-        real = episodes["mask"].bool()
-        self.set_scale("state", episodes["state"][real])
-        self.set_scale("goal", episodes["goal"][real])
-        self.set_scale("correction", (episodes["next_state"] - episodes["simulated_next"])[real])
+        real, missed = episodes["mask"].bool(), episodes["next_state"] - episodes["simulated_next"]
+        for name, values in {
+            "state": episodes["state"],
+            "goal": episodes["goal"],
+            "correction": missed,
+        }.items():
+            self.set_scale(name, values[real])
         reward = episodes["reward"][episodes["learns_reward"].bool()]
         self.reward_mean.copy_(reward.mean(0))
         self.reward_std.copy_(reward.std(0, correction=0).clamp_min(1e-3))
@@ -199,8 +194,8 @@ class Grounding(HistoryModel):
         nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
         trans = masked_mean(nll, mask[:, :-1] * mask[:, 1:])
         reward = (windows["reward"] - self.reward_mean) / self.reward_std
-        reward_error = 0.5 * (self.normal_reward(latent, action) - reward).square().sum(-1)
-        rew = masked_mean(reward_error, windows["learns_reward"] * mask)
+        error = 0.5 * (self.normal_reward(latent, action) - reward).square().sum(-1)
+        rew = masked_mean(error, windows["learns_reward"] * mask)
         corrected = self.correct(latent, action, windows["simulated_next"])
         error = ((corrected - windows["next_state"]) / self.correction_std).square().mean(-1)
         abstract = masked_mean(error, mask)
@@ -232,8 +227,7 @@ def descend(model, loss_of, error_of, training, held_out, after=lambda: None, wi
         schedule.step()
         after()
         if update % 100 == 0:
-            with torch.no_grad():
-                error = float(error_of(held_out))
+            error = float(error_of(held_out).detach())
             if error < least:
                 least, best = error, copy.deepcopy(model.state_dict())
             print(f"  update {update} of {updates}: held-out error {error:.4f}")
@@ -274,41 +268,39 @@ def alignment_losses(model, target, windows):
     mean, log_variance = model.predict_latent(latent, windows["action"])
     bandwidths = torch.tensor([0.25, 0.5, 1.0, 2.0]) * latent.shape[-1] ** 0.5
     mmd = gaussian_mmd(source_mean, source_log_variance.exp(), mean, log_variance.exp(), bandwidths)
-    distance = (latent - source).square().mean(-1)
-    return masked_mean(mmd, windows["mask"]), masked_mean(distance, windows["mask"])
+    return (masked_mean(v, windows["mask"]) for v in (mmd, (latent - source).square().mean(-1)))
 
 
 def align(model, training, held_out):
     """Fit ψ^t on full target states, with all else frozen; pairs tell more than distributions alone."""
     target = HistoryModel(*(training[name].shape[-1] for name in ("target_state", "goal", "action")))
-    real = training["mask"].bool()
-    target.set_scale("state", training["target_state"][real])
-    target.set_scale("goal", training["goal"][real])
+    for name, column in {"state": "target_state", "goal": "goal"}.items():
+        target.set_scale(name, training[column][training["mask"].bool()])
     return descend(target, *[lambda w: sum(alignment_losses(model, target, w))] * 2, training, held_out)
 
 
 # ---- Algorithm 2: the grounded simulator, and PPO in it
-class GroundedEnv:
-    """B episodes in the grounded simulator; half of them start amid recorded ones, with their histories."""
+def seen_by_policy(objective, latent, state, goal):
+    return torch.cat([latent / latent.shape[-1] ** 0.5, objective.observe(state, goal)], dim=-1)
 
+
+# B episodes in the grounded simulator; half of them start amid recorded ones, with their histories.
+class GroundedEnv:
     def __init__(self, task, model, episodes, num_envs=256, data_start_share=0.5):
-        self.task, self.model, self.objective = task, model, task.objective
+        self.model, self.objective = model, task.objective
         self.simulator, self.num_envs = task.simulator(num_envs), num_envs
         self.hidden = torch.zeros(num_envs, model.encoder.recurrence.hidden_size)
         self.goal = torch.zeros(num_envs, self.objective.goal_size)
-        self.data_start_share = data_start_share
-        real = episodes["mask"].bool()
+        self.data_start_share, names = data_start_share, ("state", "goal", "previous_action")
         with torch.no_grad():
             _, hidden = model.encode(episodes)
         before = nn.functional.pad(hidden[:, :-1], (0, 0, 1, 0))
-        recorded = {"hidden": before} | {k: episodes[k] for k in ("state", "goal", "previous_action")}
-        self.recorded = {name: values[real] for name, values in recorded.items()}
+        recorded = {name: episodes[name] for name in names} | {"hidden": before}
+        self.recorded = selected(recorded, episodes["mask"].bool())
 
     def observe(self):
-        """Return the latent, at a length of about 1, and what the task shows of state and goal."""
         latent = self.model.encoder.latent(self.hidden)
-        seen = self.objective.observe(self.simulator.state, self.goal)
-        return torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
+        return seen_by_policy(self.objective, latent, self.simulator.state, self.goal)
 
     @torch.no_grad()
     def reset(self, done):
@@ -322,9 +314,7 @@ class GroundedEnv:
             action = torch.zeros(len(fresh), self.objective.action_size)
             self._start(fresh, state, goal, action, torch.zeros(len(fresh), self.hidden.shape[1]))
             moments = torch.randint(len(self.recorded["state"]), (int(from_data.sum()),))
-            given = selected(self.recorded, moments)
-            started = (given[name] for name in ("state", "goal", "previous_action", "hidden"))
-            self._start(rows[from_data], *started)
+            self._start(rows[from_data], **selected(self.recorded, moments))
         return self.observe()
 
     def _start(self, rows, state, goal, previous_action, hidden):
@@ -342,26 +332,23 @@ class GroundedEnv:
         self.hidden = self.model.encoder.step(self.model.inputs(after, self.goal, action), self.hidden)
         success, failed = self.objective.reached(after, self.goal), self.objective.missed(after, self.goal)
         ended = success | failed
-        paid = self.objective.reward(before, after, self.goal, failed)  # for what abstract states show
+        paid = self.objective.reward(before, after, self.goal, failed)
         return paid + ~ended * self.model.predict_residual(latent, action), ended, success
 
 
+# A Gaussian policy, whose mean is clipped to ±1 with the gradient of the output, and a value.
 class ActorCritic(nn.Module):
-    """A Gaussian policy, whose mean is clipped to ±1 with the gradient of the output, and a value."""
-
     def __init__(self, observation_size, action_size):
         super().__init__()
         self.actor = mlp(observation_size, 64, 64, action_size)
         self.critic = mlp(observation_size, 64, 64, 1)
         self.log_std = nn.Parameter(torch.full((action_size,), -0.5))
         for network, gain in ((self.actor, 0.01), (self.critic, 1.0)):
-            layers = [layer for layer in network if isinstance(layer, nn.Linear)]
-            for layer in layers:
+            for layer in network[::2]:
                 nn.init.orthogonal_(layer.weight, 2**0.5)
                 nn.init.zeros_(layer.bias)
-            nn.init.orthogonal_(layers[-1].weight, gain)
-        with torch.no_grad():  # values of an untrained critic must not exceed small returns
-            self.critic[-1].weight.mul_(0.01)
+            nn.init.orthogonal_(network[-1].weight, gain)
+        self.critic[-1].weight.data.mul_(0.01)  # its values must not exceed small returns
 
     def mean(self, output):
         return output + (output.clamp(-1.0, 1.0) - output).detach()
@@ -374,9 +361,8 @@ class ActorCritic(nn.Module):
         return (((action - mean) / std).square() / -2 - std.log() - math.log(2 * math.pi) / 2).sum(-1)
 
 
+# Proximal policy optimization (Schulman et al. 2017), by the package's settings.
 class Ppo:
-    """Proximal policy optimization (Schulman et al. 2017), by the package's settings."""
-
     def __init__(self, env, policy, total_steps=2_000_000, rollout_steps=64, discount=0.99):
         self.env, self.policy, self.total_steps = env, policy, total_steps
         self.rollout_steps, self.discount, self.horizon = rollout_steps, discount, env.objective.horizon
@@ -385,8 +371,7 @@ class Ppo:
         self.sums = torch.zeros(env.num_envs)  # discounted returns, whose running deviation scales rewards
         self.count, self.mean, self.var = torch.tensor([1e-4, 0.0, 1.0], dtype=torch.float64)
         self.observation = env.reset(torch.ones(env.num_envs, dtype=torch.bool))
-        self.age = torch.randint(self.horizon, (env.num_envs,))  # not all reach the horizon at once
-        self.share = 0.0
+        self.age, self.share = torch.randint(self.horizon, (env.num_envs,)), 0.0  # not all end at once
 
     def scaled(self, reward, done):
         self.sums = self.sums * self.discount + reward
@@ -411,10 +396,9 @@ class Ppo:
             done = ended | expired
             beyond = torch.where(expired, self.policy.value(self.env.observe()), 0.0)
             row = {"observation": self.observation, "action": action, "ended": ended, "done": done}
-            row |= {"log_prob": self.policy.log_prob(mean, action), "beyond": beyond}
-            row |= {"reward": self.scaled(reward, done)}
-            for name, values in row.items():
-                rollout.setdefault(name, []).append(values)
+            log_prob, scaled = self.policy.log_prob(mean, action), self.scaled(reward, done)
+            row |= {"log_prob": log_prob, "beyond": beyond, "reward": scaled}
+            rollout = {name: [*rollout.get(name, []), values] for name, values in row.items()}
             self.age[done] = 0
             self.observation = self.env.reset(done)
             succeeded, finished = succeeded + int(success.sum()), finished + int(done.sum())
@@ -427,15 +411,14 @@ class Ppo:
         for step in reversed(range(self.rollout_steps)):
             later = error[:, step] + self.discount * 0.95 * ~rollout["done"][:, step] * later
             advantage[:, step] = later
-        rollout["target"] = advantage + value
-        rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        normal = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        rollout |= {"target": advantage + value, "advantage": normal}
         return rollout, succeeded / finished if finished else math.nan
 
     def loss(self, batch):
         """Return the clipped objective's loss, and how far the policy has moved, by the KL divergence."""
-        observation, action, before, advantage, target = (
-            batch[name].flatten(0, 1) for name in ("observation", "action", "log_prob", "advantage", "target")
-        )
+        names = "observation", "action", "log_prob", "advantage", "target"
+        observation, action, before, advantage, target = (batch[name].flatten(0, 1) for name in names)
         output = self.policy.actor(observation)
         moved = self.policy.log_prob(self.policy.mean(output), action) - before
         ratio = moved.exp()
@@ -457,13 +440,12 @@ class Ppo:
 
     def iterate(self, pace=1.0):
         """Collect a rollout and learn from it; return the share of its episodes that succeeded."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = 5e-4 * (1.0 - self.share)
+        self.optimizer.param_groups[0]["lr"] = 5e-4 * (1.0 - self.share)
         rollout, success = self.collect()
         self.learn(rollout)
-        with torch.no_grad():  # action noise fades, so that the policy is trained as it is tested
-            limit = math.log(self.first_std) + min(1.0, self.share / 0.5) * math.log(0.15 / self.first_std)
-            self.policy.log_std.clamp_(max=limit)
+        # Action noise fades, so that the policy is trained as it is tested.
+        limit = math.log(self.first_std) + min(1.0, self.share / 0.5) * math.log(0.15 / self.first_std)
+        self.policy.log_std.data.clamp_(max=limit)
         self.share = min(1.0, self.share + pace * self.env.num_envs * self.rollout_steps / self.total_steps)
         return success
 
@@ -485,16 +467,14 @@ def success_in_target(task, policy, encoder, abstraction, episodes=100, seed=0):
     """Return the share of the episodes in the target in which the policy succeeds, by mean actions."""
     env = task.target(episodes, seed=seed)
     env.reset()
-    action = torch.zeros(episodes, task.objective.action_size)
-    hidden = torch.zeros(episodes, encoder.encoder.recurrence.hidden_size)
-    active, success = torch.ones(episodes, dtype=torch.bool), torch.zeros(episodes, dtype=torch.bool)
+    sizes = task.objective.action_size, encoder.encoder.recurrence.hidden_size
+    action, hidden = (torch.zeros(episodes, size) for size in sizes)
+    active, success = (torch.full((episodes,), value) for value in (True, False))
     for _ in range(task.objective.horizon):
         hidden = encoder.encoder.step(encoder.inputs(abstraction(env.state), env.goal, action), hidden)
         latent = encoder.encoder.latent(hidden)
-        seen = task.objective.observe(task.abstraction(env.state), env.goal)
-        observation = torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
-        action = policy.mean(policy.actor(observation))
-        action = task.objective.limit_command(action, math.inf)
+        observation = seen_by_policy(task.objective, latent, task.abstraction(env.state), env.goal)
+        action = task.objective.limit_command(policy.mean(policy.actor(observation)), math.inf)
         step = env.step(action, active)
         success |= step.success & active
         active &= ~step.terminated
@@ -507,19 +487,14 @@ def astra(dataset, task, seed=0):
     episodes = load_episodes(dataset, task)
     order = torch.randperm(len(episodes["lengths"]))
     held_out, training = (selected(episodes, rows) for rows in order.tensor_split([len(order) // 10]))
-    print("Grounding (Algorithm 1)")
     model = ground(training, held_out)
-    print("Policy (Algorithm 2)")
-    policy = train(task, model, training)
-    print("Alignment (Section IV-B)")
-    target = align(model, training, held_out)
+    policy, target = train(task, model, training), align(model, training, held_out)
     by_target = success_in_target(task, policy, target, lambda state: state)
     by_source = success_in_target(task, policy, model, task.abstraction)
     print(f"success in the target {by_target:.2f} by ψ^t, {by_source:.2f} by ψ^s")
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
     file, _, name = sys.argv[2].rpartition(":")
     sys.path.insert(0, str(Path(file).parent))
     astra(sys.argv[1], getattr(import_module(Path(file).stem), name))

@@ -12,7 +12,6 @@ from astra_data.grounding.fit import Fitting, GroundConfig, HistoryFit, recorded
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.scatter import ScatterModel, ScatterShape
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 
@@ -61,36 +60,6 @@ def test_what_is_recorded_is_the_distance_that_99_of_100_steps_keep() -> None:
 def test_corrected_states_come_no_closer() -> None:
     assert highest_m(HistoryGrounding(pushed_up())) == pytest.approx(TOP_M - 0.2, abs=0.11)
     assert highest_m(HistoryGrounding(pushed_up(), clearance_m=0.7)) == pytest.approx(TOP_M - 0.7, abs=0.01)
-
-
-def scattering(size_m: float) -> ScatterModel:
-    """Return a scatter to the north and to the south, alike."""
-    made = ScatterModel(ScatterShape(pushed_up().correction_inputs(*NOTHING).shape[-1], 4, 2))
-    made.forms[:, 1] = torch.tensor([size_m, -size_m])
-    return made.requires_grad_(False).eval()
-
-
-NOTHING = torch.zeros(1, 8), torch.zeros(1, 2), torch.zeros(1, 4)
-
-
-@pytest.mark.parametrize(
-    ("by_m", "fails_at_walls", "least", "most"),
-    [(0.04, False, 0.2, 0.8), (0.04, True, 0.0, 0.0), (0.6, False, 0.2, 0.8), (0.6, True, 1.0, 1.0)],
-)
-def test_where_touches_are_failures_scatter_touches_nothing(
-    by_m: float, fails_at_walls: bool, least: float, most: float
-) -> None:
-    """Of 40 robots 0.6 m from the wall, scatter moves half into it or away; corrections move none or all."""
-    torch.manual_seed(0)
-    made = HistoryGrounding(pushed_up(by_m), scatter_model=scattering(0.9), fails_at_walls=fails_at_walls)
-    world, start = made.simulator(TASK, 40), torch.tensor([[-4.0, TOP_M - 0.6, 0.0, 0.0]]).expand(40, 4)
-    world.start(start, torch.arange(40), torch.zeros(40, 2))
-    assert not world.blocked.any()
-    state = world.step(torch.zeros(40, 2))
-    assert float(state[:, 1].min()) < TOP_M - 0.7 < TOP_M - 0.6 < float(state[:, 1].max()) < TOP_M
-    assert least <= float(world.blocked.float().mean()) <= most
-    world.start(start[:5], torch.arange(5), torch.zeros(5, 2))
-    assert not world.blocked[:5].any()
 
 
 @pytest.mark.parametrize(("printed", "at_walls"), [(False, False), (True, False), (False, True)])

@@ -74,13 +74,6 @@ def test_from_a_checkpoint_it_goes_on_to_the_bit(tmp_path: Path) -> None:
     assert torch.equal(resumed.weight, whole.weight)
 
 
-def test_the_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
-    checkpoint = tmp_path / "checkpoint.safetensors"
-    Descent(model(), CONFIG, checkpoint=checkpoint).keep()
-    with pytest.raises(BadInputError, match=f"remove {tmp_path}"):
-        Descent(nn.Linear(5, 2), CONFIG, checkpoint=checkpoint)
-
-
 @pytest.mark.parametrize("stopped", [None, 4, 8, 12])
 @pytest.mark.parametrize(
     ("errors", "best", "last"),

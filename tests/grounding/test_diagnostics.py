@@ -83,22 +83,6 @@ def test_the_latents_spread_and_rank() -> None:
     assert 1.0 < rank < 6.0
 
 
-def test_a_correction_explains_what_it_removes_of_the_squared_error() -> None:
-    given = episodes()
-    windows, std = given.windows, torch.tensor([1.0, 2.0, 0.5, 1.0])
-    error = windows.next_state - windows.simulated_next
-    assert correction_r2(windows.next_state, windows, std) == pytest.approx(1.0)
-    assert correction_r2(windows.simulated_next, windows, std) == pytest.approx(0.0, abs=1e-6)
-    half = windows.simulated_next + 0.5 * error
-    assert correction_r2(half, windows, std) == pytest.approx(0.75, abs=1e-5)
-    twice = windows.simulated_next - error
-    assert correction_r2(twice, windows, std) == pytest.approx(-3.0, abs=1e-4)
-    # Entries count in units of their own deviation.
-    first = windows.simulated_next + error * torch.tensor([1.0, 0.0, 0.0, 0.0])
-    shares = (given.steps(error) / std).square().sum(0)
-    assert correction_r2(first, windows, std) == pytest.approx(float(shares[0] / shares.sum()), rel=1e-4)
-
-
 def test_a_fit_that_diverged_is_told() -> None:
     used = model(episodes())
     next(used.encoder.parameters()).data.fill_(torch.nan)

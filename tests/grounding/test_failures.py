@@ -30,7 +30,6 @@ from astra_data.robots.registry import TASKS
 
 HERE = torch.tensor([0.0, 4.0, 0.0, 0.0])
 GROUNDING = HistoryGrounding(model())
-FEW = DescentConfig(updates=4, learning_rate=1e-3)
 
 
 def hurried(episodes: int, seed: int) -> PairedEpisodes:
@@ -175,31 +174,6 @@ def test_the_likelihood_is_that_of_the_moments_over_a_constant_rate(monkeypatch:
     assert [len(one) for one in fitted] == counts and len(counts) == 5
 
 
-@pytest.mark.parametrize("case", ["a single failure", "copies of a single one"])
-def test_a_single_recorded_failure_leaves_nothing_to_compare(
-    case: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_DESCENT", FEW)
-    monkeypatch.setattr(module, "calibration", lambda *_: pytest.fail("nothing was left out"))
-    each, training = torch.arange(10), one_failing(10, 40)
-    if case != "a single failure":
-        training = replace(hurried(10, 0), recordings=torch.where(each % 2 == 0, 0, each))
-    made, figures = fit_failures(TASK, GROUNDING, training, seed=0)
-    assert figures["latent"] is False
-    assert [one["nats_per_failure"] for one in figures["candidates"]] == [None, None]
-    rate = training.steps(failing(TASK, training).windows.fails_soon).mean()
-    torch.testing.assert_close(made.log_odds_shift, rate.logit() - torch.tensor(0.25).logit())
-
-
-@pytest.mark.parametrize("soon", [0.0, 1.0])
-def test_nothing_is_told_where_nothing_fails_or_everything(soon: float) -> None:
-    episodes = hurried(4, 0)
-    assert has_failures(TASK, episodes)
-    short = torch.zeros(4, 100)
-    short[:, :RISK_STEPS] = 1
-    assert not has_failures(TASK, marked(episodes, soon * short, short))
-
-
 def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
     """A ball beside the goal is one, wherever the padding of its episode goes; a fall is none."""
     kick = TASKS["nao-kick"]
@@ -219,16 +193,6 @@ def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
     assert torch.equal(unseen.windows.fails_soon, expected)
     assert torch.equal(unseen.windows.state, state)
     assert has_failures(kick, made) and not has_failures(kick, made.select(torch.tensor([0])))
-
-
-def test_the_last_steps_before_a_failure_are_as_many_as_asked_for() -> None:
-    episodes = hurried(4, 0)
-    fails = episodes.windows.fails_soon.any(1, True)
-    for steps in (1, 3, RISK_STEPS, 50):
-        assert torch.equal(
-            failing(TASK, episodes, steps).windows.fails_soon.bool(), fails & (left(episodes) <= steps)
-        )
-    assert torch.equal(failing(TASK, episodes).windows.fails_soon.bool(), fails & (left(episodes) <= 2))
 
 
 def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before(
@@ -271,13 +235,3 @@ def test_the_windows_before_a_failure_are_ranked_against_calm_steps() -> None:
     # Before the last window of others, its steps are calm ones, too: 20 of 110 on the level.
     near = failure_skill(said, episodes, [(11, 20)])["auc"]
     assert near == {"11-20": pytest.approx((130 + 10 / 2) / 140)}
-
-
-def test_reliability_is_what_was_said_beside_what_happened() -> None:
-    """By the bins of 0.1 to 0.2 and 0.5 to 1: of the former nothing fails."""
-    episodes = hurried(4, 0)
-    soon = episodes.windows.fails_soon.bool()
-    safe = episodes.windows.mask.bool() & ~soon & (torch.arange(100) % 2 == 0)
-    found = failure_skill(torch.where(safe, 0.125, 0.75), episodes)["reliability"]
-    calm, others = int(safe.sum()), int((episodes.windows.mask.bool() & ~safe).sum())
-    assert found == [[0.125, 0.0, calm], [0.75, pytest.approx(int(soon.sum()) / others), others]]

@@ -46,26 +46,6 @@ def test_residual_rewards_are_what_abstract_states_do_not_explain() -> None:
     assert residual.failed[0].tolist() == [0.0, 0.0, 1.0, 0.0, 0.0]
 
 
-def test_balls_that_leave_the_field_are_no_failures_to_foresee() -> None:
-    """Steps: the ball leaves the field, the robot falls."""
-    task, goal = TASKS["nao-kick"], torch.tensor([1.5, 0.0])
-    before = torch.zeros(1, 2, 8)
-    after = before.clone()
-    before[0, 0, 5], after[0, 0, 5] = 1.95, 2.05
-    given = toy_episodes(
-        before,
-        torch.zeros(1, 2, 3),
-        next_state=after,
-        goal=goal.expand(1, 2, 2),
-        reward=torch.tensor([[-10.1, -9.9]]),
-        failed=torch.ones(1, 2),
-    )
-    residual = with_own_rewards(task, given).windows
-    assert residual.own_reward is not None
-    assert float((residual.reward - residual.own_reward)[0, 1]) == pytest.approx(-9.9)
-    assert residual.goes_on.sum() == 0 and residual.failed.tolist() == [[0.0, 1.0]]
-
-
 TASK = TASKS["antmaze-umaze"]
 
 
@@ -174,34 +154,3 @@ def test_the_slow_encoder_follows_in_each_update(tmp_path: Path, monkeypatch: py
     model = fit(tmp_path)[0].model
     slow, fast = model.target_encoder.state_dict(), model.encoder.state_dict()
     assert all(torch.equal(slow[name], fast[name]) for name in fast)
-
-
-def test_what_is_told_of_a_fit_is_measured_on_held_out_episodes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given: dict[str, tuple[Any, ...]] = {}
-    for name in ("telemetry", "fit_scatter", "fit_failures", "failure_figures"):
-        made = getattr(fit_module, name)
-
-        def noted(*args: Any, name: str = name, made: Any = made) -> Any:  # noqa: ANN401
-            given[name] = args
-            return made(*args)
-
-        monkeypatch.setattr(fit_module, name, noted)
-    grounding, metrics, fitting = fit(tmp_path, seed=5)
-    training, held_out = (with_own_rewards(TASK, part) for part in (fitting.training, fitting.held_out))
-
-    def is_alike(one: PairedEpisodes, other: PairedEpisodes) -> bool:
-        first, second = one.windows, other.windows
-        return torch.equal(first.state, second.state) and torch.equal(first.reward, second.reward)
-
-    assert is_alike(given["telemetry"][1], held_out)
-    assert is_alike(given["fit_scatter"][1], training) and is_alike(given["fit_scatter"][2], held_out)
-    assert is_alike(given["fit_failures"][2], training) and is_alike(given["failure_figures"][3], held_out)
-    assert given["fit_scatter"][3] == given["fit_failures"][3] == 5
-    # Failures are foreseen in the simulator as it scatters and keeps clear of walls.
-    for used in (given["fit_failures"][1], given["failure_figures"][1]):
-        assert used == replace(grounding, failures=None)
-    assert given["failure_figures"][2] is grounding.failures
-    assert {"latent", "candidates"} == metrics["failure_model"].keys()
-    assert metrics["failures"]["failure_model"]["failures"] == 1

@@ -60,21 +60,6 @@ def test_a_start_changes_its_rows_alone() -> None:
         assert torch.equal(ours[others], theirs[others])
 
 
-@pytest.mark.parametrize("corrects_reward", [False, True])
-def test_rewards_are_of_the_last_step_and_risks_unknown_without_a_failure_model(
-    corrects_reward: bool,
-) -> None:
-    used = model(corrects_reward=corrects_reward)
-    one, own = simulator(used), torch.tensor([1.0, 2.0, 3.0])
-    for action in actions(3):
-        latent = one.latent.clone()
-        one.step(action)
-        assert not torch.allclose(latent, one.latent)
-        expected = used.predict_reward(latent, action) + (own if corrects_reward else 0.0)
-        torch.testing.assert_close(one.predicted_reward(own), expected)
-        assert one.failure_risk() is None
-
-
 def test_a_saved_state_goes_on_as_it_would_have() -> None:
     first, second = simulator(model()), simulator(model())
     for action in actions(3):
@@ -127,19 +112,3 @@ def test_a_failure_models_memory_is_kept_and_forgotten_at_a_start() -> None:
     torch.testing.assert_close(one.failure_risk(), fresh.failure_risk())
     risk = fresh.failure_risk()
     assert risk is not None and wanted is not None and not torch.allclose(risk, wanted)
-
-
-@pytest.mark.parametrize("is_warm", [False, True])
-def test_within_a_history_a_failure_model_knows_the_action_before_and_what_it_is_told(is_warm: bool) -> None:
-    used, failures, here = model(), failure_model(8), HERE.expand(3, 4)
-    hidden, before, action = torch.randn(3, 8), torch.rand(3, 2), actions(1)[0]
-    averages = torch.rand(3, 15) if is_warm else None
-    known = hidden if averages is None else torch.cat([hidden, averages], 1)
-    middle, raw = simulator(used, failures), PointMass(U_MAZE, 3, timestep_s=0.05)
-    middle.start(here, ROWS, GOAL, hidden=known, previous_action=before)
-    latent = used.encoder.latent(used.encoder.step(used.encoder_input(here, GOAL, before), hidden))
-    middle.step(action)
-    raw.reset_to(here)
-    memory = failures.initial_memory(here, before, averages)
-    said, _ = failures.step(here, action, raw.step(action), latent, memory)
-    torch.testing.assert_close(middle.failure_risk(), failures.hazard(said))

@@ -66,11 +66,6 @@ def windows_of(count: int) -> Any:  # noqa: ANN401 - what is read of episodes
 RAIL = f"{Path(__file__).parents[1] / 'small_cart.py'}:TASK"
 
 
-@pytest.mark.parametrize("count", [1, 5])
-def test_a_step_that_is_states_passes(count: int) -> None:
-    check_step(task_named(RAIL), SHIFTED, windows_of(count))
-
-
 @pytest.mark.parametrize(
     ("landed", "told"),
     [
@@ -106,22 +101,3 @@ def test_a_step_that_leaves_its_simulator_uncorrected_is_refused(
     )
     with pytest.raises(BadInputError, match=told):
         check_step(task_named(RAIL), Shifted(torch.tensor([shift_m])), windows_of(4))
-
-
-def test_a_step_returns_where_a_wall_stopped_its_correction(monkeypatch: pytest.MonkeyPatch) -> None:
-    task, windows = task_named("antmaze-umaze"), windows_of(2)
-    rng = np.random.default_rng(0)
-    windows.windows.state = torch.tensor(task.objective.draw_starts(rng, 2)).float()[:, None]
-    windows.windows.goal = torch.tensor(task.objective.draw_goals(rng, 2)).float()[:, None]
-    windows.windows.action = torch.zeros(2, 1, 2)
-    through_walls = Shifted(torch.tensor([50.0, 50.0, 0.0, 0.0]))
-    check_step(task, through_walls, windows)
-
-    def beyond(self: ShiftedSimulator, action: torch.Tensor) -> torch.Tensor:
-        landed = self.simulator.step(action) + self.shift
-        self._settle(self.state, landed)
-        return landed
-
-    monkeypatch.setattr(ShiftedSimulator, "step", beyond)
-    with pytest.raises(BadInputError, match=r"up to 50 from .* as far as walls allow$"):
-        check_step(task, through_walls, windows)

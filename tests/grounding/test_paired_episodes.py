@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from damaged import reseal
-from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
@@ -194,15 +193,6 @@ def test_copies_are_held_out_with_their_recording(tmp_path: Path) -> None:
     assert {min(held_out) for _, held_out in numbers} == {0, 1, 2}
 
 
-def test_too_few_episodes_are_not_split(episodes: PairedEpisodes) -> None:
-    with pytest.raises(BadInputError, match="recorded episodes: 5, of which 5 would be held out"):
-        episodes.split(0.95, seed=0)
-    one = episodes.select(torch.tensor([2]))
-    assert len(one) == 1
-    with pytest.raises(BadInputError, match="recorded episodes: 1, of which 1 would be held out"):
-        one.split(0.1, seed=0)
-
-
 @pytest.mark.parametrize("length", [1, 10, 100])
 def test_windows_hold_every_step_equally_often(episodes: PairedEpisodes, length: int) -> None:
     torch.manual_seed(0)
@@ -223,12 +213,6 @@ def test_windows_hold_every_step_equally_often(episodes: PairedEpisodes, length:
     assert set(seen.tolist()) == expected
     mean = count * length / sum(steps + length - 1 for steps in LENGTHS)
     assert (times - mean).abs().max() < 5 * mean**0.5
-
-
-def test_an_unpaired_dataset_is_refused(tmp_path: Path) -> None:
-    write_fake(tmp_path / "raw")
-    with pytest.raises(BadInputError, match="expected a dataset that was paired"):
-        PairedEpisodes.load(tmp_path / "raw")
 
 
 @pytest.mark.parametrize(
@@ -282,9 +266,3 @@ def test_commands_are_multiples_of_their_bounds(root: Path, tmp_path: Path) -> N
     torch.testing.assert_close(given.windows.action[mask], expected[mask])
     assert not given.windows.action[~mask].any() and not given.windows.previous_action[:, 0].any()
     assert given.commands is not None and dict(given.commands) == bounds
-
-
-def test_where_successes_are_not_recorded_no_end_is_taken_for_a_failure(tmp_path: Path) -> None:
-    given = PairedEpisodes.load(write(tmp_path / "untold", SIZES, lacks=SUCCESS))
-    assert len(given.terminated.nonzero()) == 2
-    assert not given.windows.failed.any() and not given.windows.fails_soon.any()

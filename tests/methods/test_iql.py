@@ -16,7 +16,7 @@ from astra_data.methods import METHODS, iql
 from astra_data.methods.iql import clone_behavior, experience_of, learn_from_episodes
 from astra_data.policies.iql import Iql, IqlConfig
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
-from astra_data.policies.running_policy import PolicyFile, running
+from astra_data.policies.running_policy import PolicyFile
 from astra_data.policies.train import PpoTrainConfig, Training
 from astra_data.robots.registry import TASKS
 
@@ -88,18 +88,6 @@ def learn(episodes: PairedEpisodes, tmp_path: Path) -> Learn:
         )
 
     return learn
-
-
-def test_the_policy_remembers_and_was_in_no_simulator(learn: Learn) -> None:
-    trained, curve = learn()
-    assert trained.policy.shape == ActorCriticShape(8, 2, 8, hidden_sizes=(16,))
-    assert trained.simulation is None
-    assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "0")
-    assert [(point["steps"], point["success"]) for point in curve["points"]] == [(20, None)]
-    assert curve["updates_per_second"] > 0
-    policy = running(TASK, trained)
-    policy.start(3)
-    assert policy.act(torch.randn(3, 29), torch.randn(3, 2)).abs().max() <= 1.0
 
 
 def test_fine_tuning_takes_fewer_and_smaller_updates_of_the_given_policy(

@@ -1,17 +1,7 @@
-import pytest
-
-from astra_data.core.errors import BadInputError
 from astra_data.grounding.fit import GroundConfig, HistoryFit
 from astra_data.grounding.model import LossWeights
-from astra_data.methods import METHODS, method_named, tables
+from astra_data.methods import METHODS, tables
 from astra_data.policies.train import InSimulator
-
-
-def test_methods_are_known_by_their_names() -> None:
-    assert all(name == method.name for name, method in METHODS.items())
-    assert method_named("astra_plus") is method_named("astra") is METHODS["astra"]
-    with pytest.raises(BadInputError, match="unknown method 'astro'; known: direct_transfer, "):
-        method_named("astro")
 
 
 def test_settings_are_read_from_one_table_by_the_stage_that_takes_them() -> None:

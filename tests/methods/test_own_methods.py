@@ -227,16 +227,6 @@ def test_what_is_no_method_is_refused_in_one_line(tmp_path: Path, name: str, pla
     assert "\n" not in str(caught.value)
 
 
-def test_what_learns_no_policy_is_no_row_of_the_users(tmp_path: Path) -> None:
-    """It would be tested as the package's follower."""
-    (tmp_path / "mine.py").write_text(
-        "from astra_data.methods.method import Method\nMETHOD = Method(name='', title='', learn=None)"
-    )
-    with pytest.raises(BadInputError, match=r"mine.py:METHOD learns no policy: expected learn"):
-        add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
-    assert "mine" not in METHODS
-
-
 HEAD = """
 from pydantic import BaseModel
 from astra_data.core.config import Config
@@ -277,15 +267,3 @@ def test_what_a_method_lacks_is_told_before_anything_runs(tmp_path: Path, rest: 
             recipe(tmp_path, '["mine"]', f'mine = "{tmp_path}/mine.py:METHOD"\n'), tmp_path / "runs"
         )
     assert "mine" not in METHODS
-
-
-def test_another_methods_kind_is_not_replaced(tmp_path: Path) -> None:
-    example = EXAMPLES / "delta_action.py"
-    (tmp_path / "mine.py").write_text(example.read_text())
-    add_method("first", f"{example}:METHOD")
-    add_method("again", f"{example}:METHOD")
-    with pytest.raises(
-        BadInputError, match=r"groundings of kind 'delta action' are those of .* rename its kind"
-    ):
-        add_method("mine", f"{tmp_path / 'mine.py'}:METHOD")
-    assert {"first", "again"} <= METHODS.keys() and "mine" not in METHODS

@@ -101,7 +101,7 @@ def test_the_alignment_losses_are_those_of_the_package(both: tuple[Any, ...]) ->
     target.load_state_dict(encoder.state_dict(), strict=False)
     bandwidths = torch.tensor(align._BANDWIDTHS) * 8.0
     expected = align._losses(model, encoder, episodes.windows, episodes.target_state, bandwidths)
-    found = of_the_file("alignment_losses")(mine, target, theirs)
+    found = [*of_the_file("alignment_losses")(mine, target, theirs)]
     torch.testing.assert_close(torch.stack(found), torch.stack(expected), **NEAR)
 
 

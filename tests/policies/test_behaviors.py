@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from astra_data.policies.collecting import (
-    MixedBehavior,
     RandomCommands,
     StressCommands,
     WallWatch,
@@ -84,15 +83,3 @@ def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_befo
     new = commands[1:][~is_reversed]
     assert float(new.mean(0).abs().max()) < 0.1
     assert float((new.abs() == 1).float().mean()) == pytest.approx(1 / 3, abs=0.01)
-
-
-@pytest.mark.parametrize("batch", [1, 7, 25])
-def test_batches_of_any_size_have_the_share_of_one(batch: int) -> None:
-    mixed = MixedBehavior(RandomCommands(2, (1, 1)), RandomCommands(2, (1, 1)), 0.29)
-    mixed.start(range(100), seed=0)
-    expected, found = mixed.is_random[:, 0].tolist(), []
-    for first in range(0, 100, batch):
-        rows = range(first, min(first + batch, 100))
-        mixed.start(rows, seed=first)
-        found += mixed.is_random[:, 0].tolist()
-    assert found == expected

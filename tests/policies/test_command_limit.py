@@ -46,10 +46,6 @@ def test_it_is_one_where_failures_are_half_as_frequent_again_above(
     assert command_limit(TASK, recorded(failing, lengths)) == expected
 
 
-def test_without_a_maze_there_is_none() -> None:
-    assert command_limit(replace(TASK, plane=None), recorded({LONG: 12})) == NO_LIMIT
-
-
 def test_commands_of_the_last_second_count() -> None:
     """Commands that were long until 20 steps before a failure are no part of it."""
     whole = recorded({LONG: 12})

@@ -136,12 +136,6 @@ def test_a_state_is_worth_the_expectile_of_what_its_actions_pay(
     assert float(iql.values(torch.zeros(1))) == pytest.approx(expectile, abs=0.03)
 
 
-def test_a_weight_is_at_most_100() -> None:
-    iql = trained(learner(walks(), config(critic_updates=20, temperature=1e4, policy_updates=1)))
-    assert iql._weights is not None
-    assert (float(iql._weights.max()), iql._weights.shape) == (100.0, (64, 24))
-
-
 def test_returns_are_those_of_a_plain_loop() -> None:
     experience = walks(count=5, steps=7)
     settings = config(return_steps=3, discount=0.9, reward_scale=2.0)
@@ -204,20 +198,6 @@ def test_settings_and_episodes_that_leave_nothing_to_learn_from_are_told() -> No
     assert len(transitions(constant_reward(terminated=True), config(return_steps=4))) == 24
 
 
-@pytest.mark.parametrize("memory", [0, 8])
-def test_what_lies_beyond_the_episodes_is_not_learned_from(memory: int) -> None:
-    settings = config(critic_updates=5, policy_updates=5)
-    clean, littered = walks(), walks()
-    beyond = torch.arange(24) >= littered.lengths[:, None]
-    assert beyond.any()
-    for values in (littered.observation, littered.previous_action, littered.action):
-        values[beyond] = 50.0
-    littered.reward[beyond] = 50.0
-    policies = [trained(learner(experience, settings, memory)).policy for experience in (clean, littered)]
-    for ours, theirs in zip(policies[0].parameters(), policies[1].parameters(), strict=True):
-        assert torch.equal(ours, theirs)
-
-
 def test_a_training_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_CRITIC_LEARNING_RATE", 1e30)
     iql = learner(walks(), config(critic_updates=20, policy_updates=1))
@@ -236,17 +216,6 @@ def test_resuming_gives_the_same_parameters_to_the_bit(updates: int) -> None:
     resumed.load_state_dict(came_back(begun.state_dict()))
     trained(resumed)
     assert all(map(torch.equal, whole.policy.parameters(), resumed.policy.parameters()))
-
-
-def test_slow_action_values_follow_at_their_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_TARGET_RATE", 0.3)
-    iql = learner(walks(), QUICK)
-    critics = iql._critics
-    before = [values.clone() for values in critics.slow_action_values.parameters()]
-    iql.iterate()
-    slow, fast = (part.parameters() for part in (critics.slow_action_values, critics.action_values))
-    for now, then, new in zip(slow, before, fast, strict=True):
-        torch.testing.assert_close(now, 0.7 * then + 0.3 * new)
 
 
 def test_the_policys_learning_rate_falls_along_a_half_cosine() -> None:

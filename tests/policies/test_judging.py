@@ -2,12 +2,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from rail_run import make_rail_run
 from small_cart import TASK
 
 from astra_data.grounding.files import load_grounding
-from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies import episodes as judging
 from astra_data.policies.episodes import Judge
 from astra_data.policies.running_policy import PolicyFile, RunningPolicy, running
@@ -50,14 +48,3 @@ def test_failures_are_drawn_in_the_whole_simulator_of_the_grounding(
     whole: Any = judge.grounding
     assert world.draws_failures and whole.failures is not None and whole.scatter_model is not None
     assert (used.failures, used.scatter_model) == (whole.failures, whole.scatter_model)
-
-
-def test_success_is_the_share_of_the_episodes(policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A policy that drives on reaches every goal within the horizon, where nothing fails."""
-    for speed, success in ((0.5, 1.0), (-0.6, 0.0)):
-
-        def act(_: object, state: object, goal: torch.Tensor, speed: float = speed) -> torch.Tensor:
-            return goal * 0 + speed
-
-        monkeypatch.setattr(RunningPolicy, "act_in_simulator", act)
-        assert Judge(TASK, NO_GROUNDING).success(policy, 5, 0) == success

@@ -105,15 +105,6 @@ def test_it_runs_on_the_cpu_alone(tmp_path: Path) -> None:
         driving(1.0, 8)(given)
 
 
-def test_the_same_seed_shows_it_the_same(tmp_path: Path) -> None:
-    seen: list[list[Array]] = [[], [], []]
-    for index, seed in enumerate((7, 7, 8)):
-        given = training(tmp_path)
-        object.__setattr__(given, "seed", seed)
-        driving(1.0, 80, seen[index])(given)
-    assert np.array_equal(seen[0], seen[1]) and not np.array_equal(seen[0], seen[2])
-
-
 def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
     policy, _ = driving(0.25, 8)(training(tmp_path))
     policy.save(tmp_path / "policy.safetensors")
@@ -127,11 +118,6 @@ def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
     del KINDS["constant"]
     with pytest.raises(BadInputError, match="found kind constant"):
         PolicyFile.load(tmp_path / "policy.safetensors")
-
-
-def test_what_is_not_learned_is_told(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="learn returned a float, expected a Constant"):
-        UserLearner(learn=lambda env, training: 1.0, policy=Constant)(training(tmp_path))  # type: ignore[arg-type, return-value]
 
 
 def test_a_kind_of_the_package_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,14 +7,12 @@ from constant_policy import Constant
 from toy_episodes import no_episodes
 
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.files import save_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, Student
-from astra_data.policies.running_policy import KINDS, PolicyFile, UserPolicy, running
+from astra_data.policies.running_policy import KINDS, PolicyFile, UserPolicy
 from astra_data.policies.simulator_env import Simulation, WorldConfig
-from astra_data.robots.registry import TASKS
 from astra_data.worlds.variation import PlanarVariation
 
 
@@ -37,18 +35,6 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     assert torch.equal(loaded.policy.policy(features)[0], policy.policy(features)[0])
     assert isinstance(loaded.policy, ActorCritic)
     assert torch.equal(loaded.policy.value(features), policy.value(features))
-
-
-def test_it_runs_as_it_was_trained(tmp_path: Path) -> None:
-    simulation = Simulation(WorldConfig(command_limit=0.7))
-    policy = ActorCritic(ActorCriticShape(41, 2))
-    PolicyFile(policy, simulation, None, None, "full").save(tmp_path / "policy.safetensors")
-    loaded = PolicyFile.load(tmp_path / "policy.safetensors")
-    model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8))
-    aligned = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8)
-    acting = running(TASKS["antmaze-umaze"], loaded, HistoryGrounding(model), aligned)
-    assert (acting.command_limit, acting.observed) == (0.7, "full")
-    assert acting.source_encoder is model and acting.target_encoder is aligned
 
 
 def test_a_student_comes_back_as_one(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,9 +13,8 @@ from toy_episodes import toy_episodes
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive
 from astra_data.grounding.simulator import NO_GROUNDING
-from astra_data.policies.episodes import Reached
 from astra_data.policies.running_policy import KINDS, PolicyFile, UserPolicy
-from astra_data.policies.train import PpoTrainConfig, Training, UserLearner, _masters, with_restarts
+from astra_data.policies.train import PpoTrainConfig, Training, UserLearner, with_restarts
 
 SEEDS = [7, derive(7, "try 1"), derive(7, "try 2")]
 
@@ -104,9 +102,3 @@ def test_all_tries_cost_time(tmp_path: Path) -> None:
     assert command == -0.44
     assert (curve["wall_seconds"], curve["cpu_seconds"]) == (2 + 4 + 6, 1 + 2 + 3)
     assert "wall_seconds" not in restarted(tmp_path, [-1.0, 1.0], tries=2)[1]
-
-
-def test_what_is_just_enough_masters_it() -> None:
-    training: Any = SimpleNamespace(config=PpoTrainConfig())
-    assert training.config.tries == 3
-    assert _masters(Reached(0.8, 40.0), training) and not _masters(Reached(0.79, 1.0), training)

@@ -102,16 +102,6 @@ def test_the_encoder_sees_the_shortened_command_and_the_policy_its_own() -> None
     assert torch.stack(outputs).norm(dim=-1).max() > 0.3
 
 
-def test_commands_are_actions_in_their_units() -> None:
-    policy = ActorCritic(ActorCriticShape(observation_size=2, action_size=1))
-    running = RunningPolicy(RAIL_CART, policy)
-    state, goal = torch.rand(4, 2), torch.rand(4, 1)
-    running.start(4)
-    action = running.act(state, goal)
-    running.start(4)
-    torch.testing.assert_close(running.command(state, goal), 1.5 + 2.5 * action)
-
-
 def test_states_and_goals_come_as_arrays_too_and_are_looked_at_first() -> None:
     running = RunningPolicy(RAIL_CART, ActorCritic(ActorCriticShape(observation_size=2, action_size=1)))
     state, goal = np.random.default_rng(0).uniform(size=(4, 2)), np.zeros((4, 1))

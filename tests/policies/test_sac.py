@@ -7,7 +7,6 @@ import torch
 from torch import nn
 from toy_worlds import ConstantReward, EndsAtZero, GoToZero, train, whole_and_resumed
 
-from astra_data.core.errors import BadInputError
 from astra_data.policies import sac as module
 from astra_data.policies.networks import PolicyShape, SoftActor, features_of
 from astra_data.policies.sac import Sac, SacConfig
@@ -102,36 +101,6 @@ def test_running_out_of_time_bootstraps_and_ending_does_not(
     assert value == pytest.approx(expected, rel=0.12)
 
 
-def test_a_window_begins_with_the_memory_that_the_policy_had_when_it_acted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    learner = sac(GoToZero(8), 40, horizon=9, memory=4, window=2, burn_in=0)
-    policy = learner.policy
-    acting, learning = policy.remember, policy.remember_sequence
-    acted: dict[tuple[float, ...], list[float]] = {}
-    begun: list[tuple[torch.Tensor, torch.Tensor]] = []
-
-    def remember(
-        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        for moment, memory in zip(torch.cat([observation, previous], dim=-1), hidden, strict=True):
-            acted[tuple(moment.tolist())] = memory.tolist()
-        return acting(observation, previous, hidden)
-
-    def remember_sequence(
-        observation: torch.Tensor, previous: torch.Tensor, hidden: torch.Tensor, start: torch.Tensor
-    ) -> torch.Tensor:
-        begun.append((torch.cat([observation, previous], dim=-1)[:, 0], hidden))
-        return learning(observation, previous, hidden, start)
-
-    monkeypatch.setattr(policy, "remember", remember)
-    monkeypatch.setattr(policy, "remember_sequence", remember_sequence)
-    train(learner)
-    moments, memories = (torch.cat(column) for column in zip(*begun, strict=True))
-    assert memories.tolist() == [acted[tuple(moment.tolist())] for moment in moments]
-    assert float((memories.abs().amax(-1) > 0).float().mean()) > 0.5
-
-
 @pytest.mark.parametrize("memory", [0, 8])
 def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Haarnoja et al. (2018), by hand from the windows that were drawn."""
@@ -223,17 +192,3 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
     for late, then, now in after:
         torch.testing.assert_close(late, 0.7 * then + 0.3 * now)
     assert all(parameter.requires_grad for parameter in critics.parameters())
-
-
-def test_a_window_has_to_hold_steps_to_learn_from() -> None:
-    with pytest.raises(ValueError, match=r"burn_in: expected less than the window of 8, got 8"):
-        SacConfig(window=8, burn_in=8)
-    with pytest.raises(ValueError, match=r"batch_size: expected a window of 16 or more, got 15"):
-        SacConfig(batch_size=15)
-
-
-def test_the_buffer_has_to_hold_a_window() -> None:
-    sizes: dict[str, Any] = {"horizon": 9, "memory": 8, "window": 6, "burn_in": 0}
-    with pytest.raises(BadInputError, match=r"buffer_size: expected at least 56 steps.* got 55"):
-        sac(GoToZero(8), 10, buffer_size=55, **sizes)
-    sac(GoToZero(8), 10, buffer_size=56, **sizes)

@@ -6,7 +6,7 @@ import torch
 from astra_data.grounding.failures import FailureModel, FailureShape
 from astra_data.grounding.history import GroundedSimulator
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator
+from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.policies.simulator_env import DataStarts, SimulatorEnv, policy_observation
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
@@ -69,21 +69,6 @@ def test_it_resumes_where_it_was_from_a_state_that_stays_as_it_was() -> None:
         assert torch.equal(a.reward, b.reward)
     second.reset(torch.tensor([True, False, False, True]))
     assert all(torch.equal(saved[name], values) for name, values in kept.items())
-
-
-def test_episodes_may_start_from_recorded_moments() -> None:
-    moment = torch.tensor([[4.0, 0.0, 0.1, -0.9]])
-    starts = DataStarts(moment, torch.tensor([[-4.2, -4.1]]), torch.zeros(1, 2), hidden=None)
-    torch.manual_seed(0)
-    one = world(1000, starts=starts, data_start_share=0.3)
-    one.reset()
-    recorded = (one.simulator.state == moment).all(dim=1)
-    assert float(recorded.float().mean()) == pytest.approx(0.3, abs=0.05)
-    assert bool((one.goal[recorded] == starts.goal).all())
-    # At rest near the task's start otherwise.
-    other = one.simulator.state[~recorded]
-    assert bool((other[:, 2:] == 0).all())
-    assert float((other[:, :2] - torch.tensor([-4.0, 4.0])).abs().max()) <= 0.6 + 1e-5
 
 
 def test_the_price_of_failures_is_four_times_what_they_cost_as_far_as_it_has_grown() -> None:
@@ -202,15 +187,3 @@ def test_recorded_starts_hand_over_their_history() -> None:
     expected = model.encoder.step(model.encoder_input(state, goal, starts.previous_action), starts.hidden)
     torch.testing.assert_close(grounded.hidden, expected.expand(3, 8))
     assert torch.equal(one.goal, goal.expand(3, 2)) and torch.equal(grounded.goal, one.goal)
-
-
-def test_whoever_reaches_the_goal_at_a_wall_has_not_failed() -> None:
-    task = TASKS["nao-navigation"]
-    one = SimulatorEnv(task.objective, NO_GROUNDING.simulator(task, 2))
-    # Both touch the wall at x = -2; the goal of the first is there.
-    state = torch.tensor([[-1.999, 2.0, 0.0, 0.0]]).expand(2, 4)
-    goal = torch.tensor([[-1.9, 2.0], [1.9, 2.0]])
-    one.load_state_dict(one.state_dict() | {"state": state, "goal": goal})
-    step = one.step(torch.tensor([[-1.0, 0.0]]).expand(2, 2))
-    assert one.simulator.blocked.all() and step.terminated.all()
-    assert step.success.tolist() == [True, False] and one.failed.tolist() == [False, True]

@@ -9,7 +9,6 @@ from small_cart import TASK as CART
 from stopping import Stopped, stop_past
 from torch import Tensor
 
-from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.core.seeding import derive
 from astra_data.policies import collecting as suboptimal
@@ -129,11 +128,3 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
     config = Counting.made[0].config
     assert isinstance(config, SacConfig)
     assert (config.total_steps, config.discount) == (steps, 0.99)
-
-
-def test_where_good_episodes_are_short_sac_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="good episodes are short: use 'suboptimal_ppo'"):
-        suboptimal_by_sac(
-            MAZE, steps=1, episode_steps=1, seed=0, folder=tmp_path, num_threads=1, progress=silent
-        )
-    assert not Counting.made

@@ -90,18 +90,3 @@ def test_a_deployed_policy_sees_what_it_saw_in_training() -> None:
     saved = env.state_dict()
     with torch.no_grad():
         assert torch.equal(deployed.act(saved["physics"][:, 1:30].float(), saved["goal"]), expected)
-
-
-def test_a_share_of_the_episodes_starts_from_the_data() -> None:
-    torch.manual_seed(0)
-    env = world("abstract", share=0.3, count=200)
-    env.reset()
-    saved = env.state_dict()
-    starts = recorded()
-    matches = (saved["physics"][:, None, 1:30].float() == starts.state).all(-1)
-    from_data = matches.any(1)
-    assert from_data.float().mean() == pytest.approx(0.3, abs=0.1)
-    assert torch.equal(saved["goal"][from_data], starts.goal[matches[from_data].float().argmax(1)])
-    start, goal = (torch.tensor(TASK.maze.cell_center(*cell)) for cell in (TASK.maze.start, TASK.maze.goal))
-    assert ((saved["physics"][~from_data, 1:3] - start).abs() < 0.7).all()
-    assert ((saved["goal"][~from_data] - goal).abs() < 0.7).all()

@@ -1,9 +1,6 @@
-from dataclasses import replace
-
 import pytest
 import torch
-from small_cart import TASK, Cart
-from torch import Tensor
+from small_cart import TASK
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies.episodes import Act, in_target
@@ -25,32 +22,6 @@ def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     assert late.outcome.success == [0.0] * 5 and late.outcome.steps == [TASK.objective.horizon] * 5
     assert late.filmed.shape == (TASK.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2)
     assert late.rate > 0
-
-
-def test_goals_are_told_and_each_robot_is_built_and_started_once() -> None:
-    goals: list[Tensor] = []
-
-    def begin(goal: Tensor) -> Act:
-        goals.append(goal.clone())
-        return driving(0.9)
-
-    found = in_target(replace(TASK, robot=Unseeded), begin, 3, seed=3)
-    assert torch.equal(found.start_goal["goal"], goals[0])
-    assert Unseeded.made == Unseeded.began == 3
-
-
-class Unseeded(Cart):
-    """A robot that counts how often it is built and started."""
-
-    made = 0
-    began = 0
-
-    def __init__(self) -> None:
-        type(self).made += 1
-
-    def reset(self) -> list[float]:
-        type(self).began += 1
-        return super().reset()
 
 
 @pytest.mark.parametrize("task", [TASK, TASKS["nao-navigation"], TASKS["humanoid-walker2d"]])

@@ -24,7 +24,6 @@ from astra_data.policies.train import (
     SacTrainConfig,
     Training,
     optimize,
-    train_in,
 )
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
@@ -32,18 +31,6 @@ from astra_data.worlds.variation import PlanarVariation
 
 TASK = TASKS["antmaze-umaze"]
 PPO = PpoTrainConfig(num_envs=4, rollout_steps=4, total_steps=4 * 4 * 3, hidden_sizes=(8, 6), memory_size=5)
-SAC = SacTrainConfig(
-    learner="sac",
-    num_envs=4,
-    rollout_steps=4,
-    total_steps=32,
-    updates_per_step=1,
-    batch_size=8,
-    window=4,
-    burn_in=1,
-    hidden_sizes=(8,),
-    memory_size=5,
-)
 
 
 class ToyWorld(GoToZero):
@@ -86,20 +73,6 @@ def test_the_learner_that_is_named_has_the_settings_ppo_by_default() -> None:
     assert read.validate_python(sac) is sac
     with pytest.raises(ValidationError, match="burn_in"):
         read.validate_python({"burn_in": 3})
-
-
-@pytest.mark.parametrize("config", [PPO, SAC])
-def test_the_seed_decides_the_policy(config: PpoTrainConfig | SacTrainConfig, tmp_path: Path) -> None:
-    weights = []
-    for number, seed in enumerate((0, 0, 1)):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        policy, curve = train_in(ToyWorld(4), config, 5, training(folder, seed=seed), 20)
-        weights.append(torch.cat([values.flatten() for values in policy.state_dict().values()]))
-        assert [point["steps"] for point in curve["points"]] == list(range(16, config.total_steps + 1, 16))
-        assert policy.shape.memory_size == 5
-    assert torch.equal(weights[0], weights[1])
-    assert not torch.equal(weights[0], weights[2])
 
 
 class Counting(Ppo):
@@ -236,17 +209,3 @@ def test_rows_and_their_plus_rows_differ_by_the_plus_settings_alone(
     )
     assert switches["data_start_share"] == 0.6 and plain.num_envs == PPO.num_envs
     assert others == switches | changes
-
-
-def test_parameters_vary_as_the_method_says_unless_its_settings_do(tmp_path: Path) -> None:
-    own = PlanarVariation(friction=(0.5, 0.6))
-    for ranges, settings, expected in (
-        (None, None, None),
-        ("randomized", None, TASK.varied.randomized),
-        ("wide", None, TASK.varied.wide),
-        ("wide", own, own),
-    ):
-        given = training(tmp_path, settings=settings)
-        env, simulation = InSimulator(ranges=ranges).world(given, shows_parameters=True)  # type: ignore[arg-type]
-        assert simulation.variation == expected
-        assert env.parameter_count == (0 if expected is None else len(own.names))

@@ -8,7 +8,6 @@ from toy_episodes import toy_episodes
 from astra_data.grounding.failures import (
     AHEAD_S,
     AVERAGED_S,
-    FAILURE_STEPS,
     FailureModel,
     FailureShape,
 )
@@ -120,15 +119,3 @@ def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
     assert walls[:6].tolist() == pytest.approx(to_wall, abs=0.11)
     assert to_wall[5] < 0.2 < to_wall[1] < to_wall[0]
     assert walls[6:].tolist() == pytest.approx([to_wall[0]] * 5, abs=1e-5)
-
-
-def test_the_members_probabilities_are_averaged_after_the_shift() -> None:
-    made, of = model(), windows()
-    inputs = seen(made, of)
-    made.log_odds_shift.fill_(-2.0)
-    odds = torch.stack([one(inputs.clamp(-5, 5)).squeeze(-1) for one in made.members])
-    torch.testing.assert_close(made.probability(inputs), (odds - 2.0).sigmoid().mean(0))
-    assert float((odds[0] - odds[1]).abs().max()) > 0.01
-    made.calibrate(torch.tensor(0.5), torch.tensor(-3.0))
-    torch.testing.assert_close(made.probability(inputs), (0.5 * odds - 3.0).sigmoid().mean(0))
-    assert FAILURE_STEPS == 2 and float(made.hazard(torch.tensor(0.5))) == pytest.approx(0.25)
