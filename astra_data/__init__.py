@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from astra_data.dataset.reader import Dataset as Dataset
     from astra_data.dataset.staging import StagedWriter as StagedWriter
     from astra_data.dataset.writer import DatasetWriter as DatasetWriter
-    from astra_data.io.hub.pull import pull as pull
-    from astra_data.io.hub.push import push as push
+    from astra_data.io.hub.sharing import pull as pull
+    from astra_data.io.hub.sharing import push as push
     from astra_data.methods import METHODS as METHODS
     from astra_data.pipeline.run import run as run
     from astra_data.pipeline.stages.align import align as align
@@ -63,8 +63,8 @@ _MODULES = {
     "load_policy": "pipeline.trained_policy",
     "merge": "dataset.edit",
     "pair": "pipeline.stages.pair",
-    "pull": "io.hub.pull",
-    "push": "io.hub.push",
+    "pull": "io.hub.sharing",
+    "push": "io.hub.sharing",
     "run": "pipeline.run",
     "subset": "dataset.edit",
     "train": "pipeline.stages.train",

@@ -15,10 +15,10 @@ from forks import forked
 from shared_files import contents
 
 from astra_data.dataset.reader import Dataset
-from astra_data.io.hub import store
-from astra_data.io.hub.pull import pull
+from astra_data.io.hub import stores
+from astra_data.io.hub.sharing import pull
 
-store.BLOCK_BYTES = 1024
+stores.BLOCK_BYTES = 1024
 
 
 def check(out: Path, truth: Path) -> None:

@@ -11,7 +11,7 @@ HOUSE = ROOT / "astra_data"
 ALIASES = {"envs"}
 """Modules outside of every room, kept for what others import by an old name."""
 
-NO_NEIGHBORS = {"io.exporters", "io.importers", "methods", "pipeline.stages"}
+NO_NEIGHBORS = {"io.importers", "methods", "pipeline.stages"}
 """Rooms whose files do not import each other; their `__init__` and `registry` may import them all."""
 
 FOUNDATIONS = {"methods.method"}

@@ -114,9 +114,8 @@ def test_a_card_with_its_figure_needs_no_more_than_its_own_extra(tmp_path: Path)
     write_fake(tmp_path / "whole")
     code = WITHOUT.format(names=("torch", "safetensors", "mujoco", "gymnasium")) + (
         "from pathlib import Path\nfrom astra_data import Dataset\n"
-        "from astra_data.io.hub.card import write_card\n"
-        "from astra_data.io.hub.notes import Notes\n"
-        "import astra_data.io.hub.push\n"
+        "from astra_data.io.hub.card import Notes, write_card\n"
+        "import astra_data.io.hub.sharing\n"
         "write_card(Dataset.open(Path(sys.argv[1])), Path(sys.argv[2]), Notes())\n"
     )
     python(code, str(tmp_path / "whole"), str(tmp_path / "card.md"))

@@ -119,8 +119,7 @@ def card(
     """Write a dataset card: contents, origin, and how to load it."""
     from astra_data.core.config import load_recipe
     from astra_data.dataset.versions import open_dataset
-    from astra_data.io.hub.card import write_card
-    from astra_data.io.hub.notes import Notes
+    from astra_data.io.hub.card import Notes, write_card
 
     opened = open_dataset(dataset)
     written = load_recipe(notes, Notes) if notes else Notes()
@@ -146,7 +145,7 @@ def push(
 ) -> None:
     """Share a version of a dataset, with its card; a shared version never changes."""
     from astra_data.dataset.versions import open_dataset
-    from astra_data.io.hub.push import push as send
+    from astra_data.io.hub.sharing import push as send
     from astra_data.pipeline.display import shown
 
     with shown("push") as progress:
@@ -175,8 +174,8 @@ def pull(
     ] = None,
 ) -> None:
     """Download and verify a shared dataset; run again to continue, or to verify the copy."""
-    from astra_data.io.hub.pull import MOST_BYTES
-    from astra_data.io.hub.pull import pull as fetch
+    from astra_data.io.hub.sharing import MOST_BYTES
+    from astra_data.io.hub.sharing import pull as fetch
     from astra_data.pipeline.display import shown
 
     with shown("pull") as progress:

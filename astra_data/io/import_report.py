@@ -138,41 +138,38 @@ class ImportReport:
         """Summarize it in a few lines."""
         tally = self.tally
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
-        first = f", {tally.faults}" if tally.not_finite else ""
-        if tally.torn_rows:
-            first += (
-                f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
-            )
-        taken = f"taken without a mapping: {self.taken}\n" if self.taken else ""
-        if tally.unused_fields:
-            taken += f"fields left out: {first_few(tally.unused_fields, _SHOWN)}\n"
-        ends = f"episodes end: {tally.endings}\n" if tally.endings != Endings() else ""
-        rate = f"rate: {tally.clock}\n" if tally.clock else ""
-        lines = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
-        notes = "".join(f"{line}\n" for line in lines[:_SHOWN])
-        if len(lines) > _SHOWN:
-            notes += f"and {len(lines) - _SHOWN} more lines on rates\n"
-        still = (
+        notes = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
+        more = [f"and {len(notes) - _SHOWN} more lines on rates"] if len(notes) > _SHOWN else []
+        torn = f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
+        listed = {
+            "fields left out": tally.unused_fields,
+            "files without an episode": self.unused,
+            "files of other endings, not read": self.unread,
+        }
+        left_out, *others = [f"{what}: {first_few(of, _SHOWN)}" if of else "" for what, of in listed.items()]
+        lines = [
+            f"{self.root}: {self.episodes} episodes, {self.frames} frames from {tally.rows} rows in "
+            f"{self.wall_seconds:.1f} s",
+            f"taken without a mapping: {self.taken}" if self.taken else "",
+            left_out,
+            f"split points: {points}",
+            f"episodes end: {tally.endings}" if tally.endings != Endings() else "",
+            f"rate: {tally.clock}" if tally.clock else "",
+            *notes[:_SHOWN],
+            *more,
             f"time stands still in {tally.still_rows} rows, first in {tally.still_first}: expected one row "
-            "at a time; they are of several robots, or written twice\n"
+            "at a time; they are of several robots, or written twice"
             if tally.still_rows
-            else ""
-        )
-        unused = f"files without an episode: {first_few(self.unused, _SHOWN)}\n" if self.unused else ""
-        if self.unread:
-            unused += f"files of other endings, not read: {first_few(self.unread, _SHOWN)}\n"
-        if self.left_out:
-            faults = "".join(f"  {fault}\n" for fault in self.left_out)
-            unused += f"files that cannot be imported, left out: {len(self.left_out)}\n{faults}"
-        return (
-            f"{self.root}: {self.episodes} episodes, {self.frames} frames "
-            f"from {tally.rows} rows in {self.wall_seconds:.1f} s\n"
-            f"{taken}split points: {points}\n"
-            f"{ends}{rate}{notes}{still}{unused}"
-            f"rejected rows: {tally.rejected_rows}{first}\n"
+            else "",
+            *others,
+            f"files that cannot be imported, left out: {len(self.left_out)}" if self.left_out else "",
+            *(f"  {fault}" for fault in self.left_out),
+            f"rejected rows: {tally.rejected_rows}{f', {tally.faults}' if tally.not_finite else ''}"
+            f"{torn if tally.torn_rows else ''}",
             f"last rows without a next state: {_last_rows(tally)}; "
-            f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}"
-        )
+            f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}",
+        ]
+        return "\n".join(filter(None, lines))
 
 
 def losses(tally: Tally) -> str:

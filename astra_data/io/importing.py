@@ -1,14 +1,19 @@
-"""Import recordings in other formats as datasets."""
+"""Import recordings in other formats as datasets.
+
+A recording is what a user names: a file, a folder or an archive. Its files are sources. An importer reads a
+source in blocks of rows, whose fields a mapping turns into columns; the cutter cuts them into episodes.
+"""
 
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,10 +22,10 @@ from astra_data.core.durable import files_below
 from astra_data.core.errors import AstraDataError, BadInputError, in_short
 from astra_data.core.naming import first_few
 from astra_data.dataset.columns import TRUNCATED, Episode
+from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import home_of
 from astra_data.dataset.writer import DatasetWriter, is_text
 from astra_data.io.cutting import Cut, Cutter
-from astra_data.io.export_record import ExportRecord, read_record, restored, write_restored
 from astra_data.io.import_report import ImportReport, Tally, losses
 from astra_data.io.importers import csv, hdf5, json, mcap, minari, npz, parquet, torch
 from astra_data.io.mapping import ImportMapping, read_mapping
@@ -39,6 +44,9 @@ from astra_data.io.recording import (
     other_files,
     refuse_dataset,
 )
+
+if TYPE_CHECKING:
+    import datasets
 
 FORMATS: Mapping[str, ModuleType] = {
     "csv": csv,
@@ -70,8 +78,6 @@ def import_dataset(
 ) -> ImportReport:
     """Turn recordings into one dataset; at most a block of rows and an episode are in memory at once.
 
-    Of our own exports the sums are verified; without a mapping, all that was exported comes back.
-
     Args:
         recordings: files, folders or archives of one format.
         mapping: the file that says which fields become which columns; D4RL, robomimic, d3rlpy, Minari
@@ -89,52 +95,30 @@ def import_dataset(
     Raises:
         BadInputError: a recording is malformed, unpacks to too much or does not fit the mapping; nothing is
             written.
-        CorruptDatasetError: an export of ours was altered; nothing is written.
         RecipeError: the mapping has faults.
     """
-    if not recordings:
-        raise BadInputError("expected one recording or more to import, got none")
     began = time.perf_counter()
     options = only_given(name=name, fps=fps, task=task, format=file_format)
     settings = None
     if mapping is not None:
-        read = read_mapping(mapping)
-        settings = validated(read.model_dump() | options, ImportMapping, str(mapping))
+        settings = validated(read_mapping(mapping).model_dump() | options, ImportMapping, str(mapping))
+    elif skip_bad:
+        raise BadInputError("--skip-bad needs a --mapping, which says what is missing")
     chosen = (settings.format if settings else file_format) or _common_format(recordings)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
-    format_ = FORMATS[chosen]
     if settings:
         settings.refuse_timeless(chosen, str(mapping))
-    sources = [source for recording in recordings for source in _sources(recording, chosen)]
-    if settings and chosen == "csv" and settings.files:
-        sources = joined(sources, settings.files)
-    sources = named_apart(bounded(sources, max_bytes))
-    strange = [str(source) for source in sources if not is_text(f"{source.path}/{source}")]
-    if strange:
-        raise BadInputError(f"{strange[0]!r}: expected a name in UTF-8; rename the file to import it")
-    if settings and chosen == "mcap" and not settings.split.files:
-        _refuse_parts(sources)
-    if skip_bad and settings is None:
-        raise BadInputError("--skip-bad needs a --mapping, which says what is missing")
-    left_out: list[str] = []
-    records = _records(sources, format_)
-    if records and settings is None:
-        if len(sources) > 1:
-            raise BadInputError(
-                f"{next(iter(records))} is an export of astra-data: import each export separately, then merge"
-            )
-        return _restored_export(sources[0], format_, records[sources[0]], options, out, began)
-    for source, record in records.items():
-        deque(_restored(source, format_, record), maxlen=0)  # verifies the sums
+    sources = _sources(recordings, chosen, settings, max_bytes)
     taken = ""
     if settings is None:
         settings, taken = _standard(sources[0], chosen, options)
+    left_out: list[str] | None = [] if skip_bad else None
     cutter = Cutter(settings, skip_bad=skip_bad)
-    cuts = episodes(sources, format_, settings, cutter, left_out if skip_bad else None)
+    cuts = episodes(sources, FORMATS[chosen], settings, cutter, left_out)
     first = next(cuts, None)
     if first is None:
-        if faults := left_out + cutter.tally.bad_episodes:
+        if faults := [*(left_out or ()), *cutter.tally.bad_episodes]:
             raise BadInputError("\n".join(faults))
         refuse_rejected(cutter.tally, settings)
         why = _why_none(cutter.tally, settings)
@@ -162,61 +146,40 @@ def import_dataset(
         if not skip_bad:
             refuse_rejected(cutter.tally, settings)
         cutter.check()
-        seconds = time.perf_counter() - began
-        left_out += cutter.tally.bad_episodes
-        writer.made = {"wall_seconds": seconds, **asdict(cutter.tally)}
-        writer.made |= {"left_out": left_out} if left_out else {}
+        bad = [*(left_out or ()), *cutter.tally.bad_episodes]
+        writer.made = {"wall_seconds": time.perf_counter() - began, **asdict(cutter.tally)}
+        writer.made |= {"left_out": bad} if bad else {}
     names = [str(source) for source in sources]
     # Where episodes are parts of files, their origins are no files' names.
     are_files = settings.split.files and origins <= set(names)
     unused = tuple(name for name in names if are_files and name not in origins)
-    unread = () if chosen == "minari" else other_files(recordings, _suffixes(format_))
+    unread = () if chosen == "minari" else other_files(recordings, _suffixes(FORMATS[chosen]))
     seconds = time.perf_counter() - began
-    return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, tuple(left_out), taken)
+    return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, tuple(bad), taken)
 
 
-def _refuse_parts(sources: Sequence[Source]) -> None:
-    """Refuse to let the files of a folder continue one another where each is resampled by itself."""
-    for recording, files in Counter(source.recording for source in sources).items():
-        if files > 1:
-            raise BadInputError(
-                f"{recording}: split.files = false cannot join its {files} MCAP files, each of which is "
-                "resampled separately: join them with `ros2 bag convert` or `mcap merge`, or leave out the "
-                "key, so that an episode ends with each file"
-            )
+def from_huggingface(table: "datasets.Dataset", mapping: Path | str, *, out: Path | None = None) -> Dataset:
+    """Import the rows of a `datasets.Dataset`, as `import` does those of a Parquet file.
 
+    Args:
+        table: the rows, in the order of time; `[split] field = "episode_index"` of the mapping cuts them.
+        mapping: the file that says which columns become which.
+        out: the dataset's folder, by default its place at home.
 
-def _records(sources: Sequence[Source], format_: ModuleType) -> dict[Source, ExportRecord]:
-    """Return the records of those `sources` that are our own exports."""
-    records = {}
-    for source in sources:
-        with explained(source, format_):
-            if record := read_record(format_, source):
-                records[source] = record
-    return records
-
-
-def _restored(source: Source, format_: ModuleType, record: ExportRecord) -> Iterator[Episode]:
-    with explained(source, format_):
-        yield from restored(format_, source, record)
-
-
-def _restored_export(
-    source: Source,
-    format_: ModuleType,
-    record: ExportRecord,
-    options: Mapping[str, Any],
-    out: Path | None,
-    began: float,
-) -> ImportReport:
-    """Write our own export back as it was."""
-    recorded = _restored(source, format_, record)
-    root, frames = write_restored(record, recorded, options, identities([source]), out)
-    seconds = time.perf_counter() - began
-    return ImportReport(root, len(record.lengths), frames, Tally(rows=frames), seconds)
+    Raises:
+        BadInputError: the rows do not fit the mapping; nothing is written.
+        RecipeError: the mapping has faults.
+    """
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "rows.parquet"
+        table.to_parquet(path)
+        return Dataset.open(import_dataset([path], Path(mapping), out=out).root)
 
 
 def _common_format(recordings: Sequence[Path]) -> str:
+    """Return the format of all `recordings`, by their names."""
+    if not recordings:
+        raise BadInputError("expected one recording or more to import, got none")
     faults, formats = [], {}
     for recording in recordings:
         try:
@@ -243,27 +206,43 @@ def _format_of(recording: Path) -> str:
         if any(file.lower().endswith(_suffixes(module)) for file in names):
             return name
     unknown = f"its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"
-    raise BadInputError(f"{recording}: {mcap.advice(names) or foreign(names) or unknown}")
+    raise BadInputError(f"{recording}: {foreign(names) or unknown}")
 
 
 def _suffixes(module: ModuleType) -> tuple[str, ...]:
     return tuple(getattr(module, "SUFFIXES", ()))
 
 
-def log_suffixes(mapping: ImportMapping) -> tuple[str, ...]:
-    """Return the endings of the names of logs that `mapping` may describe."""
-    modules = FORMATS.values() if mapping.format is None else [FORMATS[mapping.format]]
-    return tuple(suffix for module in modules for suffix in _suffixes(module))
-
-
-def _sources(recording: Path, file_format: str) -> list[Source]:
-    if file_format == "minari":
-        if not minari.is_dataset(recording):
-            raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
-        return [Source(recording, None, recording)]
-    if is_archive(recording) and file_format not in IN_ARCHIVES:
-        raise BadInputError(f"{recording}: {file_format} cannot be read from an archive: unpack it")
-    return find_sources(recording, _suffixes(FORMATS[file_format]))
+def _sources(
+    recordings: Sequence[Path], file_format: str, mapping: ImportMapping | None, max_bytes: int | None
+) -> list[Source]:
+    """Return the files of `recordings`, named apart, and with the bytes that may be taken from them."""
+    sources: list[Source] = []
+    for recording in recordings:
+        if file_format == "minari":
+            if not minari.is_dataset(recording):
+                raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
+            found = [Source(recording, None, recording)]
+        elif is_archive(recording) and file_format not in IN_ARCHIVES:
+            raise BadInputError(f"{recording}: {file_format} cannot be read from an archive: unpack it")
+        else:
+            suffixes = _suffixes(FORMATS[file_format])
+            if not recording.name.lower().endswith(suffixes) and (hint := foreign([recording.name])):
+                raise BadInputError(f"{recording}: {hint}")
+            found = find_sources(recording, suffixes)
+        if file_format == "mcap" and mapping and not mapping.split.files and len(found) > 1:
+            raise BadInputError(
+                f"{recording}: split.files = false cannot join its {len(found)} MCAP files, each of which is "
+                "resampled separately: join them with `ros2 bag convert` or `mcap merge`, or leave out the "
+                "key, so that an episode ends with each file"
+            )
+        sources += found
+    if file_format == "csv" and mapping and mapping.files:
+        sources = joined(sources, mapping.files)
+    for source in sources:
+        if not is_text(f"{source.path}/{source}"):
+            raise BadInputError(f"{str(source)!r}: expected a name in UTF-8; rename the file to import it")
+    return named_apart(bounded(sources, max_bytes))
 
 
 def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> tuple[ImportMapping, str]:
@@ -280,25 +259,23 @@ def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> t
     if missing:
         raise BadInputError(f"{source}: pass {' and '.join(missing)}, or --mapping FILE.toml")
     remark = keys.pop("remark", "")
-    settings = validated({"task": keys["name"]} | keys, ImportMapping, str(source))
-    taken = [f"{name} from {', '.join(column.fields)}" for name, column in settings.columns.items()]
-    return settings, "; ".join([*taken, *([remark] if remark else [])])
+    mapping = validated({"task": keys["name"]} | keys, ImportMapping, str(source))
+    taken = [f"{name} from {', '.join(column.fields)}" for name, column in mapping.columns.items()]
+    return mapping, "; ".join([*taken, *([remark] if remark else [])])
 
 
-def _why_none(tally: Tally, settings: ImportMapping) -> str:
+def _why_none(tally: Tally, mapping: ImportMapping) -> str:
     """Return why recordings hold no episode: what cuts most of their rows, if anything does."""
-    cuts = {reason: tally.split_points.get(reason, 0) for reason in ("gap", "back", "field")}
+    cuts = Counter(tally.split_points)
     reasons = {
-        "gap": f"'{settings.time}' steps by over gap_s in {cuts['gap']} rows: correct time_scale or gap_s",
-        "back": f"'{settings.time}' goes back in {cuts['back']} rows, first in {tally.back_first}: sort the "
+        "gap": f"'{mapping.time}' steps by over gap_s in {cuts['gap']} rows: correct time_scale or gap_s",
+        "back": f"'{mapping.time}' goes back in {cuts['back']} rows, first in {tally.back_first}: sort the "
         "rows by it",
-        "field": f"'{settings.split.field}' changes in {cuts['field']} rows: sort by it, or write a file of "
+        "field": f"'{mapping.split.field}' changes in {cuts['field']} rows: sort by it, or write a file of "
         "each",
     }
-    for reason, why in reasons.items():
-        if 2 * cuts[reason] > tally.rows:
-            return why
-    return "and each needs two rows if logs have no next states"
+    found = [why for reason, why in reasons.items() if 2 * cuts[reason] > tally.rows]
+    return found[0] if found else "and each needs two rows if logs have no next states"
 
 
 def episodes(
@@ -326,11 +303,11 @@ def episodes(
     size = 0
     try:
         for number, source in enumerate(sources):
-            source = source if left_out is None else replace(source, faults=left_out)
+            source = replace(source, faults=left_out)
             is_apart = mapping.split.files or source.recording != recording
             origin, row, is_bad, is_fed = "", 0, False, False
             try:
-                for block in _unstacked(_blocks(source, module, mapping), mapping):
+                for block in _blocks(source, module, mapping):
                     size += VALUE_BYTES * sum(values.size for values in block.values.values())
                     source.refuse_beyond(size)
                     recording = source.recording
@@ -348,8 +325,7 @@ def episodes(
                     is_apart, origin, row = is_apart and is_bad, block.origin, row + len(block)
             except BadInputError as error:
                 if left_out is None:
-                    faults = _faults(error, sources[number:], module, mapping)
-                    raise BadInputError("\n".join(_by_fault(faults))) from error
+                    raise BadInputError(_all_faults(error, sources[number:], module, mapping)) from error
                 left_out.append(str(error))
                 yield from cutter.abandon() if is_fed else ()
         yield from cutter.finish()
@@ -383,69 +359,56 @@ def refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
         )
 
 
-def _unstacked(blocks: Iterator[Block], mapping: ImportMapping) -> Iterator[Block]:
-    """Yield `blocks`; where fields are (episodes, steps, ...), a block for each episode.
+def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Iterator[Block]:
+    """Yield the blocks of a file; where fields are (episodes, steps, ...), one for each episode.
 
     Raises:
-        BadInputError: fields may be so, and the mapping does not say whether they are.
+        BadInputError: it cannot be read; or fields may be so, and the mapping does not say whether they are.
     """
     row, origin = 0, ""
-    for block in blocks:
-        row, origin = (row if block.origin == origin else 0), block.origin
-        shapes = [values.shape[1:] for values in map(np.asarray, block.values.values())]
-        steps = shapes[0][0] if shapes[0] else 1
-        may_be = steps > 1 and {shape[:1] for shape in shapes} == {(steps,)} and max(map(len, shapes)) > 1
-        if not mapping.stacked:
+    with explained(source, module):
+        for block in module.read(source, mapping):
+            row, origin = (row if block.origin == origin else 0), block.origin
+            shapes = [values.shape[1:] for values in map(np.asarray, block.values.values())]
+            steps = shapes[0][0] if shapes[0] else 1
+            may_be = steps > 1 and {shape[:1] for shape in shapes} == {(steps,)} and max(map(len, shapes)) > 1
+            if mapping.stacked and not may_be:
+                raise BadInputError(
+                    f"{origin}: stacked = true, but the fields' rows have the shapes "
+                    f"{', '.join(map(str, shapes))}; expected (steps, ...) with as many steps in each"
+                )
             if may_be and mapping.stacked is None and (len(shapes) > 1 or len(block) < steps):
                 raise BadInputError(
                     f"{origin}: all fields have {steps} rows in each of their rows, such as "
                     f"{next(iter(block.values))} of shape {(len(block), *shapes[0])}: set stacked = true in "
                     f"the mapping if these are the steps of {len(block)} episodes, else stacked = false"
                 )
-            yield block
-            continue
-        if not may_be:
-            raise BadInputError(
-                f"{origin}: stacked = true, but the fields' rows have the shapes "
-                f"{', '.join(map(str, shapes))}; expected (steps, ...) with as many steps in each"
-            )
-        for episode in range(len(block)):
-            values = {field: np.asarray(stack)[episode] for field, stack in block.values.items()}
-            yield Block(values, f"{origin}/{row + episode}", starts=True, known=block.known)
-        row += len(block)
+            if not mapping.stacked:
+                yield block
+                continue
+            for episode in range(len(block)):
+                values = {field: np.asarray(stack)[episode] for field, stack in block.values.items()}
+                yield Block(values, f"{origin}/{row + episode}", starts=True, known=block.known)
+            row += len(block)
 
 
-def _faults(
+def _all_faults(
     error: BadInputError, sources: Sequence[Source], module: ModuleType, mapping: ImportMapping
-) -> dict[Source, str]:
-    """Return what is wrong with the first of `sources`, and with others, as their beginnings tell."""
+) -> str:
+    """Return a line for each fault of the first of `sources` and the beginnings of others, with its files."""
     faults = {sources[0]: str(error)}
-    for source in sources[1:]:
+    for other in sources[1:]:
         try:
-            _check(source, module, mapping)
-        except BadInputError as other:
-            faults[source] = str(other)
-    return faults
-
-
-def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Iterator[Block]:
-    with explained(source, module):
-        yield from module.read(source, mapping)
-
-
-def _check(source: Source, module: ModuleType, mapping: ImportMapping) -> None:
-    """Raise BadInputError where the beginning of `source` tells that it cannot be read."""
-    if not hasattr(module, "check"):
-        next(_blocks(source, module, mapping), None)
-        return
-    with explained(source, module):
-        module.check(source, mapping)
-
-
-def _by_fault(faults: dict[Source, str]) -> list[str]:
-    """Return a line for each fault, with the names of the files that have it."""
+            with explained(other, module):
+                if hasattr(module, "check"):
+                    module.check(other, mapping)
+                else:
+                    next(_blocks(other, module, mapping), None)
+        except BadInputError as another:
+            faults[other] = str(another)
     names: dict[str, list[str]] = {}
-    for source, fault in faults.items():
-        begins = str(source) if fault.startswith(str(source)) else ""
+    for at, fault in faults.items():
+        begins = str(at) if fault.startswith(str(at)) else ""
         names.setdefault(fault.removeprefix(begins), []).append(begins)
-    return [f"{first_few([name for name in of if name], _NAMED)}{fault}" for fault, of in names.items()]
+    lines = [f"{first_few([name for name in of if name], _NAMED)}{fault}" for fault, of in names.items()]
+    return "\n".join(lines)

@@ -157,14 +157,20 @@ class Block:
         return f"{self.origin} line {self.line(number)}"
 
 
-_NAMELESS = (
-    "save it beside others under names, numpy.savez('log.npz', state=..., action=...), and import that"
-)
 ZARR = (".zgroup", ".zarray", ".zattrs", "zarr.json")
 FOREIGN = (
-    ((".npy",), f"a NumPy array without a name: {_NAMELESS}"),
     (
-        (".gz", ".bz2", ".xz", ".zst", ".zip", ".7z"),
+        (".npy",),
+        "a NumPy array without a name: save it beside others under names, numpy.savez('log.npz', state=..., "
+        "action=...), and import that",
+    ),
+    (
+        (".db3", ".db3.zstd"),
+        "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, storage_id: mcap, all: "
+        "true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and import NEW",
+    ),
+    (
+        (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"),
         "compressed: unpack it (gunzip, bunzip2, unxz, unzstd, unzip)",
     ),
     (

@@ -18,7 +18,7 @@ from astra_data.dataset.description import read_description
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.grounding.files import load_grounding, load_target_encoder
-from astra_data.io.hub.address import is_address
+from astra_data.io.hub.stores import is_address
 from astra_data.pipeline.executors import Item
 from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment
 from astra_data.pipeline.plan import stage_of

@@ -9,7 +9,7 @@ from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
 from astra_data.grounding.paired_episodes import divided
-from astra_data.io.hub.address import is_address
+from astra_data.io.hub.stores import is_address
 from astra_data.methods import method_named
 from astra_data.pipeline.condition import Condition
 from astra_data.pipeline.recipe import Recipe

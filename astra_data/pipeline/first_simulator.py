@@ -16,8 +16,7 @@ import torch
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Column
-from astra_data.io.guessing import PLACE
-from astra_data.io.logs import HEADING, TURNED, Field, Logs
+from astra_data.io.guessing import HEADING, PLACE, TURNED, Field, Logs
 
 JUDGED_STEPS = 10
 """After so many steps a simulator should be better than standing still."""

@@ -23,8 +23,7 @@ from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TER
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import locate, names_at_home
-from astra_data.io.guessing import guess
-from astra_data.io.logs import Logs, Role, csv_files, logs_of
+from astra_data.io.guessing import Logs, Role, csv_files, guess, logs_of
 from astra_data.pipeline.first_simulator import DIRECT, SimulatorKind, first_simulator, unpacked
 
 _COLUMNS: dict[Role, str] = {

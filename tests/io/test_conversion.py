@@ -38,12 +38,6 @@ def test_take_scale_offset_and_clip_follow_each_other() -> None:
     assert finite == [True] * 3
 
 
-def test_fields_stand_side_by_side_each_row_flattened() -> None:
-    block = Block({"a": np.arange(8.0).reshape(2, 2, 2), "b": np.array([10.0, 20.0])}, "log")
-    columns, _ = converter({"c": {"fields": ("b", "a")}}).convert(block)
-    assert columns["c"].tolist() == [[10, 0, 1, 2, 3], [20, 4, 5, 6, 7]]
-
-
 def test_recorded_next_states_are_described_as_the_states_unless_the_mapping_says_more() -> None:
     state = {"fields": ("f",), "names": ("x", "v"), "unit": ("m", "m/s"), "role": ("invariant",)}
     block = Block({"f": np.ones((2, 2))}, "log")
@@ -59,11 +53,6 @@ def test_what_is_not_finite_is_not_clipped_but_rejected() -> None:
     values, finite = convert({"clip": (-1.0, 1.0)}, [5.0, NAN, np.inf, -0.5])
     assert finite == [True, False, False, True]
     assert values[[0, 3]].tolist() == [1, -0.5]
-
-
-def test_what_does_not_fit_float32_is_rejected() -> None:
-    values, finite = convert({}, [1e300, 2.0])
-    assert (finite, values[1]) == ([False, True], 2.0)
 
 
 def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
@@ -99,22 +88,6 @@ def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
 def test_values_that_do_not_fit_are_refused(spec: dict[str, Any], values: Any, told: str) -> None:  # noqa: ANN401
     with pytest.raises(BadInputError, match=f"^log: {told}"):
         convert(spec, values)
-
-
-def test_whole_numbers_and_flags_keep_their_types_where_rows_are_rejected() -> None:
-    values, finite = convert({"dtype": "int64"}, [3.0, NAN])
-    assert values.dtype.name == "int64"
-    assert (int(values[0]), finite) == (3, [True, False])
-    values, _ = convert({}, [1, 0, 1], name=TERMINATED)
-    assert values.dtype.name == "bool"
-    assert values.tolist() == [True, False, True]
-
-
-def test_a_column_that_changes_in_size_is_refused() -> None:
-    made = converter({"c": {"fields": ("f",)}})
-    made.convert(Block({"f": np.zeros((2, 3))}, "log"))
-    with pytest.raises(BadInputError, match="c: 2 values, before there were 3"):
-        made.convert(Block({"f": np.zeros((2, 2))}, "log"))
 
 
 def test_sizes_that_contradict_each_other_are_all_listed() -> None:
@@ -154,11 +127,6 @@ def test_next_states_and_ends_are_derived_where_they_are_left_out() -> None:
     assert len(whole.columns) == 5
 
 
-def test_one_unit_holds_for_every_value() -> None:
-    spec = ColumnMapping(fields=("f",), unit=("m",), frame=("world", "body"))
-    assert column_of("c", spec, 2).astra == {"unit": ["m", "m"], "frame": ["world", "body"]}
-
-
 def test_values_are_called_as_their_fields_are_unless_the_mapping_says() -> None:
     spec = ColumnMapping(fields=("x", "y"))
     assert column_of("c", spec, 2).names == ("x", "y")
@@ -167,15 +135,6 @@ def test_values_are_called_as_their_fields_are_unless_the_mapping_says() -> None
     assert column_of("c", spec, 3).names is None
     assert column_of("c", spec.model_copy(update={"take": (0, 2)}), 2).names is None
     assert column_of("c", ColumnMapping(fields=("reward",)), 1).names is None
-
-
-@pytest.mark.parametrize("spec", ['fields = ["stamp", "x"]', 'fields = ["stamp"]\nscale = [1.0]'])
-def test_integers_that_become_floats_on_their_way_are_told(tmp_path: Path, spec: str) -> None:
-    fields = rows() | {"stamp": np.full(20, 2**60 + 1), "x": np.zeros(20)}
-    with pytest.raises(BadInputError, match=r"gait: numbers of 2\^53 or more came as floats"):
-        imported(
-            tmp_path, write_table(tmp_path / "log.npz", fields), MAPPING.replace('fields = ["gait"]', spec)
-        )
 
 
 def test_large_integers_need_a_dtype_that_holds_them(tmp_path: Path) -> None:
@@ -195,22 +154,6 @@ def test_whole_numbers_are_exact_to_their_bounds() -> None:
             convert({"dtype": "int64"}, [0.0, number])
     assert convert({"dtype": "int64"}, [2.0**53 - 1])[0].tolist() == [2**53 - 1]
     assert convert({}, [2**53, -(2**53)])[0].tolist() == [2**53, -(2**53)]
-
-
-def test_a_next_state_that_was_recorded_keeps_its_own_description() -> None:
-    seen = {"fields": ("f",), "meaning": "seen", "unit": ("m",)}
-    made = converter({STATE: {"fields": ("f",)}, NEXT_STATE: seen})
-    made.convert(Block({"f": np.zeros(2)}, "log"))
-    found = {column.name: column for column in made.columns}[NEXT_STATE]
-    assert (found.meaning, found.astra) == ("seen", {"unit": ["m"]})
-
-
-@pytest.mark.parametrize(("flag", "terminal"), [("g", "stand_still"), (TERMINATED, "drop")])
-def test_only_next_states_that_are_made_up_are_called_so(flag: str, terminal: str) -> None:
-    made = converter({STATE: {"fields": ("f",)}, flag: {"fields": ("f",)}}, terminal=terminal)
-    made.convert(Block({"f": np.zeros(2)}, "log"))
-    meanings = {column.name: column.meaning for column in made.columns}
-    assert meanings[NEXT_STATE] == "the state, one step later"
 
 
 def rounding(spec: dict[str, Any], values: Array) -> list[str]:
@@ -272,8 +215,3 @@ def test_large_numbers_most_of_whose_steps_are_lost_are_refused(start: float, st
 )
 def test_steps_that_float32_holds_are_not_warned_of(values: Array) -> None:
     assert rounding({}, values) == []
-
-
-def test_counts_of_which_float32_skips_every_second_are_kept_with_a_warning() -> None:
-    [warning] = rounding({}, 2**24 + ROWS)
-    assert "up to 1.67773e+07) in steps of 2, but it moves by 1" in warning

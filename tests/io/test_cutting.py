@@ -1,6 +1,5 @@
 """What the cutter makes of rows whose outcome is known."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
@@ -12,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import (
     ACTION,
     DONE,
@@ -140,13 +138,6 @@ def test_gaps_and_steps_back_in_time_begin_episodes() -> None:
     cutting.check()
 
 
-def test_no_gap_hides_behind_a_time_that_is_not_finite() -> None:
-    cutting = cutter(time="t", split={"gap_s": 0.5}, not_finite="drop")
-    episodes = cut(cutting, x=np.zeros(7), t=[0, 0.1, np.nan, 0.3, np.nan, 3.0, 3.1])
-    assert rows(episodes) == [[0, 1], [5]]
-    assert cutting.tally.split_points == {"gap": 1}
-
-
 def test_gaps_are_measured_between_the_rows_that_are_kept() -> None:
     """Over a row without a state too: no step from there to there is longer than 0.5 s."""
     nan, split = np.nan, {"gap_s": 0.5}
@@ -161,46 +152,11 @@ def test_gaps_are_measured_between_the_rows_that_are_kept() -> None:
     assert rows(cut(small, x=x, t=t)) == [[0, 1, 4, 5, 6]]
 
 
-def test_a_gap_to_a_rejected_row_is_told_and_not_the_step_back_from_it() -> None:
-    cutting = cutter(time="t", not_finite="drop", split={"gap_s": 1.0})
-    episodes = cut(cutting, x=[0, 1, np.nan, 3, 4], t=[0.0, 0.1, 50.0, 0.3, 0.4])
-    assert rows(episodes) == [[0], [3]]
-    assert (cutting.tally.split_points, cutting.tally.back_rows) == ({"gap": 1}, 1)
-
-
 def test_a_rate_is_that_of_the_rows_that_are_kept() -> None:
     cutting = cutter(time="t", not_finite="drop")
     cut(cutting, x=np.where(np.arange(60) % 2, np.nan, 1.0), t=np.arange(60) / 20)
     cutting.check()
     assert cutting.tally.clock.startswith("10 Hz declared, 10 Hz by t")
-
-
-def test_a_time_that_is_missing_does_not_stand_still() -> None:
-    cutting = cutter(time="t", not_finite="drop")
-    cut(cutting, x=np.zeros(6), t=[0, 0.1, 0.2, np.nan, 0.2, 0.3])
-    assert (cutting.tally.still_rows, cutting.tally.back_rows) == (0, 0)
-
-
-def test_gaps_that_are_not_cut_and_jitter_are_tallied() -> None:
-    seconds = np.arange(200) / 10
-    seconds[1::2] += 0.004
-    seconds[70:] += 0.3
-    seconds[150:] += 3.0
-    cutting = cutter(time="t", split={"gap_s": 1.0})
-    cut(cutting, x=np.zeros(200), t=seconds)
-    cutting.check()
-    assert cutting.tally.split_points == {"gap": 1}
-    assert (
-        cutting.tally.clock
-        == "10 Hz declared, 9.994 Hz by t; gaps within episodes: 1, jitter 4.1 % of a period"
-    )
-
-
-def test_a_rate_that_is_not_fps_is_told() -> None:
-    cutting = cutter(time="t", time_scale=0.001)
-    cut(cutting, x=np.zeros(50), t=np.arange(50) * 20.0)
-    with pytest.raises(BadInputError, match="'t' gives 50 rows per second, but fps is 10"):
-        cutting.check()
 
 
 def timed(*files: Array, names: Sequence[str] = ()) -> Cutter:
@@ -240,38 +196,6 @@ def test_episodes_of_other_rates_are_named_where_a_format_has_its_own() -> None:
     list(cutting.finish())
     cutting.check()
     assert cutting.tally.notes == ["demo_20: 5 Hz, 10 Hz declared"]
-
-
-def test_a_refusal_of_a_rate_names_the_files_that_are_off() -> None:
-    with pytest.raises(BadInputError, match=r"fps is 10: .*; fast\.csv: 20 Hz, faster\.csv: 40 Hz$"):
-        fed([("fast.csv", 20.0), ("good.csv", 10.0), ("faster.csv", 40.0)]).check()
-
-
-def test_files_of_one_name_are_measured_one_by_one() -> None:
-    """As those of `runs/*/log.csv`."""
-    cutting = fed([("log.csv", 10.0)] * 20 + [("log.csv", 5.0)] + [("log.csv", 10.0)] * 20)
-    cutting.check()
-    assert cutting.tally.notes == ["log.csv: 5 Hz, 10 Hz declared"]
-
-
-MISSING = (np.arange(50) + np.arange(50) // 3) / 10
-"""Times at 10 Hz, of which every fourth is missing."""
-BURSTS = np.arange(50) // 4 * 0.4 + np.arange(50) % 4 * 0.01
-"""Times of 10 rows a second that come four at once."""
-PAUSES = np.arange(50) / 20 + np.arange(50) // 25 * 3.0
-"""Times at 20 Hz with a pause."""
-
-
-def test_a_file_is_of_another_rate_only_where_both_its_mean_and_its_usual_rate_are() -> None:
-    cutting = timed(MISSING, BURSTS, PAUSES, np.arange(1000) / 10)
-    cutting.check()
-    assert cutting.tally.notes == ["2.csv: 20 Hz, 10 Hz declared"]
-
-
-@pytest.mark.parametrize("files", [(MISSING, BURSTS), (np.arange(50) / 20,)])
-def test_a_refusal_of_a_rate_names_no_file_where_none_stands_out(files: tuple[Array, ...]) -> None:
-    with pytest.raises(BadInputError, match=r"or resample the recording$"):
-        timed(*files).check()
 
 
 def test_jumps_are_longer_than_their_bound() -> None:
@@ -316,12 +240,6 @@ def test_a_rejected_row_still_ends_its_episode() -> None:
     assert cutting.tally.split_points == {"end": 1}
 
 
-def test_a_flag_that_is_not_known_ends_no_episode() -> None:
-    cutting = cutter(not_finite="drop", split={"ends": ("end",)})
-    episodes = cut(cutting, x=[0, 0, np.nan, 0, 0, 0], end=[0, 0, np.nan, 0, 0, 1])
-    assert rows(episodes) == [[0, 1, 3, 4]]
-
-
 @pytest.mark.parametrize(("not_finite", "kept"), [("drop", [[0, 1, 2]]), ("split", [[0], [2]])])
 def test_a_row_that_is_cut_off_where_the_next_file_goes_on_is_a_rejected_one(
     not_finite: str, kept: list[list[int]]
@@ -351,44 +269,6 @@ def test_short_episodes_are_left_out_and_counted() -> None:
     assert cutting.tally.short_rows == 1
 
 
-@pytest.mark.parametrize("rate", [8.0, 12.5])
-def test_a_log_that_is_slower_than_fps_is_told_as_one_that_is_faster(rate: float) -> None:
-    cutting = cutter(time="t")
-    cut(cutting, x=np.zeros(50), t=np.arange(50) / rate)
-    with pytest.raises(BadInputError, match=f"'t' gives {rate:g} rows per second, but fps is 10"):
-        cutting.check()
-
-
-def test_a_field_of_several_values_begins_an_episode_where_one_of_them_changes() -> None:
-    trial = [[0, 0], [0, 0], [0, 1], [0, 1], [1, 1], [1, 1]]
-    cutting = cutter(split={"field": "k"})
-    assert rows(cut(cutting, x=np.zeros(6), k=trial)) == [[0], [2], [4]]
-    assert cutting.tally.split_points == {"field": 2}
-
-
-def test_a_terminated_row_of_another_trial_is_no_log_that_went_on() -> None:
-    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
-    cutting = cutter(columns=columns, terminal="stand_still", split={"field": "k"})
-    trials = {"over": [0, 1, 1, 1, 1, 0, 1], "k": [0, 0, 0, 1, 1, 2, 2]}
-    assert rows(cut(cutting, x=np.arange(7.0), **trials)) == [[0, 1], [3], [5, 6]]
-    assert cutting.tally.rows_after_end == 2
-
-
-def test_a_recording_that_begins_with_a_terminated_row_keeps_it() -> None:
-    columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, TERMINATED: {"fields": ("over",)}}
-    cutting = cutter(columns=columns, terminal="stand_still")
-    assert rows(cut(cutting, x=np.arange(4.0), over=[1, 0, 0, 1])) == [[0], [1, 2, 3]]
-    assert cutting.tally.rows_after_end == 0
-
-
-def test_the_order_of_the_columns_makes_no_episode_of_a_terminated_row_alone() -> None:
-    columns = {TERMINATED: {"fields": ("over",)}, STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
-    cutting = cutter(columns=columns, split={"field": "k"})
-    episodes = cut(cutting, x=np.arange(6.0), over=[0, 0, 0, 1, 0, 0], k=[0, 0, 0, 1, 2, 2])
-    assert [{len(values) for values in episode.values()} for episode in episodes] == [{2}, {1}]
-    assert rows(episodes) == [[0, 1], [4]]
-
-
 def test_a_success_in_the_last_row_is_that_of_the_step_that_leads_to_it() -> None:
     columns = {STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}, SUCCESS: {"fields": ("there",)}}
     cutting = cutter(columns=columns, split={"field": "k"})
@@ -399,11 +279,6 @@ def test_a_success_in_the_last_row_is_that_of_the_step_that_leads_to_it() -> Non
         [False, True],
         [True, False],
     ]
-
-
-def test_a_jump_is_longer_than_its_bound_not_as_long() -> None:
-    cutting = cutter(split={"jump": {"column": STATE, "values": (0,), "above": 0.5}})
-    assert rows(cut(cutting, x=[0.0, 0.5, 1.0, 1.75, 2.0])) == [[0, 1], [3]]
 
 
 @pytest.mark.parametrize("not_finite", ["drop", "split"])
@@ -418,65 +293,11 @@ def test_a_failure_whose_row_is_rejected_is_that_of_the_last_row(not_finite: str
         assert [episode[name].tolist() for episode in episodes] == [[False, True], [False, True], [False]]
 
 
-def test_a_rejected_failure_right_after_an_end_is_of_no_episode() -> None:
-    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
-    columns[TERMINATED] = {"fields": ("fell",)}
-    cutting = cutter(columns=columns, not_finite="drop", split={"ends": ("end",)})
-    nan = float("nan")
-    episodes = cut(cutting, x=[0, 1, nan, 3], fell=[0, 0, 1, 0], end=[0, 1, 0, 0])
-    assert rows(episodes) == [[0, 1], [3]]
-    assert not any(episode[TERMINATED].any() for episode in episodes)
-
-
-def test_a_success_without_an_end_is_kept_where_its_row_is_rejected() -> None:
-    columns = {STATE: {"fields": ("x",)}, NEXT_STATE: {"fields": ("x",)}, ACTION: {"fields": ("a",)}}
-    cutting = cutter(columns=columns | {SUCCESS: {"fields": ("won",)}}, not_finite="drop")
-    (episode,) = cut(cutting, x=[0, 1, float("nan")], won=[0, 0, 1])
-    assert episode[SUCCESS].tolist() == [False, True]
-
-
-def test_times_of_a_formats_own_episodes_may_begin_again() -> None:
-    cutting = cutter(time="t")
-    for number in range(3):
-        times = np.arange(4) / 10 + 0.3 * (number == 2)  # the last begins when the one before ends
-        block = Block({"x": np.zeros(4), "a": np.zeros(4), "t": times}, f"log/{number}", starts=True)
-        list(cutting.feed(block, 0, is_apart=number == 0))
-    list(cutting.finish())
-    tally = cutting.tally
-    assert (tally.split_points, tally.back_rows, tally.still_rows) == ({"source": 2}, 0, 0)
-
-
 def test_rows_without_a_value_of_the_field_are_one_episode_as_empty_cells_are() -> None:
     field = [1.0, 1.0, np.nan, np.nan, np.nan, 2.0, 2.0]
     made = cutter(split={"field": "trial"})
     assert rows(cut(made, x=np.arange(7), trial=field)) == [[0], [2, 3], [5]]
     assert made.tally.split_points == {"field": 2}
-
-
-def test_a_field_may_be_a_text_after_a_number() -> None:
-    made = cutter(split={"field": "trial"})
-    arrays = [np.array(["a", "a", "b"]), np.array([7, 7, 7])]
-    episodes = []
-    for number, trial in enumerate(arrays):
-        fields = {"x": np.arange(3.0), "a": 3.0 * number + np.arange(3), "trial": trial}
-        episodes += [c for c, _ in made.feed(Block(fields, "log"), 3 * number, is_apart=number == 0)]
-    assert rows(episodes + [c for c, _ in made.finish()]) == [[0], [3, 4]]
-    assert made.tally.split_points == {"field": 2}
-
-
-@pytest.mark.parametrize(
-    ("split", "fault"),
-    [
-        ({"field": "f"}, "log: split.field has 2 values, before there were 1"),
-        ({"ends": ("f",)}, "log: split.ends f has 2 values, before there were 1"),
-    ],
-)
-def test_what_splits_keeps_its_size(split: dict[str, Any], fault: str) -> None:
-    made = cutter(split=split)
-    with pytest.raises(BadInputError, match=re.escape(fault)):
-        for number, size in enumerate((1, 2)):
-            fields = {"x": np.zeros(3), "a": np.zeros(3), "f": np.zeros((3, size))}
-            list(made.feed(Block(fields, "log"), 3 * number, is_apart=number == 0))
 
 
 cells = st.sampled_from([0.0, 0.0, 0.0, 1.0, np.nan])

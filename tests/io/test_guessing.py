@@ -8,8 +8,7 @@ import pytest
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.io.guessing import guess
-from astra_data.io.logs import Logs
+from astra_data.io.guessing import Logs, guess
 
 RAMP = np.arange(6.0)
 LATE = RAMP > 4

@@ -7,7 +7,7 @@ from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE
-from astra_data.io.huggingface import from_huggingface
+from astra_data.io.importing import from_huggingface
 
 MAPPING = """
 name = "again"

@@ -20,7 +20,7 @@ from astra_data.dataset.doctor.repair import repair
 from astra_data.dataset.reader import Dataset
 
 WARM = Path(__file__).parents[1] / "warm_commands.py"
-LOADED = [f"lerobot.scripts.lerobot_{name}" for name in ("train", "edit_dataset", "dataset_viz")]
+LOADED = [f"lerobot.scripts.lerobot_{name}" for name in ("train", "edit_dataset")]
 TRAINING_STEPS = 2
 READING = """import sys, datasets
 rows = datasets.load_dataset("parquet", data_files=sys.argv[1])["train"]
@@ -63,17 +63,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
             "--new_repo_id=a/c",
             f"--new_root={folder / 'deleted'}",
         ],
-        "split": [
-            *edit,
-            "--operation.type=split",
-            '--operation.splits={"one": [0, 1], "two": [2, 3, 4]}',
-            "--new_repo_id=a/d",
-            f"--new_root={folder / 'split'}",
-        ],
-        "viz": [
-            *["lerobot-dataset-viz", "--repo-id=a/b", *at, "--episode-index=3", "--save=1"],
-            *[f"--output-dir={folder / 'viz'}", "--num-workers=0"],
-        ],
         "train": [
             *["lerobot-train", "--dataset.repo_id=a/b", f"--dataset.root={dataset.root}"],
             *[
@@ -87,7 +76,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
             *["--num_workers=0", "--batch_size=4", f"--steps={TRAINING_STEPS}", "--log_freq=1"],
             *["--save_checkpoint=false", f"--output_dir={folder / 'training'}"],
         ],
-        "validate": ["astra-data", "validate", str(dataset.root), "--with-lerobot"],
         "datasets": [str(reading), str(dataset.root / "data/*/*.parquet")],
     }
     settings = {
@@ -138,28 +126,9 @@ def test_our_metadata_is_joined_again_after_lerobot_deleted_episodes(runs: Runs,
     assert joined.description["parents"] == [runs.dataset.identity]
 
 
-def test_lerobot_splits_it(runs: Runs) -> None:
-    assert_succeeded(runs, "split")
-    counts = {
-        path.parents[1].name: json.loads(path.read_text())["total_episodes"]
-        for path in runs.folder.glob("split*/**/meta/info.json")
-    }
-    assert sorted(counts.values()) == [2, 3]
-
-
-def test_lerobot_shows_it(runs: Runs) -> None:
-    assert_succeeded(runs, "viz")
-    [recording] = (runs.folder / "viz").glob("*.rrd")
-    assert recording.stat().st_size > 1000
-
-
 def test_lerobot_trains_act_on_it(runs: Runs) -> None:
     output = assert_succeeded(runs, "train")
     assert f"step:{TRAINING_STEPS}" in output.replace(" ", "")
-
-
-def test_lerobots_loader_cuts_the_same_windows(runs: Runs) -> None:
-    assert "is intact: 5 episodes, 55 steps" in assert_succeeded(runs, "validate")
 
 
 def test_hf_datasets_reads_the_parquet_files(runs: Runs) -> None:

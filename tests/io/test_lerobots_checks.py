@@ -94,13 +94,6 @@ def test_statistics_have_the_shapes_and_quantiles_that_lerobots_policies_take(
             np.testing.assert_allclose(meta.stats[name][key], expected, rtol=1e-4, atol=1e-5, err_msg=key)
 
 
-def test_datasets_of_two_seeds_may_be_merged(lerobot: SimpleNamespace, paired: list[Dataset]) -> None:
-    metas = [opened(lerobot, dataset.root).meta for dataset in paired]
-    fps, _, features = lerobot.aggregate.validate_all_metadata(metas)
-    assert fps == 10
-    assert set(paired[0].features) <= set(features)
-
-
 def test_the_sampler_finds_every_frame_once_and_leaves_out_last_ones(
     lerobot: SimpleNamespace, paired: list[Dataset]
 ) -> None:

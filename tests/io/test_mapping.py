@@ -45,14 +45,6 @@ def test_faults_are_told(tmp_path: Path, change: tuple[str, str], told: str) -> 
     assert told in str(caught.value)
 
 
-def test_each_field_is_asked_for_once(tmp_path: Path) -> None:
-    path = tmp_path / "mapping.toml"
-    path.write_text('time = "x"\n' + MAPPING + 'ends = ["fell"]')
-    mapping = load_recipe(path, ImportMapping)
-    assert mapping.fields == ["x", "y", "command", "reward", "fell", "gait"]
-    assert mapping.all_fields == [*mapping.fields, "trial"]
-
-
 def test_the_example_is_a_mapping_and_shows_every_key() -> None:
     path = Path(__file__).parents[2] / "recipes/imports/example.toml"
     load_recipe(path, ImportMapping)
@@ -68,14 +60,11 @@ def test_a_slip_in_a_columns_name_is_told(tmp_path: Path) -> None:
         load_recipe(path, ImportMapping)
 
 
-def test_a_name_like_that_of_a_column_beside_it_is_no_slip(tmp_path: Path) -> None:
-    path = tmp_path / "mapping.toml"
-    path.write_text(MAPPING.replace("columns.gait", "columns.actions"))
-    assert "actions" in load_recipe(path, ImportMapping).columns
-
-
-def test_a_recipe_in_place_of_a_mapping_is_told() -> None:
-    path = Path(__file__).parents[2] / "recipes/quickstart.toml"
+@pytest.mark.parametrize(
+    ("recipe", "command"), [("quickstart", "run {path}"), ("nao_real", "gap {path} --data LOGS")]
+)
+def test_a_recipe_in_place_of_a_mapping_is_told(recipe: str, command: str) -> None:
+    path = Path(__file__).parents[2] / f"recipes/{recipe}.toml"
     with pytest.raises(RecipeError) as caught:
         read_mapping(path)
     assert str(caught.value) == (

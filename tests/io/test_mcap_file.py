@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_recordings import Message, command, ns, pose, write_json
@@ -58,11 +57,6 @@ FORMS: dict[str, dict[str, Any]] = {
         "use_summary_offsets": False,
     },
 }
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_every_form_is_read(tmp_path: Path, form: str) -> None:
-    assert numbers(write(tmp_path / "log.mcap", **FORMS[form])) == (WANTED, False)
 
 
 PACKED = [CompressionType.ZSTD, CompressionType.LZ4]
@@ -135,25 +129,9 @@ def test_a_file_that_is_cut_off_is_read_up_to_there(tmp_path: Path, form: str, z
     assert len(lengths) > 5 and max(lengths) == len(WANTED)
 
 
-def test_no_message_before_a_cut_is_lost(tmp_path: Path) -> None:
-    whole = write(tmp_path / "whole.mcap", use_chunking=False).read_bytes()
-    path = tmp_path / "log.mcap"
-    end = whole.index(b"%03d" % WANTED[99]) + 23
-    path.write_bytes(whole[:end])
-    assert numbers(path) == (WANTED[:100], True)
-    path.write_bytes(whole[: end - 1])
-    assert numbers(path) == (WANTED[:99], True)
-
-
 def test_a_recorder_that_was_killed_leaves_whole_chunks(tmp_path: Path) -> None:
     read, is_cut = numbers(write(tmp_path / "log.mcap", is_finished=False))
     assert is_cut and 0 < len(read) < len(WANTED) and read == WANTED[: len(read)]
-
-
-def test_what_follows_the_end_changes_nothing(tmp_path: Path) -> None:
-    path = write(tmp_path / "log.mcap")
-    path.write_bytes(path.read_bytes() + bytes(4096))
-    assert numbers(path) == (WANTED, False)
 
 
 def test_damage_before_a_cut_is_refused(tmp_path: Path) -> None:
@@ -162,25 +140,6 @@ def test_damage_before_a_cut_is_refused(tmp_path: Path) -> None:
     content[content.index(b"050" + bytes(20))] ^= 1
     path.write_bytes(content[: 3 * len(content) // 4])
     with pytest.raises(BadInputError, match="has another checksum than was written"):
-        numbers(path)
-
-
-def test_damage_without_chunks_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "log.mcap", use_chunking=False, enable_data_crcs=True)
-    content = bytearray(path.read_bytes())
-    content[content.index(b"051" + bytes(20))] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match="crc validation failed in DataEnd"):
-        numbers(path)
-
-
-def test_an_end_within_a_message_is_damage(tmp_path: Path) -> None:
-    """It takes the place of the last bytes of a message, after which nothing comes."""
-    path = write(tmp_path / "log.mcap", use_chunking=False, **FORMS["without a summary"])
-    whole = path.read_bytes()
-    end = whole[-37:]
-    path.write_bytes(whole[: whole.index(b"099" + bytes(20)) + 23 - len(end)] + end)
-    with pytest.raises(EndOfFile):
         numbers(path)
 
 
@@ -198,35 +157,6 @@ def test_a_file_that_was_only_begun_is_told(tmp_path: Path) -> None:
         path.write_bytes(write(tmp_path / "whole.mcap").read_bytes()[:size])
         with pytest.raises(BadInputError, match=r"^log\.mcap is cut off before its first message ends"):
             numbers(path)
-
-
-def test_topics_without_messages_are_known(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.register_channel("/used", "json", schema_id=0)
-        writer.finish()  # type: ignore[no-untyped-call]
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None and not summary.chunk_indexes
-    assert numbers(path) == ([], False)
-
-
-def test_schemas_may_stand_in_the_data_alone(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=200, repeat_schemas=False)
-        writer.start()
-        other = writer.register_channel("/other", "json", schema_id=0)
-        schema = writer.register_schema("demo/Turn", "ros2msg", b"float64 turn")
-        used = writer.register_channel("/used", "cdr", schema)
-        writer.add_message(other, 0, bytes(200), 0)
-        writer.add_message(used, 0, bytes([0, 1, 0, 0]) + struct.pack("<d", 0.5), 0)
-        writer.finish()  # type: ignore[no-untyped-call]
-    read = McapFile(Source(path, None, path), ["/used"])
-    [(_, message)] = read.messages(checked=True)
-    assert read.decoder(message.channel_id)(message.data).turn == 0.5
 
 
 def test_an_encoding_that_cannot_be_read_is_told(tmp_path: Path) -> None:
@@ -291,13 +221,6 @@ def test_messages_come_in_the_order_of_their_times(tmp_path: Path, mixed: str) -
     assert all(message.time == message.log_time and not message.is_back for message in messages)
 
 
-def test_equal_times_keep_the_order_of_the_file(tmp_path: Path) -> None:
-    messages = [pose(1.0, 0), command(1.0, 1), pose(1.0, 2), command(0.9, 3), pose(1.0, 4), pose(1.2, 5)]
-    contents = [message.content for message in check(timeline(tmp_path / "log.mcap", messages))]
-    values = [content["turn"] if "turn" in content else content["position"]["x"] for content in contents]
-    assert values == [3, 0, 1, 2, 4, 5]
-
-
 @pytest.mark.parametrize("step_s", [0.6, 2.0, 100.0])
 def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path, step_s: float) -> None:
     before, after = drive(100, 105), drive(105, 110)
@@ -307,21 +230,6 @@ def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path, step_s: float) -> 
     assert [at for at, message in enumerate(messages) if message.is_back] == [len(before)]
     pause_ns = messages[len(before)].time - messages[len(before) - 1].time
     assert pause_ns > ns(PAUSE_S)
-
-
-def test_a_clock_may_be_set_back_again_and_again(tmp_path: Path) -> None:
-    messages = check(timeline(tmp_path / "log.mcap", drive(10, 13) + drive(10, 13) + drive(5, 8)))
-    assert [at for at, message in enumerate(messages) if message.is_back] == [90, 180]
-
-
-def test_a_little_back_and_far_ahead_is_no_new_beginning(tmp_path: Path) -> None:
-    ahead = [(topic, time + 3600, content) for topic, time, content in drive(4, 8)]
-    back = [(topic, time - 0.4, content) for topic, time, content in drive(8, 12)]
-    messages = check(timeline(tmp_path / "log.mcap", drive(0, 4) + ahead))
-    assert not any(message.is_back for message in messages)
-    messages = check(timeline(tmp_path / "log.mcap", drive(4, 8) + back))
-    assert not any(message.is_back for message in messages)
-    assert log_times(messages) == sorted(log_times(messages))
 
 
 def test_no_more_is_held_than_may_be_out_of_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,11 +37,6 @@ def test_all_files_that_cannot_be_read_are_told_at_once(tmp_path: Path) -> None:
     assert len(lines) == 3 and not (tmp_path / "out").exists()
 
 
-def test_a_file_alone_is_told_as_before(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"^3\.csv: no field 'gait'[^\n]*$"):
-        imported(tmp_path, logs(tmp_path)[3])
-
-
 def test_bad_files_are_left_out_where_that_is_asked_for_and_told(tmp_path: Path) -> None:
     paths = logs(tmp_path)
     alone, _ = imported(tmp_path / "alone", [paths[0], paths[5]])
@@ -124,26 +119,6 @@ def test_episodes_before_a_fault_in_a_file_are_kept(tmp_path: Path, monkeypatch:
     assert len(report.left_out) == 1 and report.left_out[0].startswith("1.jsonl line 18: expected an object")
 
 
-def test_a_file_with_columns_of_other_sizes_is_left_out(tmp_path: Path) -> None:
-    """Each can be imported by itself, but not all together."""
-    mapping = """
-name = "log"
-task = "walk"
-fps = 10
-[columns."observation.state"]
-fields = ["state"]
-[columns.action]
-fields = ["command"]
-"""
-    paths = [
-        write_table(tmp_path / f"{number}.npz", {"state": np.zeros((4, size)), "command": np.zeros(4)})
-        for number, size in enumerate((2, 3, 2))
-    ]
-    dataset, report = imported(tmp_path, paths, mapping, skip_bad=True)
-    assert dataset.metadata["source"] == ["0.npz", "2.npz"]
-    assert report.left_out == ("1.npz: columns.observation.state: 3 values, before there were 2",)
-
-
 def test_nothing_is_imported_where_all_files_are_bad(tmp_path: Path) -> None:
     with pytest.raises(
         BadInputError,
@@ -157,15 +132,6 @@ def test_nothing_is_left_out_without_a_mapping(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.h5", {"observations": np.zeros((4, 2)), "actions": np.zeros((4, 1))})
     with pytest.raises(BadInputError, match="--skip-bad needs a --mapping"):
         import_dataset([path], name="log", fps=10, out=tmp_path / "out", skip_bad=True)
-
-
-def test_a_good_import_tells_of_nothing_left_out(tmp_path: Path) -> None:
-    for skip_bad in (False, True):
-        folder = tmp_path / str(skip_bad)
-        dataset, report = imported(
-            folder, write_table(tmp_path / "log.csv", rows()), MAPPING, skip_bad=skip_bad
-        )
-        assert "imported, left out" not in str(report) and "left_out" not in dataset.description
 
 
 STACKED = """
@@ -207,14 +173,3 @@ def test_rows_of_matrices_are_no_episodes(tmp_path: Path, command: tuple[int, ..
         BadInputError, match=r"stacked = true, but the fields' rows have the shapes \(4, 3\), \("
     ):
         imported(tmp_path / "stacked", path, "stacked = true\n" + STACKED)
-
-
-def test_a_batch_in_d4rls_layout_is_episodes(tmp_path: Path) -> None:
-    fields = {
-        "observations": np.zeros((8, 50, 3)),
-        "actions": np.zeros((8, 50, 2)),
-        "rewards": np.ones((8, 50)),
-    }
-    dataset, _ = imported(tmp_path, write_table(tmp_path / "log.h5", fields), None, name="log", fps=10)
-    assert dataset.lengths.tolist() == [49] * 8
-    assert dataset.metadata["return"] == [49.0] * 8

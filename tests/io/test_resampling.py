@@ -62,35 +62,6 @@ def test_jitter_neither_repeats_nor_skips_a_state(phase_ms: float, lead: int, la
     assert resampler.unevenness() == ()
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("phase_ms", [20.0, 25.0, 30.0])
-def test_jitter_of_the_first_messages_moves_no_row(phase_ms: float, seed: int) -> None:
-    """Up to 8 ms of it, of states at 20 Hz with commands about half a step after them."""
-    odom = 1000 + 50.0 * np.arange(500) + np.random.default_rng(seed).uniform(-8, 8, 500)
-    resampler, rows = sampled(20, odom, 1000 + phase_ms + 50.0 * np.arange(-3, 497))
-    states = np.array(rows)[:, 0]
-    assert (np.diff(states) == 1).all() and len(states) > 497
-    assert resampler.repeated["/odom"] == resampler.skipped["/odom"] == 0
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_jitter_moves_no_row_toward_fast_commands_or_slow_states(seed: int) -> None:
-    """Commands at 100 Hz; states at 10 Hz, each in two rows."""
-    jitter = np.random.default_rng(seed).uniform(-8, 8, 500)
-    _, rows = sampled(20, 1000 + 50.0 * np.arange(500) + 2.4 * jitter, 900.0 + 10 * np.arange(2500))
-    assert (np.diff(np.array(rows)[:, 0]) == 1).all()
-    _, rows = sampled(20, 1000 + 100.0 * np.arange(500) + jitter, 1025 + 50.0 * np.arange(-3, 997))
-    _, held = np.unique(np.array(rows)[:, 0], return_counts=True)
-    assert (held[1:-1] == 2).all()
-
-
-def test_jitter_changes_no_row_of_a_state_that_comes_five_times_a_row() -> None:
-    odom = 20.0 * np.arange(100)
-    odom[5::10] += 1
-    _, rows = sampled(10, odom, 100.0 * np.arange(20))
-    assert rows == [(5 * k, k) for k in range(20)]
-
-
 @pytest.mark.parametrize("phase_ms", [18.0, 32.0])
 def test_jitter_moves_no_command_to_another_state(phase_ms: float) -> None:
     commands = phase_ms + 50.0 * np.arange(100)
@@ -99,22 +70,6 @@ def test_jitter_moves_no_command_to_another_state(phase_ms: float) -> None:
     resampler, rows = sampled(20, 50.0 * np.arange(100), commands)
     assert {k - command for k, command in rows} == {0 if phase_ms < 25 else 1}
     assert resampler.unevenness() == ()
-
-
-def test_jitter_changes_no_row_of_a_state_that_comes_every_other_row() -> None:
-    odom = 50.0 * np.arange(100)
-    odom[1::3] += 8
-    _, rows = sampled(40, odom, 25.0 * np.arange(200))
-    assert rows == [(row // 2, row) for row in range(200)]
-
-
-def test_a_command_out_of_step_moves_no_row_toward_the_states() -> None:
-    """Commands at 16 Hz, the first of them 20 ms after the first state."""
-    odom = 50.0 * np.arange(100)
-    odom[1::3] += 20
-    odom[2::3] -= 20
-    _, rows = sampled(20, odom, 20 + 62.5 * np.arange(79))
-    assert [k for k, _ in rows] == list(range(100))
 
 
 def test_a_state_that_falls_silent_is_held_for_as_long_as_it_may_be() -> None:
@@ -143,28 +98,10 @@ def test_clocks_that_never_meet_are_refused_in_a_line(late_ms: float) -> None:
     assert sampled(20, odom, 1350 + odom)[1]  # 0.4 s, as long as a state may be held
 
 
-def test_a_latched_topic_may_be_repeated() -> None:
-    resampler, _ = sampled(20, 50.0 * np.arange(100), 500.0 * np.arange(10), latched=True)
-    assert resampler.repeated["/cmd"] == 90 and resampler.unevenness() == ()
-
-
-def test_a_topic_out_of_step_is_held_as_it_is_at_the_time_of_the_row() -> None:
-    """A state at 25 Hz, of which each row takes the last one."""
-    odom, commands = 40.0 * np.arange(100), 100.0 * np.arange(40)
-    _, rows = sampled(10, odom, commands)
-    assert rows == [(int(100 * k // 40), k) for k in range(40)]
-
-
 def test_no_row_is_made_up_after_the_last_state() -> None:
     """The last command came just before a state that was not recorded any more."""
     _, rows = sampled(20, 50.0 * np.arange(20), 49 + 50.0 * np.arange(20))
     assert rows == [(k, k - 1) for k in range(1, 20)]
-
-
-def test_no_row_is_made_up_after_the_last_message() -> None:
-    """The next state, at 5 Hz, was not recorded any more, and neither were commands."""
-    _, rows = sampled(20, 200.0 * np.arange(10), 50.0 * np.arange(37))
-    assert rows == [(row // 4, row) for row in range(37)]
 
 
 def test_a_period_is_the_mean_one_of_the_messages_that_go_on() -> None:
@@ -178,13 +115,6 @@ def test_a_period_is_the_mean_one_of_the_messages_that_go_on() -> None:
     assert periods == {"/odom": pytest.approx(50, rel=0.01)}
 
 
-@pytest.mark.parametrize(("size", "period"), [(5, 20.0), (2, 40.0)])
-def test_a_period_of_messages_in_bursts_is_the_mean_one(size: int, period: float) -> None:
-    times = np.add.outer(size * period * np.arange(50), np.arange(size)).flatten()
-    periods = usual_periods({"/odom": times.astype(np.int64)}, 400)
-    assert periods == {"/odom": pytest.approx(period, rel=0.02)}
-
-
 def test_a_topic_that_rows_repeat_is_told_with_its_rate_and_counts() -> None:
     resampler, rows = sampled(40, 50.0 * np.arange(101), 25.0 * np.arange(201))
     assert len(rows) == 201
@@ -192,19 +122,6 @@ def test_a_topic_that_rows_repeat_is_told_with_its_rate_and_counts() -> None:
         "log: /odom comes 20 times a second, fps is 40: 100 of 200 rows repeat its message before, "
         "0 of 100 messages are in no row",
     )
-
-
-def test_a_topic_of_which_messages_are_skipped_is_told_with_its_rate_and_counts() -> None:
-    resampler, _ = sampled(20, 50.0 * np.arange(100), 10.0 * np.arange(496))
-    assert resampler.unevenness() == (
-        "log: /cmd comes 100 times a second, fps is 20: 0 of 99 rows repeat its message before, "
-        "396 of 495 messages are in no row",
-    )
-
-
-def test_a_state_that_is_taken_less_often_than_it_comes_is_not_told_where_the_steps_are_even() -> None:
-    resampler, _ = sampled(20, 10.0 * np.arange(496), 50.0 * np.arange(100))
-    assert resampler.skipped["/odom"] == 396 and resampler.unevenness() == ()
 
 
 @pytest.mark.parametrize(
@@ -233,28 +150,6 @@ def test_messages_in_no_row_are_told_where_commands_flags_outcomes_or_ends_are_l
     assert resampler.unevenness() == (told if counts else ())
 
 
-def test_joints_of_a_column_of_their_own_may_be_in_no_row_and_are_told_where_rows_repeat_them() -> None:
-    """Not observed, and no command."""
-    more: dict[str, dict[str, object]] = {
-        ACTION: {"fields": ("/odom:k",)},
-        "wheels": {"fields": ("/cmd:k",)},
-    }
-    resampler, _ = sampled(20, 50.0 * np.arange(100), 10.0 * np.arange(496), more=more)
-    assert resampler.skipped["/cmd"] == 396 and resampler.unevenness() == ()
-    [told] = sampled(20, 50.0 * np.arange(100), 100.0 * np.arange(50), more=more)[0].unevenness()
-    assert "/cmd comes 10 times a second" in told
-
-
-def test_uneven_steps_of_a_state_are_told_instead_of_the_messages_in_no_row() -> None:
-    resampler, rows = sampled(20, 100 / 3 * np.arange(300), 50.0 * np.arange(200))
-    steps = np.diff([k for k, _ in rows])
-    assert set(steps) == {1, 2} and abs(steps.mean() - 1.5) < 0.01
-    assert resampler.unevenness() == (
-        "log: /odom comes 30 times a second, of which 20 fps is no whole fraction: steps of 33 and 67 ms "
-        "alternate; take 10, 15 or 30",
-    )
-
-
 def with_dropouts() -> tuple[Array, Array]:
     """Return the times of states at 50 Hz, with three holes of up to 0.36 s, and of commands at 10 Hz."""
     odom = 20.0 * np.arange(1000)
@@ -279,53 +174,6 @@ def test_dropouts_of_a_state_are_told_with_the_gap_that_ends_episodes_there() ->
     assert len({k for k, _ in rows}) == len(rows) > 180
 
 
-def test_silences_that_the_gap_of_the_column_accepts_are_not_told() -> None:
-    """Of 0.36 s, where the column holds values for 0.38; what is longer ends episodes and is told as that."""
-    odom, commands = with_dropouts()
-    accepted, rows = sampled(10, odom, commands, state_gap_s=0.38)
-    assert len({k for k, _ in rows}) < len(rows)
-    assert accepted.unevenness() == accepted.endings() == ()
-    stamp: dict[str, dict[str, object]] = {"stamp": {"fields": ("/odom:stamp",)}}
-    assert sampled(10, odom, commands, state_gap_s=0.38, more=stamp)[0].unevenness() == ()
-    [told] = sampled(10, odom, commands, state_gap_s=0.08)[0].endings()
-    assert told.startswith(
-        'log: /odom is silent for over 0.08 s (gap_s in [columns."observation.state"]) 3 times'
-    )
-    assert "latched" not in told
-
-
-@pytest.mark.parametrize("gap_s", [None, 0.3, 0.6])
-def test_the_shortest_gap_of_the_columns_of_a_topic_is_the_one_that_is_named(gap_s: float | None) -> None:
-    odom = np.concatenate([50.0 * np.arange(20), 2000 + 50.0 * np.arange(20)])
-    more: dict[str, dict[str, object]] = {"pose": {"fields": ("/odom:pose",), "gap_s": gap_s}}
-    [told] = sampled(20, odom, 50.0 * np.arange(60), more=more)[0].endings()
-    key = '0.3 s (gap_s in [columns."pose"])' if gap_s == 0.3 else "0.4 s (split.gap_s)"
-    assert told.startswith(f"log: /odom is silent for over {key} once")
-
-
-@pytest.mark.parametrize("period_ms", [20.0, 50.0, 100.0])
-def test_a_message_that_is_lost_is_no_dropout(period_ms: float) -> None:
-    odom = np.delete(period_ms * np.arange(round(20_000 / period_ms)), [100, 150])
-    resampler, _ = sampled(10, odom, 100.0 * np.arange(200))
-    assert resampler.unevenness() == ()
-
-
-def test_rows_that_repeat_a_state_before_the_next_one_is_due_are_of_no_dropout() -> None:
-    """Each of the states is in two rows, one in eight: six of these are a dropout's."""
-    odom = np.delete(50.0 * np.arange(100), [41, 42, 43])
-    resampler, rows = sampled(40, odom, 25.0 * np.arange(200))
-    assert [k for k, _ in rows].count(40) == 8
-    assert "/odom is silent for up to 0.2 s once, where 6 rows repeat" in resampler.unevenness()[1]
-
-
-def test_a_state_that_stops_before_the_log_ends_is_told() -> None:
-    """The states end at 1 s, and the command goes on."""
-    resampler, rows = sampled(20, 50.0 * np.arange(21), 50.0 * np.arange(60))
-    [*_, told] = resampler.unevenness()
-    held = [k for k, _ in rows].count(20) - 1
-    assert f"/odom is silent for up to 0.4 s once, where {held} rows repeat" in told
-
-
 @pytest.mark.parametrize("gap_s", [0.13, 0.31])
 def test_the_gap_of_a_column_is_that_of_its_topics_alone(gap_s: float) -> None:
     """Each row after a state that is the last holds it for so long, while commands may be held for longer."""
@@ -334,17 +182,6 @@ def test_the_gap_of_a_column_is_that_of_its_topics_alone(gap_s: float) -> None:
     held = [k for k, _ in rows].count(40) - 1
     assert held == gap_s * 1000 // 50
     assert [k for k, _ in rows][: len(odom)] == list(range(41))
-
-
-def test_a_clock_that_is_a_little_off_is_not_told() -> None:
-    """20.2 Hz: one message in a hundred is in no row."""
-    resampler, _ = sampled(20, 49.5 * np.arange(400), 50.0 * np.arange(396))
-    assert 3 <= resampler.skipped["/odom"] <= 5 and resampler.unevenness() == ()
-
-
-def test_a_step_as_long_as_the_gap_is_one_of_the_period() -> None:
-    times = {"/odom": np.array([0, 100, 200, 301], np.int64)}
-    assert usual_periods(times, 100) == {"/odom": 100.0}
 
 
 def odd_share(rate: float, fps: int) -> float:
@@ -372,29 +209,3 @@ def test_rates_that_divide_are_proposed(rate: float, fps: int, steps: str, propo
     assert odd_share(round(rate), fps) > 0.05
     for each in re.findall("[0-9]+", proposed):
         assert odd_share(round(rate), int(each)) == 0
-
-
-@pytest.mark.parametrize(("rate", "fps"), [(28.7, 20), (28.7, 10), (103, 20), (12.5, 10)])
-def test_where_no_rate_divides_the_spread_is_told_and_the_rate_that_divides_best(
-    rate: float, fps: int
-) -> None:
-    told = uneven_steps("/odom", rate, fps)
-    match = re.search(
-        r"at (\d+), (\d+)% .* of (\d+) ms, the others of (\d+); at (\d+) only (\d+)% are odd", told
-    )
-    assert match is not None, told
-    at, percent, long, short, best, odd = map(int, match.groups())
-    share = rate / fps % 1
-    assert at == fps and percent == round(100 * share)
-    assert long - short == pytest.approx(1000 / rate, abs=1.1)
-    assert odd_share(rate, best) == pytest.approx(odd / 100, abs=0.006)
-    assert odd_share(rate, best) < 0.05 < odd_share(rate, fps)
-    assert "no fps nearby is a whole fraction" in told
-
-
-@pytest.mark.parametrize(
-    ("rate", "fps"), [(50, 10), (49.9, 10), (20, 20), (20.2, 20), (30, 40), (20, 40), (0.4, 1), (400, 30)]
-)
-def test_even_steps_are_not_told(rate: float, fps: int) -> None:
-    """Nor rows that repeat messages, nor steps of which one is 13 messages long and the next 14."""
-    assert uneven_steps("/odom", rate, fps) == ""

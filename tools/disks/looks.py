@@ -13,7 +13,7 @@ import numpy as np
 from astra_data.core.errors import AstraDataError
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
-from astra_data.io.hub.urls import UrlStore
+from astra_data.io.hub.stores import UrlStore
 
 Look = Callable[[Path], str | None]
 """Describes what is at a path: None if there is nothing, and "damaged: ..." if it is not whole."""

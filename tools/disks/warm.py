@@ -32,7 +32,7 @@ WITH_TORCH = (
     "dataset.samples",
     "dataset.step_windows",
     "io.hub.card",
-    "io.hub.push",
+    "io.hub.sharing",
 )
 """Modules of theirs that load torch: a process with torch takes several times as long to fork."""
 LIBRARIES = ("pandas", "fsspec.implementations.local")

@@ -4,27 +4,25 @@ import json
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
+from astra_data.core.config import Config
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import in_code, in_markdown
 from astra_data.dataset import format as layout
-from astra_data.dataset.columns import RESERVED, Column
+from astra_data.dataset.columns import RESERVED, STATE, Column
 from astra_data.dataset.description import full_name
 from astra_data.dataset.inspection import visited
 from astra_data.dataset.reader import Dataset
-from astra_data.io.hub.loading import loading
-from astra_data.io.hub.notes import Notes
+from astra_data.io.hub.stores import HubStore, parse_source
 from astra_data.reports.blocks import table
 from astra_data.reports.figures.style import coverage, png
 
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
-
-SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
-"""Upper bounds of the Hub's size categories in steps, from 1000 in factors of ten."""
 
 WIDE = 4
 """Columns with more values than this have their names listed below the table."""
@@ -39,6 +37,21 @@ CITATION = """\
   doi     = {10.1109/LRA.2026.3688068}
 }
 ```"""
+
+
+class Notes(Config):
+    """The part of a card that a person writes, a TOML file; every text is Markdown and optional."""
+
+    license: Annotated[str, Field(min_length=1)] = "unknown"
+    """One of the Hub's identifiers, such as "apache-2.0"."""
+    summary: str = ""
+    """What the dataset is; shown at the top of the card."""
+    behavior: str = ""
+    """Who or what acts in it, and how."""
+    intended_use: str = ""
+    """What it is meant for."""
+    limits: str = ""
+    """What it does not contain, and what it should not be used for."""
 
 
 def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None = None) -> list[Path]:
@@ -81,18 +94,18 @@ def render_card(
         pretty_name=description["name"],
         task_categories=["robotics"],
         tags=list(TAGS),
-        size_categories=[_size_category(int(dataset.lengths.sum()))],
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     picture = f"![Steps per cell of the plane]({figure})" if figure else ""
     sections = {
-        "Loading": loading(dataset, source),
+        "Loading": _loading(dataset, source),
         "Behavior": notes.behavior,
         "Intended use": notes.intended_use,
         "Limits": notes.limits,
         "Contents": _counts(dataset),
         "Columns": _columns(dataset),
-        "Provenance": _folded(_provenance(description)),
+        "Provenance": "<details>\n<summary>How it was made, and the sum of its values</summary>\n\n"
+        f"{_provenance(description)}\n\n</details>",
         "Citation": f"The method that these datasets are made for:\n\n{CITATION}",
     }
     front = [f"---\n{data.to_yaml()}\n---", f"# {description['name']}", notes.summary, _opening(dataset)]
@@ -100,9 +113,42 @@ def render_card(
     return "\n\n".join(part.strip() for part in parts if part) + "\n"
 
 
-def _folded(text: str) -> str:
-    summary = "How it was made, and the sum of its values"
-    return f"<details>\n<summary>{summary}</summary>\n\n{text}\n\n</details>"
+def _loading(dataset: Dataset, source: str | None) -> str:
+    """Return the section on loading with lerobot, with datasets and with astra-data."""
+    name, tag = dataset.description["name"], f"data-{dataset.description['version']}"
+    place = None if source is None else parse_source(source)[0]
+    if isinstance(place, HubStore):
+        lerobot = f'LeRobotDataset("{place.repo}", revision="{tag}")'
+        rows = f'load_dataset("{place.repo}", revision="{tag}", split="train")'
+        root = ""
+    else:
+        root = f'root = "datasets/{name}/{tag}"\n'
+        lerobot = f'LeRobotDataset("{name}", root=root)'
+        rows = 'load_dataset("parquet", data_files=f"{root}/data/*/*.parquet", split="train")'
+    column = STATE if STATE in dataset.features else dataset.schema[0].name
+    fetched = f"```sh\nastra-data pull {source} --version {tag[5:]}\n```\n\n" if source else ""
+    return f"""\
+{fetched}```python
+from astra_data.dataset.versions import open_dataset
+
+values = open_dataset("{dataset.reference}").columns([{json.dumps(column)}])
+```
+
+With [LeRobot](https://github.com/huggingface/lerobot):
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+{root}dataset = {lerobot}
+```
+
+With [datasets](https://github.com/huggingface/datasets):
+
+```python
+from datasets import load_dataset
+
+{root}rows = {rows}
+```"""
 
 
 def _opening(dataset: Dataset) -> str:
@@ -203,11 +249,3 @@ def _json(content: dict[str, Any]) -> str:
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     cells = ([" ".join(cell.split()).replace("|", "\\|") for cell in row] for row in rows)
     return table(head, cells, words=len(head))
-
-
-def _size_category(steps: int) -> str:
-    powers = [(1000 * 10**power, name) for power, name in enumerate(SIZES)]
-    above = next((number for number, (limit, _) in enumerate(powers) if steps < limit), len(powers))
-    if above == 0:
-        return f"n<{SIZES[0]}"
-    return f"n>{SIZES[-1]}" if above == len(SIZES) else f"{SIZES[above - 1]}<n<{SIZES[above]}"

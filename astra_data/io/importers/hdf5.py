@@ -13,8 +13,15 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED, Array
-from astra_data.io.hdf5_file import check_storage, stored_datasets, unpacked_bytes
-from astra_data.io.layouts import D3RLPY, D4RL, NUMBERED, RECORD, ROBOMIMIC
+from astra_data.io.hdf5_file import (
+    D3RLPY,
+    D4RL,
+    NUMBERED,
+    ROBOMIMIC,
+    check_storage,
+    stored_datasets,
+    unpacked_bytes,
+)
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import BLOCK_ROWS, Block, Source, natural, row_count
 
@@ -82,19 +89,6 @@ def _opened(source: Source) -> Iterator[tuple[Any, Any]]:
     h5py = optional("h5py")
     with h5py.File(source.path, "r") as file:
         yield h5py, file
-
-
-def record(source: Source) -> str | None:
-    """Return the record of an export of ours, None if it has none."""
-    with _opened(source) as (h5py, file):
-        found = file
-        for part in RECORD.split("/"):
-            is_here = isinstance(found, h5py.Group) and part in found
-            if not is_here or not isinstance(found.get(part, getlink=True), h5py.HardLink):
-                return None
-            found = found[part]
-        is_text = isinstance(found, h5py.Dataset) and h5py.check_string_dtype(found.dtype) is not None
-        return str(found.asstr()[()]) if is_text and found.shape == () else None
 
 
 def layout(source: Source) -> dict[str, Any]:

@@ -6,7 +6,6 @@ the info of the reset was recorded, `infos` are those before a step in columns o
 it in all others, and `next_infos` those after it in any.
 """
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -61,12 +60,6 @@ def layout(source: Source) -> dict[str, Any]:
         TRUNCATED: {"fields": ["truncations"]},
     }
     return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
-
-
-def record(source: Source) -> str | None:
-    """Return the record of an export of ours, None if it has none."""
-    metadata = json.loads((source.path / "data" / "metadata.json").read_text(encoding="utf-8"))
-    return json.dumps(metadata["astra_data"]) if "astra_data" in metadata else None
 
 
 def is_dataset(path: Path) -> bool:

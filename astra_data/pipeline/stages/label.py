@@ -30,7 +30,7 @@ from astra_data.dataset.compare import column_faults, names_apart
 from astra_data.dataset.inspection import is_terminated, outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
-from astra_data.io.hub.pull import opened
+from astra_data.io.hub.sharing import opened
 from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import explained, judged, paid

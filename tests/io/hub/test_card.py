@@ -1,18 +1,25 @@
 import re
-from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake, writer
+from fake_dataset import COLUMNS, DESCRIPTION, concatenated, fake_episodes, write_fake, writer
 from huggingface_hub import DatasetCard
 
 from astra_data.core.config import load_recipe
-from astra_data.core.errors import BadInputError, DiskError, RecipeError
-from astra_data.dataset.columns import ACTION, STATE, SUCCESS, Column, Episode
+from astra_data.dataset.columns import (
+    ACTION,
+    NEXT_STATE,
+    OUTCOME_COLUMNS,
+    STATE,
+    SUCCESS,
+    Column,
+    Episode,
+)
 from astra_data.dataset.reader import Dataset
-from astra_data.io.hub.card import _size_category, render_card, write_card
-from astra_data.io.hub.notes import Notes
+from astra_data.io.hub.card import Notes, render_card, write_card
+from astra_data.robots.registry import TASKS
 
 NOTES = Notes(
     license="mit", summary="A sum.", behavior="It walks.", intended_use="For tests.", limits="Nothing real."
@@ -26,7 +33,6 @@ def test_the_front_matter_says_what_the_hub_reads(fake: Dataset, tmp_path: Path)
     assert data["task_categories"] == ["robotics"]
     assert "LeRobot" in data["tags"]
     assert data["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
-    assert data["size_categories"] == ["n<1K"]
 
 
 def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
@@ -55,14 +61,6 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
     assert str(dataset.description["git_commit"]) in text
 
 
-def test_the_card_says_that_a_robot_is_a_stand_in(fake: Dataset, tmp_path: Path) -> None:
-    assert "stand-in" not in render_card(fake, NOTES)
-    description = {**DESCRIPTION, "environment": {"id": "naö", "stand_in": "surrogate"}}
-    text = render_card(write_fake(tmp_path / "fake", description=description), NOTES)
-    assert "The robot is a simulated stand-in (`surrogate`) for a physical one." in text
-    assert '"naö"' in text and "| from | nothing earlier |" in text
-
-
 def test_long_names_stand_below_the_table_and_facts_are_of_the_episodes_that_have_them(
     tmp_path: Path,
 ) -> None:
@@ -77,24 +75,6 @@ def test_long_names_stand_below_the_table_and_facts_are_of_the_episodes_that_hav
     assert "In `near` and `far`, in order: a, b, c, d, e." in text and text.count("in order") == 1
     assert "| `few` | float32 | (4,) |  | a, b, c, d |" in text
     assert "| return | mean 2.00; 1.00 to 3.00 |\n| success | 1 of 3 episodes (33.3%) |" in text
-    assert "- 1K<n<10K\n" in text
-
-
-def test_sizes_are_the_hubs() -> None:
-    """As size_categories.json of the package datasets lists them."""
-    units = ["1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T"]
-    listed = ["n<1K", *(f"{least}<n<{most}" for least, most in pairwise(units)), "n>1T"]
-    bounds = [10**power for power in range(3, 13)]
-    assert [_size_category(steps) for steps in (1, *bounds)] == listed
-    assert [_size_category(steps - 1) for steps in bounds] == listed[:-1]
-
-
-def test_without_notes_their_sections_are_left_out(fake: Dataset) -> None:
-    text = render_card(fake, Notes())
-    assert "license: unknown" in text
-    assert re.findall(r"^## (.*)", text, re.MULTILINE) == [
-        *("Loading", "Contents", "Columns", "Provenance", "Citation")
-    ]
 
 
 def test_words_cannot_break_a_table(tmp_path: Path) -> None:
@@ -102,23 +82,6 @@ def test_words_cannot_break_a_table(tmp_path: Path) -> None:
     with writer(tmp_path / "odd", columns=[Column("odd", meaning=meaning)]) as out:
         out.add(Episode(0, {"odd": np.zeros(1, dtype=np.float32)}))
     assert "| left \\| right, or none |" in render_card(Dataset.open(tmp_path / "odd"), Notes())
-
-
-def test_the_figure_is_shown(fake: Dataset, tmp_path: Path) -> None:
-    card, figure = write_card(fake, tmp_path / "it.md", Notes())
-    assert figure.read_bytes().startswith(b"\x89PNG")
-    text = card.read_text()
-    assert text.index(f"]({figure.name})") < text.index("## Loading") < text.index("## Contents")
-
-
-def test_what_a_person_wrote_is_not_replaced(fake: Dataset, tmp_path: Path) -> None:
-    files = write_card(fake, tmp_path / "it.md", NOTES)
-    assert write_card(fake, tmp_path / "it.md", NOTES) == files
-    with files[0].open("a") as card:
-        card.write("Robot 3 has a loose wheel.\n")
-    with pytest.raises(BadInputError, match=r"it\.md exists already and is not this card; delete it or"):
-        write_card(fake, tmp_path / "it.md", NOTES)
-    assert files[0].read_text().endswith("wheel.\n")
 
 
 def test_sums_are_folded_away(fake: Dataset) -> None:
@@ -137,18 +100,6 @@ def test_without_positions_there_is_no_figure(tmp_path: Path) -> None:
     assert "![" not in (tmp_path / "it.md").read_text()
 
 
-def test_notes_with_faults_are_told(tmp_path: Path) -> None:
-    (tmp_path / "notes.toml").write_text('limit = "none"\nlicense = 3\n')
-    with pytest.raises(RecipeError, match=r"(?s)2 errors.*did you mean 'limits'"):
-        load_recipe(tmp_path / "notes.toml", Notes)
-
-
-def test_a_card_that_cannot_be_written_is_told(fake: Dataset, tmp_path: Path) -> None:
-    (tmp_path / "none").touch()
-    with pytest.raises(DiskError, match=r"it\.md cannot be written"):
-        write_card(fake, tmp_path / "none/it.md", Notes())
-
-
 def test_what_strangers_wrote_is_words_in_a_card(tmp_path: Path) -> None:
     bad = "x\n# Heading\n<script>alert(1)</script>"
     columns = [Column(ACTION, size=2, names=("<b>", "y"), meaning=bad, astra={"unit": ["<i>", "m"]})]
@@ -159,3 +110,61 @@ def test_what_strangers_wrote_is_words_in_a_card(tmp_path: Path) -> None:
     text = re.sub(r"`[^`\n]*`", "", render_card(Dataset.open(tmp_path / "set"), NOTES))
     assert "<script>" not in text and "<b>" not in text and "<i>" not in text
     assert not re.search("^# Heading", text, re.MULTILINE)
+
+
+def test_the_code_that_it_shows_runs(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_fake(tmp_path / "datasets/fake/data-1.0.0")
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "datasets"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
+    ours, _, theirs = python_blocks(render_card(Dataset.open(tmp_path / "datasets/fake/data-1.0.0"), Notes()))
+    found: dict[str, Any] = {}
+    exec(ours, found)
+    np.testing.assert_array_equal(found["values"][STATE], concatenated(STATE))
+    exec(theirs, found)
+    np.testing.assert_array_equal(np.array(found["rows"][STATE], dtype=np.float32), concatenated(STATE))
+
+
+def test_a_shared_dataset_is_loaded_from_where_it_is(fake: Dataset) -> None:
+    on_hub = render_card(fake, Notes(), source="hf://datasets/me/it")
+    assert "astra-data pull hf://datasets/me/it --version 1.0.0" in on_hub
+    assert 'LeRobotDataset("me/it", revision="data-1.0.0")' in on_hub
+    assert 'load_dataset("me/it", revision="data-1.0.0", split="train")' in on_hub
+    elsewhere = render_card(fake, Notes(), source="s3://bucket/fake")
+    assert "astra-data pull s3://bucket/fake --version 1.0.0" in elsewhere
+    for text in (on_hub, elsewhere):
+        for block in python_blocks(text):
+            compile(block, "card", "exec")
+
+
+def python_blocks(text: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+CARDS = sorted((Path(__file__).parents[3] / "dataset_cards").glob("*.md"))
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_a_card_says_what_the_hub_reads_and_names_every_column(path: Path) -> None:
+    card = DatasetCard.load(path)
+    assert card.data.license == "apache-2.0"
+    assert "LeRobot" in card.data.tags
+    assert f"# {path.stem}\n" in card.text
+    task = TASKS.get(path.stem.removesuffix("-random-seed0"))
+    names = [STATE, ACTION, NEXT_STATE]
+    if task is not None:
+        names = [column.name for column in (*task.state_columns, *OUTCOME_COLUMNS)]
+    assert [name for name in names if f"`{name}`" not in card.text] == []
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_a_card_has_the_words_of_its_notes_and_its_figure(path: Path) -> None:
+    notes = load_recipe(path.with_suffix(".toml"), Notes)
+    text = path.read_text(encoding="utf-8")
+    assert [words for words in notes.model_dump().values() if words.strip() not in text] == []
+    figure = path.with_name(f"{path.stem}-coverage.png")
+    if path.stem.startswith("fetch"):  # whose states have no positions by name
+        assert not figure.exists() and figure.name not in text
+        return
+    assert f"]({figure.name})" in text
+    assert figure.read_bytes().startswith(b"\x89PNG")

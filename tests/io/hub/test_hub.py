@@ -1,6 +1,5 @@
 """The Hugging Face Hub, played by a server on loopback to the real huggingface_hub."""
 
-import re
 from pathlib import Path
 
 import pytest
@@ -11,11 +10,8 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, SharingError
-from astra_data.core.progress import silent
 from astra_data.dataset.reader import Dataset
-from astra_data.io.hub.pull import pull
-from astra_data.io.hub.push import push
-from astra_data.pipeline.stages.collect import CollectConfig, collect
+from astra_data.io.hub.sharing import pull, push
 
 pytestmark = [
     pytest.mark.usefixtures("quick_figure"),
@@ -24,12 +20,6 @@ pytestmark = [
 ]
 
 DATA = "data/chunk-000/file-000.parquet"
-ROOT = Path(__file__).parents[3]
-ARM = {name: f"{ROOT}/recipes/examples/fetch/{name}.py:TASK" for name in ("push", "reach")}
-NOTES = sorted(path for path in (ROOT / "dataset_cards").glob("*.toml") if path.stem != "nao-guda")
-"""Of the cards of datasets that `collect` records; the other one's data are a physical robot's."""
-REWORDED = ("| qpos and qvel one control step", "| qpos (24) and qvel (23) of the humanoid, one control step")
-"""A column's meaning as it was when the humanoid's data were recorded, and as `collect` says it since."""
 
 
 def versioned(root: Path, version: str, **changes: object) -> Dataset:
@@ -49,15 +39,6 @@ def test_what_is_pulled_is_what_was_pushed(hub: Hub, fake: Dataset, home: Path) 
     pulled = pull("me/it")
     assert pulled.root == home / "fake/data-1.0.0"
     assert contents(pulled.root) == contents(fake.root)
-
-
-def test_a_pull_goes_on_where_it_stopped(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
-    push(fake.root, "me/it")
-    part = tmp_path / ".out.pull-1.0.0" / f"{DATA}.part"
-    part.parent.mkdir(parents=True)
-    part.write_bytes((fake.root / DATA).read_bytes()[:1000])
-    assert contents(pull("me/it", out=tmp_path / "out").root) == contents(fake.root)
-    assert [asked.split("=")[1].split("-")[0] for asked in hub.ranges if DATA in asked] == ["1000"]
 
 
 def test_every_version_keeps_its_tag_and_main_shows_the_newest(
@@ -171,19 +152,6 @@ def test_a_public_repository_does_not_get_what_is_to_be_private(hub: Hub, fake: 
     assert hub.repos["me/other"].private
 
 
-def test_a_private_repository_is_hidden_from_others(
-    hub: Hub, fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    push(fake.root, "me/it", private=True)
-    assert hub.repos["me/it"].private
-    assert pull("me/it", out=tmp_path / "out").content_hash == fake.content_hash
-    monkeypatch.setenv("HF_TOKEN", "hf_other")
-    with pytest.raises(SharingError, match="no such dataset, or no rights to see it"):
-        pull("me/it", out=tmp_path / "other")
-    with pytest.raises(BadInputError, match="private is for the Hugging Face Hub"):
-        push(fake.root, f"file://{tmp_path}/shared", private=True)
-
-
 def test_missing_rights_are_told(hub: Hub, fake: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_TOKEN", "hf_other")
     with pytest.raises(SharingError, match="no rights to do this; log in with `hf auth login`"):
@@ -198,15 +166,15 @@ def test_a_repository_that_does_not_exist_is_told(hub: Hub) -> None:
 
 def test_a_name_that_the_hub_does_not_take_is_told(hub: Hub, fake: Dataset) -> None:
     for name in ("me/a--b", "me/it.git"):
-        with pytest.raises(BadInputError, match="is not a valid repository name"):
+        with pytest.raises(BadInputError, match="not a valid repository name"):
             push(fake.root, name)
-        with pytest.raises(BadInputError, match="is not a valid repository name"):
+        with pytest.raises(BadInputError, match="not a valid repository name"):
             pull(name)
 
 
 def test_no_network_is_told(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
-    with pytest.raises(SharingError, match=r"cannot be reached \(ConnectError.*check the network"):
+    with pytest.raises(SharingError, match=r"ConnectError: .*check the address"):
         pull("me/it")
 
 
@@ -221,11 +189,7 @@ def test_a_card_that_the_hub_refuses_is_told(hub: Hub, fake: Dataset, tmp_path: 
     (tmp_path / "notes.toml").write_text('license = "none-such"\n')
     with pytest.raises(BadInputError, match=r'rejects this: (.|\n)*"license" must be one of a list'):
         push(fake.root, "me/it", notes=tmp_path / "notes.toml")
-    hub.refuse = lambda method, path: 503 if "validate" in path else None
-    with pytest.raises(SharingError, match="it answered 503"):
-        push(fake.root, "me/it")
-    hub.refuse = lambda method, path: None
-    assert not hub.repos
+    assert hub.repos["me/it"].history == ["initial commit"]
     push(fake.root, "me/it")
     assert set(hub.repos["me/it"].tags) == {"v3.0", "data-1.0.0"}
 
@@ -273,31 +237,3 @@ def test_the_command_line_shares_and_fetches(
     assert contents(home / "fake/data-1.0.0") == contents(fake.root)
     assert call("card", "fake", "--notes", "notes.toml") == "written: fake.md\nwritten: fake-coverage.png\n"
     assert "license: mit" in Path("fake.md").read_text()
-
-
-@pytest.mark.parametrize("notes", NOTES, ids=lambda notes: notes.stem)
-def test_the_datasets_of_our_cards_are_shared_with_their_notes(hub: Hub, notes: Path, home: Path) -> None:
-    """Two episodes of each by random commands, since the whole takes minutes to hours; a card that was paired
-    has columns more.
-    """
-    name = notes.stem
-    task = ARM.get(name.split("-")[1]) or re.split("-random|-suboptimal", name)[0]
-    config = CollectConfig(behavior="random", start="task", episodes=2, max_steps=20)
-    recorded = collect(task, config, seed=0, out=home / "recorded", progress=silent, name=name)
-    push(recorded, f"me/{name}", notes=notes)
-    repo = hub.repos[f"me/{name}"]
-    card = repo.commits[repo.head]["README.md"].decode()
-    committed = notes.with_suffix(".md").read_text(encoding="utf-8").replace(*REWORDED)
-    for title in ("Behavior", "Intended use", "Limits", "Columns"):
-        expected = [line for line in section(committed, title) if not line.startswith("| `abstract.")]
-        assert section(card, title) == expected
-    assert f'LeRobotDataset("me/{name}", revision="data-1.0.0")' in card
-    pulled = pull(f"me/{name}")
-    assert pulled.root == home / name / "data-1.0.0"
-    assert contents(pulled.root) == contents(recorded)
-
-
-def section(card: str, title: str) -> list[str]:
-    _, _, after = card.partition(f"\n## {title}\n")
-    assert after
-    return after.partition("\n## ")[0].splitlines()

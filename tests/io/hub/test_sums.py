@@ -7,7 +7,7 @@ from shared_files import contents
 
 from astra_data.core.errors import SharingError
 from astra_data.dataset.reader import Dataset
-from astra_data.io.hub.sums import SUMS_PATH, Listed, altered, dataset_files, make_sums, parse_sums
+from astra_data.io.hub.sums import SUMS_PATH, dataset_files, make_sums, parse_sums
 
 DIGEST = "0" * 64
 DATA = "data/chunk-000/file-000.parquet"
@@ -41,14 +41,6 @@ def test_other_files_in_the_folder_are_left_out(tmp_path: Path) -> None:
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).touch()
     assert dataset_files(tmp_path) == [DATA, "meta/info.json"]
-
-
-def test_altered_files_are_those_of_another_size_or_sum(fake: Dataset, tmp_path: Path) -> None:
-    sums = parse_sums(make_sums(fake.root), "it")
-    assert altered(fake.root, sums) == []
-    assert altered(tmp_path, sums) == list(sums)
-    assert altered(fake.root, {DATA: Listed(sums[DATA].digest, 3)}) == [DATA]
-    assert altered(fake.root, {DATA: Listed(DIGEST, sums[DATA].size)}) == [DATA]
 
 
 @pytest.mark.parametrize(

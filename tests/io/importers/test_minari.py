@@ -1,12 +1,11 @@
 import os
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from minari_recordings import LENGTHS, episodes, write_minari
-from recordings import MAPPING, imported
+from recordings import imported
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
@@ -53,16 +52,6 @@ fields = ["observations/achieved_goal"]
     )
 
 
-@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
-def test_a_dataset_need_not_have_infos(tmp_path: Path, data_format: str) -> None:
-    """Minari's `DataCollector` records none by default."""
-    made = [{**episode, "infos": None} for episode in episodes(is_dict=False)]
-    path = write_minari(tmp_path / "minari", made, data_format=data_format)
-    dataset, _ = imported(tmp_path, path, None, name="ant", fps=10)
-    for got, episode in zip(dataset.episodes(), made, strict=True):
-        np.testing.assert_array_equal(got.columns[STATE], episode["observations"][:-1].astype(np.float32))
-
-
 def test_infos_that_begin_with_the_resets_are_those_before_a_step_or_after_it(tmp_path: Path) -> None:
     """Minari's `DataCollector` records the info of the reset, too."""
     made = episodes(is_dict=True)
@@ -99,33 +88,6 @@ fields = ["infos/speed"]
     both = mapping.replace('["infos/speed"]', '["infos/qpos"]')
     with pytest.raises(BadInputError, match=r"infos/qpos has an entry for the reset.* write next_infos/qpos"):
         imported(tmp_path / "both", path, both)
-
-
-def test_infos_that_are_left_out_are_named(tmp_path: Path) -> None:
-    made = [
-        {**episode, "infos": {"success": np.zeros(len(episode["rewards"]) + 1)}}
-        for episode in episodes(is_dict=True)
-    ]
-    _, report = imported(tmp_path, write_minari(tmp_path / "minari", made), None, name="ant", fps=10)
-    assert "next.reward from rewards; " in str(report) and "\nfields left out: infos/success\n" in str(report)
-
-
-def test_fields_that_are_missing_are_told(tmp_path: Path) -> None:
-    path = write_minari(tmp_path / "minari", episodes(is_dict=False))
-    with pytest.raises(BadInputError, match=r"no field 'x'; known: .*observations"):
-        imported(tmp_path, path, MAPPING)
-
-
-def test_a_folder_without_a_dataset_is_told(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="expected the folder of a Minari dataset"):
-        imported(tmp_path, tmp_path, None, name="ant", fps=10, file_format="minari")
-
-
-def test_a_missing_extra_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_minari(tmp_path / "minari", episodes(is_dict=False))
-    monkeypatch.setitem(sys.modules, "minari", None)
-    with pytest.raises(BadInputError, match="uv sync --extra minari"):
-        imported(tmp_path, path, None, name="ant", fps=10)
 
 
 @pytest.mark.parametrize("link", [h5py.ExternalLink("secret.h5", "/"), h5py.SoftLink("/episode_1")])

@@ -5,10 +5,9 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from recordings import STEPS, imported, rows, write_table
+from recordings import imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import STATE
 from astra_data.io.importers import npz
 from astra_data.io.importing import import_dataset
 from astra_data.io.mapping import ImportMapping
@@ -20,12 +19,6 @@ def test_npz_is_never_unpickled(tmp_path: Path) -> None:
         np.savez(file, **rows() | {"reward": np.array([{}] * 20)})  # type: ignore[arg-type]
     with pytest.raises(BadInputError, match=r"\.npz: reward\.npy holds Python objects"):
         imported(tmp_path, tmp_path / "log.npz")
-
-
-def test_npz_in_column_order_is_told(tmp_path: Path) -> None:
-    fields = rows() | {"command": np.asfortranarray(np.zeros((20, 2)))}
-    with pytest.raises(BadInputError, match="ascontiguousarray"):
-        imported(tmp_path, write_table(tmp_path / "log.npz", fields))
 
 
 def test_an_array_that_ends_early_is_told(tmp_path: Path) -> None:
@@ -101,24 +94,3 @@ def test_a_claimed_shape_costs_no_memory(tmp_path: Path) -> None:
     (tmp_path / "mapping.toml").write_text(BOMB_MAPPING)
     ended = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
     assert "BadInputError: log.npz cannot be read as npz" in ended.stderr.splitlines()[-1]
-
-
-def test_arrays_with_a_header_of_the_second_version_are_read(tmp_path: Path) -> None:
-    with ZipFile(tmp_path / "log.npz", "w") as archive:
-        for name, values in rows().items():
-            with archive.open(f"{name}.npy", "w") as file:
-                np.lib.format.write_array(file, values, version=(2, 0))  # type: ignore[no-untyped-call]
-    dataset, _ = imported(tmp_path, tmp_path / "log.npz")
-    assert dataset.lengths.tolist() == list(STEPS)
-    assert dataset.columns([STATE])[STATE][0, 0] == np.float32(rows()["x"][0] * 0.001)
-
-
-def test_a_header_that_claims_less_than_there_is_is_told(tmp_path: Path) -> None:
-    path = write_table(tmp_path / "log.npz", {name: values[:12] for name, values in rows().items()})
-    with ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    with ZipFile(path, "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content.replace(b"(12,", b"(10,", 1))
-    with pytest.raises(BadInputError, match=r"\.npy holds more values than its header says"):
-        imported(tmp_path, path)

@@ -7,11 +7,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from recordings import imported, rows
+from recordings import rows
 
 from astra_data.core.errors import BadInputError
 from astra_data.io.importers import parquet
-from astra_data.io.importing import import_dataset
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Source
 
@@ -96,21 +95,6 @@ def test_files_that_unpack_to_more_than_logs_do_are_refused(tmp_path: Path) -> N
         next(parquet.read(few, ImportMapping.model_validate(mapping)))
     enough = Source(path, None, path, most_bytes=2 * 8 * 10**6)
     assert len(next(parquet.read(enough, ImportMapping.model_validate(mapping)))) == 2
-
-
-def test_a_file_that_is_cut_off_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "log.parquet"
-    pq.write_table(pa.table({name: values.tolist() for name, values in rows().items()}), path)
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(BadInputError, match=r"log\.parquet cannot be read as parquet"):
-        imported(tmp_path, path)
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_mapping_is_asked_for(tmp_path: Path) -> None:
-    pq.write_table(pa.table({"a": [1.0]}), tmp_path / "log.parquet")
-    with pytest.raises(BadInputError, match="parquet has no standard fields; pass --mapping"):
-        import_dataset([tmp_path / "log.parquet"], out=tmp_path / "out")
 
 
 def test_the_values_of_lists_count_and_those_of_other_columns_do_not(tmp_path: Path) -> None:

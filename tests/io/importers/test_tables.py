@@ -4,13 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import LENGTHS, MAPPING, STEPS, TABLES, imported, rows, write_table
+from recordings import LENGTHS, STEPS, TABLES, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
 from astra_data.io.importers import hdf5, npz, parquet
-
-STAMPED = MAPPING.replace('fields = ["gait"]', 'fields = ["stamp"]')
 
 
 @pytest.mark.parametrize("block_rows", [4, 2**13])
@@ -72,19 +70,3 @@ def test_text_for_numbers_is_told(tmp_path: Path, name: str) -> None:
     )
     with pytest.raises(BadInputError, match=r"field 'reward'.*expected numbers"):
         imported(tmp_path, path)
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_no_rows_are_told(tmp_path: Path, name: str) -> None:
-    path = write_table(tmp_path / name, {field: values[:0] for field, values in rows().items()})
-    with pytest.raises(BadInputError, match="no episodes, and each needs two rows if"):
-        imported(tmp_path, path)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_integers_arrive_exactly(tmp_path: Path, name: str) -> None:
-    stamps = 1_700_000_000_050_000_002 + np.arange(20) * 10**8
-    dataset, _ = imported(tmp_path, write_table(tmp_path / name, rows() | {"stamp": stamps}), STAMPED)
-    expected = np.concatenate([stamps[:5], stamps[6:15], stamps[15:19]])
-    np.testing.assert_array_equal(dataset.columns(["gait"])["gait"], expected)

@@ -1,4 +1,3 @@
-import pickle
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
 
@@ -13,7 +12,6 @@ from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importers import torch as importer
 from astra_data.io.importing import import_dataset
-from astra_data.io.recording import Source
 
 PACE = Path(__file__).parents[3] / "recipes/imports/pace_anymal.toml"
 
@@ -56,12 +54,6 @@ def test_a_log_of_pace_needs_no_mapping(tmp_path: Path) -> None:
     assert "observation.state from dof_pos; action from des_dof_pos\nfields left out: spare\n" in str(report)
     expected = targets(1200, 3)[:-1].astype(np.float32)
     np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], expected)
-
-
-def test_a_wrong_rate_is_refused(tmp_path: Path) -> None:
-    anymal(tmp_path / "chirp_data.pt")
-    with pytest.raises(BadInputError, match=r"399\.7 rows per second, but fps is 200"):
-        import_dataset([tmp_path / "chirp_data.pt"], PACE, fps=200, out=tmp_path / "out")
 
 
 def test_other_dictionaries_of_tensors_are_mapped(tmp_path: Path) -> None:
@@ -108,12 +100,6 @@ def test_what_does_not_fit_is_told(tmp_path: Path, content: object, told: str) -
         import_dataset([tmp_path / "log.pt"], PACE, out=tmp_path / "out")
 
 
-def test_a_pickle_is_no_log(tmp_path: Path) -> None:
-    (tmp_path / "log.pt").write_bytes(pickle.dumps({"time": [1.0]}))
-    with pytest.raises(BadInputError, match=r"expected a file that torch\.save wrote"):
-        import_dataset([tmp_path / "log.pt"], PACE, out=tmp_path / "out")
-
-
 def test_what_unpacks_to_far_more_than_its_size_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,29 +115,3 @@ def test_what_unpacks_to_far_more_than_its_size_is_refused(
     torch.save({name: torch.zeros(1, 2).expand(10**9, 2) for name in log}, tmp_path / "claims.pt")
     with pytest.raises(BadInputError, match="--max-bytes"):
         import_dataset([tmp_path / "claims.pt"], PACE, out=tmp_path / "out")
-
-
-def test_two_rows_of_a_log_of_pace_tell_its_rate(tmp_path: Path) -> None:
-    log = {
-        "time": torch.tensor([0.0, 0.0025]),
-        "dof_pos": torch.zeros(2, 1),
-        "des_dof_pos": torch.zeros(2, 1),
-    }
-    path = tmp_path / "log.pt"
-    torch.save(log, path)
-    assert importer.layout(Source(path, None, path))["fps"] == 400
-    torch.save({name: values[:1] for name, values in log.items()}, path)
-    with pytest.raises(BadInputError, match="expected times that rise"):
-        importer.layout(Source(path, None, path))
-
-
-def test_a_log_of_pace_is_cut_where_its_clock_steps_back(tmp_path: Path) -> None:
-    clock = torch.arange(40) / 100.0
-    log = {
-        "time": torch.cat([clock, clock + 0.2]),
-        "dof_pos": torch.zeros(80, 1),
-        "des_dof_pos": torch.zeros(80, 1),
-    }
-    torch.save(log, tmp_path / "log.pt")
-    report = import_dataset([tmp_path / "log.pt"], name="log", out=tmp_path / "out")
-    assert (report.episodes, report.frames, report.tally.split_points) == (2, 78, {"back": 1})

@@ -21,7 +21,7 @@ from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, MET
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
-from astra_data.io.hub.push import push
+from astra_data.io.hub.sharing import push
 from astra_data.pipeline.stages.augment import AugmentConfig, augment
 from astra_data.pipeline.stages.pair import PairConfig, pair
 

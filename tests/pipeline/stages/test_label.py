@@ -26,7 +26,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.io.hub.push import push
+from astra_data.io.hub.sharing import push
 from astra_data.pipeline.stages.label import check_fits, label, remarks, with_outcomes
 from astra_data.robots.registry import task_named
 

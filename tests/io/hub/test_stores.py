@@ -2,9 +2,7 @@
 
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +16,8 @@ from shared_files import contents
 from astra_data.core.errors import BadInputError, SharingError
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version
-from astra_data.io.hub.pull import pull
-from astra_data.io.hub.push import push
-from astra_data.io.hub.urls import UrlStore
+from astra_data.io.hub.sharing import pull, push
+from astra_data.io.hub.stores import UrlStore, is_address, parse_place, parse_source
 
 pytestmark = pytest.mark.usefixtures("quick_figure")
 
@@ -83,17 +80,11 @@ def test_a_version_there_never_changes(place: str, fake: Dataset, tmp_path: Path
     filesystem.pipe_file(path, b"altered")
     with pytest.raises(SharingError, match=r"SHA256SUMS cannot be trusted"):
         push(fake.root, place)
-    with pytest.raises(BadInputError, match=r"data-1\.0\.0 holds other values"):
-        push(changed(tmp_path / "changed").root, place)
     assert filesystem.cat_file(path) == b"altered"
-
-
-def test_a_file_that_was_altered_there_is_told_by_its_size(place: str, fake: Dataset) -> None:
-    push(fake.root, place)
-    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0/meta/info.json")
-    filesystem.pipe_file(path, b"altered")
-    with pytest.raises(SharingError, match=r"was altered: meta/info\.json"):
-        push(fake.root, place)
+    filesystem.rm_file(path)
+    filesystem.rm_file(path.replace("SHA256SUMS", "meta/info.json"))
+    with pytest.raises(SharingError, match=r"data-1\.0\.0 has no SHA256SUMS"):
+        push(changed(tmp_path / "changed").root, place)
 
 
 def test_the_newest_version_is_pulled_unless_another_is_named(
@@ -189,20 +180,7 @@ def test_a_second_push_at_once_takes_nothing_from_the_first(
 
     sent = at_the_third_file(monkeypatch, second)
     push(fake.root, f"file://{tmp_path}/shared")
-    assert len(sent) == len(contents(fake.root)) + 3
-    assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
-
-
-def test_two_pushes_of_the_same_at_once_both_succeed(
-    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def second() -> None:
-        with monkeypatch.context() as other_process:
-            other_process.setattr("os.getpid", lambda: 1)
-            push(fake.root, f"file://{tmp_path}/shared")
-
-    at_the_third_file(monkeypatch, second)
-    push(fake.root, f"file://{tmp_path}/shared")
+    assert len(sent) == len(contents(fake.root)) + 1
     assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
 
 
@@ -216,33 +194,6 @@ def test_a_push_stops_where_another_began_with_it(
     assert len(sent) == 3
 
 
-def test_the_mark_is_uploaded_last(fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = UrlStore(f"file://{tmp_path}/fake")
-    sent: list[str] = []
-    put = store._filesystem.put_file
-
-    def watched(file: str, path: str) -> None:
-        sent.append(path)
-        put(file, path)
-
-    monkeypatch.setattr(store._filesystem, "put_file", watched)
-    (tmp_path / "card").mkdir()
-    (tmp_path / "card/README.md").touch()
-    (tmp_path / "card/SHA256SUMS").touch()
-    store.upload(fake, tmp_path / "card", lambda fraction, note: None)
-    assert len(sent) == len(contents(fake.root)) + 2
-    assert sent[0].endswith("SHA256SUMS")
-    assert sent[-1].endswith("dataset.json")
-
-
-def test_a_bucket_that_does_not_exist_is_told_and_not_made(s3: str, fake: Dataset) -> None:
-    with pytest.raises(SharingError, match=r"s3://no-such-bucket/x/fake: .*bucket"):
-        push(fake.root, "s3://no-such-bucket/x")
-    assert not fsspec.filesystem("s3", skip_instance_cache=True).exists("no-such-bucket")
-    with pytest.raises(SharingError, match="check the spelling"):
-        pull("s3://no-such-bucket/x/fake")
-
-
 def test_missing_rights_are_told(s3: str, fake: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     store = UrlStore(f"{s3}/fake")
 
@@ -252,15 +203,6 @@ def test_missing_rights_are_told(s3: str, fake: Dataset, monkeypatch: pytest.Mon
     monkeypatch.setattr(store._filesystem, "ls", refuse)
     with pytest.raises(SharingError, match=r"no rights to do this .*check the credentials"):
         store.versions()
-
-
-def test_a_server_that_does_not_answer_is_told(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("AWS_ENDPOINT_URL_S3", "http://127.0.0.1:9")
-    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
-    monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
-    monkeypatch.setattr("s3fs.S3FileSystem.cachable", False)
-    with pytest.raises(SharingError, match="check the address, the credentials and the network"):
-        pull(f"{s3}/fake")
 
 
 @pytest.mark.parametrize(
@@ -278,17 +220,6 @@ def test_a_missing_back_end_is_told(
         UrlStore(url)
 
 
-def test_an_unknown_kind_of_url_is_told() -> None:
-    with pytest.raises(BadInputError, match="expected a URL such as"):
-        UrlStore("gopher://x/y")
-
-
-def test_a_folder_that_cannot_be_written_is_told(fake: Dataset, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(SharingError, match="fake: "):
-        push(fake.root, f"file://{tmp_path}/file")
-
-
 def test_what_a_killed_push_left_does_not_stop_the_next(fake: Dataset, tmp_path: Path) -> None:
     left = tmp_path / "shared/fake/data-1.0.0/.SHA256SUMS.tmp-999999999"
     left.mkdir(parents=True)
@@ -298,49 +229,59 @@ def test_what_a_killed_push_left_does_not_stop_the_next(fake: Dataset, tmp_path:
     assert not left.exists()
 
 
-class Endless(BaseHTTPRequestHandler):
-    """A server whose folders each hold two folders and a file; it counts the requests."""
-
-    requests = 0
-
-    def do_GET(self) -> None:
-        """List the folder."""
-        Endless.requests += 1
-        self.send_response(200)
-        self.send_header("Content-Type", "text/html")
-        self.end_headers()
-        names = ["data-1.0.0/"] if self.path == "/" else ["one/", "two/", "file"]
-        base = self.path.rstrip("/")
-        self.wfile.write("".join(f'<a href="{base}/{name}">{name}</a>' for name in names).encode())
-
-    def do_HEAD(self) -> None:
-        """Say that there is a page."""
-        self.send_response(200)
-        self.send_header("Content-Type", "text/html")
-        self.end_headers()
-
-    def log_message(self, *_: object) -> None:
-        """Say nothing."""
+@pytest.mark.parametrize(
+    ("text", "place", "version"),
+    [
+        ("me/it", "hf://datasets/me/it", None),
+        ("hf://datasets/me/it", "hf://datasets/me/it", None),
+        ("me/it@data-1.2.0", "hf://datasets/me/it", "1.2.0"),
+        ("hf://datasets/me/it@1.2.0", "hf://datasets/me/it", "1.2.0"),
+        ("s3://bucket/ant", "s3://bucket/ant", None),
+        ("s3://bucket/ant/", "s3://bucket/ant", None),
+        ("s3://bucket/ant/data-1.2.0", "s3://bucket/ant", "1.2.0"),
+        ("file:///tmp/ant@data-10.2.0", "file:///tmp/ant", "10.2.0"),
+    ],
+)
+def test_places_and_versions(text: str, place: str, version: str | None) -> None:
+    found, named = parse_source(text)
+    assert (str(found), named) == (place, Version.parse(version) if version else None)
 
 
-@pytest.fixture
-def endless() -> Iterator[str]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Endless)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    Endless.requests = 0
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+@pytest.mark.parametrize("text", ["ant", "a/b/c", "hf://models/me/it", "hf://me/it", "", "s3://"])
+def test_anything_else_is_told(text: str) -> None:
+    with pytest.raises(BadInputError, match="expected user/name or hf://datasets/user/name"):
+        parse_place(text)
 
 
-def test_folders_without_end_are_listed_as_deep_as_datasets_are(
-    endless: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = UrlStore(endless).folder(Version(1, 0, 0))
-    assert max(path.count("/") for path in folder.files()) == 3
-    assert Endless.requests < 40
-    monkeypatch.setattr("astra_data.io.hub.store.MOST_FOLDERS", 5)
-    with pytest.raises(SharingError, match="lists more than 5 folders or 1,000,000 files, which no dataset"):
-        folder.files()
+def test_a_folder_is_a_place_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for text in ("./shared", f"{tmp_path}/shared"):
+        assert str(parse_place(text)) == f"file://{tmp_path}/shared"
+    assert str(parse_place("./My Läufe")) == f"file://{tmp_path}/My Läufe"
+    assert str(parse_place("~/shared")) == f"file://{Path.home()}/shared"
+    found, version = parse_source(f"{tmp_path}/it@data-1.2.0")
+    assert (str(found), version) == (f"file://{tmp_path}/it", Version(1, 2, 0))
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        ("me/it", True),
+        ("me/it@data-1.2.0", True),
+        ("s3://bucket/a/b/ant", True),
+        ("ant", False),
+        ("ant@data-1.2.0", False),
+        ("runs/cart/pair", False),
+        ("./it", False),
+        ("../me/it", False),
+        ("/it", False),
+    ],
+)
+def test_an_address_is_told_from_a_folder_and_a_name(data: str, expected: bool) -> None:
+    assert is_address(data) is expected
+
+
+def test_a_folder_that_is_there_is_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("me/it").mkdir(parents=True)
+    assert not is_address("me/it") and is_address("you/it")

@@ -3,24 +3,15 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
 from astra_data.core.errors import BadInputError
-from astra_data.io.message_fields import MessageField
+from astra_data.io.importers.mcap import MessageField
 
 
 def joints(names: list[str], velocity: list[float]) -> dict[str, Any]:
     return {"name": names, "velocity": velocity}
 
 
-def ros2_message(content: dict[str, Any]) -> Any:  # noqa: ANN401
-    """Write and read a message with a stamp."""
-    text = f"Header header\n{'=' * 80}\nMSG: demo/Header\nTime stamp\n{'=' * 80}\nMSG: demo/Time\n{TIME}"
-    encoded = serialize_dynamic("demo/Odometry", text)["demo/Odometry"](content)
-    return generate_dynamic("demo/Odometry", text)["demo/Odometry"](encoded)
-
-
-TIME = "int32 sec\nuint32 nanosec\n"
 TWIST = {"linear": {"x": 0.5, "y": 0.0, "z": 0.0}}
 STAMPED = {"header": {"stamp": {"sec": 1_764_000_000, "nanosec": 123_456_789}}}
 
@@ -40,13 +31,6 @@ STAMPED = {"header": {"stamp": {"sec": 1_764_000_000, "nanosec": 123_456_789}}}
 )
 def test_a_path_leads_to_a_value(field: str, content: Any, expected: Any) -> None:  # noqa: ANN401
     np.testing.assert_array_equal(MessageField(field).value(content), expected)
-
-
-def test_a_stamp_is_one_whole_number_of_ns() -> None:
-    """Floats of 64 bits tell apart 256 ns there."""
-    for content in (STAMPED, ros2_message(STAMPED)):
-        value = MessageField("/odom:header.stamp").value(content)
-        assert value.dtype == np.int64 and int(value) == 1_764_000_000_123_456_789
 
 
 @pytest.mark.parametrize(
@@ -108,12 +92,3 @@ def test_joints_in_another_order_are_told_apart_by_name_alone(field: str, left: 
         f"'/joints:{field}' is in another order than before: its names are right, left, and were left, "
         "right; take each value by its name, '/joints:velocity[left]'"
     )
-
-
-def test_names_that_are_no_names_of_a_list_may_change() -> None:
-    by_name = MessageField("/joints:name")
-    ranges = MessageField("/scan:ranges")
-    for name in ("front", "back"):
-        assert by_name.value({"name": [name]}).tolist() == [name]
-        assert ranges.value({"name": name, "ranges": [1.0]}).tolist() == [1.0]
-        assert ranges.value({"name": [name, "left"], "ranges": [1.0]}).tolist() == [1.0]

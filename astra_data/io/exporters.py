@@ -1,0 +1,328 @@
+"""Export of datasets to the formats of other libraries, episode by episode, whole or not at all.
+
+`import` reads an export as it does any file of the format. HDF5 loses a failure that it meets while it closes
+a file, and the process ends in a segmentation fault. So it writes through an object that never fails: the
+first error is kept, and raised once HDF5 is done.
+"""
+
+import io
+import json
+import logging
+from collections.abc import Buffer, Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astra_data.core.arrays import as_rows
+from astra_data.core.config import did_you_mean
+from astra_data.core.durable import atomic_file, atomic_folder
+from astra_data.core.errors import BadInputError
+from astra_data.core.optional import optional
+from astra_data.dataset.columns import (
+    ACTION,
+    GOAL,
+    NEXT_STATE,
+    REWARD,
+    STATE,
+    TERMINATED,
+    TRUNCATED,
+    Array,
+    Episode,
+)
+from astra_data.dataset.compare import recordings_of
+from astra_data.dataset.reader import Dataset
+from astra_data.io.hdf5_file import D3RLPY, D4RL, MINARI, ROBOMIMIC
+
+NEEDED = (STATE, ACTION, TERMINATED, TRUNCATED, NEXT_STATE)
+"""Columns that every format needs."""
+VECTORS = (STATE, NEXT_STATE, GOAL, ACTION)
+"""Columns that are vectors in every format, (T, size), also those of one value per step."""
+VALID_SHARE = 0.1
+"""Share of the recordings in robomimic's mask/valid, as in its own split; the others are in mask/train."""
+
+_log = logging.getLogger(__name__)
+
+
+def export(dataset: Dataset, out: Path, *, format: str) -> None:
+    """Write `dataset` to `out` in the layout of the library `format`; rewards are 0 where it has none.
+
+    Raises:
+        BadInputError: the format is unknown, a column or a package that it needs is missing, or `out` exists.
+        DiskError: `out` cannot be written; nothing is left of it.
+    """
+    if format not in EXPORTERS:
+        raise BadInputError(f"format '{format}': unknown{did_you_mean(format, EXPORTERS)}")
+    missing = [name for name in NEEDED if name not in dataset.features]
+    if missing:
+        raise BadInputError(f"{dataset.reference} cannot be exported: it lacks {', '.join(missing)}")
+    if REWARD not in dataset.features:
+        _log.warning("%s has no %s: rewards are written as 0", dataset.reference, REWARD)
+    with (atomic_folder if format == "minari" else atomic_file)(out) as path:
+        EXPORTERS[format](dataset, path, out)
+
+
+def _d4rl(dataset: Dataset, path: Path, out: Path) -> None:
+    """Write observations (N, S), actions (N, A), rewards, terminals, timeouts (N,), next_observations (N, S).
+
+    The last step of every episode is a terminal or a timeout, since nothing else separates the episodes.
+    """
+    fields = _fields(dataset, {name: field for name, field in D4RL.items() if name != TRUNCATED})
+    rows = int(dataset.lengths.sum())
+    with hdf5_file(path) as (file, disk):
+        for column in dataset.schema:
+            shape = (rows, column.size) if column.name in VECTORS or column.size > 1 else (rows,)
+            file.create_dataset(fields[column.name], shape, column.dtype)
+        file.create_dataset(D4RL[TRUNCATED], (rows,), bool)
+        if REWARD not in dataset.features:
+            file.create_dataset(D4RL[REWARD], (rows,), np.float32)
+        first = 0
+        for _, episode, values in _episodes(dataset, disk):
+            part = slice(first, first + len(episode))
+            for name, array in values.items():
+                file[fields[name]][part] = array
+            timeouts = values[TRUNCATED].copy()
+            timeouts[-1] = True
+            file[D4RL[TRUNCATED]][part] = timeouts & ~values[TERMINATED]
+            first = part.stop
+
+
+def _d3rlpy(dataset: Dataset, path: Path, out: Path) -> None:
+    """Write what d3rlpy's `ReplayBuffer.load` reads, version 2.1 of its layout.
+
+    Per episode i: observations_i (T, S + G), actions_i (T, A), rewards_i (T, 1) and terminated_i. Its
+    algorithms take one observation, so the goal, where there is one, follows the state.
+    """
+    fields = _fields(dataset, D3RLPY | {TERMINATED: "infos/next.terminated"})
+    with hdf5_file(path) as (file, disk):
+        file["columns"] = list(D3RLPY.values())
+        file["num_episodes"] = len(dataset)
+        file["version"] = "2.1"
+        for number, _, values in _episodes(dataset, disk):
+            file[f"terminated_{number}"] = bool(values[TERMINATED][-1])
+            goal = [values.pop(GOAL)] if GOAL in values else []
+            values[STATE] = np.concatenate([values[STATE], *goal], axis=1)
+            values[REWARD] = as_rows(values[REWARD])
+            for name, array in values.items():
+                file[f"{fields[name]}_{number}"] = array
+
+
+def _robomimic(dataset: Dataset, path: Path, out: Path) -> None:
+    """Write data/demo_i: actions (T, A), rewards, dones, truncated (T,), obs/state, next_obs/state (T, S).
+
+    `dones` is terminated alone: robomimic's learners do not bootstrap on it. Goals (T, G) are obs/goal and
+    next_obs/goal. mask/train and mask/valid follow the permutation of the nested subsets, by recordings with
+    all copies of them; mask/valid is what an augmentation held out, if it did. A dataset of few episodes has
+    only mask/train.
+    """
+    observed = {STATE: "obs/state", NEXT_STATE: "next_obs/state", GOAL: "obs/goal"}
+    fields = _fields(dataset, ROBOMIMIC | observed)
+    environment = dataset.description["environment"]
+    arguments = {
+        "env_name": environment.get("id", dataset.description["name"]),
+        "type": 2,  # gym
+        "env_kwargs": {key: value for key, value in environment.items() if key != "id"},
+    }
+    with hdf5_file(path) as (file, disk):
+        data = file.create_group("data")
+        data.attrs["total"] = int(dataset.lengths.sum())
+        data.attrs["env_args"] = json.dumps(arguments)
+        for number, episode, values in _episodes(dataset, disk):
+            demo = data.create_group(f"demo_{number}")
+            demo.attrs["num_samples"] = len(episode)
+            demo.attrs["episode_uid"] = episode.uid
+            for name in (TERMINATED, TRUNCATED):
+                values[name] = values[name].astype("int64")
+            for name, array in values.items():
+                demo[fields[name]] = array
+            if GOAL in values:
+                demo["next_obs/goal"] = values[GOAL]
+        is_valid = _validation(dataset)
+        for key, part in (("train", ~is_valid), ("valid", is_valid)):
+            if part.any():
+                file[f"mask/{key}"] = [f"demo_{episode}".encode() for episode in np.flatnonzero(part)]
+
+
+def _validation(dataset: Dataset) -> NDArray[np.bool_]:
+    """Return which episodes (E,) are for validation; copies go where their recording goes."""
+    recordings = recordings_of(dataset)
+    held_out = np.array(dataset.metadata.get("held_out", [False] * len(dataset)), dtype=bool)
+    if held_out.any():
+        return np.isin(recordings, recordings[held_out])
+    ordered = list(dict.fromkeys(recordings[dataset.order].tolist()))
+    train = len(ordered) - int(len(ordered) * VALID_SHARE)
+    return np.isin(recordings, ordered[train:])
+
+
+def _minari(dataset: Dataset, path: Path, out: Path) -> None:
+    """Write observations (T + 1, S), actions (T, A), rewards, terminations and truncations (T,) per episode.
+
+    With goals, observations are a dict of "observation" and "desired_goal" (T + 1, G). The end of `out` is
+    the id: its path in Minari's folder, or its name elsewhere. `minari.create_dataset_from_buffers`
+    would hold all episodes in memory, write into Minari's folder alone, and not notice a full disk.
+
+    Raises:
+        BadInputError: a next state is not the state of the following step, as Minari assumes, or the name of
+            `out` is not a valid id.
+    """
+    minari = optional("minari")
+    from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here
+    from minari.dataset.minari_storage import MinariStorage  # noqa: PLC0415 - an extra
+
+    identity = _minari_id(out)
+    boxes = {
+        name: Box(-np.inf, np.inf, dataset.features[name]["shape"], np.float32)
+        for name in (STATE, ACTION, GOAL)
+        if name in dataset.features
+    }
+    seen: Box | Dict = boxes[STATE]
+    observed = {STATE: "observations"}
+    if GOAL in boxes:
+        seen = Dict({"observation": boxes[STATE], "desired_goal": boxes[GOAL]})
+        observed = {STATE: "observations/observation", GOAL: "observations/desired_goal"}
+    fields = _fields(dataset, MINARI | observed)
+    storage = MinariStorage.new(path.absolute() / "data", seen, boxes[ACTION])
+    with hdf5_file(path / "data/main_data.hdf5", track_order=True) as (file, disk):
+        for number, episode, values in _episodes(dataset, disk):
+            group = file.create_group(f"episode_{number}")
+            group.attrs.update({"id": number, "total_steps": len(episode)})
+            if isinstance(seed := episode.metadata.get("seed"), int):
+                group.attrs["seed"] = seed
+            following = values.pop(NEXT_STATE)
+            if not np.array_equal(following[:-1], values[STATE][1:]):
+                raise BadInputError(
+                    f"episode {episode.uid}: a next state is not the state of the next step, which Minari "
+                    "cannot store; d4rl and robomimic can"
+                )
+            values[STATE] = np.concatenate([values[STATE], following[-1:]])
+            if GOAL in values:
+                values[GOAL] = np.concatenate([values[GOAL], values[GOAL][-1:]])
+            for name, array in values.items():
+                group.create_dataset(fields[name], data=array, chunks=True, maxshape=(None, *array.shape[1:]))
+    storage.update_metadata(
+        {
+            "total_episodes": len(dataset),
+            "total_steps": int(dataset.lengths.sum()),
+            "dataset_id": identity,
+            "minari_version": minari.__version__,
+            "description": f"{dataset.reference}, content hash {dataset.content_hash}",
+            "dataset_size": float(storage.get_size()),
+        }
+    )
+
+
+def _minari_id(out: Path) -> str:
+    """Return the id of a dataset in folder `out`: its path in Minari's folder, or its name elsewhere."""
+    from minari.dataset.minari_dataset import parse_dataset_id  # noqa: PLC0415 - an extra
+    from minari.storage.datasets_root_dir import get_dataset_path  # noqa: PLC0415 - an extra
+
+    shelf, place = get_dataset_path().resolve(), out.resolve()
+    name = str(place.relative_to(shelf)) if place.is_relative_to(shelf) else place.name
+    # Its parser raises a TypeError for a name without a version.
+    try:
+        parse_dataset_id(name)
+    except (ValueError, TypeError) as error:
+        raise BadInputError(
+            f"{out}: '{name}' is not a Minari id; end --out with a name and a version, such as maze/random-v0"
+        ) from error
+    return name
+
+
+EXPORTERS: dict[str, Callable[[Dataset, Path, Path], None]] = {
+    "d3rlpy": _d3rlpy,
+    "d4rl": _d4rl,
+    "minari": _minari,
+    "robomimic": _robomimic,
+}
+"""Each writes a dataset to a new path, which is renamed to `out` afterwards."""
+
+
+def _fields(dataset: Dataset, standard: dict[str, str]) -> dict[str, str]:
+    """Return the field of each column: a standard one of the format, or another one, among its infos."""
+    fields = {REWARD: standard[REWARD]}
+    for name in (column.name for column in dataset.schema):
+        info = f"infos/{name}"
+        fields[name] = standard.get(name, f"{info}_" if info in standard.values() else info)
+    return fields
+
+
+def _episodes(dataset: Dataset, disk: "Disk") -> Iterator[tuple[int, Episode, dict[str, Array]]]:
+    """Yield each episode with its number and its columns, (T,) or (T, size), while the disk takes them."""
+    for number, episode in enumerate(dataset.episodes([column.name for column in dataset.schema])):
+        values = {name: as_rows(v) if name in VECTORS else v for name, v in episode.columns.items()}
+        yield number, episode, {REWARD: np.zeros(len(episode), np.float32)} | values
+        disk.check()
+
+
+class Disk(io.RawIOBase):
+    """A new file that keeps the first error of writing instead of raising it.
+
+    Attributes:
+        failure: that error; None while all is well.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Create the file at `path`.
+
+        Raises:
+            OSError: it cannot be created.
+        """
+        self.failure: OSError | None = None
+        self._file = path.open("w+b", buffering=0)
+        self.seek, self.tell, self.readinto = self._file.seek, self._file.tell, self._file.readinto  # type: ignore[method-assign]
+
+    def check(self) -> None:
+        """Raise the first error, if there was one."""
+        if self.failure:
+            raise self.failure
+
+    def write(self, content: Buffer, /) -> int:
+        """Write all of `content`, as far as the disk takes it."""
+        rest = memoryview(content).cast("B")
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            self.failure = self.failure or error
+        return memoryview(content).nbytes
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Cut or extend the file."""
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        super().close()
+
+
+@contextmanager
+def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[tuple[Any, Disk]]:
+    """Yield a new HDF5 file at `path`, and the disk that it is written to.
+
+    Args:
+        path: where to.
+        track_order: list groups in the order of their making instead of by name.
+
+    Raises:
+        BadInputError: h5py is not installed.
+        OSError: something could not be written; what there is at `path` is of no use.
+    """
+    h5py = optional("h5py")
+    disk = Disk(path)
+    try:
+        with h5py.File(disk, "w", track_order=track_order) as file:
+            yield file, disk
+    except Exception:
+        # What HDF5 stumbles over after a failed write is not the reason.
+        disk.check()
+        raise
+    finally:
+        disk.close()
+    disk.check()

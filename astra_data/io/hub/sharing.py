@@ -1,0 +1,312 @@
+"""Push a version of a dataset, and pull one; an interrupted push or pull is continued by the next."""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from astra_data.core.config import load_recipe
+from astra_data.core.durable import folder_for, held, publish, writing
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, SharingError
+from astra_data.core.progress import Progress, silent
+from astra_data.dataset.description import NAME
+from astra_data.dataset.doctor.check import check
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import Version, home_of, open_dataset
+from astra_data.io.hub.stores import (
+    HubStore,
+    RemoteFolder,
+    UrlStore,
+    explained,
+    is_address,
+    parse_place,
+    parse_source,
+)
+from astra_data.io.hub.sums import SUMS_PATH, Listed, altered, make_sums, parse_sums
+
+MOST_BYTES = 100 * 10**9
+"""Most bytes that are downloaded unless more are asked for; a robot's logs stay far below."""
+
+
+def push(
+    dataset: str | Path,
+    destination: str,
+    *,
+    notes: Path | None = None,
+    private: bool = False,
+    progress: Progress = silent,
+) -> str:
+    """Upload `dataset` with its card to `destination`; if it is there already, compare it instead.
+
+    Args:
+        dataset: a folder, name@data-1.2.0, or name for the newest at home.
+        destination: "user/name" or "hf://datasets/user/name" on the Hugging Face Hub, or any URL that fsspec
+            knows, below which <name>/data-<version>/ is made.
+        notes: TOML file with the hand-written part of the card, see `Notes`.
+        private: create the repository on the Hub as private, and refuse one that is public.
+        progress: called with the fraction done.
+
+    Returns:
+        the source from which `pull` downloads it, with its version.
+
+    Raises:
+        BadInputError: there is no such dataset, the place holds something else under this version, the
+            Hub rejects the card, or a repository that should be private is public.
+        CorruptDatasetError: the dataset is incomplete or was altered.
+        RecipeError: the notes have faults.
+        SharingError: the place denies access or cannot be reached, or the version in it was altered.
+
+    Example:
+        >>> from astra_data import push
+        >>> push("walks", "./shared").rpartition("/shared/")[2]
+        'walks@data-1.0.0'
+    """
+    from astra_data.io.hub.card import Notes, write_card  # noqa: PLC0415 - draws, unlike pull
+
+    place = parse_place(destination)
+    local = open_dataset(dataset)
+    if local.recorded is not None:
+        raise BadInputError(
+            f"{local.root} was recorded by LeRobot: make a dataset of it first, with `astra-data subset "
+            f"{local.root} --percent 100`"
+        )
+    written = load_recipe(notes, Notes) if notes else Notes()
+    if isinstance(place, UrlStore):
+        if private:
+            raise BadInputError(
+                f"{place}: private is for the Hugging Face Hub; elsewhere, set permissions of the storage."
+            )
+        place = place.below(local.description["name"])
+    if faults := check(local.root).faults:
+        raise CorruptDatasetError(f"{local.root} was altered: {'; '.join(faults)}. Restore it from a copy.")
+    version = Version.parse(local.description["version"])
+    if isinstance(place, HubStore):
+        place.create(private=private)
+    if version in place.versions():
+        _refuse_change(place.folder(version), local)
+    else:
+        with TemporaryDirectory() as folder:
+            card = Path(folder)
+            write_card(local, card / "README.md", written, source=str(place))
+            (card / SUMS_PATH).write_text(make_sums(local.root), encoding="utf-8")
+            place.upload(local, card, progress)
+    return f"{place}@{version.tag}"
+
+
+def _refuse_change(there: RemoteFolder, local: Dataset) -> None:
+    """Compare a version that was shared with ours: its sums, and its files."""
+    ours = parse_sums(make_sums(local.root), str(local.root))
+    listed = parse_sums(there.read_text(SUMS_PATH), there.name)
+    if others := sorted(path for path in ours.keys() | listed if ours.get(path) != listed.get(path)):
+        raise BadInputError(
+            f"{there.name} holds other values or was altered: {SUMS_PATH} there differs in "
+            f"{', '.join(others)}. Versions never change: give the dataset a new one, or push elsewhere."
+        )
+    if changed := there.altered(ours):
+        raise SharingError(
+            f"{there.name} was altered: {', '.join(changed)} there differ from {SUMS_PATH}. "
+            "Delete this version there and push again, or push elsewhere."
+        )
+
+
+def pull(
+    source: str,
+    *,
+    out: Path | None = None,
+    version: str | None = None,
+    max_bytes: int = MOST_BYTES,
+    progress: Progress = silent,
+) -> Dataset:
+    """Download a version of the dataset at `source`; if it is there already, compare it file by file.
+
+    Files are downloaded to a hidden folder beside the dataset's; those that are whole are not downloaded
+    again after an interruption. The dataset appears once it is complete and its values are verified.
+
+    Args:
+        source: "user/name" or "hf://datasets/user/name" on the Hugging Face Hub, or the URL of the dataset's
+            folder, whose last part is its name; "@data-1.2.0" after it names a version.
+        out: the dataset's folder, by default its place at home.
+        version: such as "1.2.0", by default the newest.
+        max_bytes: the most bytes of all its files; a larger dataset is refused before it is downloaded.
+        progress: called with the fraction done.
+
+    Raises:
+        BadInputError: the source has no such version or is a folder of datasets, or `out` holds something
+            else.
+        CorruptDatasetError: `out` holds this dataset, altered.
+        SharingError: the source cannot be reached, denies access, is too large, or is not a valid dataset.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from astra_data import pull, push
+        >>> pull(push("walks", "./shared"), out=Path("copy")).reference
+        'walks@data-1.0.0'
+    """
+    place, named = parse_source(source)
+    asked = Version.parse(version.removeprefix("data-")) if version else named
+    if named and asked != named:
+        raise BadInputError(f"{source} names {named.tag}, but the version asked for is {version}.")
+    if isinstance(place, HubStore) and not source.startswith("hf://") and Path(place.repo).is_dir():
+        raise BadInputError(
+            f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub"
+        )
+    known = place.versions()
+    if not known:
+        if isinstance(place, UrlStore) and (inside := place.datasets()):
+            raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
+        raise SharingError(
+            f"{place} has no dataset of astra-data: no tag or folder such as data-1.2.0. "
+            "A plain LeRobot dataset is opened with lerobot; otherwise check the spelling."
+        )
+    if asked and asked not in known:
+        listed = ", ".join(one.tag for one in known)
+        raise BadInputError(f"{place} has no version {asked.tag}; it has {listed}.")
+    chosen = asked or known[-1]
+    remote = place.folder(chosen)
+    description = remote.description()
+    name, called = description.get("name"), description.get("version")
+    if not isinstance(name, str) or not NAME.fullmatch(name) or called != str(chosen):
+        raise SharingError(f"{remote.name} calls itself {name!r} {called!r}; it cannot be trusted.")
+    target = home_of(description) if out is None else out
+    sums = parse_sums(remote.read_text(SUMS_PATH), remote.name)
+    if target.exists():
+        dataset = _present(target, description, sums)
+        progress(1.0, f"it is there already, and whole: {len(sums)} files were compared")
+        return dataset
+    try:
+        with folder_for(target):
+            _fetch_all(remote, sums, target, description, max_bytes, progress)
+    except OSError as error:
+        raise BadInputError(f"{target} cannot be written ({error}); choose another folder.") from error
+    return Dataset.open(target)
+
+
+def opened(data: str | Path) -> Dataset:
+    """Open a dataset here, or pull it.
+
+    Raises:
+        BadInputError, CorruptDatasetError, SharingError: as `open_dataset` and `pull`.
+    """
+    return pull(str(data)) if is_address(data) else open_dataset(data)
+
+
+def _fetch_all(
+    remote: RemoteFolder,
+    sums: Mapping[str, Listed],
+    target: Path,
+    description: Mapping[str, Any],
+    max_bytes: int,
+    progress: Progress,
+) -> None:
+    """Download the files of `sums` and, once their values are verified, rename their folder to `target`."""
+    sizes = {path: remote.facts(path).get("size") for path in sums}
+    wrong = [
+        f"{path} has {sizes[path]} bytes, listed are {listed.size}"
+        for path, listed in sums.items()
+        if sizes[path] not in (None, listed.size)
+    ]
+    if wrong:
+        raise SharingError(f"{remote.name} was altered: {'; '.join(wrong)}. Nothing was downloaded.")
+    total = sum(listed.size for listed in sums.values())
+    if total > max_bytes:
+        raise SharingError(
+            f"{remote.name} has {total} bytes, of which at most {max_bytes} are taken; nothing was "
+            "downloaded. If you trust it, pass a larger --max-bytes."
+        )
+    partial = target.with_name(f".{target.name}.pull-{description['version']}")
+    partial.mkdir(parents=True, exist_ok=True)
+    refuse_planted(partial)
+    with held(partial) as ours:
+        if not ours:
+            raise BadInputError(f"{target} is being pulled right now; wait or choose another folder.")
+        for file in [file for file in partial.rglob("*") if file.is_file()]:
+            if file.relative_to(partial).as_posix() not in sums:
+                file.unlink()
+        for number, path in enumerate(altered(partial, sums)):
+            progress(number / len(sums), path)
+            fetch(remote, path, partial, sums[path].size)
+        _check(partial, sums, description, remote.name)
+        publish(partial, target)
+    progress(1.0, f"{len(sums)} files")
+
+
+def fetch(remote: RemoteFolder, path: str, folder: Path, size: int) -> None:
+    """Download the file `path` into `folder`: never more than one byte over its listed `size`.
+
+    Raises:
+        DiskError: it cannot be written.
+        SharingError: it cannot be read.
+    """
+    target = folder / path
+    with explained(f"{remote.name}: {path}"), writing(target, place=False):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("wb") as file:
+            for block in remote.blocks(path, size + 1):
+                file.write(block)
+
+
+def refuse_planted(folder: Path) -> None:
+    """Look for what no pull leaves in its unfinished `folder`, through which one would write elsewhere.
+
+    Raises:
+        SharingError: there is a link, a device or a pipe, or a file that has another name besides.
+    """
+    for entry in [folder, *folder.rglob("*")]:
+        is_plain = entry.is_file() and entry.lstat().st_nlink == 1
+        if entry.is_symlink() or not (entry.is_dir() or is_plain):
+            raise SharingError(
+                f"{entry} is a link, a device or a pipe, which no pull leaves there: "
+                f"delete {folder}, then run the same command again."
+            )
+
+
+def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Listed]) -> Dataset:
+    """Return the dataset in folder `target`, which must be the one described, whole."""
+    changed = altered(target, sums)
+    try:
+        dataset = Dataset.open(target)
+        is_other = dataset.content_hash != description.get("content_hash")
+    except CorruptDatasetError as error:
+        if len(changed) < len(sums):
+            raise CorruptDatasetError(f"{error} Delete it, or pull to another folder.") from error
+        is_other = True
+    except AstraDataError:
+        is_other = True
+    if is_other:
+        raise BadInputError(
+            f"{target} exists already and holds something else; delete it or choose another folder."
+        )
+    if changed:
+        raise CorruptDatasetError(
+            f"{target} was altered: it differs from what is shared in {', '.join(changed)}. "
+            "Delete it, or pull to another folder."
+        )
+    return dataset
+
+
+def _check(folder: Path, sums: Mapping[str, Listed], description: Mapping[str, Any], name: str) -> None:
+    """Check that the downloaded files are the complete dataset; they may have been written by anybody.
+
+    Raises:
+        SharingError: they are not; what differs from its sum is deleted, or everything.
+    """
+    if wrong := altered(folder, sums):
+        for path in wrong:
+            (folder / path).unlink(missing_ok=True)
+        raise SharingError(
+            f"{name}: {', '.join(wrong)} do not have the size and sha256 in {SUMS_PATH}: the download was "
+            "cut off, or they were altered there; run the same command again."
+        )
+    try:
+        dataset = Dataset.open(folder)
+        faults = check(folder).faults
+        outside = [str(path) for path in dataset.paths if path.relative_to(folder).as_posix() not in sums]
+        faults += [f"{path} does not belong to it" for path in outside]
+        if dataset.content_hash != description.get("content_hash"):
+            faults.append("its description changed during the download")
+    except Exception as error:  # noqa: BLE001 - raised below
+        faults = [str(error)]
+    if faults:
+        shutil.rmtree(folder)
+        raise SharingError(f"{name} is not a complete dataset: {'; '.join(faults)}.")

@@ -1,0 +1,461 @@
+"""The places where datasets are shared: a repository on the Hugging Face Hub, or a folder at any URL.
+
+Both hold a dataset's own files and SHA256SUMS, which lists them all, under the tag of each version.
+"""
+
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from astra_data.core.durable import file_digest, sync_tree, write_file, writing
+from astra_data.core.errors import AstraDataError, BadInputError, SharingError
+from astra_data.core.optional import how_to_install
+from astra_data.core.progress import Progress
+from astra_data.dataset import format as layout
+from astra_data.dataset.description import VERSION
+from astra_data.dataset.reader import Dataset
+from astra_data.dataset.versions import Version
+from astra_data.io.hub.sums import SUMS_PATH, Listed, dataset_files
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
+KIND = "dataset"
+TEXT_BYTES = 2**26
+"""Most bytes of a description or of SHA256SUMS; some hundred thousand recordings or files fit into it."""
+BLOCK_BYTES = 2**24
+"""Bytes per request."""
+MOST_FOLDERS = 20
+"""Folders in which datasets are looked for, each with a request of its own."""
+MOST_VERSIONS = 1000
+EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
+"""Protocol → the extra of this package that is needed for it."""
+
+_WORD = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+_HUB = re.compile(rf"(hf://datasets/)?(?P<repo>{_WORD}/{_WORD})/?")
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://.+")
+_VERSION = re.compile(rf"[@/](data-)?(?P<version>{VERSION.pattern})/?$")
+
+
+def parse_place(text: str) -> "HubStore | UrlStore":
+    """Read "user/name", "hf://datasets/user/name", another URL, or a folder that begins with a dot, / or ~.
+
+    Raises:
+        BadInputError: it is none of these.
+    """
+    if hub := _HUB.fullmatch(text):
+        return HubStore(hub["repo"])
+    if text.startswith(("/", "./", "../", "~/")):
+        return UrlStore(f"file://{Path(text).expanduser().absolute()}")
+    if not _URL.fullmatch(text) or text.startswith("hf://"):
+        raise BadInputError(
+            f"{text}: expected user/name or hf://datasets/user/name for the Hugging Face Hub, "
+            "a URL such as s3://bucket/folder or gs://bucket/folder, or a folder such as ./shared or /shared"
+        )
+    return UrlStore(text.rstrip("/"))
+
+
+def parse_source(text: str) -> "tuple[HubStore | UrlStore, Version | None]":
+    """Read a place, and the version where one is named: "user/name@data-1.2.0", "s3://…/name/data-1.2.0".
+
+    Raises:
+        BadInputError: it is not an address.
+    """
+    named = _VERSION.search(text)
+    if named is None:
+        return parse_place(text), None
+    return parse_place(text[: named.start()]), Version.parse(named["version"])
+
+
+def is_address(data: str | Path) -> bool:
+    """Return whether `data` is an address to pull from, such as user/name or s3://…, and no folder here."""
+    if Path(data).is_dir():
+        return False
+    return "://" in str(data) or (len(Path(data).parts) == 2 and not str(data).startswith((".", "/")))
+
+
+@dataclass(frozen=True)
+class RemoteFolder:
+    """The files of one version, wherever they are; of what a stranger put there, only plain files are read.
+
+    Attributes:
+        filesystem: an fsspec file system.
+        path: of the folder in it.
+        name: of the version, for messages.
+    """
+
+    filesystem: Any
+    path: str
+    name: str
+
+    def facts(self, path: str) -> dict[str, Any]:
+        """Return what the file system knows of a file, such as its "size"; empty if it is not there.
+
+        Raises:
+            SharingError: it is a link, a device or a pipe, or the place cannot be reached.
+        """
+        with explained(self.name):
+            try:
+                facts = dict(self.filesystem.info(f"{self.path}/{path}"))
+            except FileNotFoundError:
+                return {}
+            is_linked = self._is_here and os.path.realpath(f"{self.path}/{path}") != os.path.join(
+                os.path.realpath(self.path), path
+            )
+        if facts.get("type") != "file" or facts.get("islink") or is_linked:
+            raise SharingError(f"{self.name}: {path} is a link, a device or a pipe, expected a file.")
+        return facts
+
+    def blocks(self, path: str, most: int) -> Iterator[bytes]:
+        """Yield the bytes of the file `path`, at most `most` in all, in blocks."""
+        options = {"block_size": BLOCK_BYTES, "cache_type": "none"}
+        with self.filesystem.open(f"{self.path}/{path}", "rb", **options) as source:
+            while most > 0 and (block := source.read(min(BLOCK_BYTES, most))):
+                most -= len(block)
+                yield block
+
+    def read_text(self, path: str) -> str:
+        """Return the text of the small file `path`.
+
+        Raises:
+            SharingError: it cannot be read, is not there, or is larger than `TEXT_BYTES`.
+        """
+        if not self.facts(path):
+            raise SharingError(f"{self.name} has no {path}: it was not pushed by astra-data.")
+        with explained(f"{self.name}: {path}"):
+            content = b"".join(self.blocks(path, TEXT_BYTES + 1))
+            if len(content) > TEXT_BYTES:
+                raise SharingError(f"{self.name}: {path} is larger than {TEXT_BYTES // 2**20} MB.")
+            return content.decode()
+
+    def description(self) -> dict[str, Any]:
+        """Return meta/astra/dataset.json.
+
+        Raises:
+            SharingError: it cannot be read.
+        """
+        text = self.read_text(layout.DATASET_PATH)
+        try:
+            return dict(json.loads(text))
+        except (RecursionError, TypeError, ValueError) as error:
+            raise SharingError(
+                f"{self.name}: {layout.DATASET_PATH} is not a JSON object ({error})."
+            ) from error
+
+    def altered(self, sums: Mapping[str, Listed]) -> list[str]:
+        """Return which files of `sums` are missing here or differ, as far as is known without a download.
+
+        Sizes are compared everywhere, the sha256 of large files on the Hub and of all in folders here.
+
+        Raises:
+            SharingError: the place cannot be reached, or something is no plain file.
+        """
+        found = {path: self.facts(path) for path in sums}
+        return [
+            path
+            for path, listed in sums.items()
+            if not found[path]
+            or found[path].get("size") not in (None, listed.size)
+            or self._digest(path, found[path]) not in (None, listed.digest)
+        ]
+
+    def _digest(self, path: str, facts: Mapping[str, Any]) -> str | None:
+        """Return the sha256 of a file, None where it would have to be downloaded for that."""
+        if self._is_here:
+            return file_digest(Path(self.path, path))
+        return facts["lfs"]["sha256"] if facts.get("lfs") else None
+
+    @property
+    def _is_here(self) -> bool:
+        protocol = self.filesystem.protocol
+        return "file" in ((protocol,) if isinstance(protocol, str) else protocol)
+
+
+@dataclass(frozen=True)
+class HubStore:
+    """The repository `repo`, "user/name", on the Hugging Face Hub, whose tags data-<version> never move."""
+
+    repo: str
+
+    def __str__(self) -> str:
+        """Return it as a URL."""
+        return f"hf://datasets/{self.repo}"
+
+    def create(self, *, private: bool) -> None:
+        """Create the repository unless it exists.
+
+        Raises:
+            BadInputError: the repository is public and should be private.
+            SharingError: the Hub refuses or cannot be reached.
+        """
+        with self._api() as api:
+            # None stands for the default of the user or the organization.
+            api.create_repo(self.repo, repo_type=KIND, private=private or None, exist_ok=True)
+            if private and not api.repo_info(self.repo, repo_type=KIND).private:
+                raise BadInputError(
+                    f"{self.repo} exists already and is public, expected a private repository. Nothing was "
+                    "uploaded: make it private in its settings on the Hub, choose another, or leave out "
+                    "--private."
+                )
+
+    def versions(self) -> list[Version]:
+        """Return the tagged versions, the oldest first."""
+        return sorted(self._commits())
+
+    def folder(self, version: Version) -> RemoteFolder:
+        """Return the folder with the files of `version`: the commit that its tag names right now."""
+        from huggingface_hub import HfFileSystem  # noqa: PLC0415 - slow to import
+
+        path = f"datasets/{self.repo}@{self._commits()[version]}"
+        return RemoteFolder(HfFileSystem(skip_instance_cache=True), path, f"{self.repo}@{version.tag}")
+
+    def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
+        """Add `dataset`: its files and card, then the tag "v3.0", then the tag that marks it as complete.
+
+        `upload_folder` may make several commits, of which the first would leave a mixture behind.
+
+        Args:
+            dataset: complete and verified.
+            card: a folder with SHA256SUMS, README.md and perhaps its figure.
+            progress: called with the fraction done.
+
+        Raises:
+            BadInputError: the Hub refuses the card, or the repository holds another dataset or a newer one.
+            SharingError: the Hub refuses or cannot be reached.
+        """
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
+
+        version = Version.parse(dataset.description["version"])
+        self._refuse_mixing(dataset, version)
+        with self._api() as api:
+            progress(0.0, "files")
+            # If somebody else commits from here on, this commit fails.
+            head = api.repo_info(self.repo, repo_type=KIND).sha
+            there = api.list_repo_files(self.repo, revision=head, repo_type=KIND)
+            if layout.INFO_PATH in there and SUMS_PATH not in there:
+                raise BadInputError(
+                    f"{self.repo} holds a dataset that astra-data did not push; choose another repository."
+                )
+            files = dataset_files(dataset.root)
+            old = [path for path in there if path.startswith(("data/", "meta/")) and path not in files]
+            commit = api.create_commit(
+                self.repo,
+                [
+                    *(CommitOperationAdd(path, dataset.root / path) for path in files),
+                    *(CommitOperationDelete(path, is_folder=False) for path in old),
+                    *(CommitOperationAdd(path.name, path) for path in sorted(card.iterdir())),
+                ],
+                repo_type=KIND,
+                parent_commit=head,
+                commit_message=f"Add {dataset.reference}",
+            )
+            progress(0.9, "tags")
+            tags = api.list_repo_refs(self.repo, repo_type=KIND).tags
+            if layout.CODEBASE_VERSION in [tag.name for tag in tags]:
+                api.delete_tag(self.repo, tag=layout.CODEBASE_VERSION, repo_type=KIND)
+            for tag in (layout.CODEBASE_VERSION, version.tag):
+                api.create_tag(self.repo, tag=tag, revision=commit.oid, repo_type=KIND)
+        progress(1.0, version.tag)
+
+    def _refuse_mixing(self, dataset: Dataset, version: Version) -> None:
+        known = self.versions()
+        if not known:
+            return
+        name = self.folder(known[-1]).description().get("name")
+        if name != dataset.description["name"]:
+            raise BadInputError(f"{self.repo} holds the dataset {name!r}; choose another repository.")
+        if known[-1] > version:
+            raise BadInputError(
+                f"{self.repo} has {known[-1].tag} already, and main shows the newest version: "
+                f"{version.tag} can no longer be added. Push it to another place."
+            )
+
+    def _commits(self) -> dict[Version, str]:
+        with self._api() as api:
+            tags = api.list_repo_refs(self.repo, repo_type=KIND).tags
+        versions = ((Version.from_tag(tag.name), tag.target_commit) for tag in tags)
+        return {version: commit for version, commit in versions if version}
+
+    @contextmanager
+    def _api(self) -> Iterator["HfApi"]:
+        from huggingface_hub import HfApi  # noqa: PLC0415 - slow to import
+
+        with explained(f"{self.repo} on the Hugging Face Hub"):
+            yield HfApi()
+
+
+class UrlStore:
+    """The versions of one dataset below a URL; a version counts once its `layout.DATASET_PATH` exists."""
+
+    def __init__(self, url: str) -> None:
+        """Take the folder `url`, whose last part is the dataset's name.
+
+        Raises:
+            BadInputError: no installed package handles such a URL.
+        """
+        import fsspec  # noqa: PLC0415 - slow to import
+
+        self.url = url
+        protocol = url.partition("://")[0].lower()
+        self._is_local = protocol in ("file", "local")
+        try:
+            with explained(url):
+                self._filesystem, self._path = fsspec.core.url_to_fs(url)
+        except SharingError as error:
+            if not isinstance(error.__cause__, ImportError | ValueError):
+                raise
+            how = f"expected a URL such as s3://bucket/folder ({error.__cause__})"
+            if isinstance(error.__cause__, ImportError):
+                extra = EXTRAS.get(protocol)
+                how = f"the package for {protocol}:// is not installed: "
+                how += how_to_install(extra) if extra else str(error.__cause__)
+            raise BadInputError(f"{url}: {how}") from error
+
+    def __str__(self) -> str:
+        """Return the URL."""
+        return self.url
+
+    def below(self, name: str) -> "UrlStore":
+        """Return the folder `name` in this one."""
+        return UrlStore(f"{self.url}/{name}")
+
+    def versions(self) -> list[Version]:
+        """Return the complete versions, the oldest first."""
+        with explained(self.url):
+            self._filesystem.invalidate_cache()
+            versions = {version for name in self._listed() if (version := Version.from_tag(name))}
+            if len(versions) > MOST_VERSIONS:  # each is a request
+                raise SharingError(f"{self.url} lists more than {MOST_VERSIONS} versions")
+            marks = {version: f"{self.folder(version).path}/{layout.DATASET_PATH}" for version in versions}
+            return sorted(version for version, mark in marks.items() if self._filesystem.exists(mark))
+
+    def datasets(self) -> list[str]:
+        """Return the URLs of the datasets that the first of its folders are, where it holds several."""
+        with explained(self.url):
+            inside = [self.below(name) for name in sorted(self._listed())[:MOST_FOLDERS]]
+        return [store.url for store in inside if store.versions()]
+
+    def _listed(self) -> list[str]:
+        """Return the names of the folders in it."""
+        try:
+            found = self._filesystem.ls(self._path, detail=True)
+        except FileNotFoundError:
+            return []
+        paths = [str(facts["name"]).rstrip("/") for facts in found if facts["type"] == "directory"]
+        return [path.rpartition("/")[2] for path in paths]
+
+    def folder(self, version: Version) -> RemoteFolder:
+        """Return the folder with the files of `version`."""
+        return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}", f"{self.url}/{version.tag}")
+
+    def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
+        """Upload `dataset`: `layout.DATASET_PATH` is written last and marks it as complete.
+
+        SHA256SUMS is written first and identifies the upload: the next push of the same files repeats an
+        interrupted one, and no existing file is ever deleted.
+
+        Raises:
+            BadInputError: the folder holds other files.
+            SharingError: the place denies access or cannot be reached.
+        """
+        remote = self.folder(Version.parse(dataset.description["version"]))
+        sums = (card / SUMS_PATH).read_bytes()
+        files = {path: dataset.root / path for path in dataset_files(dataset.root)}
+        files |= {path.name: path for path in sorted(card.iterdir()) if path.name != SUMS_PATH}
+        mark = files.pop(layout.DATASET_PATH)
+        with explained(self.url):
+            self._filesystem.invalidate_cache()
+            if not self._is_begun(remote):
+                self._write(f"{remote.path}/{SUMS_PATH}", sums)
+            for number, (path, file) in enumerate(files.items()):
+                # Checked before every file: a push of other values may have begun at the same time.
+                self._refuse_others(remote, sums)
+                progress(number / len(files), path)
+                target = f"{remote.path}/{path}"
+                if self._is_local:
+                    Path(target).parent.mkdir(parents=True, exist_ok=True)
+                self._filesystem.put_file(str(file), target)
+            if self._is_local:
+                sync_tree(Path(remote.path))
+            self._refuse_others(remote, sums)
+            self._write(f"{remote.path}/{layout.DATASET_PATH}", mark.read_bytes())
+        progress(1.0, f"{len(files) + 1} files")
+
+    def _is_begun(self, remote: RemoteFolder) -> bool:
+        """Return whether there are files, but for hidden ones, which a killed push may leave in a folder."""
+        found = (str(path).removeprefix(remote.path) for path in self._filesystem.find(remote.path))
+        return any("/." not in path for path in found)
+
+    def _write(self, path: str, content: bytes) -> None:
+        """Write a small file; in a folder of this machine it is there whole, or not at all."""
+        if self._is_local:
+            write_file(Path(path), content)
+        else:
+            self._filesystem.pipe_file(path, content)
+
+    def _refuse_others(self, remote: RemoteFolder, sums: bytes) -> None:
+        try:
+            there = self._filesystem.cat_file(f"{remote.path}/{SUMS_PATH}")
+        except FileNotFoundError:
+            there = None
+        if there != sums:
+            raise BadInputError(
+                f"{remote.name} exists already and holds something else: other files, or a part of another "
+                f"push of this version, stopped or going on right now. Nothing in it is replaced: look at it "
+                "and delete it, give the dataset a new version, or push elsewhere."
+            )
+
+
+@contextmanager
+def explained(place: str) -> Iterator[None]:
+    """Turn the exceptions of the Hub and of file systems into one-line messages."""
+    try:
+        with writing(Path(place.removeprefix("file://")), place=False):
+            yield
+    except AstraDataError:
+        raise
+    except PermissionError as error:
+        raise SharingError(f"{place}: no rights to do this ({error}); check the credentials.") from error
+    except FileNotFoundError as error:
+        raise SharingError(f"{place}: does not exist ({error}); check the spelling.") from error
+    except Exception as error:
+        raise _of_the_hub(place, error) or SharingError(
+            f"{place}: {type(error).__name__}: {error}; check the address, the credentials and the network, "
+            "then run the same command again."
+        ) from error
+
+
+def _of_the_hub(place: str, error: Exception) -> AstraDataError | None:
+    """Return what to say of an exception of the Hub's; None if it is none."""
+    if "Hugging Face Hub" not in place:
+        return None
+    from huggingface_hub.errors import (  # noqa: PLC0415 - slow to import
+        HfHubHTTPError,
+        HFValidationError,
+        RepositoryNotFoundError,
+    )
+
+    if isinstance(error, ValueError) and not isinstance(error, HFValidationError):
+        return BadInputError(f"{place} rejects this: {error}")
+    # A failed upload raises the exception of its transfer, wrapped or not.
+    cause = error if isinstance(error, HfHubHTTPError) else error.__cause__ or error
+    if isinstance(cause, HFValidationError):
+        return BadInputError(f"{place}: not a valid repository name: {cause}")
+    if isinstance(cause, RepositoryNotFoundError):
+        return SharingError(
+            f"{place}: no such dataset, or no rights to see it; check its name, log in with `hf auth login`."
+        )
+    if isinstance(cause, HfHubHTTPError):
+        status = cause.response.status_code
+        why = f"it answered {status}: {cause.server_message or cause}"
+        if status in (401, 403):
+            why = "no rights to do this; log in with `hf auth login` and a token that may write."
+        elif status in (409, 412):
+            why = "it was changed by somebody else at the same time; run the same command again."
+        return SharingError(f"{place}: {why}")
+    return None
