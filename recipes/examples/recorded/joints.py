@@ -13,6 +13,7 @@ import torch
 from steps import Recorded, write_steps
 
 from astra_data import Column, Task
+from astra_data.worlds.simulators import FreeStates
 
 LEGS = [f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE")]
 SIDES = [
@@ -22,7 +23,7 @@ SIDES = [
 ]
 
 
-class Joints:
+class Joints(FreeStates):
     """Joints [positions; how far each moved in the last step], in rad.
 
     In a step they cover the share 1 - exp(-timestep_s / time_constant_s) of the way to their targets: all of
@@ -31,17 +32,13 @@ class Joints:
 
     def __init__(self, num_envs, joints, timestep_s, time_constant_s, device="cpu"):
         self.joints, self.parameters = joints, {"timestep_s": timestep_s}
-        is_slow = time_constant_s not in (0.0, None)
-        self.share = 1.0 - math.exp(-timestep_s / time_constant_s) if is_slow else 1.0
-        self.has_targets = time_constant_s is not None
-        self.state = torch.zeros(num_envs, 2 * joints, device=device)
-
-    def reset_to(self, state, rows=None):
-        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
+        share = 1.0 - math.exp(-timestep_s / time_constant_s) if time_constant_s else 1.0
+        self.share = 0.0 if time_constant_s is None else share
+        super().__init__(torch.zeros(num_envs, 2 * joints, device=device))
 
     def step(self, target):
         place = self.state[:, : self.joints]
-        moved = self.share * (target - place) if self.has_targets else torch.zeros_like(place)
+        moved = self.share * (target - place)
         self.state = torch.cat([place + moved, moved], dim=-1)
         return self.state
 

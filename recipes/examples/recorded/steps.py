@@ -32,29 +32,24 @@ def write_steps(task, source, test=None, *, states, stretches, rows, share=0.25)
         source: a dataset, by its name or folder. test: another, of the same columns.
         states: from recorded states (T + 2, S) at the ends of steps to those of the task, (T + 1, S').
         stretches: from recorded states (N, S) and their rate to (first, last) of rows that belong together.
-        rows: of a control step.
     """
-    parts = [(part, is_test) for part, is_test in ((source, False), (test, True)) if part]
     columns = [task.state, task.action, Column("next.observation.state", size=task.state.size)]
-    opened = [(open_dataset(part), is_test) for part, is_test in parts]
+    opened = [(open_dataset(part), part is test) for part in (source, test) if part]
     fps = int(opened[0][0].info["fps"]) // rows
     identity = {"name": f"{task.name}-steps", "version": "1.0.0"}
-    parents = [dataset.identity for dataset, _ in opened]
-    description = {**identity, "stage": "steps", "parents": parents, "config": {"rows": rows}}
-    rng, count, held = np.random.default_rng(0), 0, 0
-    root = home_of(identity)
-    with DatasetWriter(root, columns, fps=fps, task=task.instruction, description=description) as writer:
+    description = {**identity, "stage": "steps", "parents": [dataset.identity for dataset, _ in opened]}
+    rng, count = np.random.default_rng(0), 0
+    settings = {"fps": fps, "task": task.instruction, "description": description}
+    with DatasetWriter(root := home_of(identity), columns, **settings) as writer:
         for dataset, is_test in opened:
             for episode in dataset.episodes():
                 state = episode.columns["observation.state"].astype(float)
                 action = episode.columns.get("action", np.zeros((len(state), task.action.size)))
                 for first, last in stretches(state, rows * fps):
                     held_out = is_test or (test is None and rng.random() < share)
-                    held += held_out
                     # Of what is held out one copy: intervals resample episodes as if none resembled another.
                     for begin in range(first, first + (1 if held_out else rows)):
-                        steps = (last - begin) // rows
-                        if steps < 3:
+                        if (steps := (last - begin) // rows) < 3:
                             continue
                         ends = states(state[begin : begin + steps * rows + 1 : rows]).astype(np.float32)
                         each = action[begin + rows : begin + steps * rows].reshape(steps - 1, rows, -1)
@@ -63,4 +58,4 @@ def write_steps(task, source, test=None, *, states, stretches, rows, share=0.25)
                         metadata = {"held_out": bool(held_out), "source_episode": int(episode.uid)}
                         writer.add(Episode(count, values, metadata))
                         count += 1
-    print(f"{root}: {count} episodes of {rows / (rows * fps):.3g} s a step, {held} stretches held out")
+    print(f"{root}: {count} episodes")

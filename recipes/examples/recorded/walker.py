@@ -11,45 +11,38 @@ import torch
 from steps import Recorded, write_steps
 
 from astra_data import Column, Task
+from astra_data.worlds.simulators import FreeStates
 
 ROWS, FPS = 10, 60
 STEP_S = ROWS / FPS
 FASTEST = torch.tensor([[0.15, 0.25], [0.20, 0.20], [2.094, 2.094]])
-"""Backward and forward, right and left in m/s, clockwise and back in rad/s, of the robot's walk engine
-(BadgerRLSystemCodeRelease2023, walkingEngine.cfg)."""
+"""Backward and forward, right and left in m/s, both turns in rad/s (BadgerRLSystemCodeRelease2023)."""
 JUMP_M, JUMP_RAD, CARRIED_M_S = 0.06, 0.1, 0.6
 """Between two rows a larger change is self-localization that corrects itself; a robot that is faster over
 half a second is carried."""
-START = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+START, ROLES = [0.0, 0.0, 1.0] + [0.0] * 4, ["position"] * 2 + ["heading"] * 2 + ["invariant"] * 3
 
 
-class PlanarWalker:
-    """Bodies [x, y, heading before the last step; forward, left, turn in it], in m and rad.
+class PlanarWalker(FreeStates):
+    """Bodies [x, y, heading before the last step; forward, left, turn in it, in the body's frame]; m, rad.
 
-    The motions are in the body's frame, so that what is learned of them holds anywhere. Not modeled: legs,
-    the delay of the walk, kicks.
+    So what is learned of motions holds anywhere. Not modeled: legs, the delay of the walk, kicks.
     """
 
     abstract_state = Column(
         "abstract.state",
         size=7,
         names=("x", "y", "heading_x", "heading_y", "forward", "left", "turn"),
-        astra={
-            "unit": ["m", "m", "1", "1", "m", "m", "rad"],
-            "role": ["position"] * 2 + ["heading"] * 2 + ["invariant"] * 3,
-        },
+        astra={"unit": ["m", "m", "1", "1", "m", "m", "rad"], "role": ROLES},
     )
     parameters = {"timestep_s": STEP_S}
 
     def __init__(self, num_envs, device="cpu"):
-        self.state = torch.tensor(START, device=device).repeat(num_envs, 1)
+        super().__init__(torch.tensor(START, device=device).repeat(num_envs, 1))
 
     @staticmethod
     def abstraction(state):
         return state
-
-    def reset_to(self, state, rows=None):
-        self.state = state.clone() if rows is None else self.state.index_copy(0, rows, state)
 
     def step(self, action):
         x, y, heading_x, heading_y, forward, left, turn = self.state.unbind(-1)

@@ -21,7 +21,8 @@ class Window(torch.nn.Module):
     def __init__(self, seen, actions, states, is_network):
         super().__init__()
         self.sizes, self.is_network = [seen, actions, states], is_network
-        inputs = STEPS * (len(seen) + actions) + 2 * len(seen) + actions
+        self.memory = STEPS * (len(seen) + actions)
+        inputs = self.memory + 2 * len(seen) + actions
         self.register_buffer("mean", torch.zeros(inputs))
         self.register_buffer("std", torch.ones(inputs))
         self.register_buffer("error", torch.ones(states))
@@ -32,10 +33,6 @@ class Window(torch.nn.Module):
         )
         torch.nn.init.zeros_(self.network[-1].weight)
         torch.nn.init.zeros_(self.network[-1].bias)
-
-    @property
-    def memory(self):
-        return STEPS * (len(self.sizes[0]) + self.sizes[1])
 
     def remembered(self, memory, state, action):  # (..., M) after a step from `state` by `action`
         here = torch.cat([state[..., self.sizes[0]], action], dim=-1)
@@ -132,17 +129,10 @@ def fit(fitting, is_network):
     return WindowGrounding(window.requires_grad_(False)), {"steps": len(inputs)}
 
 
+fit_ridge, fit_network = (partial(fit, is_network=is_network) for is_network in (False, True))
 RIDGE = Method(
-    name="ridge",
-    title="Ridge regression",
-    color="#8C564B",
-    fit=partial(fit, is_network=False),
-    grounding=WindowGrounding,
+    name="ridge", title="Ridge regression", color="#8C564B", fit=fit_ridge, grounding=WindowGrounding
 )
 NETWORK = Method(
-    name="network",
-    title="Network of one step",
-    color="#E377C2",
-    fit=partial(fit, is_network=True),
-    grounding=WindowGrounding,
+    name="network", title="Network of one step", color="#E377C2", fit=fit_network, grounding=WindowGrounding
 )
