@@ -40,13 +40,14 @@ def shortened(content: Notebook) -> Notebook:
 
     def cell(kept: dict[str, Any]) -> dict[str, Any]:
         source = "".join(kept["source"])
-        for name, least in (("updates", 4), ("total_steps", 4096), ("episodes", 20)):
+        for name, least in (("updates", 4), ("total_steps", 4096), ("episodes", 30)):
             source = re.sub(rf"\b{name}=[\d_]+", f"{name}={least}", source)
         return kept | {"source": source.splitlines(keepends=True)}
 
     return content | {"cells": [cell(kept) for kept in content["cells"]]}
 
 
+@pytest.mark.usefixtures("quick_failures")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: str(path.stem))
 def test_a_notebook_runs_and_shows_what_it_prints(path: Path) -> None:
     kept = read_notebook(path)

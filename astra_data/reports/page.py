@@ -435,8 +435,9 @@ def _speeds(results: Results) -> dict[str, str]:
 
 
 def _every_seed(results: Results) -> Iterator[Block]:
-    table = results.table
+    table, left_out = results.table, [one.measure for one in COLUMNS if not _is_shown(results, one)]
     found = table[(table["where"] == TESTED) & table["row"].isin(results.tested())]
+    found = found[~found["measure"].isin(left_out)]
     wide = found.pivot_table(index=["row", "percent", "seed"], columns="measure", values="value", sort=False)
     swept = len(results.percents) > 1
     order = [key for row in results.tested() for key in wide.index if key[0] == row]

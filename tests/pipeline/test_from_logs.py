@@ -97,7 +97,7 @@ def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
     assert not re.search(r"wall contact|maze|path length to success", text) and "Correlation with" not in text
     results = json.loads((folder / "report/results.json").read_text())
     assert results["tested_in"] == "simulators" and results["rows"] == ["direct_transfer", "nas", "astra"]
-    assert [dataset["stage"] for dataset in results["datasets"]] == ["label", "pair"]
+    assert [dataset["stage"] for dataset in results["datasets"]] == ["label", "pair", "evaluate"]
     policy = load_policy(folder, "astra")
     policy.start(2)
     action = policy.act(torch.zeros(2, 8), torch.ones(2, 0))
