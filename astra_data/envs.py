@@ -1,3 +1,32 @@
-"""`import astra_data.envs` registers the Gymnasium ids; see `astra_data.pipeline.gymnasium_ids`."""
+"""Gymnasium ids of targets, of abstract simulators and of what a run grounded, registered on import.
 
-from astra_data.pipeline import gymnasium_ids as gymnasium_ids
+    import astra_data.envs
+    gymnasium.make("astra_data/AntMazeUMaze-v0")
+    gymnasium.make_vec("astra_data/AntMazeUMaze-v0", num_envs=64)
+    gymnasium.make("astra_data/Grounded-v0", run="runs/cart", row="nas", seed=0)
+
+Everything else stays unloaded until an environment is made.
+"""
+
+from astra_data.core.optional import optional
+
+gymnasium = optional("gymnasium")
+
+_FACES = "astra_data.policies.gymnasium"
+_GROUNDED = "astra_data.pipeline.grounded_env"
+
+for _maze, _task, _horizon in (("UMaze", "antmaze-umaze", 700), ("Long", "antmaze-long", 1000)):
+    for _world, _faces in (("AntMaze", "ant_maze"), ("PointMaze", "point_maze")):
+        gymnasium.register(
+            f"astra_data/{_world}{_maze}-v0",
+            entry_point=f"{_FACES}:{_faces}",
+            vector_entry_point=f"{_FACES}:{_faces}_vector",
+            max_episode_steps=_horizon,
+            kwargs={"task": _task},
+        )
+
+gymnasium.register(
+    "astra_data/Grounded-v0",
+    entry_point=f"{_GROUNDED}:grounded",
+    vector_entry_point=f"{_GROUNDED}:grounded_vector",
+)

@@ -1,17 +1,13 @@
-import dataclasses
-import functools
 import importlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import fake_stages
 import pytest
 
 if TYPE_CHECKING:
-    from astra_data.pipeline.recipe import Recipe
-    from astra_data.pipeline.stages.registry import Stage
+    from fake_stages import FakeStages
 
 # Before torch and numpy are loaded: tests run side by side, a core each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -70,37 +66,8 @@ def forgotten_methods() -> Iterator[None]:
         found.update(before)
 
 
-@functools.cache
-def _fake_stages() -> "tuple[dict[str, Stage], type[Recipe]]":
-    """Return fake stages and the model of their recipes, which takes long to make."""
-    plan, recipe = (importlib.import_module(f"astra_data.pipeline.{name}") for name in ("plan", "recipe"))
-    stages: dict[str, Stage] = {
-        name: dataclasses.replace(stage, run=getattr(fake_stages, name), config=fake_stages.CONFIGS.get(name))
-        for name, stage in plan.STAGES.items()
-    }
-    return stages, recipe.with_tables(recipe.Recipe, stages.values(), ())
-
-
 @pytest.fixture
-def fake_recipe(monkeypatch: pytest.MonkeyPatch) -> "type[Recipe]":
-    """Replace the stages, methods and tasks by fake ones, and return the model of their recipes."""
-    # Imported here, so that tests of other parts need not wait for every stage.
-    plan, recipe, experiment, staleness = (
-        importlib.import_module(f"astra_data.pipeline.{name}")
-        for name in ("plan", "recipe", "experiment", "staleness")
-    )
-    registry = importlib.import_module("astra_data.robots.registry")
-    stages, model = _fake_stages()
-    monkeypatch.setattr(plan, "STAGES", stages)
-    methods = importlib.import_module("astra_data.methods")
-    for module in (recipe, staleness, methods):
-        monkeypatch.setattr(module, "METHODS", fake_stages.METHODS)
-    monkeypatch.setitem(registry.TASKS, "maze", registry.TASKS["antmaze-umaze"])
-    monkeypatch.setattr(experiment, "Recipe", model)
-    condition = importlib.import_module("astra_data.pipeline.condition")
-    monkeypatch.setattr(condition, "Dataset", fake_stages.FakeDataset)
-    monkeypatch.setattr(condition, "read_description", fake_stages.read_description)
-    # Without torch and the real stages, the spawned processes start at once.
-    monkeypatch.setattr(plan, "Reported", fake_stages.Reported)
-    monkeypatch.setattr("astra_data.pipeline.run._prepare", fake_stages.prepare)
-    return model
+def stages() -> "Iterator[FakeStages]":
+    """Stages that make small artifacts at once."""
+    with importlib.import_module("fake_stages").fake_stages() as runs:
+        yield runs

@@ -7,7 +7,7 @@ import pytest
 from astra_data.core.progress import silent
 from astra_data.grounding.descent import DescentConfig
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.plan import plan, stage_of, stages_until
+from astra_data.pipeline.plan import plan, stages_until
 
 
 def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
@@ -19,7 +19,7 @@ def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
     experiment.folder.mkdir(parents=True)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
     for item in plan(experiment.recipe, path, experiment.folder, device=device):
-        if stage_of(item) in stages:
+        if item.stage in stages:
             item.call(progress=silent)
     return experiment.folder
 

@@ -12,25 +12,7 @@ import typer
 from typer.core import TyperArgument
 from typer.models import OptionInfo
 
-from astra_data.cli import (
-    building,
-    deploying,
-    recipes,
-    selecting,
-    sharing,
-    shipping,
-    starting,
-    sweeping,
-    tasks,
-    viewing,
-)
-from astra_data.cli import building as augmenting
-from astra_data.cli import datasets as checking
-from astra_data.cli import datasets as comparing
-from astra_data.cli import datasets as editing
-from astra_data.cli import datasets as inspecting
-from astra_data.cli import sharing as exporting
-from astra_data.cli import sharing as importing
+from astra_data.cli import building, datasets, recipes, sharing, starting
 from astra_data.core.durable import NO_FSYNC, disk_error
 from astra_data.core.errors import AstraDataError
 from astra_data.core.naming import in_lines
@@ -83,40 +65,35 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
     "Recipes": {
         "new": starting.new,
         "run": recipes.run,
-        "sweep": sweeping.sweep,
         "check": recipes.check,
         "ground": recipes.ground,
         "train": recipes.train,
         "align": recipes.align,
         "evaluate": recipes.evaluate,
         "report": recipes.report,
-        "select": selecting.select,
-        "deploy": deploying.deploy,
-        "tasks": tasks.tasks,
+        "select": recipes.select,
+        "deploy": recipes.deploy,
+        "view": recipes.view,
     },
     "Recipes or datasets": {
         "collect": building.collect,
         "pair": building.pair,
-        "subset": editing.subset,
+        "subset": datasets.subset,
     },
     "Datasets": {
-        "label": tasks.label,
-        "augment": augmenting.augment,
-        "merge": editing.merge,
-        "delete": editing.delete,
-        "filter": editing.filter_,
-        "list": inspecting.list_,
-        "inspect": inspecting.inspect,
-        "view": viewing.view,
-        "validate": checking.validate,
-        "repair": checking.repair,
-        "log": comparing.log,
-        "diff": comparing.diff,
+        "label": building.label,
+        "augment": building.augment,
+        "merge": datasets.merge,
+        "filter": datasets.filter_,
+        "list": datasets.list_,
+        "inspect": datasets.inspect,
+        "validate": datasets.validate,
+        "repair": datasets.repair,
+        "log": datasets.log,
     },
     "Exchange": {
-        "import": importing.import_,
-        "export": exporting.export,
-        "card": sharing.card,
+        "import": sharing.import_,
+        "export": sharing.export,
         "push": sharing.push,
         "pull": sharing.pull,
     },
@@ -124,8 +101,7 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
 EXAMPLES = {
     "new": "astra-data new robot --from logs/*.csv",
     "run": "astra-data run recipes/quickstart.toml --until ground",
-    "sweep": "astra-data sweep recipes/cart_sizes.toml --method astra --seed 0",
-    "check": "astra-data check recipes/quickstart.toml",
+    "check": "astra-data check recipes/quickstart.toml cart.py:TASK",
     "ground": "astra-data ground recipes/quickstart.toml --method astra",
     "train": "astra-data train recipes/quickstart.toml --method astra_plus --device cuda",
     "align": "astra-data align recipes/quickstart.toml",
@@ -133,14 +109,12 @@ EXAMPLES = {
     "report": "astra-data report recipes/quickstart.toml",
     "select": "astra-data select runs/cart --row astra --trials 40",
     "deploy": "astra-data deploy runs/quickstart --row astra",
-    "tasks": "astra-data tasks cart.py:TASK",
     "collect": "astra-data collect antmaze-umaze --episodes 50 --name walks",
     "pair": "astra-data pair walks --simulator antmaze-umaze",
     "subset": "astra-data subset walks --percent 50 --name half",
     "label": "astra-data label logs --task cart.py:TASK",
     "augment": "astra-data augment walks --copies 3 --rotations quarter",
     "merge": "astra-data merge walks more --name all",
-    "delete": "astra-data delete walks --episode 3 --episode 7",
     "filter": "astra-data filter walks --success",
     "list": "astra-data list",
     "inspect": "astra-data inspect walks --plot figures",
@@ -148,10 +122,8 @@ EXAMPLES = {
     "validate": "astra-data validate walks@data-1.0.0",
     "repair": "astra-data repair broken --out repaired",
     "log": "astra-data log walks",
-    "diff": "astra-data diff walks@data-1.0.0 walks@data-2.0.0",
     "import": "astra-data import logs/*.csv --mapping logs.toml",
     "export": "astra-data export walks --format d4rl --out walks.hdf5",
-    "card": "astra-data card walks",
     "push": "astra-data push walks me/walks",
     "pull": "astra-data pull me/walks",
 }
@@ -187,7 +159,7 @@ for panel, commands in PANELS.items():
         epilog = f"Example: {EXAMPLES[name]}" if name in EXAMPLES else None
         app.command(name, rich_help_panel=panel, epilog=epilog)(_name_values(command))
 app.add_typer(
-    shipping.app,
+    starting.app,
     name="recipes",
     help="List or copy the package's recipes and mappings.",
     rich_help_panel="Recipes",

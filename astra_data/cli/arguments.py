@@ -1,27 +1,31 @@
-"""Arguments of several commands, options from the models of settings, and tables in the terminal."""
+"""Arguments of several commands, options from the models of settings, and what several commands do."""
 
 import ast
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import wraps
-from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import RECORD, RUNS, STAGE_NAMES
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
 
 def recipe_at(path: Path) -> Path:
-    """Refuse a path at which there is no recipe, and say where one of this name is.
+    """Refuse a path at which there is no recipe, and say where one of this name is; and unknown names in one.
 
     Raises:
-        RecipeError: there is no such file, or it is not TOML.
+        RecipeError: there is no such file, it is not TOML, or it has unknown names.
     """
     from astra_data.core.config import load_tables
+    from astra_data.pipeline.first_look import check_names
     from astra_data.pipeline.shipped import whereabouts
 
     if path.is_dir():  # a run or a dataset, perhaps: what is read then says so
@@ -31,6 +35,7 @@ def recipe_at(path: Path) -> Path:
     except RecipeError as error:
         place = "" if path.exists() else whereabouts(path.name.removesuffix(".toml"))
         raise RecipeError(f"{path} does not exist: {place}" if place else str(error)) from None
+    check_names(path)
     return path
 
 
@@ -100,7 +105,6 @@ Out = Annotated[
         help="Folder of the new dataset.", show_default="its place in $ASTRA_DATA_HOME or ./datasets"
     ),
 ]
-
 NewName = Annotated[
     str | None,
     typer.Option(
@@ -111,22 +115,14 @@ NewName = Annotated[
     ),
 ]
 RecipePath = Annotated[
-    Path,
-    typer.Argument(metavar="RECIPE", help="A recipe (TOML file).", show_default=False),
+    Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).", show_default=False)
 ]
-RecipePaths = Annotated[list[Path], typer.Argument(metavar="RECIPE...", help="Recipes (TOML files).")]
 RunFolder = Annotated[
-    Path,
-    typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.", show_default=False),
+    Path, typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.", show_default=False)
 ]
 Methods = Annotated[
     list[str] | None,
-    typer.Option(
-        "--method",
-        metavar="ROW",
-        help="Run only this row of the recipe; may be repeated.",
-        show_default=False,
-    ),
+    typer.Option("--method", metavar="ROW", help="Run only this row; may be repeated.", show_default=False),
 ]
 Seeds = Annotated[
     list[int] | None,
@@ -155,34 +151,6 @@ Until = Annotated[
     ),
 ]
 
-
-def check_asked(
-    recipe: Path,
-    methods: list[str] | None = None,
-    seeds: list[int] | None = None,
-    percents: list[int] | None = None,
-) -> None:
-    """Refuse rows, seeds and sizes that a recipe's file does not list; where it is unclear, refuse nothing.
-
-    Raises:
-        BadInputError: the recipe has no such row, seed or size.
-        RecipeError: its file, or that of its base, cannot be read.
-    """
-    from astra_data.core.config import load_tables
-    from astra_data.pipeline.points import refuse_unknown
-
-    if recipe.is_dir() or not (methods or seeds or percents):
-        return
-    tables = load_tables(recipe)
-    base = recipe.with_name(f"{tables.get('based_on')}.toml")
-    tables = (load_tables(base) if base.is_file() else {}) | tables
-    sweep = tables.get("sweep")
-    sizes = sweep.get("percent", []) if isinstance(sweep, dict) else []
-    match (tables.get("methods"), tables.get("seeds"), sizes):
-        case (list() as rows, list() as known, list() as sizes):
-            refuse_unknown(methods or (), seeds or (), percents or (), rows, known, sizes)
-
-
 _KINDS: dict[str, Any] = {
     **dict.fromkeys(("int", "Count", "AtOnce", "CountFromZero"), int),
     **dict.fromkeys(("float", "Positive", "NotNegative", "Share"), float),
@@ -191,46 +159,26 @@ _KINDS: dict[str, Any] = {
 """Types of settings by name, and what stands for one on the command line; else the default decides."""
 
 
-class Setting(NamedTuple):
-    """A field of a model: its name, its type on the command line, its default, and the text below it."""
-
-    name: str
-    kind: Any
-    default: Any
-    about: str
-
-
-def settings_of(place: str) -> list[Setting]:
-    """Return the fields of a model at "package.module:Model", as its source says.
-
-    The module is not run: it may take seconds to load.
-    """
-    module, _, name = place.partition(":")
-    spec = find_spec(module)
-    assert spec is not None and spec.origin is not None
-    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
-    (model,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
-    return list(_settings(model))
-
-
 def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a command take an option for each field of a model, in the place of its parameter `settings`.
+    """Let a command take an option for each field of a model at "package.module:Model", as its source says.
 
-    That is then given those that were typed, by their names.
+    The command's parameter `settings` is then given those that were typed, by their names. The model is not
+    loaded, as its module may take seconds to run.
     """
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
-        fields = {setting.name: setting for setting in settings_of(place)}
+        from astra_data.pipeline.first_look import fields_of
+
+        options = [_option(field, about) for field, about in fields_of(place)]
 
         @wraps(command)
         def run(**given: Any) -> None:  # noqa: ANN401 - of any option
-            typed = {name: value for name in fields if (value := given.pop(name)) is not None}
+            typed = {one.name: value for one in options if (value := given.pop(one.name)) is not None}
             command(settings=typed, **given)
 
         parameters: list[Parameter] = []
         for parameter in signature(command).parameters.values():
-            is_theirs = parameter.name == "settings"
-            parameters += map(_option, fields.values()) if is_theirs else [parameter]
+            parameters += options if parameter.name == "settings" else [parameter]
         run.__dict__.pop("__wrapped__")
         run.__dict__["__signature__"] = Signature(parameters)
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -239,49 +187,25 @@ def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., N
     return decorated
 
 
-def _settings(model: ast.ClassDef) -> Iterator[Setting]:
-    texts: list[Any] = [*model.body[1:], None]
-    for node, after in zip(model.body, texts, strict=True):
-        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-            continue
-        value = node.value
-        if isinstance(value, ast.Call):
-            value = next(keyword.value for keyword in value.keywords if keyword.arg == "default")
-        assert value is not None
-        default = ast.literal_eval(value)
-        match after:
-            case ast.Expr(value=ast.Constant(value=str() as text)):
-                about = " ".join(text.split())
-            case _:
-                about = ""
-        yield Setting(node.target.id, _kind(node.annotation, default), default, about)
-
-
-def _kind(annotation: ast.expr, default: object) -> Any:  # noqa: ANN401 - a type
-    """Return the type of an option for values of an annotation such as `Count | None`."""
-    names = (node.id for node in ast.walk(annotation) if isinstance(node, ast.Name))
-    kind = next((_KINDS[name] for name in names if name in _KINDS), str)
-    return tuple[float, float] if isinstance(default, tuple) else kind
-
-
-def _option(setting: Setting) -> Parameter:
-    dashed, default = setting.name.replace("_", "-"), setting.default
+def _option(field: ast.AnnAssign, about: str) -> Parameter:
+    """Return the parameter of a command for a field, which is None where it is not typed."""
+    assert isinstance(field.target, ast.Name)
+    name, value = field.target.id, field.value
+    if isinstance(value, ast.Call):
+        value = next(keyword.value for keyword in value.keywords if keyword.arg == "default")
+    assert value is not None
+    default = ast.literal_eval(value)
+    types = (node.id for node in ast.walk(field.annotation) if isinstance(node, ast.Name))
+    kind: Any = next((_KINDS[one] for one in types if one in _KINDS), str)
     shown: Any = False if default is None else str(default)
-    names: list[str] = []
+    flag, flags, metavar = name.replace("_", "-"), list[str](), None
     if isinstance(default, bool):
-        names = [f"--{dashed}/--no-{dashed}"]
-        shown = dashed if default else f"no-{dashed}"
-    metavar = "LEAST LARGEST" if isinstance(default, tuple) else None
+        flags, shown = [f"--{flag}/--no-{flag}"], flag if default else f"no-{flag}"
     if isinstance(default, tuple):
-        shown = " ".join(f"{end:g}" for end in default)
-    about = setting.about.replace("`", "")
-    option = typer.Option(*names, help=about, show_default=shown, metavar=metavar)
-    annotation: Any = Annotated[setting.kind | None, option]
-    return Parameter(setting.name, Parameter.POSITIONAL_OR_KEYWORD, default=None, annotation=annotation)
-
-
-if TYPE_CHECKING:
-    from rich.table import Table
+        kind, metavar, shown = tuple[float, float], "LEAST LARGEST", " ".join(f"{end:g}" for end in default)
+    option = typer.Option(*flags, help=about.replace("`", ""), show_default=shown, metavar=metavar)
+    annotation: Any = Annotated[kind | None, option]
+    return Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=None, annotation=annotation)
 
 
 def show_table(table: "Table") -> None:
@@ -289,3 +213,55 @@ def show_table(table: "Table") -> None:
     from rich.console import Console
 
     Console(markup=False, emoji=False).print(table)
+
+
+@contextmanager
+def resumable(how: str = "run the same command again to continue") -> Iterator[None]:
+    """At Ctrl-C, print how to continue, and exit with code 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"stopped: {how}", err=True)
+        raise typer.Exit(130) from None
+
+
+def run_stage(recipe: Path, stage: str, **options: Any) -> Path:  # noqa: ANN401 - as `run.run_stage`
+    """Run one stage of a recipe, and print the folder of its artifacts.
+
+    Options that are given None are left out.
+    """
+    from astra_data.pipeline.first_look import check_asked
+
+    options = {name: value for name, value in options.items() if value is not None}
+    check_asked(recipe_at(recipe), options.get("methods"), options.get("seeds"))
+    from astra_data.pipeline.run import run_stage as run
+
+    with resumable():
+        folder = run(recipe, stage, **options)
+        if stage != "report":
+            typer.echo(f"finished: {folder}")
+    return folder
+
+
+def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
+    """Refuse `options` that are given, since a recipe sets them itself.
+
+    Raises:
+        BadInputError: one is given.
+    """
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
+    if given:
+        raise BadInputError(
+            f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}"
+        )
+
+
+def refuse_of_recipes(command: str, seeds: Sequence[int] | None, jobs: int | None) -> int | None:
+    """Return the one seed that is given with a task or a dataset, if any.
+
+    Raises:
+        BadInputError: there are several, or `jobs`, which are for recipes.
+    """
+    if len(seeds or ()) > 1 or jobs is not None:
+        raise BadInputError(f"{command}: give at most one --seed and no --jobs (these are for recipes)")
+    return seeds[0] if seeds else None

@@ -1,4 +1,4 @@
-"""`astra-data collect`, `pair` and `augment`, for a recipe or on their own."""
+"""Commands of stages that make datasets: for a recipe, or for a task or a dataset on their own."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,74 +13,67 @@ from astra_data.cli.arguments import (
     Root,
     Seeds,
     Source,
+    refuse,
+    refuse_of_recipes,
+    resumable,
+    run_stage,
     task_at,
     with_settings,
 )
-from astra_data.cli.recipes import refuse, resumable, run_stage
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS
-
-Task = Annotated[
-    str,
-    typer.Argument(
-        metavar="RECIPE|TASK",
-        help="A recipe (.toml), or a task such as antmaze-umaze. "
-        "The settings below apply to a task only; a recipe has its own.",
-        show_default=False,
-    ),
-]
-SeedOrSeeds = Annotated[
-    list[int] | None,
-    typer.Option(
-        "--seed",
-        help="Random seed; with a recipe, run only this one of its seeds (may be repeated).",
-        show_default="0; all seeds of a recipe",
-    ),
-]
-Name = Annotated[
-    str | None, typer.Option(help="Name of the dataset.", show_default="task, behavior and seed")
-]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue the same command after an interruption.")]
 
 
 @with_settings("astra_data.pipeline.stages.collect:CollectConfig")
 def collect(
-    task: Task,
+    task: Annotated[
+        str,
+        typer.Argument(
+            metavar="RECIPE|TASK",
+            help="A recipe (.toml), or a task such as antmaze-umaze. "
+            "The settings below apply to a task only; a recipe has its own.",
+            show_default=False,
+        ),
+    ],
     settings: dict[str, Any],
-    seeds: SeedOrSeeds = None,
+    seeds: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--seed",
+            help="Random seed; with a recipe, run only this one of its seeds (may be repeated).",
+            show_default="0; all seeds of a recipe",
+        ),
+    ] = None,
     jobs: Jobs = None,
     root: Root = RUNS,
-    name: Name = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the dataset.", show_default="task, behavior and seed")
+    ] = None,
     out: Out = None,
-    resume: Resume = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the same command after an interruption.")
+    ] = False,
 ) -> None:
     """Record episodes in the target environment."""
     if task.endswith(".toml"):
         refuse({**settings, "name": name, "out": out, "resume": resume or None}, "collect")
-        run_stage(Path(task), "collect", seeds=seeds or (), jobs=jobs, root=root)
+        run_stage(Path(task), "collect", seeds=seeds, jobs=jobs, root=root)
         return
-    if len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError(
-            "collect: with a task, give at most one --seed and no --jobs (these are for recipes)"
-        )
+    seed = refuse_of_recipes("collect", seeds, jobs) or 0
     task_at(task)
     import torch
 
     from astra_data.core.config import validated
     from astra_data.pipeline.display import shown
     from astra_data.pipeline.stages.collect import CollectConfig
-    from astra_data.pipeline.stages.collect import collect as collect_dataset
+    from astra_data.pipeline.stages.collect import collect as make
 
     planned = {"behavior": "planned"} if "plan" in settings and "behavior" not in settings else {}
     config = validated(settings | planned, CollectConfig, "collect")
-    seed = seeds[0] if seeds else 0
     # The networks' idle threads would slow down the physics.
     torch.set_num_threads(1)
-    how = "run the same command with --resume to continue"
-    with resumable(how), shown("collect") as progress:
-        folder = collect_dataset(
-            task, config, seed=seed, out=out, name=name, resume=resume, progress=progress
-        )
+    with resumable("run the same command with --resume to continue"), shown("collect") as progress:
+        folder = make(task, config, seed=seed, out=out, name=name, resume=resume, progress=progress)
     typer.echo(f"finished: {folder}")
 
 
@@ -105,7 +98,7 @@ def pair(
     """Add the abstract simulator's next state, from the same state and action, to every step."""
     if dataset.endswith(".toml"):
         refuse({**settings, "simulator": simulator, "name": name, "out": out}, "pair")
-        run_stage(Path(dataset), "pair", seeds=seeds or (), jobs=jobs, root=root)
+        run_stage(Path(dataset), "pair", seeds=seeds, jobs=jobs, root=root)
         return
     if seeds or jobs is not None:
         raise BadInputError("pair: with a dataset, leave out --seed and --jobs (these are for recipes)")
@@ -118,11 +111,11 @@ def pair(
     from astra_data.core.config import validated
     from astra_data.pipeline.display import shown
     from astra_data.pipeline.stages.pair import PairConfig
-    from astra_data.pipeline.stages.pair import pair as pair_dataset
+    from astra_data.pipeline.stages.pair import pair as make
 
     config = validated(settings, PairConfig, "pair")
     with shown("pair") as progress:
-        folder = pair_dataset(simulator, config, dataset=source, name=name, out=out, progress=progress)
+        folder = make(simulator, config, dataset=source, name=name, out=out, progress=progress)
     typer.echo(f"finished: {folder}")
 
 
@@ -148,9 +141,35 @@ def augment(
     from astra_data.core.config import validated
     from astra_data.pipeline.display import shown
     from astra_data.pipeline.stages.augment import AugmentConfig
-    from astra_data.pipeline.stages.augment import augment as augment_dataset
+    from astra_data.pipeline.stages.augment import augment as make
 
     config = validated(settings, AugmentConfig, "augment")
     with shown("augment") as progress:
-        folder = augment_dataset(task, config, dataset=root, seed=seed, name=name, out=out, progress=progress)
+        folder = make(task, config, dataset=root, seed=seed, name=name, out=out, progress=progress)
+    typer.echo(f"finished: {folder}")
+
+
+def label(
+    dataset: DatasetName,
+    task: Annotated[
+        str,
+        typer.Option(
+            help="A task: a name, or a place such as cart.py:TASK. Its code is run.",
+            show_default=False,
+        ),
+    ],
+    seed: Annotated[int, typer.Option(help="Random seed of the goals.")] = 0,
+    name: NewName = None,
+    out: Out = None,
+) -> None:
+    """Compute the goals, rewards, successes and failures that a log lacks, as a task defines them."""
+    task_at(task)
+    from astra_data.dataset.versions import locate
+
+    data = locate(dataset)
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.stages.label import label as make
+
+    with shown("label") as progress:
+        folder = make(task, data=data, seed=seed, name=name, out=out, progress=progress)
     typer.echo(f"finished: {folder}")

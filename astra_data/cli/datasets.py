@@ -3,12 +3,22 @@
 from json import dumps
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from astra_data.cli.arguments import DatasetName, Jobs, NewName, Out, Root, Source, show_table
-from astra_data.cli.recipes import refuse, run_stage
+from astra_data.cli.arguments import (
+    DatasetName,
+    Jobs,
+    NewName,
+    Out,
+    Root,
+    Source,
+    refuse,
+    refuse_of_recipes,
+    run_stage,
+    show_table,
+)
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RUNS, first_few, printable
@@ -55,12 +65,9 @@ def subset(
     if dataset.endswith(".toml"):
         options = {"episodes": episodes, "percent": percent, "of": of, "stratify": stratify}
         refuse(options | {"name": name, "out": out}, "subset", "sweep")
-        run_stage(Path(dataset), "subset", seeds=seeds or (), jobs=jobs, root=root)
+        run_stage(Path(dataset), "subset", seeds=seeds, jobs=jobs, root=root)
         return
-    if len(seeds or ()) > 1 or jobs is not None:
-        raise BadInputError(
-            "subset: with a dataset, give at most one --seed and no --jobs (these are for recipes)"
-        )
+    seed = refuse_of_recipes("subset", seeds, jobs)
     from astra_data.dataset.edit import subset as write
     from astra_data.dataset.versions import open_dataset
 
@@ -71,7 +78,7 @@ def subset(
             episodes=episodes,
             percent=percent,
             of=of,
-            seed=seeds[0] if seeds else None,
+            seed=seed,
             stratify=stratify,
             name=name,
             out=out,
@@ -100,26 +107,14 @@ def merge(
     _report(write([open_dataset(dataset) for dataset in datasets], new_uids=new_uids, name=name, out=out))
 
 
-def delete(
-    dataset: DatasetName,
-    uids: Annotated[
-        list[int],
-        typer.Option(
-            "--episode", metavar="UID", help="Uid of an episode; may be repeated.", show_default=False
-        ),
-    ],
-    name: NewName = None,
-    out: Out = None,
-) -> None:
-    """Write a dataset without some of its episodes."""
-    from astra_data.dataset.edit import delete as write
-    from astra_data.dataset.versions import open_dataset
-
-    _report(write(open_dataset(dataset), uids, name=name, out=out))
-
-
 def filter_(
     dataset: DatasetName,
+    without: Annotated[
+        list[int] | None,
+        typer.Option(
+            metavar="UID", help="Leave out the episode with this uid; may be repeated.", show_default=False
+        ),
+    ] = None,
     success: Annotated[
         bool | None,
         typer.Option(
@@ -133,22 +128,23 @@ def filter_(
     name: NewName = None,
     out: Out = None,
 ) -> None:
-    """Write a dataset of the episodes that meet every given condition."""
-    from astra_data.dataset.edit import filter_episodes
+    """Write a dataset of the episodes that meet every given condition, or without some of them."""
+    from astra_data.dataset.edit import delete, filter_episodes
     from astra_data.dataset.versions import open_dataset
 
-    _report(
-        filter_episodes(
-            open_dataset(dataset),
-            success=success,
-            min_return=min_return,
-            max_return=max_return,
-            min_length=min_length,
-            max_length=max_length,
-            name=name,
-            out=out,
-        )
-    )
+    conditions: dict[str, Any] = {
+        "success": success,
+        "min_return": min_return,
+        "max_return": max_return,
+        "min_length": min_length,
+        "max_length": max_length,
+    }
+    if without:
+        if given := [f"--{key.replace('_', '-')}" for key, value in conditions.items() if value is not None]:
+            raise BadInputError(f"--without goes alone: leave out {', '.join(given)}, or filter twice")
+        _report(delete(open_dataset(dataset), without, name=name, out=out))
+    else:
+        _report(filter_episodes(open_dataset(dataset), **conditions, name=name, out=out))
 
 
 def _report(folder: Path) -> None:
@@ -222,8 +218,12 @@ def list_(
             "--clean", help="Instead, remove leftovers of killed commands from the home folder and FOLDER."
         ),
     ] = False,
+    tasks: Annotated[bool, typer.Option("--tasks", help="Instead, list the named tasks.")] = False,
 ) -> None:
-    """List the datasets in the home folder, and their versions."""
+    """List the datasets in the home folder, and their versions; or the named tasks."""
+    if tasks:
+        _list_tasks()
+        return
     if clean:
         _clean(folders or [])
         return
@@ -260,6 +260,29 @@ def list_(
     show_table(table)
     if faults:
         raise CorruptDatasetError("\n".join(faults))
+
+
+def _list_tasks() -> None:
+    from rich.table import Table
+
+    from astra_data.robots.registry import TASKS, known_tasks
+
+    table = Table("task", "commands", "abstract states", "target", "steps/s")
+    table.columns[0].no_wrap = True
+    for name, known in known_tasks().items():
+        states = known.abstract_state.names or (f"{known.abstract_state.size} values",)
+        table.add_row(
+            name if name in TASKS else f"{name} (installed)",
+            first_few(list(known.limits), _NAMED),
+            first_few(states, _NAMED),
+            "yes" if known.has_target else "no",
+            str(known.fps),
+        )
+    show_table(table)
+    typer.echo(
+        "`astra-data check TASK` tests one and shows all its values. Name your own task by its place: "
+        "cart.py:TASK or package.module:TASK. Its code is run."
+    )
 
 
 def _clean(folders: list[Path]) -> None:
@@ -347,31 +370,31 @@ def repair(
     typer.echo(f"finished: {printable(str(out))} ({repaired.episodes} episodes, {repaired.frames} steps)")
 
 
+_NAMED = 4
+"""Names that a row lists."""
 _SHOWN = 5
 """Uids of episodes whose metadata differ."""
 
 
-def log(dataset: DatasetName) -> None:
-    """Show what a dataset was made from: a tree of datasets with versions, hashes, stages and settings."""
-    from astra_data.dataset.compare import lineage, tree_lines
-    from astra_data.dataset.versions import open_dataset
-
-    for line in tree_lines(lineage(open_dataset(dataset))):
-        typer.echo(line)
-
-
-def diff(
-    a: DatasetName,
-    b: Annotated[str, typer.Argument(metavar="DATASET", help="The other one.", show_default=False)],
+def log(
+    dataset: DatasetName,
+    other: Annotated[
+        str | None,
+        typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.", show_default=False),
+    ] = None,
 ) -> None:
-    """Show how two datasets differ: columns, episodes by uid, origin."""
-    from astra_data.dataset.compare import differences
+    """Show what a dataset was made from, as a tree; or how two differ: columns, episodes by uid, origin."""
+    from astra_data.dataset.compare import differences, lineage, tree_lines
     from astra_data.dataset.versions import open_dataset
 
-    first, second = open_dataset(a), open_dataset(b)
+    first = open_dataset(dataset)
+    if other is None:
+        typer.echo("\n".join(tree_lines(lineage(first))))
+        return
+    second = open_dataset(other)
     found = differences(first, second)
-    for dataset in (first, second):
-        typer.echo(f"{dataset.reference}: {len(dataset)} episodes, {dataset.lengths.sum()} steps")
+    for one in (first, second):
+        typer.echo(f"{one.reference}: {len(one)} episodes, {one.lengths.sum()} steps")
     listed = {
         f"only in {first.reference}": found.only_in_a,
         f"only in {second.reference}": found.only_in_b,

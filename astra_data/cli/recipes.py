@@ -1,9 +1,10 @@
-"""Commands that work on recipes."""
+"""Commands on recipes and runs."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import json
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,41 +13,94 @@ from astra_data.cli.arguments import (
     Jobs,
     Methods,
     RecipePath,
-    RecipePaths,
     Root,
+    RunFolder,
     Seeds,
     Until,
-    check_asked,
     recipe_at,
+    resumable,
+    run_at,
+    run_stage,
+    task_at,
 )
 from astra_data.core.errors import AstraDataError, BadInputError
-from astra_data.core.naming import RUNS
+from astra_data.core.naming import RECORD, RUNS, artifact_key
 
 Publish = Annotated[
     bool,
     typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe."),
 ]
+Row = Annotated[
+    str,
+    typer.Option(metavar="ROW", help="A row of the run's recipe, such as astra_plus.", show_default=False),
+]
 
 
 def run(
     recipe: RecipePath,
+    methods: Methods = None,
     seeds: Seeds = None,
+    percents: Annotated[
+        list[int] | None,
+        typer.Option("--percent", help="Run only this dataset size; may be repeated.", show_default=False),
+    ] = None,
     jobs: Jobs = None,
     device: Device = "cpu",
     until: Until = None,
     root: Root = RUNS,
+    engine: Annotated[
+        str, typer.Option(help="processes of this machine, or ray: tasks of a Ray cluster.")
+    ] = "processes",
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a Ray cluster; its machines must share this folder and installation.",
+            show_default="a cluster on this machine",
+        ),
+    ] = None,
+    trackio: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PROJECT", help="Log each finished point to this trackio project.", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
-    check_asked(recipe_at(recipe), seeds=seeds)
+    from astra_data.core.config import did_you_mean
+    from astra_data.pipeline.first_look import ENGINES, check_asked
+
+    if engine not in ENGINES:
+        raise BadInputError(f"unknown engine '{engine}'{did_you_mean(engine, ENGINES)}")
+    if address is not None and engine != "ray":
+        raise BadInputError("--address is for --engine ray: leave it out, or add that")
+    check_asked(recipe_at(recipe), methods, seeds, percents)
     from astra_data.pipeline.run import run as run_recipe
 
     with resumable():
-        folder = run_recipe(recipe, seeds=seeds or (), root=root, jobs=jobs, device=device, until=until)
+        folder = run_recipe(
+            recipe,
+            methods=methods or (),
+            seeds=seeds or (),
+            percents=percents or (),
+            root=root,
+            jobs=jobs,
+            device=device,
+            until=until,
+            engine=engine,
+            address=address,
+            trackio=trackio,
+        )
         show_made(folder, until)
 
 
 def check(
-    recipes: RecipePaths,
+    recipes: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RECIPE|TASK...",
+            help="Recipes (TOML files); or tasks: names, or places like cart.py:TASK.",
+        ),
+    ],
     root: Root = RUNS,
     verify: Annotated[
         bool,
@@ -55,37 +109,56 @@ def check(
         ),
     ] = False,
 ) -> None:
-    """Check recipes without running them, and list which artifacts are finished, damaged or stale."""
-    for recipe in recipes:
-        recipe_at(recipe)
-    from astra_data.pipeline.run import check as check_recipe
-
+    """Check recipes, listing which artifacts are finished, damaged or stale; or tasks. Nothing is run."""
+    is_task = [":" in name or not (Path(name).suffix or Path(name).exists()) for name in recipes]
     faults: list[str] = []
-    for recipe in recipes:
+    for name, of_task in zip(recipes, is_task, strict=True):
         try:
-            conditions = check_recipe(recipe, root=root, verify=verify)
+            if of_task:
+                _check_task(task_at(name))
+            else:
+                faults += _check_recipe(recipe_at(Path(name)), root, verify)
         except AstraDataError as error:
             faults.append(str(error))
-            continue
-        states = [found.state for found in conditions.values()]
-        typer.echo(f"{recipe}: {states.count('finished')} of {len(states)} items are finished")
-        for key, found in conditions.items():
-            why = f": {found.why}" if found.why else ""
-            typer.echo(f"  {'to do' if found.state == 'missing' else found.state:8}  {key}{why}")
-            for warning in found.warnings:
-                typer.echo(f"  warning   {key}: {warning}")
-        spoilt = [f"{states.count(state)} {state}" for state in ("damaged", "stale") if state in states]
-        if spoilt:
-            again = f"`astra-data run {recipe}` recreates these"
-            # What differs in its bytes alone, `run` finds only once a step reads it.
-            again = (
-                f"move them away, and {again}"
-                if verify
-                else f"{again}, except those that the list asks you to remove"
-            )
-            faults.append(f"{recipe}: {' and '.join(spoilt)}: {again}")
     if faults:
         raise AstraDataError("\n".join(faults))
+
+
+def _check_recipe(recipe: Path, root: Path, verify: bool) -> list[str]:
+    from astra_data.pipeline.run import check as check_recipe
+
+    conditions = check_recipe(recipe, root=root, verify=verify)
+    states = [found.state for found in conditions.values()]
+    typer.echo(f"{recipe}: {states.count('finished')} of {len(states)} items are finished")
+    for key, found in conditions.items():
+        why = f": {found.why}" if found.why else ""
+        typer.echo(f"  {'to do' if found.state == 'missing' else found.state:8}  {key}{why}")
+        for warning in found.warnings:
+            typer.echo(f"  warning   {key}: {warning}")
+    spoilt = [f"{states.count(state)} {state}" for state in ("damaged", "stale") if state in states]
+    if not spoilt:
+        return []
+    again = f"`astra-data run {recipe}` recreates these"
+    # What differs in its bytes alone, `run` finds only once a step reads it.
+    how = (
+        f"move them away, and {again}"
+        if verify
+        else f"{again}, except those that the list asks you to remove"
+    )
+    return [f"{recipe}: {' and '.join(spoilt)}: {how}"]
+
+
+def _check_task(name: str) -> None:
+    from astra_data.robots.registry import task_named
+    from astra_data.worlds.walk_through import check_task
+
+    task = task_named(name)
+    if faults := check_task(task):
+        raise BadInputError("\n".join(f"task {name}: {fault}" for fault in faults))
+    bounds = ", ".join(f"{axis} {low:g}…{high:g}" for axis, (low, high) in task.limits.items())
+    names = task.abstract_state.names or (f"{task.abstract_state.size} values",)
+    typer.echo(f"commands: {bounds}\nabstract states: {', '.join(names)}")
+    typer.echo(f"{name}: found no errors in its states, simulator, objective and robot")
 
 
 def _of_networks(stage: str, summary: str) -> Callable[..., None]:
@@ -99,9 +172,7 @@ def _of_networks(stage: str, summary: str) -> Callable[..., None]:
         device: Device = "cpu",
         root: Root = RUNS,
     ) -> None:
-        run_stage(
-            recipe, stage, methods=methods or (), seeds=seeds or (), jobs=jobs, device=device, root=root
-        )
+        run_stage(recipe, stage, methods=methods, seeds=seeds, jobs=jobs, device=device, root=root)
 
     command.__doc__ = summary
     return command
@@ -135,7 +206,7 @@ def evaluate(
     if policy is None:
         if out is not None:
             raise BadInputError("evaluate: --out goes with --policy; without it, leave out --out")
-        run_stage(recipe, "evaluate", methods=methods or (), seeds=seeds or (), jobs=jobs, root=root)
+        run_stage(recipe, "evaluate", methods=methods, seeds=seeds, jobs=jobs, root=root)
         return
     if not (methods and seeds and out) or len(methods) + len(seeds) > 2 or jobs is not None:
         raise BadInputError(
@@ -154,48 +225,17 @@ def evaluate(
 
 def report(recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, root: Root = RUNS) -> None:
     """Write the recipe's tables and figures."""
-    run_stage(recipe, "report", seeds=seeds or (), publish=publish, root=root)
+    show_made(run_stage(recipe, "report", seeds=seeds, publish=publish, root=root).parent, None)
 
 
-def run_stage(
-    recipe: Path,
-    stage: str,
-    *,
-    root: Path,
-    methods: Sequence[str] = (),
-    seeds: Sequence[int] = (),
-    jobs: int | None = None,
-    device: str = "cpu",
-    publish: bool = False,
-) -> None:
-    """Run one stage of a recipe, and print the folder of its artifacts."""
-    check_asked(recipe_at(recipe), [*methods], [*seeds])
-    from astra_data.pipeline.run import run_stage as run
-
-    with resumable():
-        folder = run(
-            recipe,
-            stage,
-            methods=methods,
-            seeds=seeds,
-            root=root,
-            jobs=jobs,
-            device=device,
-            publish=publish,
-        )
-        if stage == "report":
-            show_made(folder.parent, None)
-        else:
-            typer.echo(f"finished: {folder}")
-
-
-def show_made(folder: Path, until: str | None, *others: Path) -> None:
-    """Print what a run that went on `until` a stage has found, and the paths of its pages and of `others`.
+def show_made(folder: Path, until: str | None) -> None:
+    """Print what a run that went on `until` a stage has found, and the paths of its pages.
 
     After the report: the verdict, best method, floor and the interval between them, and the command that
     deploys it. Where it ends with its groundings: the page of their held-out errors.
     """
     from astra_data.pipeline.plan import stages_until
+    from astra_data.pipeline.run import POINTS
     from astra_data.pipeline.stages.report import HTML, JSON
     from astra_data.reports.held_out import PAGE
     from astra_data.reports.results import read_results
@@ -214,32 +254,119 @@ def show_made(folder: Path, until: str | None, *others: Path) -> None:
         if verdict.row is None:
             for remark in verdict.remarks:
                 typer.echo(f"  {remark}")
-    pages = {"ground": folder / PAGE, "report": folder / "report" / HTML}
-    for file in (*(page for stage, page in pages.items() if stage in made), *others):
+    pages = {"ground": folder / PAGE, "report": folder / "report" / HTML, "evaluate": folder / POINTS}
+    for file in (page for stage, page in pages.items() if stage in made):
         if file.is_file():
             typer.echo(str(file))
     if verdict and (command := verdict.command(folder)):
         typer.echo(command)
 
 
-def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
-    """Refuse `options` that are given, since a recipe sets them itself.
+def select(
+    run: RunFolder,
+    row: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROW", help="Rank only policies of this row; may be repeated.", show_default="all"
+        ),
+    ] = None,
+    judge: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROW",
+            help="The row whose groundings serve as judges.",
+            show_default="nas, else the first that grounds",
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            help="Episodes of each policy with each judge.", min=1, show_default="the recipe's, or 100"
+        ),
+    ] = None,
+    trials: Annotated[
+        int | None,
+        typer.Option(
+            help="Make the final choice with this many episodes in the target.", min=1, show_default="none"
+        ),
+    ] = None,
+    field: Annotated[
+        int | None,
+        typer.Option(
+            help="With --trials: number of candidates to try.", show_default="as many as the trials allow"
+        ),
+    ] = None,
+    percent: Annotated[
+        int | None,
+        typer.Option(
+            help="With --trials, after a sweep: the dataset size whose policies are tried.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Rank the trained policies of a run without the target, or with a few trials in it."""
+    run_at(run)
+    if trials is None and (field is not None or percent is not None):
+        raise BadInputError("--field and --percent need --trials: add --trials, or leave them out")
+    from astra_data.pipeline.display import shown
+    from astra_data.pipeline.selecting import choose_by_trials
+    from astra_data.pipeline.selecting import select as rank
+    from astra_data.reports.choice import FOLDER
 
-    Raises:
-        BadInputError: one is given.
-    """
-    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
-    if given:
-        raise BadInputError(
-            f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}"
-        )
+    given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
+    with shown("select") as progress:
+        if trials is not None:
+            made = choose_by_trials(run, trials, field=field, percent=percent, progress=progress, **given)
+        else:
+            judged = rank(run, progress=progress, **given)
+    if trials is not None:
+        assert made.chosen is not None
+        best, seed = made.chosen
+        typer.echo(f"chosen with {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}")
+    else:
+        for percent in judged.percents:
+            first = judged.ranked(percent)[0]
+            reached = f"{first.lower:.2f} in the lower quartile of its judges"
+            size = f" at {percent} %" if percent else ""
+            typer.echo(f"chosen{size}: {first.row}, seed {first.seed}: {reached}")
+    typer.echo(f"written: {run / FOLDER / 'select.md'}")
 
 
-@contextmanager
-def resumable(how: str = "run the same command again to continue") -> Iterator[None]:
-    """At Ctrl-C, print how to continue, and exit with code 130."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        typer.echo(f"stopped: {how}", err=True)
-        raise typer.Exit(130) from None
+def deploy(
+    run: RunFolder,
+    row: Row,
+    out: Annotated[
+        Path | None, typer.Option(help="The new folder.", show_default="RUN/deploy/ROW/seed_SEED")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="A seed of the run's recipe.")] = 0,
+    percent: Annotated[
+        int | None,
+        typer.Option(help="The dataset size in percent, if the recipe has several.", show_default=False),
+    ] = None,
+) -> None:
+    """Export a trained policy as a folder that runs without this package."""
+    from astra_data.core.durable import refuse_existing
+    from astra_data.pipeline.first_look import refuse_unmade
+
+    run_at(run)
+    out = out or run / artifact_key("deploy", row, seed, percent)
+    refuse_existing(out)
+    if not (run / artifact_key("train", row, seed, percent)).is_dir():
+        with suppress(ValueError, TypeError, AttributeError):  # a damaged record is told of below
+            refuse_unmade(json.loads((run / RECORD).read_bytes()), row, seed)
+    from astra_data.deployment.folder import deploy as write
+
+    typer.echo(f"finished: {write(run, row, out, seed=seed, percent=percent)}")
+
+
+def view(
+    run: RunFolder,
+    save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write a recording.")] = None,
+    uids: Annotated[list[int] | None, typer.Option("--episode", help="Its uid; may be repeated.")] = None,
+    seed: Annotated[int | None, typer.Option(help="One of its recipe's.", show_default="the first")] = None,
+) -> None:
+    """Show a run's held-out episodes in Rerun, and replays of them in its simulators."""
+    run_at(run)
+    from astra_data.pipeline.run_view import view_run
+
+    view_run(run, uids or (), seed=seed, save=save)

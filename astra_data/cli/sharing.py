@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from astra_data.cli.arguments import DatasetName, Out
+from astra_data.core.errors import BadInputError
 
+NotesPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--notes", help="TOML file: license, summary, behavior, intended_use, limits.", show_default="none"
+    ),
+]
 Recordings = Annotated[
     list[Path],
     typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.", show_default=False),
@@ -81,51 +88,45 @@ def import_(
 
 def export(
     dataset: DatasetName,
-    format: Annotated[str, typer.Option(help="minari, d4rl, robomimic or d3rlpy.", show_default=False)],
+    format: Annotated[
+        str,
+        typer.Option(
+            help="minari, d4rl, robomimic or d3rlpy; or card: its dataset card.", show_default=False
+        ),
+    ],
     out: Annotated[
         Path,
-        typer.Option(help="The new file; for minari a folder, such as maze/random-v0.", show_default=False),
+        typer.Option(
+            help="The new file; for minari a folder, such as maze/random-v0; for a card the Markdown file, "
+            "next to which a figure is written.",
+            show_default=False,
+        ),
     ],
+    notes: NotesPath = None,
 ) -> None:
-    """Convert a dataset to the format of another library."""
+    """Convert a dataset to the format of another library, or write its card: contents, origin, loading."""
     from astra_data.dataset.versions import open_dataset
-    from astra_data.io.exporters import export as write
 
-    write(open_dataset(dataset), out, format=format)
-    typer.echo(f"finished: {out}")
+    opened = open_dataset(dataset)
+    if format != "card":
+        from astra_data.io.exporters import export as write
+
+        if notes is not None:
+            raise BadInputError("--notes are for --format card and for push: leave them out")
+        write(opened, out, format=format)
+        typer.echo(f"finished: {out}")
+        return
+    from astra_data.core.config import load_recipe
+    from astra_data.io.hub.card import Notes, write_card
+
+    written = load_recipe(notes, Notes) if notes else Notes()
+    opened.require_whole()
+    for path in write_card(opened, out, written):
+        typer.echo(f"written: {path}")
 
 
 if TYPE_CHECKING:
     from astra_data.dataset.reader import Dataset
-
-NotesPath = Annotated[
-    Path | None,
-    typer.Option(
-        "--notes", help="TOML file: license, summary, behavior, intended_use, limits.", show_default="none"
-    ),
-]
-
-
-def card(
-    dataset: DatasetName,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="The Markdown file; a figure is written next to it.", show_default="<name>.md here"
-        ),
-    ] = None,
-    notes: NotesPath = None,
-) -> None:
-    """Write a dataset card: contents, origin, and how to load it."""
-    from astra_data.core.config import load_recipe
-    from astra_data.dataset.versions import open_dataset
-    from astra_data.io.hub.card import Notes, write_card
-
-    opened = open_dataset(dataset)
-    written = load_recipe(notes, Notes) if notes else Notes()
-    opened.require_whole()
-    for path in write_card(opened, out or Path(f"{opened.description['name']}.md"), written):
-        typer.echo(f"written: {path}")
 
 
 def push(

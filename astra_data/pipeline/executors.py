@@ -9,9 +9,12 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
+from graphlib import TopologicalSorter
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import Thread, current_thread, main_thread
@@ -22,11 +25,14 @@ import numpy as np
 
 from astra_data.core.durable import disk_error
 from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.naming import stage_of_key
 from astra_data.core.optional import optional
 from astra_data.core.provenance import cores
 from astra_data.core.seeding import derive
 
 SECONDS_BETWEEN_NOTES = 0.1
+CUDA_JOBS = 2
+"""Items at a time on a CUDA device, where each process has its own context."""
 Note = tuple[float, str]
 """The fraction of an item that is done, and a remark."""
 
@@ -41,6 +47,7 @@ class Item:
         call: makes it; called as `call(progress=...)` in another process, so it must be picklable.
         is_threaded: whether `call` also takes `num_threads` and runs faster with more of them.
         device: torch device that it computes on.
+        settings: what it is made with beside its inputs, as JSON.
     """
 
     key: str
@@ -48,6 +55,17 @@ class Item:
     call: Callable[..., object]
     is_threaded: bool = False
     device: str = "cpu"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage(self) -> str:
+        """The stage that makes it."""
+        return stage_of_key(self.key)
+
+    @property
+    def wants_gpu(self) -> bool:
+        """Whether it computes on a GPU."""
+        return self.device.startswith("cuda")
 
 
 class Watcher(Protocol):
@@ -83,16 +101,23 @@ def run_in_order(
     Raises:
         ValueError: items wait for each other.
     """
-    waiting = {item.key: item for item in items}
-    unfinished = set(waiting)
-    while unfinished:
-        for item in [item for item in waiting.values() if unfinished.isdisjoint(item.inputs)]:
-            if len(unfinished) - len(waiting) == jobs:
-                break
-            begin(waiting.pop(item.key))
-        if len(waiting) == len(unfinished):
-            raise ValueError(f"items wait for each other: {', '.join(sorted(unfinished))}")
-        unfinished.difference_update(wait())
+    keys = [item.key for item in items]
+    order = TopologicalSorter({item.key: set(item.inputs).intersection(keys) for item in items})
+    order.prepare()
+    known, ready, running = {item.key: item for item in items}, list[str](), 0
+    while order.is_active():
+        ready = sorted([*ready, *order.get_ready()], key=keys.index)
+        while ready and running != jobs:
+            begin(known[ready.pop(0)])
+            running += 1
+        for key in wait():
+            order.done(key)
+            running -= 1
+
+
+def with_threads(item: Item, num_threads: int) -> Item:
+    """Return `item`, to be made by `num_threads` threads if it steps the target's physics."""
+    return replace(item, call=partial(item.call, num_threads=num_threads)) if item.is_threaded else item
 
 
 def pickled(item: Item, prepare: Callable[[], object] | None) -> bytes:
@@ -193,12 +218,15 @@ def _flush() -> None:
 def execute(
     items: Collection[Item],
     *,
-    jobs: int,
     logs: Path,
     watch: Watcher,
+    jobs: int | None = None,
     prepare: Callable[[], object] | None = None,
+    address: str | None = None,
 ) -> None:
     """Run `items` in up to `jobs` spawned processes, each as soon as its inputs are finished.
+
+    Those that step the target's physics share the cores.
 
     Inputs that are not among `items` count as finished. What an item prints goes to `<logs>/<key>.txt`; the
     file of an item that printed nothing is removed. When an item fails, at Ctrl-C or SIGTERM, or when this
@@ -206,19 +234,25 @@ def execute(
 
     Args:
         items: in order of preference.
-        jobs: number of processes.
         logs: folder of the log files.
         watch: is notified of every start, progress and finish.
+        jobs: number of processes; by default one per core, or `CUDA_JOBS` where an item wants a GPU.
         prepare: called in the process of an item before the item.
+        address: None, as this machine has none.
 
     Raises:
         AstraDataError: an item failed; its own error, with its key before the message, or where its
             traceback is when it crashed.
         KeyboardInterrupt: at Ctrl-C or SIGTERM.
     """
+    if address is not None:
+        raise BadInputError("--address is for --engine ray: leave it out, or add that")
+    jobs = jobs or (CUDA_JOBS if any(item.wants_gpu for item in items) else cores())
+    counts = Counter(item.stage for item in items)
     workers: list[_Worker] = []
 
     def begin(item: Item) -> None:
+        item = with_threads(item, max(1, cores() // min(jobs, counts[item.stage])))
         worker = next((worker for worker in workers if worker.key is None), None)
         if worker is None:
             worker = _Worker()
@@ -349,7 +383,7 @@ def _exit_with_parent() -> None:
 
 
 HERE = "local"
-"""The address of a cluster of this machine alone, which starts and stops with the run."""
+"""Ray's address of a cluster of this machine alone."""
 GPU_SHARE = 0.5
 """Share of a GPU for an item that computes on one: two of them keep their CUDA contexts on one GPU."""
 SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
@@ -362,36 +396,38 @@ PATIENCE_S = 10
 def execute_on_cluster(
     items: Collection[Item],
     *,
-    address: str,
-    jobs: int | None,
     logs: Path,
     watch: Watcher,
+    jobs: int | None = None,
     prepare: Callable[[], object] | None = None,
+    address: str | None = None,
 ) -> None:
-    """Run `items` as `local_executor.execute` does, each as a task with one core of the cluster at `address`.
+    """Run `items` as `execute` does, each as a task with one core of the Ray cluster at `address`.
 
     Relative paths and modules mean the same on every machine: a task runs in this process's working folder
     and with its module search path.
 
     Args:
         items: in order of preference.
-        address: of a running cluster, such as ray://head:10001 or head:6379; or `HERE`.
-        jobs: number of tasks at a time, by default as many as the cluster has cores.
         logs: folder of the log files, one per item that printed something.
         watch: is notified of every start, progress and finish.
+        jobs: number of tasks at a time, by default as many as the cluster has cores.
         prepare: called in each task before its item.
+        address: of a running cluster, such as ray://head:10001 or head:6379; by default one of this machine
+            starts and stops with the run.
 
     Raises:
         BadInputError: Ray is not installed, no cluster answers, or it lacks the GPU that an item wants.
         AstraDataError: an item failed; its own error, with its key before the message, or where its
             traceback is when it crashed. Or the connection to the cluster was lost.
     """
+    items, address = [with_threads(item, 1) for item in items], address or HERE
     ray = _connect(address, jobs)
     running: dict[Any, str] = {}
     here = Path.cwd(), sys.path
 
     def begin(item: Item) -> None:
-        share = GPU_SHARE if _wants_gpu(item) else 0
+        share = GPU_SHARE if item.wants_gpu else 0
         log = logs / f"{item.key}.txt"
         begun = task.options(num_gpus=share).remote(item.key, pickled(item, prepare), log, here, mailbox)
         running[begun] = item.key
@@ -408,7 +444,7 @@ def execute_on_cluster(
         return [running.pop(task_id) for task_id in done]
 
     try:
-        if any(map(_wants_gpu, items)) and not ray.cluster_resources().get("GPU"):
+        if any(item.wants_gpu for item in items) and not ray.cluster_resources().get("GPU"):
             raise BadInputError(f"the Ray cluster at {address} has no GPU: use --device cpu")
         mailbox = ray.remote(num_cpus=0)(Mailbox).remote()
         task = ray.remote(num_cpus=1, max_retries=0)(_work)
@@ -461,10 +497,6 @@ def _leave(ray: Any, running: list[Any]) -> None:  # noqa: ANN401 - Ray's
     ray.shutdown()
 
 
-def _wants_gpu(item: Item) -> bool:
-    return item.device.startswith("cuda")
-
-
 def _first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0]
 
@@ -507,3 +539,7 @@ def _work(
 
     send(None)
     return run_item(key, work, log, send)
+
+
+EXECUTORS: dict[str, Callable[..., None]] = {"processes": execute, "ray": execute_on_cluster}
+"""What runs items, by the names of `--engine`: each takes the arguments of `execute`."""

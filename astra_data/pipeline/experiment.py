@@ -2,31 +2,39 @@
 
     based_on = "antmaze_umaze"
 
-A recipe with this line lists only the differences from the recipe of that name beside it. Stages without a
-difference are not run again: links in its folder lead to the other recipe's artifacts. It may have another
-task with the same target; then it shares the collected episodes.
+A recipe with this line lists only the differences from the recipe of that name beside it. A stage whose
+artifacts would be the base's is not run again: a link in the recipe's folder leads to them. It may have
+another task with the same target; then it shares the collected episodes.
+
+What an artifact is made with is written down before it is begun, in `made_with/<key>.json`: its settings and
+the digests of the user's code. While they are others, what was made or begun with them is refused.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import did_you_mean, validated
-from astra_data.core.durable import begun_beside, made_in
+from astra_data.core.config import Config, did_you_mean, read_written, validated
+from astra_data.core.durable import begun_beside, write_file
 from astra_data.core.errors import RecipeError
-from astra_data.core.naming import RECORD, base_method, reference_of, stage_of_key
-from astra_data.methods import method_named
-from astra_data.pipeline.changed_settings import differences, restated, share_target
-from astra_data.pipeline.recipe import Recipe, read_tables, recorded_settings
+from astra_data.core.naming import first_few, shortened, stage_of_key
+from astra_data.dataset.description import changed_values
+from astra_data.pipeline.executors import Item
+from astra_data.pipeline.plan import Selection, plan
+from astra_data.pipeline.recipe import Recipe, read_tables
 from astra_data.pipeline.stages.registry import STAGES
-from astra_data.pipeline.staleness import ROWS_TABLES, reads, stale_stages
-from astra_data.pipeline.user_code import changed_code
-from astra_data.reports.results import read_results
+from astra_data.reports.results import Results, read_results
+from astra_data.robots.registry import task_named
 
 ALWAYS_NEW = {"report"}
 """Made by every run: it is cheap, and shows the rows and seeds that the recipe has now."""
+MADE_WITH = "made_with"
+"""The folder of a run for what its artifacts were made with."""
+_MOST_KEYS, _MOST_LETTERS = 3, 60
 
 
 @dataclass(frozen=True)
@@ -45,19 +53,18 @@ class Experiment:
     base: "Experiment | None" = None
 
     @cached_property
+    def items(self) -> dict[str, Item]:
+        """All artifacts of the recipe by their keys, each after those it reads."""
+        return {item.key: item for item in plan(self.recipe, self.path, self.folder)}
+
+    @cached_property
     def borrowed(self) -> set[str]:
-        """The stages whose artifacts are taken from the base."""
+        """The stages whose artifacts are taken from the base: those that would be the same."""
         if self.base is None:
             return set()
-        changed = {*differences(self.base.recipe.settings, self.recipe)}
-        absent = set() if self.recipe.sweep.percent else {"subset"}
-        asked = {stage.name: stage.asked_by for stage in STAGES.values() if stage.asked_by}
-        absent |= {stage for stage, key in asked.items() if not getattr(self.recipe, key)}
-        sizes, theirs = (set(one.sweep.percent) for one in (self.recipe, self.base.recipe))
-        begun = {"subset"} if bool(sizes) != bool(theirs) or not sizes <= theirs else set[str]()
-        own = restated(self.base.recipe.settings, self.recipe)
-        begun |= {method_named(name).configures for name in own}
-        return STAGES.keys() - ALWAYS_NEW - absent - stale_stages(changed, begun)
+        ours, theirs = settings_with_inputs(self.items), settings_with_inputs(self.base.items)
+        others = {stage_of_key(key) for key in ours if ours[key] != theirs.get(key)}
+        return {stage_of_key(key) for key in ours} - others - ALWAYS_NEW
 
     def maker(self, stage: str) -> "Experiment":
         """Return the experiment that makes the artifacts of `stage`."""
@@ -97,57 +104,63 @@ class Experiment:
                 )
             link.symlink_to(Path("..") / source.name / stage)
 
+    def write_made_with(self, items: Collection[Item]) -> None:
+        """Write down what `items` are made with, before they are begun."""
+        for item in items:
+            if item.stage not in ALWAYS_NEW:
+                write_file(self._made_with(item.key), json.dumps(item.settings, indent=1) + "\n")
+
+    def _made_with(self, key: str) -> Path:
+        return self.folder / MADE_WITH / f"{key}.json"
+
+    @cached_property
+    def _outdated(self) -> dict[str, str]:
+        """What changed since artifacts were made or begun, by their keys, and those that read them."""
+        found: dict[str, str] = {}
+        for key, item in self.items.items():
+            stage = item.stage
+            if stage in ALWAYS_NEW | self.borrowed or not (self.has(key) or begun_beside(self.folder / key)):
+                continue
+            read = next((found[made] for made in item.inputs if made in found), "")
+            if changed := self._changed(item) or read:
+                found[key] = changed
+        return found
+
+    def _changed(self, item: Item) -> str:
+        """Return which settings of an artifact are others than it was made or begun with."""
+        file = self._made_with(item.key)
+        if not file.is_file():
+            return ""
+        advice = f"restore it from a copy, or remove it with {self.folder / item.key}"
+        before = read_written(dict[str, Any], file, by="a run", advice=advice)
+        return changes(before, item.settings, self.recipe)
+
     def check_unchanged(self) -> None:
-        """Refuse settings that differ from those of existing artifacts, finished or not.
+        """Refuse settings and code that differ from those of existing artifacts, finished or not.
 
         Raises:
             RecipeError: they differ, here or in the base.
         """
         if self.base:
             self.base.check_unchanged()
-        changed, folders = self._outdated
-        if folders:
+        if self._outdated:
+            folders = _outermost({place for key in self._outdated for place in self._made(key)}, self.folder)
             raise RecipeError(
-                f"{changed} since {self.folder} was made: "
+                f"{' and '.join(dict.fromkeys(self._outdated.values()))} since {self.folder} was made: "
                 f"give the recipe another name, or remove {' '.join(map(str, folders))}"
             )
 
     def outdated(self, key: str) -> str:
-        """Return which settings changed since the artifact `key` was made, or begun; empty if none."""
-        changed, folders = self.maker(stage_of_key(key))._outdated
-        places = [self.place(key)] if self.has(key) else begun_beside(self.place(key))
-        if not any(place.is_relative_to(folder) for place in places for folder in folders):
+        """Return what changed since the artifact `key` was made or begun; empty if nothing."""
+        maker = self.maker(stage_of_key(key))
+        if key not in maker._outdated:
             return ""
-        this = "this" if self.has(key) else " ".join(map(str, places))
-        return f"{changed} since: give the recipe another name, or remove {this}"
+        this = "this" if self.has(key) else " ".join(map(str, maker._made(key)))
+        return f"{maker._outdated[key]} since: give the recipe another name, or remove {this}"
 
-    @cached_property
-    def _outdated(self) -> tuple[str, list[Path]]:
-        """What changed since the artifacts were made, and the folders made or begun with the old."""
-        if not (self.folder / RECORD).is_file():
-            return "", []
-        recorded = recorded_settings(self.folder)
-        for key in ("task", "data"):
-            now = getattr(self.recipe, key)
-            if _is_same_place(recorded.get(key), now):
-                recorded[key] = now
-        changes = differences(recorded, self.recipe)
-        changed = changes.keys()
-        code = changed_code(self.recipe, self.folder)
-        whole = stale_stages((changed - ROWS_TABLES) | ({"task"} & code.keys()))
-        own = STAGES.keys() - self.borrowed - ALWAYS_NEW
-        own = {stage for stage in own if (self.folder / stage).exists() and not self._is_link(stage)}
-        folders = [self.folder / stage for stage in STAGES if stage in whole & own]
-        for table in sorted(changed & ROWS_TABLES):
-            for stage in sorted((stale_stages({table}) - whole) & own):
-                folders += self._rows_of(table, stage)
-        rows = [place for stage in sorted(own - whole) for place in sorted((self.folder / stage).iterdir())]
-        folders += [row for row in rows if base_method(row.name) in code]
-        tables = " and ".join(f"{table} ({how})" for table, how in sorted(changes.items()))
-        texts = [f"{tables} changed in the recipe"] if tables else []
-        texts += [f"{what} changed" for what in dict.fromkeys(code.values())]
-        outermost = [folder for folder in dict.fromkeys(folders) if folder.parent not in folders]
-        return " and ".join(texts), [made for folder in outermost for made in made_in(folder, "seed_*")]
+    def _made(self, key: str) -> list[Path]:
+        """Return the folders of a finished or begun artifact."""
+        return [self.folder / key] if self.has(key) else begun_beside(self.folder / key)
 
     @property
     def results(self) -> Path:
@@ -166,32 +179,32 @@ class Experiment:
         names = dict.fromkeys((self.maker("evaluate").path.stem, self.path.stem))
         files = [file for name in names if (file := self.results / f"{name}.json").exists()]
         for file in files:
-            found = read_results(file)
-            changed = differences(found.settings, self.recipe).keys() - ALWAYS_NEW - {"select"}
-            tested = {*found.tested(), *filter(None, [reference_of(self.recipe.methods)])}
-            changed -= {table for table in ROWS_TABLES if not any(reads(row, table) for row in tested)}
-            own = restated(found.settings, self.recipe) & {*map(base_method, tested)}
-            changed |= {f"own_methods.{name}" for name in own}
-            if changed:
+            if changed := self._changed_since(read_results(file)):
                 raise RecipeError(
-                    f"{' and '.join(sorted(changed))} changed in {self.path} since the results in {file} "
-                    "were made: move them away to publish the new ones without them"
+                    f"{changed} in {self.path} since the results in {file} were made: move them away to "
+                    "publish the new ones without them"
                 )
         return files
 
-    def _rows_of(self, table: str, stage: str) -> list[Path]:
-        """Return the folders in `stage` of the rows that depend on `table`; its own where all do."""
-        folder = self.folder / stage
-        if stage == "select":  # it has no rows; that it is of other policies is told by digests
-            return [folder] if table == "ground" else []
-        rows = sorted(folder.iterdir())
-        # An evaluation may be of a time when the recipe had the reference.
-        grounded = (place.name for place in (self.folder / "ground").glob("*"))
-        reference = reference_of([*self.recipe.methods, *grounded]) if stage == "evaluate" else None
-        if reference and reads(reference, table):
-            return [folder]
-        found = [row for row in rows if reads(row.name, table)]
-        return [folder] if found == rows else found
+    def _changed_since(self, found: Results) -> str:
+        """Return what of the settings of tested rows is other than in results."""
+        rows = tuple(found.tested())
+        kept = {"methods": tuple(dict.fromkeys((*self.recipe.methods, *rows))), "select": None}
+        now = self.recipe.model_copy(update=kept)
+        seeds = [seed for seed in now.seeds if seed in found.seeds]
+        before = dict(found.settings) | kept | {"task": now.task, "seeds": now.seeds}
+        try:
+            old = self._plan(validated(before, type(now), "settings"), rows, seeds)
+        except RecipeError as error:
+            return str(error)
+        new = self._plan(now, rows, seeds)
+        texts = [changes(old[key], new[key], now) if key in old else "sweep changed" for key in new]
+        return " and ".join(dict.fromkeys(filter(None, texts)))
+
+    def _plan(self, recipe: Recipe, rows: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
+        """Return what the artifacts of rows of a recipe are made with."""
+        items = plan(recipe, self.path, self.folder, Selection.of(recipe, rows, seeds))
+        return {item.key: item.settings for item in items if item.stage not in ALWAYS_NEW}
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
@@ -218,14 +231,59 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     return Experiment(recipe, path, folder, base)
 
 
-def _is_same_place(before: object, now: object) -> bool:
-    """Return whether two names of a file or folder of the user's, told from different folders, may be of one.
+def settings_with_inputs(items: Mapping[str, Item]) -> dict[str, Any]:
+    """Return, by the keys of items, what they are made with, and what all that they read is made with."""
+    found: dict[str, Any] = {}
+    for key, item in items.items():
+        found[key] = item.settings, {made: found[made] for made in item.inputs}
+    return found
 
-    Whether it holds what it held then is told by digests: of code in code.json, of data as of artifacts.
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) -> str:
+    """Say which tables and files differ between what an artifact was made with and would be made with.
+
+    Settings that did not exist then have their defaults, as they took effect.
     """
-    file, is_code, _ = str(now).partition(".py:")
-    there = Path(f"{file}.py").is_file() if is_code else Path(file).is_dir()
-    return there and Path(str(before)).name == Path(str(now)).name
+    texts = []
+    for name in dict.fromkeys((*before, *now)):
+        old, new = before.get(name), now.get(name)
+        if old == new:
+            continue
+        if name == "code":
+            old, new = old or {}, new or {}
+            files = [file for file in dict.fromkeys((*old, *new)) if old.get(file) != new.get(file)]
+            texts += [f"{file} changed" for file in files]
+            continue
+        if isinstance(old, dict) and isinstance(config := getattr(recipe, name, None), Config):
+            with suppress(RecipeError):
+                old = validated(old, type(config), name).model_dump(mode="json")
+        if old != new:
+            texts.append(f"{name} ({_change(old, new)}) changed in the recipe")
+    return " and ".join(texts)
+
+
+def _change(before: object, now: object) -> str:
+    if not isinstance(before, dict) or not isinstance(now, dict):
+        return f"{_shown(before)}, now {_shown(now)}"
+    found = [f"{key}: {_shown(old)}, now {_shown(new)}" for key, old, new in changed_values(before, now)]
+    return first_few(found, _MOST_KEYS)
+
+
+def _shown(value: object) -> str:
+    text = "none" if value is None else json.dumps(value, default=str)
+    return text if isinstance(value, str) else shortened(text, _MOST_LETTERS)
+
+
+def _outermost(places: Collection[Path], root: Path) -> list[Path]:
+    """Return the folders that hold nothing but `places`, and those places that are in none of these."""
+    found = set(places)
+    while True:
+        whole = {
+            parent for place in found if (parent := place.parent) != root and found >= {*parent.iterdir()}
+        }
+        if not whole:
+            return sorted(found)
+        found = {place for place in found if place.parent not in whole} | whole
 
 
 def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,7 +301,9 @@ def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, 
 
 def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
     name, faults = base.path.stem, []
-    if recipe.task != base.recipe.task and not share_target(base.recipe.task, recipe.task):
+    if recipe.task != base.recipe.task and not task_named(recipe.task).shares_target(
+        task_named(base.recipe.task)
+    ):
         faults.append(
             f"task: expected that of {name}, '{base.recipe.task}', or one with the same target, "
             f"got '{recipe.task}'"

@@ -16,8 +16,7 @@ from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
 from astra_data.methods.method import Method
-from astra_data.pipeline.plan import plan
-from astra_data.pipeline.points import Selection
+from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.trained_policy import settings_of
 from astra_data.pipeline.user_code import add_all

@@ -12,25 +12,84 @@ and everything from ground on is made for each.
 """
 
 import inspect
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
+
+from pydantic import JsonValue
 
 from astra_data.core.config import did_you_mean, in_full
 from astra_data.core.errors import BadInputError
-from astra_data.core.naming import artifact_key, base_method, reference_of, stage_of_key
+from astra_data.core.naming import artifact_key, base_method, reference_of
+from astra_data.io.hub.stores import is_address
 from astra_data.methods import grounded_as, method_named
 from astra_data.methods.method import Method
 from astra_data.pipeline.executors import Item
-from astra_data.pipeline.points import Selection
+from astra_data.pipeline.first_look import refuse_unknown
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import benches, judge_of
+from astra_data.pipeline.user_code import digests_of
 from astra_data.reports.runs import Reported
+from astra_data.robots.registry import task_named
 
 ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
 """Parameters of stages that are folders of artifacts."""
+
+
+@dataclass(frozen=True)
+class RunPoint:
+    """A row on the dataset of one seed, or on one size of it: the unit of training and evaluation."""
+
+    method: str
+    seed: int
+    percent: int | None = None
+
+    @property
+    def key(self) -> str:
+        """Key of its evaluation, the last artifact to be made for it."""
+        return artifact_key("evaluate", self.method, self.seed, self.percent)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Rows, seeds and sizes of a recipe; `percents` is empty where the recipe has no sizes."""
+
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    percents: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls,
+        recipe: Recipe,
+        methods: Sequence[str] = (),
+        seeds: Sequence[int] = (),
+        percents: Sequence[int] = (),
+    ) -> "Selection":
+        """Return those that are named; of an axis on which nothing is named, all.
+
+        Raises:
+            BadInputError: the recipe has no such method, seed or size.
+        """
+        known = (recipe.methods, recipe.seeds, recipe.sweep.percent)
+        refuse_unknown(methods, seeds, percents, *known)
+        return cls(
+            tuple(dict.fromkeys(methods)) or recipe.methods,
+            tuple(dict.fromkeys(seeds)) or recipe.seeds,
+            tuple(dict.fromkeys(percents)) or recipe.sweep.percent,
+        )
+
+    def points(self) -> tuple[RunPoint, ...]:
+        """Return every row on every size of every seed."""
+        return tuple(
+            RunPoint(method, seed, percent)
+            for method in self.methods
+            for percent in self.percents or (None,)
+            for seed in self.seeds
+        )
 
 
 def plan(
@@ -93,12 +152,8 @@ def _choice(recipe: Recipe, reported: Reported, folder: Path) -> Item | None:
         "select",
         tuple(inputs),
         partial(STAGES["select"].run, reported, recipe.select, root=folder),
+        settings={"select": recipe.select.model_dump(mode="json")},
     )
-
-
-def stage_of(item: Item) -> str:
-    """Return the stage that makes `item`."""
-    return stage_of_key(item.key)
 
 
 def stages_until(last: str | None) -> set[str]:
@@ -174,12 +229,13 @@ class _Plan:
         parameters = inspect.signature(stage.run).parameters
         artifacts = self._artifacts(stage, seed, percent, name)
         keys = {parameter: artifacts[parameter] for parameter in parameters if parameter in ARTIFACTS}
+        settings = recipe.settings_of(name, stage.name) if name else None
         known = {
             "task": recipe.task,
             "simulator": recipe.task,
             "method": name,
             "config": recipe.config_of(stage.name),
-            "settings": recipe.settings_of(name, stage.name) if name else None,
+            "settings": settings,
             "seed": seed,
             "percent": percent,
             "of": recipe.collect and recipe.collect.episodes,
@@ -199,7 +255,40 @@ class _Plan:
             is_threaded="num_threads" in parameters
             and (method is None or stage.each != "policy" or method.steps_target),
             device=self.device if "device" in parameters else "cpu",
+            settings=self._settings(stage, name, {key: known[key] for key in known if key in parameters}),
         )
+
+    def _settings(self, stage: Stage, name: str, given: Mapping[str, Any]) -> dict[str, JsonValue]:
+        """Return what an artifact is made with, as JSON: settings, and digests of the user's code by files.
+
+        A task of the user's is named by its file, whose digest tells it from others. Of data in a folder,
+        digests tell; of recorded episodes, any task with the same target is the same.
+        """
+        recipe, method = self.recipe, base_method(name)
+        names = {"task": recipe.task} | {own: given.method for own, given in recipe.own_methods.items()}
+        used = {"task": {"task", "simulator"} & given.keys(), method: method in names}
+        code = {
+            Path(names[one].rpartition(":")[0]).name: self._digests[one]
+            for one in used
+            if used[one] and one in self._digests
+        }
+        task = task_named(recipe.task)
+        about: dict[str, Any] = {
+            "task": Path(recipe.task).name if used["task"] else None,
+            "method": name or None,
+            **{key: given.get(key) for key in ("seed", "percent", "of")},
+            "data": recipe.data if recipe.data and "data" in given and is_address(recipe.data) else None,
+            stage.name: given["config"].model_dump(mode="json") if given.get("config") else None,
+            method: given["settings"].model_dump(mode="json") if given.get("settings") else None,
+            "code": code or None,
+        }
+        if stage.name == "collect" and task.target_id is not None:
+            about["task"] = task.target_id
+        return {key: value for key, value in about.items() if value is not None}
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
+        return digests_of(self.recipe.task, self.recipe.own_methods)
 
     def _recorded(self, method: Method | None, seed: int, percent: int | None, name: str) -> Path | None:
         """Return the dataset that the policy of a row was trained on; None if it is none."""
@@ -243,5 +332,4 @@ def _command(recipe: Recipe, path: Path, selection: Selection) -> str:
     options += [
         f" --percent {percent}" for percent in selection.percents if selection.percents != whole.percents
     ]
-    swept = recipe.sweep.percent or selection.methods != whole.methods
-    return f"astra-data {'sweep' if swept else 'run'} {path}{''.join(options)}"
+    return f"astra-data run {path}{''.join(options)}"

@@ -1,47 +1,71 @@
-"""Run recipes: make every artifact that is not finished yet, for every row and seed."""
+"""Run recipes: make every artifact that is not finished yet, for every row, seed and size.
 
-import logging
-from collections.abc import Callable, Collection, Sequence
-from contextlib import AbstractContextManager
+A point, a row on a seed and a size, is finished when its evaluation is; `sweep.csv` in the recipe's folder
+has one line per finished point.
+"""
+
+import csv
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
+from io import StringIO
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
 
 from astra_data.core.durable import alone_in, clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
-from astra_data.core.naming import RECORD, RUNS, row_of_key, stage_of_key
-from astra_data.methods import grounded_as
-from astra_data.pipeline.condition import Condition, can_be_made_again, condition, spoilt, to_make_again
-from astra_data.pipeline.data_check import data_condition
-from astra_data.pipeline.devices import check_device, default_jobs, share_cores, with_threads
+from astra_data.core.naming import RECORD, RUNS, reference_of, row_of_key, stage_of_key
+from astra_data.core.optional import optional
+from astra_data.methods import grounded_as, method_named
+from astra_data.pipeline.condition import (
+    Condition,
+    can_be_made_again,
+    condition,
+    data_condition,
+    spoilt,
+    to_make_again,
+)
 from astra_data.pipeline.display import display
-from astra_data.pipeline.executors import Item, Watcher, execute, execute_on_cluster
+from astra_data.pipeline.executors import EXECUTORS, Item, Watcher
 from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment, load_experiment
-from astra_data.pipeline.held_out import write_errors
-from astra_data.pipeline.plan import check_stage, plan, stage_of, stages_until
-from astra_data.pipeline.points import Selection
+from astra_data.pipeline.plan import RunPoint, Selection, check_stage, plan, stages_until
+from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.stages.report import is_current
-from astra_data.pipeline.user_code import OwnMethod, add_all, record_code
+from astra_data.pipeline.user_code import OwnMethod, add_all, digests_of, record_code
+from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
+from astra_data.reports.held_out import write_held_out
 from astra_data.robots.registry import TASKS, task_named
 from astra_data.worlds.walk_through import check_task
 
 SET_ASIDE = "set_aside"
 """The folder of a run for artifacts that are made again: what took hours to make is not deleted."""
-_log = logging.getLogger(__name__)
+POINTS = "sweep.csv"
+TIMED = {"ground": METRICS, "train": CURVE, "align": METRICS, "evaluate": EVALUATION}
+"""Stages that are run for few points at once, and the file with the time that they took."""
+COLUMNS = (
+    *("method", "percent", "seed", "success", "steps", "return", "failed", "simulated_success"),
+    *("dataset_version", "dataset_hash", "commit", "wall_seconds"),
+)
 
 
 def run(
     recipe_path: Path,
     *,
+    methods: Sequence[str] = (),
     seeds: Sequence[int] = (),
+    percents: Sequence[int] = (),
     root: Path = RUNS,
     jobs: int | None = None,
     device: str = "cpu",
     until: str | None = None,
+    engine: str = "processes",
+    address: str | None = None,
+    trackio: str | None = None,
 ) -> Path:
     """Make every artifact of a recipe that is not finished yet; return the recipe's folder.
 
@@ -49,16 +73,22 @@ def run(
 
     Args:
         recipe_path: the recipe.
-        seeds: the recipe's seeds to make and to report; by default all.
+        methods: the recipe's rows to make and to report; by default all.
+        seeds: seeds of the recipe; by default all.
+        percents: sizes of the recipe; by default all.
         root: folder with the recipe's folder.
         jobs: number of items at a time; by default one per core, or two on a CUDA device.
         device: torch device of the networks.
         until: the last stage to run, by default all.
+        engine: what runs the items, a name in `EXECUTORS`.
+        address: of a Ray cluster; by default one of this machine is started.
+        trackio: project of trackio to which each finished point is logged, if any.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
         MissingStageError: an artifact of the recipe that it is based on is not finished.
-        BadInputError: another process runs in the recipe's folder.
+        BadInputError: the recipe has no such row, seed or size, a package is not installed, or another
+            process runs in the recipe's folder.
         AstraDataError: an item failed.
 
     Example:
@@ -72,13 +102,28 @@ def run(
     stages = stages_until(until)
     experiment = load_experiment(recipe_path, root)
     wanted = stages - experiment.borrowed
-    part = Selection.of(experiment.recipe, seeds=seeds)
+    part = Selection.of(experiment.recipe, methods, seeds, percents)
+    log = _tracked(trackio, experiment.folder.name) if trackio else None
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
-    items = [item for item in planned if stage_of(item) in wanted]
-    make(experiment, items, planned, jobs=jobs, device=device)
+    items = [item for item in planned if item.stage in wanted]
+    show = partial(_shown, PointTable(experiment, part.points()), log)
+    make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, show=show)
     if "ground" in wanted:
         write_errors(experiment, part)
     return experiment.folder
+
+
+def write_errors(experiment: Experiment, part: Selection) -> Path | None:
+    """Write the page of held-out errors of the groundings that `part` needs; return it, None if none."""
+    rows = [*part.methods, reference_of(experiment.recipe.methods)]
+    return write_held_out(
+        experiment.path.stem,
+        experiment.folder,
+        tuple(dict.fromkeys(grounded_as(row) for row in rows if row and method_named(row).grounds)),
+        part.seeds,
+        part.percents,
+        timestep_s=task_named(experiment.recipe.task).timestep_s,
+    )
 
 
 def run_stage(
@@ -98,9 +143,7 @@ def run_stage(
 
     Raises:
         MissingStageError: an artifact that the stage reads is not finished.
-        RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
-        BadInputError: another process runs in the recipe's folder.
-        AstraDataError: an item failed.
+        RecipeError, BadInputError, AstraDataError: as `run`.
     """
     check_stage(stage)
     experiment = load_experiment(recipe_path, root)
@@ -112,12 +155,11 @@ def run_stage(
     recipe, folder = experiment.recipe, experiment.folder
     if stage == "collect" and recipe.data is not None:
         raise BadInputError(f"{recipe_path} uses the data {recipe.data}: there is nothing to collect")
-    part = Selection.of(recipe, methods, seeds)
     planned = plan(
         recipe,
         recipe_path,
         folder,
-        part,
+        Selection.of(recipe, methods, seeds),
         device=device,
         publish=experiment.results if publish else None,
         published=experiment.published() if publish else (),
@@ -139,9 +181,8 @@ def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict
     experiment = load_experiment(recipe_path, root)
     _check_task(experiment)
     data = data_condition(experiment.recipe)
-    planned = plan(experiment.recipe, recipe_path, experiment.folder)
-    conditions = {item.key: condition(item, experiment, verify=verify) for item in planned}
-    return conditions if data is None else {"data": data, **conditions}
+    found = {key: condition(item, experiment, verify=verify) for key, item in experiment.items.items()}
+    return found if data is None else {"data": data, **found}
 
 
 def _check_task(experiment: Experiment, device: str = "cpu") -> None:
@@ -151,8 +192,26 @@ def _check_task(experiment: Experiment, device: str = "cpu") -> None:
         raise BadInputError("\n".join(f"{experiment.path}: task {name}: {fault}" for fault in faults))
 
 
-Show = Callable[[Collection[str], Console], AbstractContextManager[Watcher]]
-"""Shows the progress of items by their keys, as `display.display` does."""
+def check_device(device: str, engine: str = "processes") -> None:
+    """Check that the CPU or a CUDA device is available, or may be on a cluster.
+
+    Raises:
+        BadInputError: it is not.
+    """
+    try:
+        wanted = torch.device(device)
+    except RuntimeError:
+        wanted = None
+    if wanted is None or wanted.type not in {"cpu", "cuda"}:
+        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'")
+    if engine == "ray":
+        # Ray gives each task its own GPU, which is the only one that it sees.
+        if wanted.index:
+            raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
+        return
+    found = torch.cuda.device_count()
+    if wanted.type == "cuda" and (wanted.index or 0) >= found:
+        raise BadInputError(f"device '{device}' is not available: torch finds {found} CUDA devices")
 
 
 def make(
@@ -160,10 +219,11 @@ def make(
     items: Collection[Item],
     planned: Collection[Item],
     *,
-    jobs: int | None,
-    device: str,
-    cluster: str | None = None,
-    show: Show = display,
+    jobs: int | None = None,
+    device: str = "cpu",
+    engine: str = "processes",
+    address: str | None = None,
+    show: Callable[[Collection[str], Console], Any] = display,
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
@@ -174,11 +234,11 @@ def make(
         experiment: whose artifacts they are.
         items: each after those it reads.
         planned: all items of the recipe that these may read.
-        jobs: number of items at a time; by default one per core, or two on a CUDA device.
-        device: torch device of the networks.
-        cluster: address of the Ray cluster to run on, or "local" to start one; by default processes of
-            this machine are used.
-        show: shows the progress of the items.
+        jobs: as for `run`.
+        device: as for `run`.
+        engine: as for `run`.
+        address: as for `run`.
+        show: shows the progress of items by their keys, as `display` does.
 
     Raises:
         MissingStageError: an artifact that an item reads is neither among them nor finished and intact.
@@ -187,11 +247,11 @@ def make(
             a dataset is damaged that the recipe cannot make again.
         AstraDataError: an item failed.
     """
-    check_device(device, cluster)
+    check_device(device, engine)
     recipe, folder = experiment.recipe, experiment.folder
     with folder_for(folder / RECORD), alone_in(folder):
         experiment.check_unchanged()
-        _check_task(experiment, "cpu" if cluster else device)
+        _check_task(experiment, "cpu" if engine == "ray" else device)
         clean(folder)
         again = to_make_again(items, experiment)
         for key, reason in again.items():
@@ -200,28 +260,36 @@ def make(
                     f"{experiment.place(key)} is {reason}, and was not made by this recipe: restore it from "
                     "a copy, recover its intact episodes with `astra-data repair`, or remove it"
                 )
-        items = [item for item in items if item.key in again or not finished(item, experiment)]
-        if [stage_of(item) for item in items] == ["report"] and _is_reported(items[0]):
+        items = [
+            item
+            for item in items
+            if item.key in again or item.stage in ALWAYS_NEW or not experiment.has(item.key)
+        ]
+        if [item.stage for item in items] == ["report"] and _is_reported(items[0]):
             items = []
-        data = data_condition(recipe) if any(stage_of(item) == "label" for item in items) else None
+        data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
         console = Console()
-        for warning in data.warnings if data else ():
-            console.print(f"warning: data: {warning}", markup=False, highlight=False, soft_wrap=True)
-        for key, reason in again.items():
-            line = f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}"
+        lines = [f"warning: data: {warning}" for warning in (data.warnings if data else ())]
+        lines += [
+            f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}"
+            for key, reason in again.items()
+        ]
+        for line in lines:
             console.print(line, markup=False, highlight=False, soft_wrap=True)
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
-        record_code(recipe, folder)
-        prepare, logs = partial(_prepare, dict(recipe.own_methods)), folder / "logs"
+        record_code(folder, digests_of(recipe.task, recipe.own_methods))
+        experiment.write_made_with(items)
         with show([item.key for item in items], console) as watch:
-            if cluster is None:
-                jobs = jobs or default_jobs(device)
-                execute(share_cores(items, jobs), jobs=jobs, logs=logs, watch=watch, prepare=prepare)
-            else:
-                items = [with_threads(item, 1) for item in items]
-                execute_on_cluster(items, address=cluster, jobs=jobs, logs=logs, watch=watch, prepare=prepare)
+            EXECUTORS[engine](
+                items,
+                jobs=jobs,
+                logs=folder / "logs",
+                watch=watch,
+                prepare=partial(_prepare, dict(recipe.own_methods)),
+                address=address,
+            )
 
 
 def _is_reported(item: Item) -> bool:
@@ -247,7 +315,7 @@ def _check_inputs(experiment: Experiment, items: Collection[Item], planned: Coll
         key
         for item in items
         for key in item.inputs
-        if key not in made and (stage_of(item) not in ALWAYS_NEW or experiment.has(key))
+        if key not in made and (item.stage not in ALWAYS_NEW or experiment.has(key))
     ]
     for key in dict.fromkeys(reads):
         stage, root = stage_of_key(key), experiment.folder.parent
@@ -271,13 +339,8 @@ def set_aside(folder: Path, key: str) -> Path:
     return aside
 
 
-def finished(item: Item, experiment: Experiment) -> bool:
-    """Return whether the artifact of `item` is finished and need not be made again."""
-    return stage_of(item) not in ALWAYS_NEW and experiment.has(item.key)
-
-
 def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> list[Item]:
-    selected = [item for item in items if stage_of(item) == stage]
+    selected = [item for item in items if item.stage == stage]
     if not selected and not methods:
         raise BadInputError(f"the recipe has no stage '{stage}'")
     made = {row_of_key(item.key) for item in selected}
@@ -286,3 +349,118 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
         if row not in made:
             raise BadInputError(f"{row} has no stage '{stage}'")
     return [item for item in selected if not rows or row_of_key(item.key) in rows]
+
+
+class PointTable:
+    """The finished points of a recipe, in `sweep.csv`; the line of a finished point does not change."""
+
+    def __init__(self, experiment: Experiment, shown: Collection[RunPoint]) -> None:
+        """Look at all points of the recipe; show those of this run."""
+        self.experiment, self.folder, self.shown = experiment, experiment.folder, tuple(shown)
+        self._points = Selection.of(experiment.recipe).points()
+        self._lines: dict[RunPoint, dict[str, Any]] = {}
+
+    def write(self) -> dict[RunPoint, dict[str, Any]]:
+        """Write the lines of all points that are finished now, if there are any, and return them."""
+        for point in self._points:
+            if point not in self._lines and (self.folder / point.key).is_dir():
+                self._lines[point] = self._line(point)
+        lines = {point: self._lines[point] for point in self._points if point in self._lines}
+        if lines:
+            text = StringIO()
+            writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(lines.values())
+            write_file(self.folder / POINTS, text.getvalue())
+        return lines
+
+    def message(self, point: RunPoint) -> str:
+        """Return one line for a point that has just finished."""
+        headline = self.experiment.recipe.headline
+        done = sum(one in self._lines for one in self.shown)
+        score = headline.text(self._lines[point][headline.measure])
+        return f"{point.key}  done {score}  ({done} of {len(self.shown)} points)"
+
+    def _line(self, point: RunPoint) -> dict[str, Any]:
+        evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
+        means = evaluation.outcomes.means()
+        stages = {key: stage_of_key(key) for key in sorted(set(_needed(point.key, self.experiment.items)))}
+        timed = [self.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
+        # The artifacts that a point was made of may have been deleted since.
+        is_complete = all(file.is_file() for file in timed)
+        seconds = [read_json(Artifact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
+        simulated = evaluation.simulated
+        return {
+            "method": point.method,
+            "percent": WHOLE if point.percent is None else point.percent,
+            "seed": point.seed,
+            **{measure: means[measure] for measure in ("success", "steps", "return", "failed")},
+            "simulated_success": None if simulated is None else simulated.means()["success"],
+            "dataset_version": evaluation.dataset_version,
+            "dataset_hash": evaluation.dataset_hash,
+            "commit": evaluation.git_commit,
+            "wall_seconds": round(sum(seconds), 3) if is_complete else None,
+        }
+
+
+def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
+    """Yield `key` and the keys of all artifacts that it is made of.
+
+    An evaluation is made of the policy and its encoder, not of the simulators in which it tests them.
+    """
+    yield key
+    for read in items[key].inputs:
+        if not (key.startswith("evaluate/") and read.startswith("ground/")):
+            yield from _needed(read, items)
+
+
+@contextmanager
+def _shown(
+    table: PointTable,
+    log: Callable[[dict[str, Any]], None] | None,
+    keys: Collection[str],
+    console: Console,
+) -> Iterator[Watcher]:
+    """Show the running items, and keep `sweep.csv` up to date."""
+    table.write()
+    with display(keys, console) as watch:
+        yield _PointWatcher(watch, table, log, console)
+
+
+class _PointWatcher:
+    """Passes notifications on, and writes down every point that is finished."""
+
+    def __init__(
+        self,
+        watch: Watcher,
+        table: PointTable,
+        log: Callable[[dict[str, Any]], None] | None,
+        console: Console,
+    ) -> None:
+        self.started, self.progressed, self.failed = watch.started, watch.progressed, watch.failed
+        self._watch, self._table, self._log, self._console = watch, table, log, console
+
+    def finished(self, key: str, seconds: float) -> None:
+        self._watch.finished(key, seconds)
+        point = next((point for point in self._table.shown if point.key == key), None)
+        if point is None:
+            return
+        line = self._table.write()[point]
+        self._console.print(self._table.message(point), markup=False, highlight=False, soft_wrap=True)
+        if self._log:
+            self._log(line)
+
+
+def _tracked(project: str, recipe: str) -> Callable[[dict[str, Any]], None]:
+    """Return a function that logs each point as a run of a trackio project."""
+    trackio = optional("trackio")
+
+    def log(line: dict[str, Any]) -> None:
+        named = {key: line[key] for key in ("method", "percent", "seed")}
+        name = f"{recipe} {' '.join(map(str, named.values()))}"
+        settings = {key: value for key, value in line.items() if isinstance(value, str)}
+        trackio.init(project=project, name=name, config=named | settings)
+        trackio.log({key: value for key, value in line.items() if isinstance(value, float)})
+        trackio.finish()
+
+    return log

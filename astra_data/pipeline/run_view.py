@@ -20,8 +20,7 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.open_loop import replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
-from astra_data.pipeline.plan import plan, stage_of
-from astra_data.pipeline.points import Selection
+from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.pipeline.trained_policy import settings_of
@@ -49,7 +48,7 @@ def view_run(
     seeds = recipe.seeds[:1] if seed is None else (seed,)
     selection = Selection.of(recipe, seeds=seeds, percents=sorted(recipe.sweep.percent)[-1:])
     items = plan(recipe, Path(f"{run}.toml"), run, selection)
-    pairs = next(run / item.key for item in items if stage_of(item) == "pair")
+    pairs = next(run / item.key for item in items if item.stage == "pair")
     if not pairs.is_dir():
         raise BadInputError(f"{run} has no pairs of seed {seeds[0]} yet: run the recipe until pair")
     dataset, held_out = Dataset.open(pairs), (episodes := PairedEpisodes.load(pairs))
@@ -57,7 +56,7 @@ def view_run(
     simulators: dict[str, Grounding] = {"raw": NO_GROUNDING}
     for item in items:
         made = run / item.key / str(STAGES["ground"].result)
-        if stage_of(item) == "ground" and made.is_file():
+        if item.stage == "ground" and made.is_file():
             assert isinstance(item.call, partial)
             share, drawn = item.call.keywords["config"].held_out_share, item.call.keywords["seed"]
             if (data := item.call.keywords["dataset"]).is_dir():

@@ -99,33 +99,8 @@ def with_offered(tables: Mapping[str, Any], keys: Collection[str]) -> dict[str, 
     return rest | {"own_methods": {**own, **taken}} if taken else rest
 
 
-_SETTINGS = ".settings"
-
-
-def changed_code(recipe: Any, folder: Path) -> dict[str, str]:  # noqa: ANN401 - a Recipe
-    """Return what was recorded in `folder` and is another now.
-
-    Returns:
-        "task" and names of methods, each to what of it changed: its file, or its settings.
-
-    Raises:
-        BadInputError: the record is damaged.
-    """
-    before = recorded_code(folder)
-    now = _digests(recipe)
-    changed = [name for name, digest in before.items() if now.get(name, digest) != digest]
-    return {
-        name.removesuffix(_SETTINGS): f"the settings of {name.removesuffix(_SETTINGS)}"
-        if name.endswith(_SETTINGS)
-        else Path(_places(recipe)[name].rpartition(":")[0]).name
-        for name in changed
-    }
-
-
 def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
     """Refuse code at a `place` that is not what the folder of a run has recorded of its task, or of a method.
-
-    That of an installed task may be its name.
 
     Raises:
         BadInputError: it is another, or the record is damaged.
@@ -139,19 +114,14 @@ def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
         )
 
 
-def record_code(recipe: Any, folder: Path) -> None:  # noqa: ANN401 - a Recipe
-    """Write down in `folder` what the code is now, if there is any; that of other methods stays written."""
-    if digests := _digests(recipe):
-        write_file(folder / CODE, json.dumps(recorded_code(folder) | digests, indent=1) + "\n")
+def record_code(folder: Path, digests: Mapping[str, str]) -> None:
+    """Write in `folder` the digests of "task" and of methods by their names; others there stay."""
+    if digests:
+        write_file(folder / CODE, json.dumps(recorded_code(folder) | dict(digests), indent=1) + "\n")
 
 
-def _places(recipe: Any) -> dict[str, str]:  # noqa: ANN401
-    return {"task": place_of(recipe.task)} | {name: own.method for name, own in recipe.own_methods.items()}
-
-
-def _digests(recipe: Any) -> dict[str, str]:  # noqa: ANN401
-    found = {name: code_digest(place) for name, place in _places(recipe).items()}
-    for name, own in recipe.own_methods.items():
-        if settings := own.settings(name):
-            found[f"{name}{_SETTINGS}"] = settings.model_dump_json()
+def digests_of(task: str, own_methods: Mapping[str, OwnMethod]) -> dict[str, str]:
+    """Return the digest of the code of "task", and of methods by their names, where it is the user's."""
+    places = {"task": place_of(task)} | {name: own.method for name, own in own_methods.items()}
+    found = {name: code_digest(place) for name, place in places.items()}
     return {name: digest for name, digest in found.items() if digest}

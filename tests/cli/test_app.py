@@ -61,12 +61,17 @@ def test_the_package_runs_as_a_module_does(tmp_path: Path) -> None:
             ["train", "small.toml", "--method", "astr"],
             "no method 'astr': did you mean 'astra'?",
         ),
-        (["sweep", "small.toml", "--percent", "7"], "the recipe has no size 7; its sizes: none"),
+        (["run", "small.toml", "--percent", "7"], "the recipe has no size 7; its sizes: none"),
+        (["run", "small.toml", "--engine", "rai"], "unknown engine 'rai': did you mean 'ray'?"),
+        (["run", "wrong.toml"], "task: unknown task 'antmaze-umase': did you mean 'antmaze-umaze'?"),
+        (["run", "wrong.toml"], "methods: unknown method 'nsa': did you mean 'nas'?"),
+        (["check", "wrong.toml"], "trian: unknown key: did you mean 'train'?"),
+        (["train", "wrong.toml"], "ground.updats: unknown key: did you mean 'updates'?"),
         (["pair", "none.toml"], "none.toml does not exist"),
         (["pair", "none", "--simulator", "antmaze-umaze"], "no dataset 'none' in"),
         (["pair", "fake", "--simulator", "no.py:SIMULATOR"], "no.py:SIMULATOR: expected a file no.py"),
         (["collect", "no.py:TASK"], "no.py:TASK: expected a file no.py, found none: write path.py:TASK"),
-        (["tasks", "no.py:TASK"], "no.py:TASK: expected a file no.py"),
+        (["check", "no.py:TASK"], "no.py:TASK: expected a file no.py"),
         (["label", "none", "--task", "antmaze-umaze"], "no dataset 'none' in"),
         (["label", "fake", "--task", "no.py:TASK"], "no.py:TASK: expected a file no.py"),
         (["augment", "none"], "no dataset 'none' in"),
@@ -98,6 +103,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "recipes/quickstart.toml").touch()
     (folder / "small.toml").write_text('task = "antmaze-umaze"\nmethods = ["nas", "astra"]\nseeds = [0]\n')
     (folder / "broken.toml").write_text("=")
+    wrong = 'task = "antmaze-umase"\nmethods = ["nsa"]\nseeds = [0]\n[ground]\nupdats = 1\n[trian]\n'
+    (folder / "wrong.toml").write_text(wrong)
     (folder / "runs/cart").mkdir(parents=True)
     (folder / "runs/cart/recipe.json").write_text('{"task": "a", "methods": ["nas"], "seeds": [0]}')
     return folder

@@ -20,7 +20,7 @@ def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> No
     assert "(fake@data-1.1.0, 2 episodes, " in output_of(
         "subset", fake, "--percent", "40", "--stratify", "success"
     )
-    assert "(fake@data-1.2.0, 3 episodes, " in output_of("delete", fake, "--episode", "13", "--episode", "0")
+    assert "(fake@data-1.2.0, 3 episodes, " in output_of("filter", fake, "--without", "13", "--without", "0")
     assert "(fake@data-1.3.0, 2 episodes, " in output_of("filter", fake, "--success")
     assert "(fake@data-1.4.0, 3 episodes, " in output_of("filter", fake, "--no-success")
     assert "(fake@data-1.4.0, 5 episodes, 55 " in output_of(
@@ -57,7 +57,7 @@ def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str
 
 
 def test_a_refused_edit_writes_nothing(fake: str) -> None:
-    result = call("delete", fake, "--episode", "1")
+    result = call("filter", fake, "--without", "1")
     assert isinstance(result.exception, BadInputError)
     assert len(versions_at_home("fake")) == 1
 

@@ -37,7 +37,7 @@ def test_findings_are_shown_and_written(tmp_path: Path) -> None:
     found = json.loads((tmp_path / "found.json").read_text())
     (finding,) = found["findings"]
     assert finding["episodes"] == [*range(21, 30)]
-    assert f"astra-data delete '{logs}' --episode 21" in finding["advice"]
+    assert f"astra-data filter '{logs}' --without 21" in finding["advice"]
     shown = "warning: " + finding["what"] + " (episodes 21, 22, 23, 24, 25 and 4 more): " + finding["advice"]
     assert lines[-5:] == ["check-up", *found["summary"], shown, f"written: {tmp_path / 'found.json'}"][-5:]
 

@@ -5,16 +5,19 @@ import pytest
 from typer.testing import CliRunner
 
 from astra_data.cli import app as cli
-from astra_data.cli.recipes import refuse, show_made
+from astra_data.cli.arguments import refuse
+from astra_data.cli.recipes import show_made
 from astra_data.core.errors import AstraDataError, BadInputError
 
-pytestmark = pytest.mark.usefixtures("fake_recipe")
+pytestmark = pytest.mark.usefixtures("stages")
 
 
 @pytest.fixture
 def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "r.toml"
-    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[train]\nsteps = 5\n')
+    path.write_text(
+        'task = "antmaze-umaze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[train]\ntries = 5\n'
+    )
     return path
 
 
@@ -34,25 +37,46 @@ def test_the_command_line_checks_and_runs_a_stage(recipe: Path, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("until", "looked_at", "shown"),
     [
-        (None, ["gap.md", "report/results.html", "more"], ""),
-        ("ground", ["gap.md", "more"], "held-out errors\n"),
-        ("align", ["gap.md", "more"], ""),
-        ("pair", ["more"], ""),
+        (None, ["gap.md", "report/results.html", "sweep.csv"], ""),
+        ("ground", ["gap.md"], "held-out errors\n"),
+        ("pair", [], ""),
     ],
 )
 def test_a_run_ends_with_the_pages_to_look_at(
     tmp_path: Path, until: str | None, looked_at: list[str], shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    others = tmp_path / "more", tmp_path / "none"
-    show_made(tmp_path, until, *others)
+    show_made(tmp_path, until)
     assert capsys.readouterr().out == f"finished: {tmp_path}\n"
     (tmp_path / "gap.md").write_text("held-out errors")
     (tmp_path / "report").mkdir()
-    for page in (tmp_path / "report/results.html", others[0]):
-        page.touch()
-    show_made(tmp_path, until, *others)
+    for page in ("report/results.html", "sweep.csv"):
+        (tmp_path / page).touch()
+    show_made(tmp_path, until)
     listed = "".join(f"{tmp_path / page}\n" for page in looked_at)
     assert capsys.readouterr().out == f"{shown}finished: {tmp_path}\n{listed}"
+
+
+def test_a_run_passes_its_options_on(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe.write_text('task = "antmaze-umaze"\nmethods = ["nas"]\nseeds = [0, 1]\n[sweep]\npercent = [50]\n')
+    asked: list[dict[str, Any]] = []
+
+    def run(_: Path, **given: Any) -> Path:  # noqa: ANN401
+        asked.append(given)
+        return tmp_path
+
+    monkeypatch.setattr("astra_data.pipeline.run.run", run)
+    words = "--method nas --seed 1 --seed 0 --percent 50 --jobs 3 --device cuda --root elsewhere"
+    words += " --trackio ants --until ground --engine ray --address head:6379"
+    assert CliRunner().invoke(cli.app, ["run", str(recipe), *words.split()]).exit_code == 0
+    assert CliRunner().invoke(cli.app, ["run", str(recipe)]).exit_code == 0
+    assert asked[0] == {
+        **{"methods": ["nas"], "seeds": [1, 0], "percents": [50], "jobs": 3, "device": "cuda"},
+        **{"root": Path("elsewhere"), "trackio": "ants", "until": "ground", "engine": "ray"},
+        "address": "head:6379",
+    }
+    assert asked[1]["engine"] == "processes" and not asked[1]["methods"]
+    refused = CliRunner().invoke(cli.app, ["run", str(recipe), "--address", "head:6379"])
+    assert "--address is for --engine ray" in str(refused.exception)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +95,7 @@ def test_a_command_passes_its_options_to_its_stage(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, takes: set[str]
 ) -> None:
     asked: list[Any] = []
-    recipe.write_text('task = "maze"\nmethods = ["nas", "astra"]\nseeds = [4, 7]\n')
+    recipe.write_text('task = "antmaze-umaze"\nmethods = ["nas", "astra"]\nseeds = [4, 7]\n')
 
     def run_stage(*arguments: object, **options: object) -> Path:
         asked.append((*arguments, options))
@@ -88,9 +112,11 @@ def test_a_command_passes_its_options_to_its_stage(
     given = [word for name in sorted(takes) for word in words[name][0]]
     result = CliRunner().invoke(cli.app, [stage, str(recipe), "--root", str(tmp_path), *given])
     assert result.output == f"finished: {tmp_path if stage == 'report' else tmp_path / 'made'}\n"
-    defaults = {"methods": (), "seeds": (), "jobs": None, "device": "cpu", "publish": False}
-    expected = defaults | {name: words[name][1] for name in takes} | {"root": tmp_path}
-    assert asked == [(recipe, stage, expected)]
+    given_by_default = {"device": "cpu", "publish": False}
+    (told,) = asked
+    assert told[:2] == (recipe, stage)
+    expected = {name: words[name][1] for name in takes} | {"root": tmp_path}
+    assert {key: value for key, value in told[2].items() if given_by_default.get(key) != value} == expected
 
 
 def test_faults_of_all_recipes_are_told(recipe: Path, tmp_path: Path) -> None:
@@ -108,7 +134,7 @@ def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch)
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("astra_data.pipeline.run.execute", interrupted)
+    monkeypatch.setattr("astra_data.pipeline.run.record_code", interrupted)
     result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
     assert result.exit_code == 130
     assert "run the same command again" in result.output

@@ -45,10 +45,13 @@ def test_a_version_that_is_a_subset_of_another_is_told(fake: Dataset, tmp_path: 
 
 def test_a_card_is_written_with_its_notes(fake: Dataset, tmp_path: Path) -> None:
     (tmp_path / "notes.toml").write_text('license = "mit"\n')
-    assert output_of("card", str(fake.root)) == "written: fake.md\nwritten: fake-coverage.png\n"
+    assert (
+        output_of("export", str(fake.root), "--format", "card", "--out", "fake.md")
+        == "written: fake.md\nwritten: fake-coverage.png\n"
+    )
     assert "license: unknown" in (tmp_path / "fake.md").read_text()
     out = tmp_path / "it.md"
-    output_of("card", str(fake.root), "--out", str(out), "--notes", "notes.toml")
+    output_of("export", str(fake.root), "--format", "card", "--out", str(out), "--notes", "notes.toml")
     assert "license: mit" in out.read_text()
 
 

@@ -20,7 +20,7 @@ CART = Path(__file__).parents[1] / "small_cart.py"
 def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     offered = EntryPoint("rail-cart", "small_cart:LOGS_ALONE", registry.TASK_GROUP)
     monkeypatch.setattr(user_code, "entry_points", lambda group: [offered])
-    result = CliRunner().invoke(app, ["tasks"], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, ["list", "--tasks"], env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
     lines = {line.split()[1]: line for line in result.output.splitlines() if line.startswith("│")}
     assert set(registry.TASKS) <= set(lines)
@@ -28,7 +28,7 @@ def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pyte
     assert "vx, vy" in lines["antmaze-long"] and " 20 " in lines["antmaze-long"]
     assert "z, pitch, left_hip, left_knee and 11 more" in lines["humanoid-walker2d"]
     assert "no" in lines["rail-cart"].split() and "yes" in lines["antmaze-umaze"].split()
-    narrow = CliRunner().invoke(app, ["tasks"], env={"COLUMNS": "80"}).output
+    narrow = CliRunner().invoke(app, ["list", "--tasks"], env={"COLUMNS": "80"}).output
     assert all(f"│ {task} " in narrow for task in registry.TASKS)
     assert max(map(len, narrow.splitlines()[:-1])) <= 80
     assert registry.task_named("rail-cart").name == "rail-cart"
@@ -57,13 +57,13 @@ TASK = replace(RIGHT, objective=Wrong(horizon=40))
 
 
 def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = CliRunner().invoke(app, ["tasks", f"{CART}:TASK"])
+    result = CliRunner().invoke(app, ["check", f"{CART}:TASK"])
     assert result.exit_code == 0 and "small_cart.py:TASK: found no errors" in result.output
     assert result.output.startswith("commands: v -1…4\nabstract states: x\n")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "wrong.py").write_text(WRONG)
     told = "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)"
-    result = CliRunner().invoke(app, ["tasks", "wrong.py:TASK"])
+    result = CliRunner().invoke(app, ["check", "wrong.py:TASK"])
     assert result.exit_code == 1
     assert str(result.exception) == f"task wrong.py:TASK: {told}"
     (tmp_path / "wrong.toml").write_text(

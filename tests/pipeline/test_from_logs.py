@@ -18,10 +18,8 @@ from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
 from astra_data.pipeline.condition import can_be_made_again, condition
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.held_out import write_errors
-from astra_data.pipeline.plan import plan
-from astra_data.pipeline.points import Selection
-from astra_data.pipeline.run import check, set_aside
+from astra_data.pipeline.plan import Selection, plan
+from astra_data.pipeline.run import check, set_aside, write_errors
 from astra_data.pipeline.stages.label import label
 from astra_data.pipeline.trained_policy import load_policy
 from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json

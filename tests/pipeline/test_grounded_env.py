@@ -23,7 +23,7 @@ from astra_data.io.importing import import_dataset
 from astra_data.pipeline import grounded_env
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.grounded_env import OPTIONS, evaluate_policy
-from astra_data.pipeline.plan import plan, stage_of
+from astra_data.pipeline.plan import plan
 from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.trained_policy import load_policy, settings_of
 from astra_data.policies.gymnasium import Array, BatchedVectorEnv, SingleEnv
@@ -73,7 +73,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "cart.toml").write_text(RECIPE)
     experiment = load_experiment(folder / "cart.toml", folder / "runs")
     for item in plan(experiment.recipe, experiment.path, experiment.folder):
-        if item.key == "train/astra/seed_0" or stage_of(item) in ("label", "pair", "ground", "align"):
+        if item.key == "train/astra/seed_0" or item.stage in ("label", "pair", "ground", "align"):
             item.call(progress=silent)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
     return experiment.folder

@@ -6,25 +6,21 @@ import pytest
 
 from astra_data.core.config import load_recipe
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.pipeline import plan as module
-from astra_data.pipeline.plan import plan, stages_until
-from astra_data.pipeline.points import Selection
+from astra_data.pipeline.plan import Selection, plan, stages_until
 from astra_data.pipeline.recipe import Recipe
-from astra_data.pipeline.stages.registry import Stage
-from astra_data.robots.registry import TASKS
 
-KNOWN = f"{', '.join([*TASKS, 'maze'])}; name your own task like cart.py:TASK"
-HEAD = 'task = "maze"\nmethods = ["follower", "direct_transfer", "astra", "astra_plus"]\nseeds = [0, 7]\n'
+ROWS = '"follower", "direct_transfer", "astra", "astra_plus"'
+HEAD = f'task = "antmaze-umaze"\nmethods = [{ROWS}]\nseeds = [0, 7]\n'
 
 
-def load(folder: Path, model: type[Recipe], text: str) -> Recipe:
+def load(folder: Path, text: str) -> Recipe:
     path = folder / "r.toml"
     path.write_text(text)
-    return load_recipe(path, model)
+    return load_recipe(path, Recipe)
 
 
-def test_rows_read_what_their_method_needs(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    recipe = load(tmp_path, fake_recipe, HEAD)
+def test_rows_read_what_their_method_needs(tmp_path: Path) -> None:
+    recipe = load(tmp_path, HEAD)
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
     assert len(items) == 2 * (1 + 1 + 1 + 3 + 1 + 4) + 1
     assert items["ground/astra/seed_7"].inputs == ("pair/seed_7",)
@@ -45,37 +41,16 @@ def test_rows_read_what_their_method_needs(tmp_path: Path, fake_recipe: type[Rec
     assert recorded == {"astra_plus": pairs, "direct_transfer": pairs, "follower": None}
 
 
-def test_rows_are_tested_in_one_grounded_simulator_if_the_recipe_has_it(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
+def test_rows_are_tested_in_one_grounded_simulator_if_the_recipe_has_it(tmp_path: Path) -> None:
     text = HEAD.replace('"astra_plus"', '"nas_plus"')
-    items = {
-        item.key: item for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
-    }
+    items = {item.key: item for item in plan(load(tmp_path, text), tmp_path / "r.toml", tmp_path)}
     assert items["evaluate/follower/seed_7"].inputs == ("ground/nas/seed_7",)
     assert items["evaluate/nas_plus/seed_7"].inputs == ("train/nas_plus/seed_7", "ground/nas/seed_7")
     assert items["evaluate/astra/seed_7"].inputs[-1] == "ground/nas/seed_7"
 
 
-def test_a_method_may_borrow_a_grounding_and_go_on_from_a_policy(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
-    text = 'task = "maze"\nmethods = ["astra_again", "fine_tuned"]\nseeds = [0]\n'
-    items = {
-        item.key: item for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
-    }
-    assert {"ground/astra/seed_0", "align/astra/seed_0", "train/direct_transfer/seed_0"} <= items.keys()
-    assert "ground/astra_again/seed_0" not in items and "evaluate/direct_transfer/seed_0" not in items
-    assert items["train/fine_tuned/seed_0"].inputs == ("pair/seed_0", "train/direct_transfer/seed_0")
-    assert items["evaluate/astra_again/seed_0"].inputs == (
-        "train/astra_again/seed_0",
-        "ground/astra/seed_0",
-        "align/astra/seed_0",
-    )
-
-
-def test_a_recipe_may_augment_what_it_collects(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    recipe = load(tmp_path, fake_recipe, HEAD + "[collect]\nepisodes = 50\n[augment]\nsteps = 4\n")
+def test_a_recipe_may_augment_what_it_collects(tmp_path: Path) -> None:
+    recipe = load(tmp_path, HEAD + "[collect]\nepisodes = 50\n[augment]\ncopies = 4\n")
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
     assert items["augment/seed_7"].inputs == ("collect/seed_7",)
     assert items["pair/seed_7"].inputs == ("augment/seed_7",)
@@ -83,12 +58,12 @@ def test_a_recipe_may_augment_what_it_collects(tmp_path: Path, fake_recipe: type
     assert isinstance(call, partial)
     assert call.keywords["seed"] == 7
     assert call.keywords["dataset"] == tmp_path / "collect/seed_7"
-    plain = plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path)
+    plain = plan(load(tmp_path, HEAD), tmp_path / "r.toml", tmp_path)
     assert not [item for item in plain if item.key.startswith("augment")]
 
 
-def test_rows_are_made_of_every_size(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
+def test_rows_are_made_of_every_size(tmp_path: Path) -> None:
+    recipe = load(tmp_path, HEAD + "[sweep]\npercent = [50, 150]\n")
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
     assert len(items) == 2 * (1 + 1 + 2 * (1 + 1 + 3 + 1 + 4)) + 1
     assert items["collect/seed_7"].call.keywords["config"].episodes == 300  # type: ignore[attr-defined]
@@ -101,11 +76,11 @@ def test_rows_are_made_of_every_size(tmp_path: Path, fake_recipe: type[Recipe]) 
     )
     report = items["report"].call
     assert report.args[0].percents == (50, 150)  # type: ignore[attr-defined]
-    assert report.keywords["command"] == f"astra-data sweep {tmp_path / 'r.toml'}"  # type: ignore[attr-defined]
+    assert report.keywords["command"] == f"astra-data run {tmp_path / 'r.toml'}"  # type: ignore[attr-defined]
 
 
-def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    recipe = load(tmp_path, fake_recipe, HEAD + "[sweep]\npercent = [50, 150]\n")
+def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path) -> None:
+    recipe = load(tmp_path, HEAD + "[sweep]\npercent = [50, 150]\n")
     part = Selection.of(recipe, methods=["astra"], seeds=[7], percents=[50])
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
     assert list(items) == [
@@ -128,85 +103,47 @@ def test_a_part_of_a_sweep_collects_as_much_as_the_whole(tmp_path: Path, fake_re
     [
         ({}, "run {}"),
         ({"seeds": [7]}, "run {} --seed 7"),
-        ({"methods": ["astra"]}, "sweep {} --method astra"),  # which `run` does not take
+        ({"methods": ["astra"]}, "run {} --method astra"),
     ],
 )
 def test_the_command_that_made_a_part_is_one_that_takes_its_options(
-    tmp_path: Path, fake_recipe: type[Recipe], part: dict[str, list[Any]], command: str
+    tmp_path: Path, part: dict[str, list[Any]], command: str
 ) -> None:
-    recipe, path = load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml"
+    recipe, path = load(tmp_path, HEAD), tmp_path / "r.toml"
     *_, report = plan(recipe, path, tmp_path, Selection.of(recipe, **part))
     assert report.call.keywords["command"] == f"astra-data {command.format(path)}"  # type: ignore[attr-defined]
 
 
-def test_a_new_stage_is_planned_by_what_its_function_takes(
-    tmp_path: Path, fake_recipe: type[Recipe], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def judge(method: str, *, policy: Path | None, dataset: Path, seed: int, out: Path) -> None: ...
-
-    stages = vars(module)["STAGES"] | {"judge": Stage("judge", judge, "policy", ("pair", "subset", "train"))}
-    monkeypatch.setattr(module, "STAGES", stages)
-    recipe = load(tmp_path, fake_recipe, HEAD)
-    items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
-    item = items["judge/astra_plus/seed_7"]
-    assert item.inputs == ("train/astra_plus/seed_7", "pair/seed_7")
-    assert item.call.keywords == {  # type: ignore[attr-defined]
-        "method": "astra_plus",
-        "policy": tmp_path / "train/astra_plus/seed_7",
-        "dataset": tmp_path / "pair/seed_7",
-        "seed": 7,
-        "out": tmp_path / "judge/astra_plus/seed_7",
-    }
-    assert "judge/follower/seed_7" not in items and not item.is_threaded
-
-
-def test_who_steps_the_target_gets_threads_and_networks_a_device(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
+def test_who_steps_the_target_gets_threads_and_networks_a_device(tmp_path: Path) -> None:
     text = HEAD.replace('"astra_plus"', '"target"')
-    recipe = load(tmp_path, fake_recipe, text)
+    recipe = load(tmp_path, text)
     items = plan(recipe, tmp_path / "r.toml", tmp_path, device="cuda")
     threaded = {
         item.key.removesuffix("/seed_0") for item in items if item.is_threaded and "seed_0" in item.key
     }
     rows = ("follower", "direct_transfer", "astra", "target")
     assert threaded == {"collect", "train/target", *(f"evaluate/{row}" for row in rows)}
-    on_device = {module.stage_of(item) for item in items if item.device == "cuda"}
+    on_device = {item.stage for item in items if item.device == "cuda"}
     assert on_device == {"ground", "train", "align"}
     settings = {item.key: item.call.keywords.get("settings") for item in items}  # type: ignore[attr-defined]
     assert settings["train/target/seed_0"] is not None and settings["train/astra/seed_0"] is None
 
 
-def test_every_artifact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    seen: set[str] = set()
-    for item in plan(load(tmp_path, fake_recipe, HEAD), tmp_path / "r.toml", tmp_path):
-        assert seen.issuperset(item.inputs)
-        seen.add(item.key)
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (HEAD + "[train]\nstep = 1", "train.step: unknown key: did you mean 'steps'?"),
+        (HEAD + "[train]\ntrie = 1", "train.trie: unknown key: did you mean 'tries'?"),
         (HEAD + "train = 1", "train: expected a table, got 1"),
-        (
-            HEAD + "[plus]\nrate = 1.0",
-            "plus: unknown key; known: task, data, own_methods, methods, seeds, collect, augment, pair, "
-            "ground, train, align, select, evaluate, report, based_on, sweep, rma, target, iql",
-        ),
-        (HEAD + "[train]\nsteps = 'x'", "train.steps: expected a whole number, got 'x'"),
+        (HEAD + "[plus]\nrate = 1.0", "plus: unknown key; known: task, data, own_methods, methods, seeds, "),
+        (HEAD + "[train]\ntries = 'x'", "train.tries: expected a whole number, got 'x'"),
         (HEAD.replace("astra_", "astro_"), "methods: unknown method 'astro_plus': did you mean 'astra'?"),
-        (HEAD.replace("maze", "moon"), "task: unknown task 'moon'; known: " + KNOWN),
+        (HEAD.replace("antmaze-umaze", "moon"), "task: unknown task 'moon'; known: antmaze-umaze"),
         (
-            HEAD.replace("astra_plus", "fine_tuned_plus"),
-            "methods: 'fine_tuned_plus' trains nothing in a simulator, so plus settings have no "
-            "effect: leave out _plus",
+            HEAD.replace("astra_plus", "iql_plus"),
+            "methods: 'iql_plus' trains nothing in a simulator, so plus",
         ),
         (HEAD.replace("7", "0"), "expected each of seeds once, got [0, 0]"),
-        (
-            HEAD.replace('"follower", "direct_transfer", "astra"', '"astra_plus"'),
-            "expected each of methods once, got ['astra_plus', 'astra_plus']",
-        ),
+        (HEAD.replace('"follower"', '"astra"'), "expected each of methods once, got ['astra', 'direct_tra"),
         (HEAD + "[sweep]\npercent = [5, 5]", "expected each of sweep.percent once, got [5, 5]"),
         (
             HEAD + "[collect]\nepisodes = 9\n[sweep]\npercent = [5]",
@@ -215,23 +152,21 @@ def test_every_artifact_comes_after_those_it_reads(tmp_path: Path, fake_recipe: 
         (HEAD.replace("[0, 7]", "[]"), "seeds: expected 1 or more, got none"),
     ],
 )
-def test_faults_are_told(tmp_path: Path, fake_recipe: type[Recipe], text: str, expected: str) -> None:
+def test_faults_are_told(tmp_path: Path, text: str, expected: str) -> None:
     with pytest.raises(RecipeError) as caught:
-        load(tmp_path, fake_recipe, text)
-    assert str(caught.value) == f"{tmp_path / 'r.toml'}: {expected}"
+        load(tmp_path, text)
+    assert str(caught.value).startswith(f"{tmp_path / 'r.toml'}: {expected}")
 
 
-def test_a_recipe_with_data_labels_that_and_collects_nothing(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
+def test_a_recipe_with_data_labels_that_and_collects_nothing(tmp_path: Path) -> None:
     text = 'data = "walks@data-1.0.0"\n' + HEAD + "[sweep]\npercent = [50, 100]\n"
-    recipe = load(tmp_path, fake_recipe, text)
+    recipe = load(tmp_path, text)
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
     assert not [key for key in items if key.startswith("collect")]
     label, subset = (items[key].call.keywords for key in ("label/seed_7", "subset/percent_050/seed_7"))  # type: ignore[attr-defined]
     assert (label["data"], label["seed"], label["out"]) == ("walks@data-1.0.0", 7, tmp_path / "label/seed_7")
     assert items["pair/seed_7"].inputs == ("label/seed_7",)
-    without = load(tmp_path, fake_recipe, HEAD)
+    without = load(tmp_path, HEAD)
     assert subset["of"] is None and "data" not in without.settings
     reported = plan(without, tmp_path / "r.toml", tmp_path)[-1].call.args[0]  # type: ignore[attr-defined]
     assert reported.settings["data"] is None
@@ -240,60 +175,55 @@ def test_a_recipe_with_data_labels_that_and_collects_nothing(
         ("[sweep]\npercent = [150]\n", "sweep.percent: expected at most 100 % of data, got 150"),
     ):
         with pytest.raises(RecipeError, match=expected):
-            load(tmp_path, fake_recipe, 'data = "walks"\n' + HEAD + more)
+            load(tmp_path, 'data = "walks"\n' + HEAD + more)
 
 
-SELECT = HEAD.replace('"astra_plus"', '"astra_plus", "target", "nas"') + "[select]\nsteps = 3\n"
+SELECT = HEAD.replace('"astra_plus"', '"astra_plus", "target", "nas"') + "[select]\nepisodes = 3\n"
 
 
-def test_a_choice_reads_all_policies_and_groundings_that_it_needs(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
-    recipe = load(tmp_path, fake_recipe, SELECT)
+def test_a_choice_reads_all_policies_and_groundings_that_it_needs(tmp_path: Path) -> None:
+    recipe = load(tmp_path, SELECT)
     planned = plan(recipe, tmp_path / "r.toml", tmp_path)
     items = {item.key: item for item in planned}
     rows, seeds = ("direct_transfer", "astra", "astra_plus", "nas"), (0, 7)
     policies = {f"train/{row}/seed_{seed}" for row in rows for seed in seeds}  # neither follower nor target
     groundings = {f"ground/{owner}/seed_{seed}" for owner in ("astra", "nas") for seed in seeds}
-    assert set(items["select"].inputs) == policies | groundings | {"pair/seed_0", "pair/seed_7"}
+    assert set(items["select"].inputs) == policies | groundings
     assert [item.key for item in planned][-2:] == ["select", "report"]
     assert items["report"].inputs[-1] == "select"
     call = items["select"].call
     assert isinstance(call, partial) and call.keywords == {"root": tmp_path}
-    assert call.args[0].methods == recipe.methods and call.args[1].steps == 3
-    assert "select" not in {item.key for item in plan(load(tmp_path, fake_recipe, HEAD), tmp_path, tmp_path)}
+    assert call.args[0].methods == recipe.methods and call.args[1].episodes == 3
+    assert "select" not in {item.key for item in plan(load(tmp_path, HEAD), tmp_path, tmp_path)}
 
 
-def test_one_seed_alone_is_not_judged(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    recipe = load(tmp_path, fake_recipe, SELECT)
+def test_one_seed_alone_is_not_judged(tmp_path: Path) -> None:
+    recipe = load(tmp_path, SELECT)
     items = {item.key: item for item in plan(recipe, tmp_path, tmp_path, Selection.of(recipe, seeds=[7]))}
     assert "select" not in items and "select" not in items["report"].inputs
 
 
-def test_rows_without_policies_to_judge_are_reported_without_a_choice(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
-    recipe = load(tmp_path, fake_recipe, SELECT)
+def test_rows_without_policies_to_judge_are_reported_without_a_choice(tmp_path: Path) -> None:
+    recipe = load(tmp_path, SELECT)
     for row in ("follower", "target"):
         part = Selection.of(recipe, methods=[row])
         items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
         assert "select" not in items and "select" not in items["report"].inputs
 
 
-def test_the_judge_is_grounded_even_if_its_row_is_left_out(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    recipe = load(tmp_path, fake_recipe, SELECT.replace("steps = 3", 'judge = "astra_again"'))
+def test_the_judge_is_grounded_even_if_its_row_is_left_out(tmp_path: Path) -> None:
+    recipe = load(tmp_path, SELECT.replace("episodes = 3", 'judge = "astra_plus"'))
     part = Selection.of(recipe, methods=["direct_transfer"])
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path, part)}
     assert "ground/astra/seed_7" in items and "ground/astra/seed_7" in items["select"].inputs
     assert "ground/nas/seed_7" not in items["select"].inputs
 
 
-def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path, fake_recipe: type[Recipe]) -> None:
-    recipe = load(tmp_path, fake_recipe, SELECT + "[sweep]\npercent = [50, 150]\n")
+def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path) -> None:
+    recipe = load(tmp_path, SELECT + "[sweep]\npercent = [50, 150]\n")
     items = {item.key: item for item in plan(recipe, tmp_path / "r.toml", tmp_path)}
     inputs = items["select"].inputs
     assert "train/nas/percent_050/seed_0" in inputs and "ground/nas/percent_150/seed_7" in inputs
-    assert "subset/percent_050/seed_7" in inputs and "pair/seed_7" not in inputs
 
 
 @pytest.mark.parametrize(
@@ -315,11 +245,9 @@ def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path, fake_recipe:
         ),
     ],
 )
-def test_a_choice_that_cannot_be_made_is_refused(
-    text: str, message: str, tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
+def test_a_choice_that_cannot_be_made_is_refused(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=message):
-        load(tmp_path, fake_recipe, text)
+        load(tmp_path, text)
 
 
 def test_the_last_stage_is_one_of_those_made() -> None:
@@ -330,20 +258,9 @@ def test_the_last_stage_is_one_of_those_made() -> None:
         stages_until("grond")
 
 
-def test_a_policy_to_go_on_from_comes_first_wherever_its_row_is(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
-    text = 'task = "maze"\nmethods = ["fine_tuned", "direct_transfer"]\nseeds = [0]\n'
-    keys = [item.key for item in plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)]
-    first, then = (keys.index(f"train/{row}/seed_0") for row in ("direct_transfer", "fine_tuned"))
-    assert first < then and len(set(keys)) == len(keys)
-
-
-def test_who_was_trained_in_the_target_goes_beyond_no_recorded_commands(
-    tmp_path: Path, fake_recipe: type[Recipe]
-) -> None:
+def test_who_was_trained_in_the_target_goes_beyond_no_recorded_commands(tmp_path: Path) -> None:
     text = HEAD.replace('"astra_plus"', '"target"')
-    items = plan(load(tmp_path, fake_recipe, text), tmp_path / "r.toml", tmp_path)
+    items = plan(load(tmp_path, text), tmp_path / "r.toml", tmp_path)
     calls = {item.key: item.call for item in items if item.key.startswith("evaluate")}
     known = {key: call.keywords["recorded"] for key, call in calls.items() if isinstance(call, partial)}
     assert known["evaluate/target/seed_0"] is None

@@ -11,7 +11,6 @@ from fake_items import Record, crash, fail, hang, kill_itself, rendezvous, touch
 
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError
 from astra_data.pipeline.executors import SETTINGS, Item, execute_on_cluster
-from astra_data.pipeline.sweep import sweep
 
 # Ray looks when it is imported.
 os.environ |= SETTINGS
@@ -64,33 +63,6 @@ def test_failures_come_back_and_stop_the_others(address: str, tmp_path: Path) ->
     lost = [Item("a", (), kill_itself)]
     with pytest.raises(AstraDataError, match=r"^a was lost with its worker: "):
         execute_on_cluster(lost, address=address, jobs=1, logs=tmp_path, watch=Record())
-
-
-NAMING_FOLDERS = ("asked.json", "dataset.json", "manifest.json")
-
-
-def test_a_sweep_on_a_cluster_writes_what_processes_write(
-    address: str, tmp_path: Path, fake_recipe: object
-) -> None:
-    recipe = tmp_path / "r.toml"
-    recipe.write_text(
-        'task = "maze"\nmethods = ["nas"]\nseeds = [0, 1]\n'
-        "[collect]\nepisodes = 20\n[sweep]\npercent = [50]\n"
-    )
-    folders = [
-        sweep(recipe, root=tmp_path / root, jobs=2, cluster=cluster)
-        for root, cluster in (("processes", None), ("ray", address))
-    ]
-    files = [
-        {
-            path.relative_to(folder): path.read_text().replace(str(folder), "")
-            for path in folder.rglob("*")
-            if path.is_file() and path.name not in NAMING_FOLDERS
-        }
-        for folder in folders
-    ]
-    assert files[0] == files[1]
-    assert len(files[0]) > 10
 
 
 def test_a_cluster_that_does_not_answer_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,297 +1,230 @@
+"""Runs of fake stages: what is made, made again, refused and told."""
+
+import csv
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from fake_runs import bare_results
-from fake_stages import asked
+from fake_stages import FakeStages
 
-from astra_data.core.errors import BadInputError, MissingStageError, RecipeError
+from astra_data.core.artifact import MANIFEST
+from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError, RecipeError
+from astra_data.dataset.format import DATASET_PATH
+from astra_data.pipeline.condition import LOADERS
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.run import check, make, run, run_stage
+from astra_data.pipeline.run import check, check_device, make, run, run_stage
+from astra_data.pipeline.stages.registry import STAGES
 from astra_data.reports.results import results_json
 from astra_data.worlds.task import Task
 
-pytestmark = pytest.mark.usefixtures("fake_recipe")
+HEAD = 'task = "antmaze-umaze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n'
+GROUND, TRAIN, ALIGN, EVALUATE = (
+    f"{stage}/astra/seed_0" for stage in ("ground", "train", "align", "evaluate")
+)
+MADE_OF_DATA = ("astra", "astra_plus", "target")
+PLUS = ("train/astra_plus/seed_0", "evaluate/astra_plus/seed_0")
+pytestmark = pytest.mark.usefixtures("stages")
 
 
 @pytest.fixture
 def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "r.toml"
-    path.write_text('task = "maze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[train]\nsteps = 5\n')
+    path.write_text(HEAD)
     return path
 
 
-def test_a_recipe_runs_whole(recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = run(recipe, root=tmp_path, jobs=2)
-    assert folder == tmp_path / "r"
-    assert asked(folder / "train/astra_plus/seed_0") == {
-        "task": "maze",
-        "method": "astra_plus",
-        "dataset": str(folder / "pair/seed_0"),
-        "grounding": str(folder / "ground/astra/seed_0"),
-        "initial": None,
-        "seed": 0,
-        "steps": 5,
-    }
-    assert asked(folder / "evaluate/astra/seed_0")["target_encoder"] == str(folder / "align/astra/seed_0")
-    assert asked(folder / "report")["methods"] == ["astra", "astra_plus"]
-    assert json.loads((folder / "recipe.json").read_text())["train"]["steps"] == 5
-    lines = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"report  finished in [\d.]+ s  \(9 of 9\)", lines[-1])
-
-    unfinished = [key for key, found in check(recipe, root=tmp_path).items() if not found.is_finished]
-    assert unfinished == []
-    run(recipe, root=tmp_path, jobs=1)
-    assert (folder / "train/astra/seed_0/attempts").read_text() == "."
+@pytest.fixture
+def folder(recipe: Path, stages: FakeStages) -> Path:
+    made = run(recipe, root=recipe.parent)
+    stages.made.clear()
+    return made
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next(recipe: Path, tmp_path: Path) -> None:
-    folder = run(recipe, root=tmp_path, jobs=1)
-    left = folder / "collect/.seed_0.tmp-999999999"
-    (left / "episodes").mkdir(parents=True)
-    staged = folder / "collect/.seed_1.staged"
-    staged.mkdir()
-    run(recipe, root=tmp_path, jobs=1)
-    assert not left.exists()
-    assert staged.exists()
+def states(recipe: Path, *, verify: bool = False) -> dict[str, tuple[str, str]]:
+    found = check(recipe, root=recipe.parent, verify=verify)
+    return {key: (of.state, of.why) for key, of in found.items() if (of.state, of.why) != ("finished", "")}
 
 
-@pytest.mark.parametrize(("jobs", "each_of_two"), [(None, 1), (1, 3)])
-def test_items_side_by_side_share_the_cores(
-    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int | None, each_of_two: int
+def made_again(folder: Path) -> list[str]:
+    aside = folder / "set_aside"
+    return sorted(path.relative_to(aside).as_posix() for path in aside.rglob("seed_0"))
+
+
+def alter(file: Path) -> None:
+    whole = file.read_bytes()
+    file.write_bytes(whole[:9] + b"?" + whole[10:])
+
+
+def test_a_recipe_runs_whole_and_once(
+    recipe: Path, tmp_path: Path, stages: FakeStages, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("astra_data.pipeline.devices.cores", lambda: 3)
-    folder = run(recipe, root=tmp_path, jobs=jobs)
-    assert asked(folder / "collect/seed_0")["num_threads"] == 3
-    for row in ("astra", "astra_plus"):
-        assert asked(folder / "evaluate" / row / "seed_0")["num_threads"] == each_of_two
+    recipe.write_text(HEAD + "[train]\ntries = 5\n")
+    folder = run(recipe, root=tmp_path)
+    asked = stages.asked[PLUS[0]]
+    assert (asked["dataset"], asked["grounding"]) == (folder / "pair/seed_0", folder / GROUND)
+    assert (asked["method"], asked["seed"], asked["config"].tries) == ("astra_plus", 0, 5)
+    assert stages.asked[EVALUATE]["target_encoder"] == folder / ALIGN
+    assert stages.asked["report"]["recipe"].methods == ("astra", "astra_plus")
+    assert json.loads((folder / "recipe.json").read_text())["train"]["tries"] == 5
+    out = capsys.readouterr().out
+    assert "report  finished in 1.0 s  (9 of 9)" in out and f"{EVALUATE}  done 0.50  (1 of 2 points)" in out
+    assert states(recipe) == {}
+    stages.made.clear()
+    run(recipe, root=tmp_path)
+    assert stages.made == ["report"]
 
 
-def test_trainings_in_the_target_get_their_share_of_the_cores_and_one_table(
-    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_a_killed_run_left_is_removed_by_the_next(recipe: Path, folder: Path) -> None:
+    left, staged = folder / "collect/.seed_0.tmp-999999999", folder / "collect/.seed_1.staged"
+    for place in (left / "episodes", staged):
+        place.mkdir(parents=True)
+    run(recipe, root=recipe.parent)
+    assert not left.exists() and staged.exists()
+
+
+def test_a_failed_run_keeps_what_is_finished_and_goes_on(
+    recipe: Path, tmp_path: Path, stages: FakeStages
 ) -> None:
-    monkeypatch.setattr("astra_data.pipeline.devices.cores", lambda: 8)
-    methods = '["direct_transfer", "target", "full_obs"]'
-    recipe.write_text(f'task = "maze"\nmethods = {methods}\nseeds = [0]\n[target]\nnum_envs = 7\n')
-    folder = run(recipe, root=tmp_path, jobs=2, until="train")
-    for row in ("target", "full_obs"):
-        told = asked(folder / "train" / row / "seed_0")
-        assert told["num_threads"] == 4 and "num_envs=7" in str(told["settings"])
-    assert "num_threads" not in asked(folder / "train/direct_transfer/seed_0")
-
-
-@pytest.mark.parametrize(("until", "calls"), [("pair", 0), ("ground", 1), (None, 1)])
-def test_every_run_that_grounds_writes_the_page_of_errors(
-    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: str | None, calls: int
-) -> None:
-    told: list[object] = []
-    monkeypatch.setattr("astra_data.pipeline.run.write_errors", lambda *given: told.append(given))
-    run(recipe, root=tmp_path, jobs=1, until=until)
-    assert len(told) == calls
-
-
-def test_a_stage_may_make_what_its_own_items_read(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text('task = "maze"\nmethods = ["fine_tuned"]\nseeds = [0]\n')
-    run(recipe, root=tmp_path, until="pair")
-    folder = run_stage(recipe, "train", root=tmp_path)
-    assert asked(folder / "fine_tuned/seed_0")["initial"] == str(folder / "direct_transfer/seed_0")
-
-
-@pytest.mark.parametrize(("device", "jobs"), [("cpu", 5), ("cuda:0", 2)])
-def test_few_items_at_a_time_hold_a_context_of_a_gpu(
-    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, jobs: int
-) -> None:
-    told: list[int] = []
-    monkeypatch.setattr("astra_data.pipeline.devices.cores", lambda: 5)
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    monkeypatch.setattr("astra_data.pipeline.run.execute", lambda *_, jobs, **__: told.append(jobs))
-    run(recipe, root=tmp_path, device=device)
-    run(recipe, root=tmp_path, device=device, jobs=3)
-    assert told == [jobs, 3]
-
-
-def test_networks_compute_on_the_device_that_is_asked_for(
-    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run(recipe, root=tmp_path, jobs=1, until="pair")
-    told: list[tuple[str, str]] = []
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    monkeypatch.setattr(
-        "astra_data.pipeline.run.execute",
-        lambda items, **_: told.extend((item.key, item.device) for item in items),
-    )
-    run(recipe, root=tmp_path, device="cuda:0", until="ground")
-    run_stage(recipe, "ground", root=tmp_path, device="cuda:0")
-    assert told == [("ground/astra/seed_0", "cuda:0")] * 2
-
-
-@pytest.mark.parametrize(("cluster", "walked"), [(None, "cuda:0"), ("auto", "cpu")])
-def test_a_task_is_walked_through_where_its_policies_are_trained(
-    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cluster: str | None, walked: str
-) -> None:
-    """A cluster's machines have GPUs that this one may lack."""
-    told: list[str] = []
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    monkeypatch.setattr("astra_data.pipeline.run.TASKS", {})
-
-    def walked_through(task: Task, device: str) -> list[str]:
-        told.append(device)
-        return []
-
-    monkeypatch.setattr("astra_data.pipeline.run.check_task", walked_through)
-    for way in ("execute", "execute_on_cluster"):
-        monkeypatch.setattr(f"astra_data.pipeline.run.{way}", lambda *_, **__: None)
-    device = "cuda" if cluster else "cuda:0"
-    experiment = load_experiment(recipe, tmp_path)
-    make(experiment, (), (), jobs=1, device=device, cluster=cluster)
-    assert told == [walked]
-
-
-@pytest.mark.parametrize("stage", ["ground", "align"])
-def test_a_row_is_grounded_and_aligned_as_its_method(recipe: Path, tmp_path: Path, stage: str) -> None:
-    with pytest.raises(MissingStageError, match="pair/seed_0 is missing"):
-        run_stage(recipe, stage, methods=["astra_plus"], root=tmp_path)
-
-
-def test_several_rows_of_a_stage(recipe: Path, tmp_path: Path) -> None:
-    rows = ["direct_transfer", "astra", "astra_plus"]
-    recipe.write_text(
-        recipe.read_text().replace('"astra", "astra_plus"', ", ".join(f'"{row}"' for row in rows))
-    )
-    run(recipe, root=tmp_path, until="ground")
-    folder = run_stage(recipe, "train", methods=["direct_transfer", "astra_plus"], root=tmp_path)
-    assert sorted(row.name for row in folder.iterdir()) == ["astra_plus", "direct_transfer"]
-    with pytest.raises(BadInputError, match=r"^direct_transfer has no stage 'align'$"):
-        run_stage(recipe, "align", methods=["astra", "direct_transfer"], root=tmp_path)
-
-
-def test_a_failed_run_goes_on_where_it_stopped(recipe: Path, tmp_path: Path) -> None:
-    text = recipe.read_text()
-    recipe.write_text(text + "[pair]\nfails = true\n")
-    with pytest.raises(BadInputError, match=r"^pair/seed_0: told to fail$"):
-        run(recipe, root=tmp_path, jobs=1)
-    assert (tmp_path / "r/collect/seed_0").is_dir()
-    assert not (tmp_path / "r/pair/seed_0").exists()
-    (tmp_path / "r/recipe.json").unlink()
-    recipe.write_text(text)
-    run(recipe, root=tmp_path, jobs=1, until="pair")
-    assert (tmp_path / "r/pair/seed_0/attempts").read_text() == ".."
-    assert not (tmp_path / "r/ground").exists()
-
-
-def test_a_folder_in_use_is_left_alone(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "r"
-
-    def files() -> dict[Path, int]:
-        return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-
-    def run_again(*_: object, **__: object) -> None:
-        before = files()
-        with pytest.raises(BadInputError) as caught:
-            run_stage(recipe, "collect", root=tmp_path)
-        assert str(caught.value) == f"{folder} is in use by another run: wait until it ends, or stop it"
-        assert files() == before
-
-    with monkeypatch.context() as patched:
-        patched.setattr("astra_data.pipeline.run.execute", run_again)
+    recipe.write_text(HEAD.replace("[0]", "[0, 1]"))
+    stages.failing = {"train/astra/seed_1"}
+    with pytest.raises(BadInputError, match=r"^train/astra/seed_1: told to fail$"):
         run(recipe, root=tmp_path)
-    run_stage(recipe, "collect", root=tmp_path, jobs=1)
-    assert (folder / "collect/seed_0").is_dir()
+    before = [*stages.made]
+    assert not (tmp_path / "r/train/astra/seed_1").exists()
+    stages.failing, stages.made = set(), []
+    run(recipe, root=tmp_path)
+    assert "train/astra/seed_1" in stages.made and not set(before[:-1]) & set(stages.made)
 
 
-def test_a_stage_needs_the_stages_before_it(recipe: Path, tmp_path: Path) -> None:
+def test_a_folder_in_use_is_left_alone(
+    recipe: Path, tmp_path: Path, stages: FakeStages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_again(*_: object, **__: object) -> None:
+        with pytest.raises(BadInputError, match="is in use by another run: wait until it ends, or stop it"):
+            run_stage(recipe, "collect", root=tmp_path)
+
+    monkeypatch.setattr("astra_data.pipeline.run.record_code", run_again)
+    run(recipe, root=tmp_path, until="collect")
+    assert stages.made == ["collect/seed_0"]
+
+
+def test_damage_is_set_aside_and_made_again_with_what_was_made_from_it(
+    recipe: Path, folder: Path, stages: FakeStages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = folder / TRAIN / "policy.safetensors"
+    whole = policy.read_bytes()
+    policy.write_bytes(b"")
+    why = f"policy.safetensors has 0 bytes, expected {len(whole)}"
+    assert states(recipe) == {TRAIN: ("damaged", why)}
+    capsys.readouterr()
+    run(recipe, root=recipe.parent)
+    assert policy.read_bytes() == whole and states(recipe) == {}
+    aside = folder / "set_aside/1"
+    assert capsys.readouterr().out.splitlines()[:2] == [
+        f"{TRAIN} is recreated: damaged ({why}); the old one is in {aside / TRAIN}",
+        f"{EVALUATE} is recreated: made from {TRAIN}; the old one is in {aside / EVALUATE}",
+    ]
+    assert (aside / TRAIN / "policy.safetensors").read_bytes() == b""
+    assert stages.made == [TRAIN, EVALUATE, "report"]
+    (folder / EVALUATE / "evaluation.json").unlink()
+    run(recipe, root=recipe.parent)
+    assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}", f"2/{EVALUATE}"]
+
+
+def test_altered_bytes_are_found_where_a_step_reads_them(
+    recipe: Path, folder: Path, stages: FakeStages
+) -> None:
+    grounding = folder / GROUND / "grounding.safetensors"
+    whole = grounding.read_bytes()
+    alter(grounding)
+    assert states(recipe) == {}
+    assert states(recipe, verify=True)[GROUND] == ("damaged", "grounding.safetensors was altered")
+    run(recipe, root=recipe.parent)
+    assert stages.made == ["report"], "no step reads the grounding"
+    shutil.rmtree(folder / PLUS[1])
+    run(recipe, root=recipe.parent)
+    assert grounding.read_bytes() == whole
+    # All of these are made from it; the same bytes again, evaluations of others would do.
+    assert {GROUND, TRAIN, ALIGN, PLUS[0]} <= set(stages.made) and "pair/seed_0" not in stages.made
+
+
+def test_altered_values_of_a_dataset_are_made_again_once_a_step_reads_them(
+    recipe: Path, folder: Path, stages: FakeStages
+) -> None:
+    (data,) = (folder / "collect/seed_0/data").rglob("*.parquet")
+    alter(data)
+    run(recipe, root=recipe.parent)
+    assert stages.made == ["report"], "no step reads the episodes"
+    shutil.rmtree(folder / "pair/seed_0")
+    run(recipe, root=recipe.parent)
+    assert stages.made[:3] == ["report", "collect/seed_0", "pair/seed_0"] and states(recipe) == {}
+
+
+def test_a_damaged_dataset_that_no_stage_made_is_not_replaced(recipe: Path, folder: Path) -> None:
+    description = folder / "collect/seed_0" / DATASET_PATH
+    description.write_text("{")
+    with pytest.raises(BadInputError, match=r"collect/seed_0 is damaged .* and was not made by this recipe"):
+        run(recipe, root=recipe.parent)
+    assert description.read_text() == "{" and not (folder / "set_aside").exists()
+
+
+def test_an_artifact_of_another_input_is_stale(recipe: Path, folder: Path, stages: FakeStages) -> None:
+    recipe.write_text(HEAD.replace("[0]", "[0, 1]"))
+    run(recipe, root=recipe.parent)
+    assert states(recipe) == {}
+    for one, other in (("seed_0", "aside"), ("seed_1", "seed_0"), ("aside", "seed_1")):
+        (folder / "collect" / one).rename(folder / "collect" / other)
+    stages.made.clear()
+    stale = ("stale", "made from another collect/seed_0")
+    assert states(recipe)["pair/seed_0"] == stale
+    shutil.rmtree(folder / "ground")
+    with pytest.raises(MissingStageError, match=r"pair/seed_0 is stale \(made from another collect/seed_0\)"):
+        run_stage(recipe, "ground", seeds=[0], root=recipe.parent)
+    run(recipe, root=recipe.parent, until="pair")
+    assert stages.made == ["pair/seed_0", "pair/seed_1"]
+
+
+def test_manifests_that_are_missing_or_damaged_and_files_that_are_foreign(recipe: Path, folder: Path) -> None:
+    (folder / ALIGN / MANIFEST).unlink()
+    (folder / TRAIN / MANIFEST).write_text("{")
+    (folder / GROUND / "notes.txt").touch()
+    found = states(recipe)
+    assert found[ALIGN] == ("damaged", "manifest.json is missing")
+    assert found[TRAIN][0] == "damaged" and found[TRAIN][1].startswith("manifest.json cannot be read")
+    assert found[GROUND] == ("finished", "not of it: notes.txt")
+
+
+def test_results_are_read_as_other_stages_read_them(recipe: Path, folder: Path, tmp_path: Path) -> None:
+    found = states(recipe, verify=True)
+    for key in (GROUND, TRAIN, ALIGN):  # whose fakes are no networks
+        assert found[key][0] == "damaged" and found[key][1].endswith(", after removing this")
+    assert LOADERS.keys() == {stage.name for stage in STAGES.values() if stage.result}
+    (tmp_path / "result").write_text("{}")
+    for load in LOADERS.values():
+        with pytest.raises(AstraDataError):
+            load(tmp_path / "result")
+
+
+def test_a_stage_alone_reads_nothing_missing_and_nothing_altered(
+    recipe: Path, tmp_path: Path, stages: FakeStages
+) -> None:
     with pytest.raises(MissingStageError) as caught:
         run_stage(recipe, "train", methods=["astra"], root=tmp_path)
-    root = tmp_path / "r"
-    assert str(caught.value) == (
-        f"{root / 'pair/seed_0'} is missing: run `astra-data pair {recipe} --root {tmp_path}` first"
-    )
-
-
-@pytest.mark.parametrize(
-    ("stage", "part", "fault"),
-    [
-        ("report", "evaluate/astra/seed_1/evaluation.json", r"damaged \(evaluation.json was altered\)"),
-        ("evaluate", "train/astra/seed_0/policy.safetensors", r"damaged \(policy.safetensors was altered\)"),
-        ("train", "ground/astra", r"stale \(made from another pair/seed_0\)"),
-        ("evaluate", "align/astra", r"stale \(made from another pair/seed_0\)"),
-    ],
-)
-def test_a_stage_alone_reads_nothing_altered_and_nothing_swapped(
-    recipe: Path, tmp_path: Path, stage: str, part: str, fault: str
-) -> None:
-    recipe.write_text('task = "maze"\nmethods = ["astra"]\nseeds = [0, 1]\n')
-    place = run(recipe, root=tmp_path, jobs=2) / part
-    if place.is_file():
-        place.write_bytes(place.read_bytes().swapcase())
-    else:
-        for one, other in (("seed_0", "aside"), ("seed_1", "seed_0"), ("aside", "seed_1")):
-            (place / one).rename(place / other)
-    if stage != "report":
-        shutil.rmtree(tmp_path / "r" / stage)
-    with pytest.raises(MissingStageError, match=f"/{part.partition('/seed')[0]}/seed_. is {fault}: run"):
-        run_stage(recipe, stage, root=tmp_path, jobs=1)
-
-
-def test_moved_copies_are_made_by_running_the_recipe(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text(recipe.read_text() + "[augment]\nsteps = 4\n")
-    run_stage(recipe, "collect", root=tmp_path)
-    missing = tmp_path / "r/augment/seed_0"
-    message = f"{missing} is missing: run `astra-data run {recipe} --root {tmp_path}` first"
-    with pytest.raises(MissingStageError, match=f"^{re.escape(message)}$"):
-        run_stage(recipe, "pair", root=tmp_path)
-
-
-def test_a_report_does_not_wait_for_every_seed(recipe: Path, tmp_path: Path) -> None:
-    run_stage(recipe, "report", root=tmp_path)
-    assert asked(tmp_path / "r/report")["seeds"] == [0]
-
-
-def test_a_report_is_published_beside_the_recipe_and_added_to_what_is_there(
-    recipe: Path, tmp_path: Path
-) -> None:
-    results = tmp_path / "results"
-    run_stage(recipe, "report", root=tmp_path, jobs=1, publish=True)
-    told = asked(tmp_path / "r/report")
-    assert (told["publish"], told["published"]) == (str(results), [])
-    settings = load_experiment(recipe, tmp_path).recipe.settings
-    results.mkdir(exist_ok=True)
-    (results / "r.json").write_text(results_json(bare_results("r", {"astra": [0]}, settings)))
-    run_stage(recipe, "report", root=tmp_path, jobs=1, publish=True)
-    assert asked(tmp_path / "r/report")["published"] == [str(results / "r.json")]
-    run_stage(recipe, "report", root=tmp_path, jobs=1)
-    assert (told := asked(tmp_path / "r/report"))["publish"] is None and told["published"] == []
-    recipe.write_text(recipe.read_text() + "[evaluate]\nsteps = 7\n")
-    with pytest.raises(RecipeError, match=r"^evaluate changed in .* since the results in .*r.json were made"):
-        run_stage(recipe, "report", root=tmp_path, publish=True)
-
-
-def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, tmp_path: Path) -> None:
-    text, folder = recipe.read_text(), tmp_path / "r"
-    run(recipe, root=tmp_path, jobs=2)
-    recipe.write_text(text.replace("steps = 5", "steps = 6"))
-    stale = {key: found.why for key, found in check(recipe, root=tmp_path).items() if found.state == "stale"}
-    rows = ("astra", "astra_plus")
-    assert stale == dict.fromkeys(
-        [f"{stage}/{row}/seed_0" for stage in ("train", "evaluate") for row in rows],
-        "train (steps: 5, now 6) changed in the recipe since: give the recipe another name, or remove this",
-    )
-    with pytest.raises(RecipeError) as caught:
-        run(recipe, root=tmp_path)
-    assert str(caught.value) == (
-        f"train (steps: 5, now 6) changed in the recipe since {folder} was made: "
-        f"give the recipe another name, or remove {folder / 'train'} {folder / 'evaluate'}"
-    )
-    shutil.rmtree(folder / "train")
-    shutil.rmtree(folder / "evaluate")
-    assert sorted(key for key, found in check(recipe, root=tmp_path).items() if not found.is_finished) == [
-        f"{stage}/{row}/seed_0" for stage in ("evaluate", "train") for row in rows
-    ]
-    recipe.write_text(text.replace("seeds = [0]", "seeds = [0, 1]"))
-    assert check(recipe, root=tmp_path)["collect/seed_1"].state == "missing"
+    missing = f"{tmp_path / 'r/pair/seed_0'} is missing: run `astra-data pair {recipe} --root {tmp_path}`"
+    assert str(caught.value) == f"{missing} first"
+    run(recipe, root=tmp_path, until="ground")
+    stages.made.clear()
+    run_stage(recipe, "train", methods=["astra_plus"], root=tmp_path)
+    assert stages.made == [PLUS[0]]
+    alter(tmp_path / "r" / GROUND / "grounding.safetensors")
+    with pytest.raises(MissingStageError, match=r"damaged \(grounding.safetensors was altered\): run `astra"):
+        run_stage(recipe, "train", root=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -306,45 +239,266 @@ def test_a_changed_recipe_does_not_mix_with_what_the_old_one_made(recipe: Path, 
     ],
 )
 def test_bad_arguments(recipe: Path, tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(BadInputError) as caught:
+    with pytest.raises(BadInputError, match=f"^{re.escape(message)}$"):
         run_stage(recipe, root=tmp_path, **arguments)
-    assert str(caught.value) == message
 
 
-def test_some_seeds_of_a_recipe(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text(recipe.read_text().replace("seeds = [0]", "seeds = [0, 1, 2]"))
-    folder = run(recipe, seeds=[2, 0], root=tmp_path, jobs=2)
-    assert sorted(path.name for path in (folder / "evaluate/astra").iterdir()) == ["seed_0", "seed_2"]
-    told = asked(folder / "report")
-    assert told["seeds"] == [2, 0]
-    assert told["command"] == f"astra-data run {recipe} --seed 2 --seed 0"
-    run_stage(recipe, "pair", seeds=[0], root=tmp_path)
-    with pytest.raises(MissingStageError, match="collect/seed_1 is missing"):
-        run_stage(recipe, "pair", root=tmp_path)
+def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    check_device("cuda:0")
+    check_device("cuda", "ray")
+    for device, engine in (("cuda:1", "processes"), ("cuda:1", "ray"), ("mps", "ray")):
+        with pytest.raises(BadInputError):
+            check_device(device, engine)
 
 
-def test_seeds_that_other_machines_ran_are_copied_together(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text(recipe.read_text().replace("seeds = [0]", "seeds = [0, 1]"))
-    ours, theirs = (run(recipe, seeds=[seed], root=tmp_path / f"machine{seed}", jobs=1) for seed in (0, 1))
+@pytest.mark.parametrize(("engine", "device"), [("processes", "cuda:0"), ("ray", "cpu")])
+def test_a_task_is_walked_through_where_its_policies_are_trained(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str, device: str
+) -> None:
+    """A cluster's machines have GPUs that this one may lack."""
+    told: list[str] = []
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("astra_data.pipeline.run.TASKS", {})
+
+    def walked_through(task: Task, on: str) -> list[str]:
+        told.append(on)
+        return ["fault"]
+
+    monkeypatch.setattr("astra_data.pipeline.run.check_task", walked_through)
+    with pytest.raises(BadInputError, match="task antmaze-umaze: fault"):
+        given = "cuda" if engine == "ray" else device
+        make(load_experiment(recipe, tmp_path), (), (), device=given, engine=engine)
+    assert told == [device]
+
+
+def test_some_seeds_and_what_other_machines_ran_is_copied_together(
+    recipe: Path, tmp_path: Path, stages: FakeStages
+) -> None:
+    recipe.write_text(HEAD.replace("[0]", "[0, 1, 2]"))
+    ours, theirs = (run(recipe, seeds=seeds, root=tmp_path / str(seeds[0])) for seeds in ([2, 0], [1]))
+    reported = stages.asked["report"]
+    assert reported["recipe"].seeds == (1,) and reported["command"] == f"astra-data run {recipe} --seed 1"
     shutil.copytree(theirs, ours, dirs_exist_ok=True)
-    run(recipe, root=tmp_path / "machine0", jobs=1)
-    made = [ours / f"train/astra_plus/seed_{seed}/attempts" for seed in (0, 1)]
-    assert [path.read_text() for path in made] == [".", "."]
-    assert asked(ours / "report")["seeds"] == [0, 1]
+    stages.made.clear()
+    run(recipe, root=tmp_path / "2")
+    assert stages.made == ["report"] and stages.asked["report"]["recipe"].seeds == (0, 1, 2)
 
 
-def test_a_recipe_with_data_is_labeled_and_has_nothing_to_collect(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text('data = "me/walks"\n' + recipe.read_text())
+def test_a_recipe_with_data_is_labeled_and_has_nothing_to_collect(
+    recipe: Path, tmp_path: Path, stages: FakeStages
+) -> None:
+    recipe.write_text('data = "me/walks"\n' + HEAD)
     with pytest.raises(BadInputError, match=r"r\.toml uses the data me/walks: there is nothing to collect"):
         run_stage(recipe, "collect", root=tmp_path)
-    folder = run(recipe, root=tmp_path, jobs=1, until="pair")
-    assert asked(folder / "label/seed_0")["data"] == "me/walks"
-    assert asked(folder / "pair/seed_0")["dataset"] == str(folder / "label/seed_0")
-    recipe.write_text(recipe.read_text().replace('"me/walks"', '"runs"'))
-    with pytest.raises(RecipeError, match=r'data \("me/walks", now ".*runs"\) changed in the recipe since'):
-        run(recipe, root=tmp_path, jobs=1, until="pair")
-    (tmp_path / "runs/meta").mkdir(parents=True)
-    (tmp_path / "runs/meta/info.json").touch()
-    with pytest.raises(RecipeError, match=r'data \("me/walks", now ".*runs"\) changed'):
-        run(recipe, root=tmp_path, jobs=1, until="pair")
-    assert load_experiment(recipe, tmp_path).recipe.data == str(tmp_path / "runs")
+    folder = run(recipe, root=tmp_path, until="pair")
+    assert stages.asked["label/seed_0"]["data"] == "me/walks"
+    assert stages.asked["pair/seed_0"]["dataset"] == folder / "label/seed_0"
+    recipe.write_text('data = "you/walks"\n' + HEAD)
+    with pytest.raises(
+        RecipeError, match=r'data \("me/walks", now "you/walks"\) changed in the recipe since'
+    ):
+        run(recipe, root=tmp_path, until="pair")
+
+
+def test_a_choice_is_asked_for_by_its_table_and_made_again_with_more_policies(
+    recipe: Path, tmp_path: Path, stages: FakeStages
+) -> None:
+    rows = 'task = "antmaze-umaze"\nmethods = ["nas"]\nseeds = [0, 1]\n'
+    recipe.write_text(rows)
+    folder = run(recipe, root=tmp_path)
+    assert "select" not in stages.made
+    recipe.write_text(rows + "[select]\nepisodes = 2\n")
+    stages.made.clear()
+    run(recipe, root=tmp_path)
+    assert stages.made == ["select", "report"] and states(recipe) == {}
+    recipe.write_text(rows + "[select]\nepisodes = 3\n")
+    with pytest.raises(
+        RecipeError, match=rf"select \(episodes: 2, now 3\) changed .* remove {folder}/select$"
+    ):
+        run(recipe, root=tmp_path)
+    recipe.write_text(rows.replace("1]", "1, 2]") + "[select]\nepisodes = 2\n")
+    assert states(recipe)["select"] == ("stale", "made without train/nas/seed_2")
+    run(recipe, root=tmp_path)
+    assert (folder / "set_aside/1/select").is_dir() and states(recipe) == {}
+
+
+def changed(recipe: Path, text: str) -> list[str]:
+    """Return what a run with another text of the recipe asks to remove; nothing if it does not refuse."""
+    recipe.write_text(text)
+    found = {key for key, of in check(recipe, root=recipe.parent).items() if of.state == "stale"}
+    try:
+        load_experiment(recipe, recipe.parent).check_unchanged()
+    except RecipeError as error:
+        assert found
+        folder = f"{recipe.parent / recipe.stem}/"
+        return [place.removeprefix(folder) for place in str(error).partition(" or remove ")[2].split()]
+    assert not found
+    return []
+
+
+@pytest.mark.parametrize(
+    ("table", "stale"),
+    [
+        (
+            "[collect]\nepisodes = 7",
+            ["align", "collect", *(f"evaluate/{row}" for row in MADE_OF_DATA), "ground", "pair", "train"],
+        ),
+        (
+            "[ground]\nupdates = 7",
+            ["align", "evaluate/astra", "evaluate/astra_plus", "ground", "train/astra", "train/astra_plus"],
+        ),
+        ("[align]\nupdates = 7", ["align", "evaluate/astra", "evaluate/astra_plus"]),
+        ("[train]\ntries = 7", [*(f"evaluate/{row}" for row in MADE_OF_DATA), "train"]),
+        ("[target]\nnum_envs = 7", ["evaluate/target", "train/target"]),
+        ("[evaluate]\nepisodes = 7", ["evaluate"]),
+        ("[rma]\nextrinsics_size = 7\n[report]\ntrajectory_episodes = 7", []),
+    ],
+)
+def test_other_settings_are_refused_where_something_was_made_with_the_old_ones(
+    recipe: Path, stages: FakeStages, table: str, stale: list[str]
+) -> None:
+    text = HEAD.replace('"astra_plus"', '"astra_plus", "target", "follower"')
+    recipe.write_text(text)
+    folder = run(recipe, root=recipe.parent)
+    assert changed(recipe, f"{text}{table}\n") == stale
+    with pytest.raises(RecipeError) if stale else pytest.MonkeyPatch.context():
+        run(recipe, root=recipe.parent)
+    for place in stale:
+        shutil.rmtree(folder / place)
+    stages.made.clear()
+    run(recipe, root=recipe.parent)
+    assert {key for key in stages.made if key != "report"} == {
+        key
+        for key in load_experiment(recipe, folder).items
+        if any(key.startswith(f"{one}/") for one in stale)
+    }
+    assert states(recipe) == {}
+
+
+def test_changes_are_told_key_by_key_and_new_keys_have_their_defaults(recipe: Path, folder: Path) -> None:
+    recipe.write_text(HEAD + "[train]\ntries = 7\nnum_envs = 3\n")
+    with pytest.raises(RecipeError) as caught:
+        run(recipe, root=recipe.parent)
+    found = re.fullmatch(
+        rf"train \((\w+: \S+, now \d, )?(\w+: \S+, now \d)\) changed in the recipe since {folder} was made: "
+        rf"give the recipe another name, or remove {folder}/evaluate {folder}/train",
+        str(caught.value),
+    )
+    assert found, str(caught.value)
+    recipe.write_text(HEAD)
+    record = folder / f"made_with/{TRAIN}.json"
+    kept = json.loads(record.read_text())
+    del kept["train"]["tries"]
+    record.write_text(json.dumps(kept))
+    assert states(recipe) == {}
+    record.write_text("[]")
+    with pytest.raises(AstraDataError, match=r"seed_0\.json is not what a run writes: .*restore it"):
+        check(recipe, root=recipe.parent)
+
+
+def test_what_was_begun_with_other_settings_is_refused_alike(
+    recipe: Path, tmp_path: Path, stages: FakeStages
+) -> None:
+    stages.failing = {TRAIN}
+    with pytest.raises(BadInputError):
+        run(recipe, root=tmp_path)
+    partial = tmp_path / "r/train/astra/.seed_0.partial"
+    assert partial.is_dir()
+    assert changed(recipe, HEAD + "[train]\ntries = 9\n") == ["train"]
+    found = check(recipe, root=tmp_path)
+    assert found[TRAIN].why.endswith(f"or remove {partial}") and found[PLUS[0]].state == "missing"
+    shutil.rmtree(partial)
+    stages.failing = set()
+    run(recipe, root=tmp_path)
+    assert stages.asked[TRAIN]["config"].tries == 9
+
+
+def test_rows_and_seeds_come_and_go_without_changing_others(recipe: Path, folder: Path) -> None:
+    assert changed(recipe, HEAD.replace('"astra", "astra_plus"', '"astra", "direct_transfer"')) == []
+    assert changed(recipe, HEAD.replace("[0]", "[1]")) == []
+    assert changed(recipe, HEAD.replace("umaze", "long")) == [
+        "align",
+        "collect",
+        "evaluate",
+        "ground",
+        "pair",
+        "train",
+    ]
+
+
+SWEEP = HEAD.replace('"astra", "astra_plus"', '"nas", "follower"').replace("[0]", "[0, 1]") + (
+    "[collect]\nepisodes = 20\n[sweep]\npercent = [50, 150]\n"
+)
+
+
+def lines(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_sweep_goes_on_point_by_point_and_makes_shared_artifacts_once(
+    recipe: Path, tmp_path: Path, stages: FakeStages
+) -> None:
+    recipe.write_text(SWEEP)
+    part: dict[str, Any] = {"methods": ["nas"], "seeds": [1], "percents": [50], "root": tmp_path}
+    folder = run(recipe, **part)
+    expected = "nas 50 1 1.0 20.0 2.5 0.5 0.5 fake@data-1.0.0 hash1 abc 7.0"
+    assert [list(line.values()) for line in lines(folder)] == [expected.split()]
+    run(recipe, root=tmp_path)
+    assert len(stages.made) == len({*stages.made}) + 1, "the report twice"
+    assert [tuple(line.values())[:3] for line in lines(folder)] == [
+        (row, percent, seed)
+        for row in ("nas", "follower")
+        for percent in ("50", "150")
+        for seed in ("0", "1")
+    ]
+    shutil.rmtree(folder / "train")
+    run(recipe, methods=["follower"], root=tmp_path)
+    times = {line["method"]: line["wall_seconds"] for line in lines(folder)}
+    assert times["nas"] == "" and float(times["follower"]) > 0
+    text = SWEEP.replace("[50, 150]", "[25, 150]")
+    assert changed(recipe, text) == []
+    assert "collect" in changed(recipe, text.replace("150]", "200]"))
+
+
+def test_finished_points_are_logged(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Any] = []
+    trackio = SimpleNamespace(
+        init=lambda **settings: told.append(settings), log=told.append, finish=lambda: told.append("finished")
+    )
+    recipe.write_text(SWEEP)
+    part: dict[str, Any] = {"methods": ["follower"], "seeds": [1], "percents": [50], "root": tmp_path}
+    monkeypatch.setitem(sys.modules, "trackio", None)
+    with pytest.raises(BadInputError, match="uv sync --extra trackio"):
+        run(recipe, **part, trackio="ants")
+    assert not (tmp_path / "r").exists()
+    monkeypatch.setitem(sys.modules, "trackio", trackio)
+    for _ in range(2):
+        run(recipe, **part, trackio="ants")
+    began, logged, ended = told
+    assert (began["project"], began["name"], ended) == ("ants", "r follower 50 1", "finished")
+    assert began["config"]["dataset_hash"] == "hash1" and logged["success"] == 1.0
+
+
+def test_a_report_is_added_to_what_is_published_beside_the_recipe(
+    recipe: Path, tmp_path: Path, stages: FakeStages
+) -> None:
+    results, text = tmp_path / "results", HEAD.replace('"astra_plus"', '"target"')
+    recipe.write_text(text)
+    run_stage(recipe, "report", root=tmp_path, publish=True)
+    asked = stages.asked["report"]
+    assert (asked["publish"], asked["published"]) == (results, [])
+    settings = load_experiment(recipe, tmp_path).recipe.settings
+    results.mkdir()
+    (results / "r.json").write_text(results_json(bare_results("r", {"astra": [0]}, settings)))
+    run_stage(recipe, "report", root=tmp_path, publish=True)
+    assert stages.asked["report"]["published"] == [results / "r.json"]
+    run_stage(recipe, "report", root=tmp_path)
+    assert stages.asked["report"]["publish"] is None
+    for table in ("[report]\ntrajectory_episodes = 7\n", "[rma]\nextrinsics_size = 7\n"):
+        recipe.write_text(text + table)
+        assert load_experiment(recipe, tmp_path).published() == [results / "r.json"]
+    recipe.write_text(text + "[evaluate]\nepisodes = 7\n")
+    with pytest.raises(RecipeError, match=r"^evaluate \(episodes: 100, now 7\) changed .* since the results"):
+        run_stage(recipe, "report", root=tmp_path, publish=True)

@@ -19,7 +19,7 @@ from astra_data.grounding.files import load_grounding
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.plan import plan, stage_of
+from astra_data.pipeline.plan import plan
 from astra_data.pipeline.run_view import view_run
 from astra_data.robots.registry import task_named
 
@@ -53,7 +53,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("astra_data.grounding.failures._DESCENT", DescentConfig(updates=10, learning_rate=3e-3))
         for item in plan(experiment.recipe, experiment.path, experiment.folder):
-            if stage_of(item) in ("collect", "pair", "ground") and item.key.endswith("seed_3"):
+            if item.stage in ("collect", "pair", "ground") and item.key.endswith("seed_3"):
                 item.call(progress=silent)
     (experiment.folder / "recipe.json").write_text(experiment.recipe.model_dump_json())
     return experiment.folder

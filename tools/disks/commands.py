@@ -133,7 +133,7 @@ def _on_collected(
 COMMANDS = {
     "subset": Command("subset GIVEN/walks --episodes 2 --out out"),
     "merge": Command("merge GIVEN/walks GIVEN/others --new-uids --out out"),
-    "delete": Command("delete GIVEN/walks --episode 7 --out out"),
+    "delete": Command("filter GIVEN/walks --without 7 --out out"),
     "filter": Command("filter GIVEN/walks --min-length 6 --out out"),
     "repair": Command("repair GIVEN/broken --out out"),
     "repair --like": Command("repair GIVEN/stripped --like GIVEN/walks --out out"),
@@ -149,7 +149,7 @@ COMMANDS = {
     "pull": Command("pull GIVEN/shared/walks --out out", adds=True),
     "import minari": _on_collected("import GIVEN/minari-v0 --name back --out out"),
     "export minari": _on_collected("export GIVEN/walks --format minari --out out-v0", looks.files, "out-v0"),
-    "card": _on_collected("card GIVEN/walks --out out.md", looks.card, "out.md", adds=True),
+    "card": _on_collected("export GIVEN/walks --format card --out out.md", looks.card, "out.md", adds=True),
     "push": _on_collected("push GIVEN/walks ./shared", looks.remote, "shared/walks", adds=True),
     "collect": _on_collected(f"{COLLECT} --out out --resume"),
     "pair": _on_collected("pair GIVEN/collected --simulator antmaze-umaze --out out"),

@@ -58,8 +58,8 @@ def listed(uids: Sequence[int]) -> str:
 
 def deletion(called: str, uids: Sequence[int]) -> str:
     """Return the command that leaves `uids` out of the dataset `called`; it spells the first `SHOWN`."""
-    options = " ".join(f"--episode {uid}" for uid in uids[:SHOWN])
-    return f"astra-data delete {called} {options}" + (" ..." if len(uids) > SHOWN else "")
+    options = " ".join(f"--without {uid}" for uid in uids[:SHOWN])
+    return f"astra-data filter {called} {options}" + (" ..." if len(uids) > SHOWN else "")
 
 
 def labels(column: Column) -> list[str]:

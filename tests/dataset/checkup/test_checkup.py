@@ -104,11 +104,11 @@ FAULTS: list[tuple[Callable[[int, Columns], Columns | None], str, tuple[int, ...
     (missed, "warning", (3, 4), "steps of over 1.5 periods: 2, the longest 0.15 s", "gap_s = 0.075"),
     (slow, "warning", (), "time runs at 10 Hz, but 20 Hz is declared", "correct `fps`"),
     (jittery, "note", (), "5 % of the steps are off by 24 %", "resample the recording to 20 Hz"),
-    (standing, "warning", (9,), "time stands still or goes back", "delete walks --episode 9"),
+    (standing, "warning", (9,), "time stands still or goes back", "filter walks --without 9"),
     (dead, "note", (), "constant in all steps: y of observation.state", "check the log"),
-    (stuck, "warning", (5,), "others move: yaw of observation.state", "delete walks --episode 5"),
+    (stuck, "warning", (5,), "others move: yaw of observation.state", "filter walks --without 5"),
     (unused, "note", (), "constant in all steps: w of action", "its effect cannot be learned"),
-    (copied, "warning", (11, 12), "11 has the states and actions of 2", "--episode 11 --episode 12"),
+    (copied, "warning", (11, 12), "11 has the states and actions of 2", "--without 11 --without 12"),
     (torn, "warning", (2,), "not the state of the next row: 1 of 2970", "rows are missing"),
     (in_degrees, "warning", (), "yaw of observation.state: up to", "degrees, set `scale` to 0.0174533"),
     (saturated, "note", (), "at the edge of their range in up to", "record gentler commands"),
@@ -144,8 +144,8 @@ def test_warnings_come_first_and_findings_are_recorded(tmp_path: Path) -> None:
 def test_five_episodes_are_named_and_the_others_counted() -> None:
     assert listed([7]) == "episode 7"
     assert listed(range(7)) == "episodes 0, 1, 2, 3, 4 and 2 more"
-    assert deletion("walks", [3, 9]) == "astra-data delete walks --episode 3 --episode 9"
-    assert deletion("walks", range(6)).endswith("--episode 3 --episode 4 ...")
+    assert deletion("walks", [3, 9]) == "astra-data filter walks --without 3 --without 9"
+    assert deletion("walks", range(6)).endswith("--without 3 --without 4 ...")
     pose = Column("pose", size=2, names=("x", "y"))
     assert (labels(pose), channels(pose, [1])) == (["x", "y"], "y of pose")
     assert (labels(Column("charge")), channels(Column("charge"), [0])) == (["charge"], "charge")
