@@ -13,7 +13,6 @@ from typing import Any
 
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import METHOD_NAMES, TASK_NAMES, base_method
-from astra_data.worlds.user_code import is_user_code, offered
 
 TABLES = {
     "collect": ("astra_data.pipeline.stages.collect:CollectConfig",),
@@ -44,6 +43,7 @@ def check_names(path: Path) -> None:
         RecipeError: it has some; lists them all.
     """
     from astra_data.core.config import did_you_mean, load_tables
+    from astra_data.worlds.user_code import is_user_code, offered
 
     tables = load_tables(path)
     if "methods" not in tables and "based_on" not in tables:
