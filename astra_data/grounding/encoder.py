@@ -79,6 +79,10 @@ class Encoder(nn.Module, ABC):
     def sequence(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return the latents (B, T, Z) and memories (B, T, M) of `step` for `inputs` (B, T, I)."""
 
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what `sequence` does, as of any network."""
+        return self.sequence(inputs)
+
 
 class HistoryEncoder(Encoder):
     """A GRU, whose memory is its hidden state, and whose latent is this after a LayerNorm without gain.
