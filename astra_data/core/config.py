@@ -26,6 +26,8 @@ Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 _UNNAMED = ""
 _MOST_FAULTS = 5
+_MOST_PARTS = 64
+"""Of a key in TOML, between dots."""
 """Of a file that no user writes by hand."""
 
 
@@ -108,6 +110,11 @@ def load_tables(path: Path) -> dict[str, Any]:
         raise RecipeError(f"{path} is a folder: expected a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path} cannot be read as a text file: {error}") from None
+    for number, line in enumerate(text.splitlines(), 1):
+        # The parser takes time with the square of a key's parts.
+        keys = re.split(r"[,=\[\]{}]", line.replace(" ", "").replace("\t", ""))
+        if any(len(list(filter(None, key.split(".")))) > _MOST_PARTS for key in keys):
+            raise RecipeError(f"{path} line {number}: a key of more than {_MOST_PARTS} parts")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -155,6 +155,9 @@ def test_a_component_takes_its_own_settings_or_the_usual_ones() -> None:
     [
         ("x = " + "[" * 5000 + "]" * 5000, "is nested too deeply"),
         ("x = " + "9" * 5000, "cannot be read as TOML: Exceeds the limit"),
+        (".".join("a" * 20_000) + " = 1", "recipe.toml line 1: a key of more than 64 parts"),
+        ("x = 1\n[" + " . ".join("a" * 65) + "]", "recipe.toml line 2: a key of more than 64 parts"),
+        ("x = {" + "'a'.\t" * 64 + "a = 1}", "recipe.toml line 1: a key of more than 64 parts"),
     ],
 )
 def test_hostile_toml_is_one_line(tmp_path: Path, text: str, told: str) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from toy_logs import Columns, toy_columns, write_logs
 
+from astra_data.core.arrays import Floats
 from astra_data.dataset.checkup.checkup import (
     Checkup,
     DeadChannels,
@@ -14,6 +15,7 @@ from astra_data.dataset.checkup.checkup import (
     EpisodeEnds,
     GivenCommands,
     Repeats,
+    Shift,
     check_up,
     held_steps,
     longest_rests,
@@ -226,6 +228,59 @@ def test_rows_that_were_written_twice_are_found(state: Array, found: bool) -> No
     repeats.add(Episode(0, {STATE: state[:200].astype(np.float32)}))
     repeats.add(Episode(1, {STATE: state[200:].astype(np.float32)}))
     assert bool(repeats.findings()) is found
+
+
+def shifted(state: Floats, action: Floats) -> list[Finding]:
+    part = Shift()
+    for uid, half in enumerate((slice(0, len(state) // 2), slice(len(state) // 2, None))):
+        columns = {STATE: state[half].astype(np.float32), ACTION: action[half].astype(np.float32)}
+        part.add(Episode(uid, columns))
+    return part.findings()
+
+
+def walk(actions: Floats, delay: int = 0) -> Floats:
+    """Return states (T, 2) that each action of `delay` rows before moves."""
+    moves = np.roll(actions, delay, axis=0)
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(0.1 * moves, axis=0)[:-1]])
+
+
+ACTIONS = np.random.default_rng(0).normal(size=(400, 2))
+
+
+@pytest.mark.parametrize("off", [-3, -1, 1, 2])
+def test_actions_of_other_rows_are_found(off: int) -> None:
+    [finding] = shifted(walk(ACTIONS), np.roll(ACTIONS, off, axis=0))
+    rows = f"{abs(off)} row{'s' if abs(off) > 1 else ''}"
+    where = "later" if off > 0 else "earlier"
+    assert finding.what.startswith(f"steps follow from the action {rows} {where}, which explains 100%")
+    assert finding.severity == ("warning" if off > 0 else "note")
+
+
+def feedback() -> tuple[Floats, Floats]:
+    """Return states and actions of a robot that is steered back to 0, with noise in both."""
+    rng = np.random.default_rng(1)
+    states, actions = np.zeros((400, 2)), np.zeros((400, 2))
+    for t in range(400):
+        actions[t] = -states[t] + 0.1 * rng.normal(size=2)
+        if t < 399:
+            states[t + 1] = states[t] + 0.2 * actions[t] + 0.02 * rng.normal(size=2)
+    return states, actions
+
+
+@pytest.mark.parametrize(
+    ("state", "action"),
+    [
+        (walk(ACTIONS), ACTIONS),
+        (walk(ACTIONS) + 0.01 * np.random.default_rng(2).normal(size=(400, 2)), ACTIONS),
+        (np.zeros((400, 2)), ACTIONS),
+        (walk(np.repeat(ACTIONS[:40], 10, axis=0)), np.repeat(ACTIONS[:40], 10, axis=0)),
+        (np.random.default_rng(3).normal(size=(400, 2)), ACTIONS),
+        (walk(ACTIONS)[:30], np.roll(ACTIONS, 1, axis=0)[:30]),  # too few
+        feedback(),
+    ],
+)
+def test_actions_of_their_own_rows_are_not(state: Floats, action: Floats) -> None:
+    assert shifted(state, action) == []
 
 
 def counted(ends: list[tuple[int, bool | None]], successes: list[bool | None] | None) -> EpisodeEnds:
