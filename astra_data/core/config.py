@@ -26,9 +26,9 @@ Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 _UNNAMED = ""
 _MOST_FAULTS = 5
+"""Of a file that no user writes by hand."""
 _MOST_PARTS = 64
 """Of a key in TOML, between dots."""
-"""Of a file that no user writes by hand."""
 
 
 def in_order(ends: tuple[float, float]) -> tuple[float, float]:
