@@ -10,6 +10,7 @@ import sys
 import sysconfig
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from string import Template
 
@@ -23,7 +24,7 @@ from astra_data.dataset.columns import ACTION, GOAL, REWARD, STATE, SUCCESS, TER
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import locate, names_at_home
-from astra_data.io.guessing import Logs, Role, csv_files, guess, logs_of
+from astra_data.io.guessing import HEADING, Field, Logs, Role, csv_files, guess, logs_of
 from astra_data.pipeline.first_simulator import DIRECT, SimulatorKind, first_simulator, unpacked
 
 _COLUMNS: dict[Role, str] = {
@@ -276,7 +277,22 @@ def _column(role: Role, logs: Logs) -> str:
     if role in ("state", "command", "goal"):
         keys = {"names": "short", "unit": "unit", "scale": "scale", "offset": "offset"}
         lines += [f"{key} = {_code([getattr(field, of) for field in fields])}" for key, of in keys.items()]
+    if role == "state" and "position" in (roles := _roles(fields)):
+        lines.append(
+            f"role = {_code(roles)}  # how a turn and a shift of the ground act; CHECK the invariant"
+        )
     return "\n".join(line for line in lines if not re.fullmatch(r"offset = \[(0\.0(, )?)+\]", line)) + "\n"
+
+
+def _roles(fields: Sequence[Field]) -> list[str]:
+    """Return what each state is to a turn and a shift of the ground: the one pair x, y, and headings."""
+    roles = [
+        "heading" if one.unit == "rad" and HEADING.fullmatch(one.short) else "invariant" for one in fields
+    ]
+    for at, (one, other) in enumerate(pairwise(fields)):
+        if (one.short, other.short) == ("x", "y") and one.unit == other.unit == "m":
+            roles[at : at + 2] = ["position", "position"]
+    return roles
 
 
 def _code(value: str | Iterable[str] | Iterable[float]) -> str:
