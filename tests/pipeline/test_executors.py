@@ -59,7 +59,7 @@ def test_items_that_wait_for_each_other_are_a_bug() -> None:
     items = [Item("a", ("b",), no_call), Item("b", ("a",), no_call), Item("c", (), no_call)]
     with pytest.raises(ValueError, match="nodes are in a cycle"):
         run_in_order(items, 1, workshop.begin, workshop.wait)
-    assert workshop.begun == ["c"]
+    assert workshop.begun == []
 
 
 def prepared() -> None:

@@ -12,6 +12,7 @@ from damaged import DATA, EPISODES, alter, drop, edit
 from numpy.typing import NDArray
 from small_run import TASK
 
+from astra_data.cli.sharing import export as export_card
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.progress import silent
 from astra_data.dataset.compare import differences
@@ -20,7 +21,6 @@ from astra_data.dataset.format import DATASET_PATH, DIGESTS_PATH, INFO_PATH, MET
 from astra_data.dataset.inspection import inspect_dataset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import export
-from astra_data.io.hub.card import Notes, write_card
 from astra_data.io.hub.sharing import push
 from astra_data.pipeline.stages.augment import AugmentConfig, augment
 from astra_data.pipeline.stages.pair import PairConfig, pair
@@ -43,7 +43,7 @@ COMMANDS: dict[str, Command] = {
         TASK, AugmentConfig(episodes=10), dataset=root, seed=0, out=out, progress=silent
     ),
     "pair": lambda root, out: pair(TASK, PairConfig(), dataset=root, out=out, progress=silent),
-    "card": lambda root, out: write_card(opened(root), out, Notes()),
+    "card": lambda root, out: export_card(str(root), format="card", out=out),
     "export": lambda root, out: export(opened(root), out, format="d4rl"),
     "diff": lambda root, _: differences(opened(root), opened(root)),
     "inspect": lambda root, _: inspect_dataset(opened(root)),
