@@ -129,7 +129,7 @@ def test_folders_that_were_swapped_are_noticed(tmp_path: Path) -> None:
             BadInputError, match=f"was made from another ({of}|grounding and another dataset) than"
         ):
             deploy(run, "astra", tmp_path / "policy")
-        if stage != "align":
+        if stage == "ground":
             with pytest.raises(BadInputError, match="was made from another"):
                 select(run, rows=["astra"], episodes=2)
         swap(rows / "seed_0", rows / "seed_1")

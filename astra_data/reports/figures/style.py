@@ -4,6 +4,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +16,9 @@ from PIL import Image
 
 from astra_data.core.arrays import Ints
 from astra_data.core.naming import base_method, is_plus
-from astra_data.worlds.objective import Score
+
+if TYPE_CHECKING:
+    from astra_data.worlds.objective import Score  # loads torch, which a dataset's figures can do without
 
 SPARE_COLORS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
 """For methods without a color of their own. The others are Okabe and Ito's palette and shades that
@@ -90,7 +93,7 @@ def method_title(method: str) -> str:
     return methods.method_title(method)
 
 
-def score_axis(axes: Axes, score: Score) -> None:
+def score_axis(axes: Axes, score: "Score") -> None:
     """Start the vertical axis at a score of zero, and end it at the limit if there is one."""
     if score.limit is None:
         axes.set_ylim(bottom=0)

@@ -235,5 +235,7 @@ def test_the_command_line_shares_and_fetches(
     assert b"license: mit" in repo.commits[repo.head]["README.md"]
     assert call("pull", "me/it") == f"fake@data-1.0.0: {home}/fake/data-1.0.0\n"
     assert contents(home / "fake/data-1.0.0") == contents(fake.root)
-    assert call("card", "fake", "--notes", "notes.toml") == "written: fake.md\nwritten: fake-coverage.png\n"
+    assert call("export", "fake", "--format", "card", "--out", "fake.md", "--notes", "notes.toml") == (
+        "written: fake.md\nwritten: fake-coverage.png\n"
+    )
     assert "license: mit" in Path("fake.md").read_text()
