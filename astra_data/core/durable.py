@@ -6,7 +6,6 @@ holds by a lock. What killed processes left is removed by the next one with the 
 
 import errno
 import fcntl
-import fnmatch
 import glob
 import hashlib
 import itertools
@@ -293,21 +292,6 @@ def begun_beside(target: Path) -> list[Path]:
     """Return the folders beside `target` with which a command goes on to make it."""
     beside = target.parent.glob(f".{glob.escape(target.name)}.*")
     return sorted(path for path in beside if _RESUMABLE.fullmatch(path.name))
-
-
-def made_in(folder: Path, finished: str) -> list[Path]:
-    """Return what commands go on with in `folder`, if that is all it holds; else the folder itself.
-
-    An empty folder holds nothing; one whose name matches `finished`, such as "seed_*", is not empty.
-    """
-    unfinished: list[Path] = []
-    for parent, folders, files in os.walk(folder):
-        inner = [name for name in folders if not _HIDDEN.fullmatch(name)]
-        unfinished += [Path(parent, name) for name in inner if _RESUMABLE.fullmatch(name)]
-        folders[:] = [name for name in inner if not _RESUMABLE.fullmatch(name)]
-        if fnmatch.filter(folders, finished) or not all(map(_HIDDEN.fullmatch, files)):
-            return [folder]
-    return sorted(unfinished)
 
 
 def _remove_dead(path: Path) -> bool:

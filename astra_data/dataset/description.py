@@ -93,10 +93,6 @@ class ContentHash:
             self._kinds[name] = f"{values.dtype.name}{values.shape[1:]}"
         self._columns[name].update(values.data)
 
-    def column_sums(self) -> dict[str, str]:
-        """Return the sha256 of each column's values so far."""
-        return {name: digest.hexdigest() for name, digest in self._columns.items()}
-
     def hexdigest(self) -> str:
         """Return the hash of all values so far."""
         total = hashlib.sha256()

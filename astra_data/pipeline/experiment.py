@@ -18,11 +18,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import Config, did_you_mean, read_written, validated
+from astra_data.core.config import Config, did_you_mean, in_full, read_written, validated
 from astra_data.core.durable import begun_beside, write_file
-from astra_data.core.errors import RecipeError
-from astra_data.core.naming import first_few, shortened, stage_of_key
+from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.naming import base_method, first_few, shortened, stage_of_key
 from astra_data.dataset.description import changed_values
+from astra_data.methods import grounded_as
 from astra_data.pipeline.executors import Item
 from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.recipe import Recipe, read_tables
@@ -193,10 +194,11 @@ class Experiment:
         now = self.recipe.model_copy(update=kept)
         seeds = [seed for seed in now.seeds if seed in found.seeds]
         before = dict(found.settings) | kept | {"task": now.task, "seeds": now.seeds}
+        before["own_methods"] = _of_rows(before.get("own_methods", {}), rows, in_full(now)["own_methods"])
         try:
             old = self._plan(validated(before, type(now), "settings"), rows, seeds)
         except RecipeError as error:
-            return str(error)
+            return f"settings changed ({str(error).removeprefix('settings: ')})"
         new = self._plan(now, rows, seeds)
         texts = [changes(old[key], new[key], now) if key in old else "sweep changed" for key in new]
         return " and ".join(dict.fromkeys(filter(None, texts)))
@@ -260,6 +262,15 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) -
         if old != new:
             texts.append(f"{name} ({_change(old, new)}) changed in the recipe")
     return " and ".join(texts)
+
+
+def _of_rows(before: dict[str, Any], rows: Collection[str], now: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings `now` of the user's methods, but those `before` of what made `rows`."""
+    makers = {base_method(row) for row in rows}
+    for row in rows:
+        with suppress(BadInputError):  # of a method that is no more
+            makers.add(grounded_as(row))
+    return now | {name: settings for name, settings in before.items() if name in makers}
 
 
 def _change(before: object, now: object) -> str:

@@ -136,23 +136,6 @@ def _world(
     return *learn.world(training), training
 
 
-def training_of(
-    run: str | Path,
-    row: str,
-    seed: int,
-    percent: int | None = None,
-    changes: Mapping[str, Any] = {},
-) -> Training:
-    """Return what `train` gives the method of a row of a run, with `changes` of its `[train]`.
-
-    The policy that another one starts from is not read.
-
-    Raises:
-        BadInputError: the row trains nothing, an artifact is not there, or a change does not fit.
-    """
-    return _training(run, settings_of(run), row, seed, percent, changes)
-
-
 def _training(
     run: str | Path,
     settings: dict[str, Any],
@@ -161,8 +144,7 @@ def _training(
     percent: int | None,
     changes: Mapping[str, Any],
 ) -> Training:
-    if _method_of(settings, row).learn is None:
-        raise BadInputError(f"{row} has no training: expected a row that is trained")
+    """Return what `train` gives the method of a row, but no initial policy, with `changes` of `[train]`."""
     changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | dict(changes)}
     of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
     _check_made(of_train, ("dataset", "grounding"))

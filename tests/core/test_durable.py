@@ -20,7 +20,6 @@ from astra_data.core.durable import (
     files_below,
     held,
     hidden_folder,
-    made_in,
     make_folder,
     sync_tree,
     write_file,
@@ -166,29 +165,6 @@ def test_what_a_command_goes_on_with_is_beside_its_target(tmp_path: Path) -> Non
         (tmp_path / name).mkdir()
     assert begun_beside(tmp_path / "set") == [tmp_path / ".set.partial", tmp_path / ".set.staged"]
     assert begun_beside(tmp_path / "none") == []
-
-
-@pytest.mark.parametrize(
-    ("holds", "made"),
-    [
-        ([], []),
-        (["a/", "b/c/"], []),
-        (["b/.seed_0.partial/policy", "a/.seed_1.staged/x/y"], ["a/.seed_1.staged", "b/.seed_0.partial"]),
-        (["a/.seed_0.partial/seed_0/x", "a/.seed_0.tmp-12/x", "a/.x.json.tmp-12"], ["a/.seed_0.partial"]),
-        (["a/.seed_0.partial/x", "a/file"], ["."]),
-        (["a/.seed_0.partial/x", "a/.seed_0.old/x"], ["."]),
-        (["a/.seed_0.partial/x", "b/seed_0/"], ["."]),
-    ],
-)
-def test_a_folder_of_nothing_but_begun_work_holds_that_alone(
-    holds: list[str], made: list[str], tmp_path: Path
-) -> None:
-    for name in holds:
-        place = tmp_path / name
-        (place if name.endswith("/") else place.parent).mkdir(parents=True, exist_ok=True)
-        if not name.endswith("/"):
-            place.touch()
-    assert made_in(tmp_path, "seed_*") == [tmp_path / name for name in made]
 
 
 def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:

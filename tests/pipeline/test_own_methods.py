@@ -132,9 +132,9 @@ def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_r
     recipe.write_text(OWN.format(place=DELTA, memory=8))
     with pytest.raises(RecipeError, match=r"^delta \(memory: 32, now 8\) changed in .* since the results"):
         load_experiment(recipe, tmp_path).published()
-    other = {"own_methods": {"delta": {"method": DELTA, "memory": 3}}}
+    other = {"own_methods": {"delta": {"method": DELTA, "no_setting": 3}}}
     published(**other)
-    with pytest.raises(RecipeError, match=r"^delta \(memory: 3, now 8\) changed"):
+    with pytest.raises(RecipeError, match=r"^settings changed \(own_methods: delta: no_setting: unknown key"):
         load_experiment(recipe, tmp_path).published()
     published(other=True, **other)
     assert len(load_experiment(recipe, tmp_path).published()) == 1

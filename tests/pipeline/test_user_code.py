@@ -2,7 +2,6 @@
 
 import shutil
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.core.naming import CODE
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.grounded_env import training_of
+from astra_data.pipeline.grounded_env import grounded
 from astra_data.pipeline.run import run
 from astra_data.pipeline.trained_policy import load_policy, task_of
 from astra_data.pipeline.user_code import check_unchanged
@@ -132,7 +131,7 @@ def test_no_command_takes_a_run_of_another_task(
         "restore that version, or run the recipe under another name"
     )
     assert sorted(made.rglob("*")) == before
-    for load in (load_policy, partial(training_of, seed=0)):
+    for load in (load_policy, grounded):
         with pytest.raises(BadInputError, match=f"^{made}/rail.py changed since {made}/runs/rail was made"):
             load(made / "runs/rail", "nas")
 
