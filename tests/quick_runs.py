@@ -10,6 +10,32 @@ from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.plan import plan, stages_until
 
 
+def small_tables(*, held_out_share: float, episodes: int, train: str = "") -> str:
+    """Return the tables of a recipe whose fits and trainings take a moment; `train` is added to `[train]`."""
+    return f"""
+[ground]
+updates = 2
+batch_windows = 4
+window = 5
+latent_size = 4
+held_out_share = {held_out_share}
+[train]
+num_envs = 4
+rollout_steps = 8
+total_steps = 64
+hidden_sizes = [8]
+memory_size = 4
+tries = 1
+{train}
+[align]
+updates = 2
+batch_windows = 4
+window = 5
+[evaluate]
+episodes = {episodes}
+"""
+
+
 def run_here(path: Path, until: str | None = None, device: str = "cpu") -> Path:
     """Run a recipe in this process, to `runs` beside it; return its folder.
 

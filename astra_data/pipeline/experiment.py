@@ -193,7 +193,7 @@ class Experiment:
         kept = {"methods": tuple(dict.fromkeys((*self.recipe.methods, *rows))), "select": None}
         now = self.recipe.model_copy(update=kept)
         seeds = [seed for seed in now.seeds if seed in found.seeds]
-        before = dict(found.settings) | kept | {"task": now.task, "seeds": now.seeds}
+        before: dict[str, Any] = dict(found.settings) | kept | {"task": now.task, "seeds": now.seeds}
         before["own_methods"] = _of_rows(before.get("own_methods", {}), rows, in_full(now)["own_methods"])
         try:
             old = self._plan(validated(before, type(now), "settings"), rows, seeds)

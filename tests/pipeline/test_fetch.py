@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from quick_runs import run_here
+from quick_runs import run_here, small_tables
 
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
 from astra_data.dataset.reader import Dataset
@@ -24,25 +24,6 @@ seeds = [0]
 episodes = 3
 max_steps = 12
 hold_s = [0.1, 0.5]
-[ground]
-updates = 2
-batch_windows = 4
-window = 5
-latent_size = 4
-held_out_share = 0.34
-[train]
-num_envs = 4
-rollout_steps = 8
-total_steps = 64
-hidden_sizes = [8]
-memory_size = 4
-tries = 1
-[align]
-updates = 2
-batch_windows = 4
-window = 5
-[evaluate]
-episodes = 2
 """
 
 
@@ -52,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("fetch")
     for file in FETCH.glob("*.py"):
         shutil.copy(file, made)
-    (made / "reach.toml").write_text(SMALL)
+    (made / "reach.toml").write_text(SMALL + small_tables(held_out_share=0.34, episodes=2))
     return run_here(made / "reach.toml", until="evaluate")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from quick_runs import small_tables
 
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import GOAL, REWARD
@@ -26,27 +27,7 @@ from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
 
 pytestmark = pytest.mark.usefixtures("quick_failures")
 CART = Path(__file__).parents[2] / "recipes/examples/cart"
-SMALL = """
-[ground]
-updates = 2
-batch_windows = 4
-window = 5
-latent_size = 4
-held_out_share = 0.25
-[train]
-num_envs = 4
-rollout_steps = 8
-total_steps = 64
-hidden_sizes = [8]
-memory_size = 4
-tries = 1
-[align]
-updates = 2
-batch_windows = 4
-window = 5
-[evaluate]
-episodes = 3
-"""
+SMALL = small_tables(held_out_share=0.25, episodes=3)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from quick_runs import small_tables
 
 import astra_data.envs
 from astra_data.cli.app import app
@@ -40,26 +41,6 @@ task = "cart.py:TASK"
 data = "logs"
 methods = ["direct_transfer", "nas", "astra", "astra_plus"]
 seeds = [0]
-[ground]
-updates = 2
-batch_windows = 4
-window = 5
-latent_size = 4
-held_out_share = 0.25
-[train]
-num_envs = 4
-rollout_steps = 8
-total_steps = 64
-hidden_sizes = [8]
-memory_size = 4
-data_start_share = 0.0
-tries = 1
-[align]
-updates = 2
-batch_windows = 4
-window = 5
-[evaluate]
-episodes = 3
 """
 
 
@@ -70,7 +51,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     user_object(f"{EXAMPLES}/cart/robot.py:record")(folder / "csv", drives=8, seconds=6)
     (folder / "cart.py").write_text((EXAMPLES / "cart/cart.py").read_text())
     import_dataset(sorted((folder / "csv").glob("*.csv")), EXAMPLES / "cart/logs.toml", out=folder / "logs")
-    (folder / "cart.toml").write_text(RECIPE)
+    tables = small_tables(held_out_share=0.25, episodes=3, train="data_start_share = 0.0")
+    (folder / "cart.toml").write_text(RECIPE + tables)
     experiment = load_experiment(folder / "cart.toml", folder / "runs")
     for item in plan(experiment.recipe, experiment.path, experiment.folder):
         if item.key == "train/astra/seed_0" or item.stage in ("label", "pair", "ground", "align"):
