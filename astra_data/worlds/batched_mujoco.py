@@ -5,6 +5,7 @@ Gymnasium environment would (`mujoco.rollout` starts every call cold). Each thre
 `MjData`, which therefore stays in the core's cache; `mj_step` releases the interpreter lock.
 """
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -14,14 +15,19 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.provenance import cores
+from astra_data.worlds.plane.mazes import Maze
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _STATE = int(_PHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
 
 
-def attribute(numbers: Iterable[float]) -> str:
-    """Return numbers as an attribute of MuJoCo's XML."""
-    return " ".join(repr(float(number)) for number in numbers)
+def add_walls(world: ElementTree.Element, maze: Maze, height: float, **attributes: str) -> None:
+    """Add a box of `height` m for each wall cell of `maze` to the body `world` of a model's XML."""
+    half = 0.5 * maze.scale
+    for row, column in maze.wall_cells():
+        x, y = maze.cell_center(row, column)
+        box = {"name": f"block_{row}_{column}", "type": "box", "size": f"{half} {half} {height / 2}"}
+        ElementTree.SubElement(world, "geom", {**box, "pos": f"{x} {y} {height / 2}", **attributes})
 
 
 def wall_geoms(model: mujoco.MjModel) -> tuple[int, int] | None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.arrays import Floats
-from astra_data.core.errors import BadInputError
+from astra_data.worlds.batched_mujoco import add_walls
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
 
@@ -50,50 +50,18 @@ def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> mujoco.MjM
         maze: walls to add, placed as gymnasium-robotics places them; none for an open plane.
         leg_scale: factor on the length of all leg segments (1.25 in the paper's morphology test).
     """
-    path = Path(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))
-    tree = ElementTree.parse(path)
-    root = tree.getroot()
-    _find(root, "option").set("integrator", INTEGRATOR)
-    worldbody = _find(root, "worldbody")
-    if leg_scale != 1.0:
-        _scale_legs(_find(worldbody, "body"), leg_scale)
+    root = ElementTree.parse(Path(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))).getroot()
+    root.findall("option")[0].set("integrator", INTEGRATOR)
+    world = root.findall("worldbody")[0]
+    torso = world.findall("body")[0]
+    for part in [*torso.iter("geom"), *torso.iterfind(".//body")] if leg_scale != 1.0 else []:
+        for length in {"fromto", "pos"} & {*part.attrib}:
+            scaled = [str(float(value) * leg_scale) for value in part.attrib[length].split()]
+            part.set(length, " ".join(scaled))
     if maze is not None:
-        half = 0.5 * maze.scale
-        height = 0.5 * WALL_HEIGHT * maze.scale
-        for row, column in maze.wall_cells():
-            x, y = maze.cell_center(row, column)
-            ElementTree.SubElement(
-                worldbody,
-                "geom",
-                name=f"block_{row}_{column}",
-                pos=f"{x} {y} {height}",
-                size=f"{half} {half} {height}",
-                type="box",
-                material="",
-                contype="1",
-                conaffinity="1",
-                rgba="0.7 0.5 0.3 1.0",
-            )
+        look = {"material": "", "contype": "1", "conaffinity": "1", "rgba": "0.7 0.5 0.3 1.0"}
+        add_walls(world, maze, WALL_HEIGHT * maze.scale, **look)
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
-
-
-def _find(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    found = element.find(tag)
-    if found is None:
-        raise BadInputError(f"Gymnasium's ant.xml has no <{tag}>; expected gymnasium >= 1.1.")
-    return found
-
-
-def _scale_legs(torso: ElementTree.Element, factor: float) -> None:
-    def scaled(text: str) -> str:
-        return " ".join(str(float(value) * factor) for value in text.split())
-
-    for body in torso.iter("body"):
-        for geom in body.findall("geom"):
-            if "fromto" in geom.attrib:
-                geom.set("fromto", scaled(geom.attrib["fromto"]))
-        if body is not torso:
-            body.set("pos", scaled(body.get("pos", "0 0 0")))
 
 
 def standing_pose(count: int) -> Floats:

@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
 from astra_data.robots.nao.bodies import (
-    BALL_MASS_KG,
     MOTORS,
-    STIFFNESS_NM_PER_RAD,
     SUBSTEPS,
     TICKS,
     BatchedBodies,
@@ -20,28 +18,40 @@ from astra_data.robots.nao.kicking import BALL_RADIUS_M
 from astra_data.robots.nao.kinematics import (
     HIP_OFFSET_Z_M,
     IDENTICAL,
-    LEG_JOINTS,
     TO_MOTORS,
     Traits,
     leg_angles,
 )
 from astra_data.robots.nao.walk import Gait, StepPlanner, Targets, WalkEngine, WalkLimits, WalkStyle
 
+LEG = ("HipYawPitch", "HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
 
-def test_masses_are_the_published_ones() -> None:
+
+def test_masses_and_joints_are_the_published_ones() -> None:
     model = nao_model()
     # B-Human's calibration of the V6: torso, neck, head; arms of 93.0 + 157.8 + 64.8 + 77.6 + 185.3 g; legs.
     fixed = 1.0496 + 0.0784 + 0.6594 + 2 * (0.0930 + 0.1578 + 0.0648 + 0.0776 + 0.1853)
-    leg = (0.0698, 0.1405, 0.3897, 0.3014, 0.1342, 0.1718)
+    masses = (0.0698, 0.1405, 0.3897, 0.3014, 0.1342, 0.1718)
     assert model.body("Torso").mass[0] == pytest.approx(fixed)
-    for side in "LR":
-        np.testing.assert_allclose([model.body(side + name).mass[0] for name in LEG_JOINTS], leg)
+    assert [model.joint(joint).name for joint in range(1, 13)] == [
+        side + name for side in "LR" for name in LEG
+    ]
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        np.testing.assert_allclose([model.body(side + name).mass[0] for name in LEG], masses)
+        for name in LEG[1:]:
+            axis = (1, 0, 0) if name.endswith("Roll") else (0, 1, 0)
+            np.testing.assert_array_equal(model.joint(side + name).axis, axis)
+        hip = model.joint(f"{side}HipYawPitch").axis
+        np.testing.assert_allclose(hip, (0.0, 0.5**0.5, -sign * 0.5**0.5))
+        # Roll angles and the ranges of their joints are mirrored.
+        roll = model.joint(f"{side}HipRoll").range
+        np.testing.assert_allclose(np.degrees(np.sort(sign * roll)), (-21.74, 45.29))
     assert model.body_mass.sum() == pytest.approx(5.36, abs=0.005)
 
 
 def test_the_ball_rolls_to_a_stop_at_the_published_rate() -> None:
     model = nao_model(ball=True)
-    assert model.body("ball").mass[0] == pytest.approx(BALL_MASS_KG)
+    assert model.body("ball").mass[0] == pytest.approx(0.045)
     data = mujoco.MjData(model)
     data.qpos[2] = 5.0  # the robot is still falling
     data.qvel[18:21], data.qvel[21:24] = [1.0, 0, 0], [0, 1.0 / BALL_RADIUS_M, 0]
@@ -122,8 +132,8 @@ def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> 
     for row, (friction, stiffness) in enumerate(((0.3, 0.8), (0.7, 1.0))):
         model = nao_model()
         model.geom("floor").friction[0] = friction
-        model.actuator_gainprm[:, 0] = stiffness * STIFFNESS_NM_PER_RAD
-        model.actuator_biasprm[:, 1] = -stiffness * STIFFNESS_NM_PER_RAD
+        model.actuator_gainprm[:, 0] = stiffness * 100.0
+        model.actuator_biasprm[:, 1] = -stiffness * 100.0
         data = mujoco.MjData(model)
         data.qpos[:] = before[row]
         mujoco.mj_forward(model, data)

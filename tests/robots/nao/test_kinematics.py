@@ -1,5 +1,3 @@
-import math
-
 import mujoco
 import numpy as np
 import pytest
@@ -7,31 +5,12 @@ from nao_values import foot_poses
 
 from astra_data.core.arrays import Floats
 from astra_data.robots.nao.kinematics import (
-    ARM,
-    HEAD,
     HIP_OFFSET_Y_M,
     HIP_OFFSET_Z_M,
-    LEG,
-    TORSO,
     Traits,
     TraitSpread,
     leg_angles,
 )
-
-
-def test_the_legs_joints_are_those_of_the_documentation() -> None:
-    assert [link.name for link in LEG] == [
-        *("HipYawPitch", "HipRoll", "HipPitch"),
-        *("KneePitch", "AnklePitch", "AnkleRoll"),
-    ]
-    axes = {link.name: link.axis for link in LEG}
-    assert all(axes[name] == (1, 0, 0) for name in axes if name.endswith("Roll"))
-    assert all(axes[name] == (0, 1, 0) for name in ("HipPitch", "KneePitch", "AnklePitch"))
-    assert axes["HipYawPitch"] == pytest.approx((0.0, math.sqrt(0.5), -math.sqrt(0.5)))
-    # Hip to ankle, standing: 100 mm and 102.9 mm down.
-    assert np.sum([link.offset_m for link in LEG[1:]], axis=0) == pytest.approx([0.0, 0.0, -0.2029])
-    assert all(link.axis is None for link in (TORSO, *HEAD, *ARM))
-
 
 STANDING_Z_M = -0.230 - HIP_OFFSET_Z_M
 
