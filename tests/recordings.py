@@ -12,8 +12,7 @@ import pyarrow.parquet as pq
 
 from astra_data.dataset.columns import Array
 from astra_data.dataset.reader import Dataset
-from astra_data.io.import_report import ImportReport
-from astra_data.io.importing import import_dataset
+from astra_data.io.importing import ImportReport, import_dataset
 
 LENGTHS = (6, 9, 5)
 STEPS = (5, 9, 4)

@@ -1,16 +1,16 @@
-"""Cut recordings into episodes.
+"""Turn the rows of recordings into columns, and cut them into episodes.
 
-Rows are gathered until an episode has ended for sure, and cut with whole arrays: at most an episode and a
-block are held, or as much again.
+Rows are converted block by block, and cut once a file has ended, or an episode of a format that has its own.
+So many of them are held, and those of a whole recording whose files continue one another.
 """
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astra_data.core.arrays import as_rows
+from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.dataset.checkup.clock import Clock
@@ -27,25 +27,98 @@ from astra_data.dataset.columns import (
     Column,
     Scalar,
 )
-from astra_data.dataset.inspection import is_terminated
-from astra_data.io.conversion import Converter, Mask
-from astra_data.io.import_report import Tally
-from astra_data.io.mapping import ImportMapping
-from astra_data.io.recording import BLOCK_ROWS, Block
+from astra_data.dataset.inspection import Endings, is_terminated
+from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
+from astra_data.io.mapping import MAPPED_FLAGS, ColumnMapping, ImportMapping
+from astra_data.io.recording import Block
 
 REASONS = ("file", "source", "field", "end", "gap", "back", "jump", "rejected")
 """Why a new episode begins, the first that applies: a new file, the format's own episodes, a field that
 changes, a flag in the row before (next.terminated and next.truncated too), a gap in time, time that goes
 back, a jump, rows that were rejected."""
-
 RATE_TOLERANCE = 0.1
 """Largest relative difference between fps and the rate measured from the times."""
-_ENOUGH = 20
+_TIMED = 20
 """Steps of a file of which its rate can be told."""
+EXACT = 2**53
+"""Floats represent whole numbers below this exactly."""
+_LARGE = 2**16
+"""Numbers beyond it that float32 cannot hold are refused: times, and positions far from their origin."""
+_ROUNDED = 0.05
+"""Mean error of a step, as a share of a typical step, from which on rounding is warned of ..."""
+_LOST = 0.5
+"""... and from which on large numbers are refused."""
+_TYPICAL = 0.9
+"""Quantile of the steps that is typical: robots often stand still, and their sensors do not."""
+_ENOUGH = 10
+"""Fewer steps tell nothing of rounding."""
+_SAMPLES, _MOST_SAMPLES = 2**9, 2**15
+"""Steps that are looked at in a block, and in all."""
+_SHOWN = 8
+"""Fields and files that are listed."""
+_KINDS = {"U": "text", "S": "text", "O": "values that are not numbers, such as missing ones"}
 
+Mask = NDArray[np.bool_]
 Cut = tuple[dict[str, Array], dict[str, Scalar]]
+"""The columns and the metadata of an episode."""
 Table = dict[str, Array]
 """Rows: columns by name and, by words without a dot, what decides where they are cut."""
+
+
+@dataclass
+class Tally:
+    """How many rows were read and dropped, and why."""
+
+    rows: int = 0
+    rejected_rows: int = 0
+    """Those with a value that is not finite, and torn ones."""
+    not_finite: dict[str, tuple[int, str]] = field(default_factory=dict)
+    """Field to how many rows it is not finite in, and where the first is."""
+    bad_episodes: list[str] = field(default_factory=list)
+    """Those that are left out for such a row, in a line each."""
+    torn_rows: int = 0
+    """Those that are cut off at the end of their files."""
+    torn_first: str = ""
+    split_points: dict[str, int] = field(default_factory=dict)
+    """Number of boundaries between episodes, by reason."""
+    last_rows: int = 0
+    """Last rows of episodes, dropped because their next state was not recorded."""
+    last_terminated: int = 0
+    """Those of them that were terminated."""
+    last_reward: float = 0.0
+    """The sum of the rewards of the others."""
+    back_rows: int = 0
+    """Those at which time goes back, within a file."""
+    back_first: str = ""
+    still_rows: int = 0
+    """Those with the time of the row before."""
+    still_first: str = ""
+    short_rows: int = 0
+    """Rows of episodes that were too short."""
+    rows_after_end: int = 0
+    """Terminated rows right after a terminated one: the log went on, the episode did not."""
+    endings: Endings = field(default_factory=Endings)
+    clock: str = ""
+    """The recorded rate, gaps and jitter, where the mapping names the times."""
+    unused_fields: list[str] = field(default_factory=list)
+    """Fields, or topics, that no column takes."""
+    notes: list[str] = field(default_factory=list)
+    """What is strange about the rates of files, in a line each."""
+    topics: dict[str, list[str]] = field(default_factory=dict)
+    """What is strange about topics, in a line each, with the files that it is true of."""
+
+    @property
+    def faults(self) -> str:
+        """Which fields are not finite, and where."""
+        rows = self.rows - self.torn_rows
+        empty = [name for name, (count, _) in self.not_finite.items() if count == rows]
+        parts = [f"{first_few(empty, _SHOWN)} is empty in all {rows} rows: leave it out"] if empty else []
+        for name, (count, place) in self.not_finite.items():
+            if count < rows:
+                parts.append(
+                    f"{name} in 1 row, {place}" if count == 1 else f"{name} in {count} rows, first {place}"
+                )
+        return "; ".join(parts[:_SHOWN]) + (f" and {len(parts) - _SHOWN} more" if len(parts) > _SHOWN else "")
 
 
 class Cutter:
@@ -53,59 +126,54 @@ class Cutter:
 
     Attributes:
         tally: of the rows so far.
+        columns: of the dataset, including derived ones; known after the first block.
     """
 
     def __init__(self, mapping: ImportMapping, *, skip_bad: bool = False) -> None:
         """Cut by `mapping`; `skip_bad` leaves out whole episodes with a value that is not finite."""
         self.tally = Tally()
+        self.columns: tuple[Column, ...] = ()
         self._mapping, self._skips = mapping, skip_bad and mapping.not_finite == "refuse"
-        self._converter = Converter(mapping)
+        self._converted: dict[str, Column] = {}
+        self._rounding: dict[str, _Rounding] = {}
         self._clock = Clock(mapping.time or "", mapping.fps)
         self._tables: list[Table] = []
-        self._rows = self._carried = 0
         self._parts: list[Block] = []
         self._spent: list[NDArray[np.float64]] = []
-        self._file = 0
-        self._was_torn = self._ended = False
+        self._begins = "file"
+        self._has_rows = self._was_torn = self._ended = False
 
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """Columns of the episodes; known after the first block."""
-        return self._converter.columns
-
-    def feed(self, block: Block, row: int, *, is_apart: bool) -> Iterator[Cut]:
+    def feed(self, block: Block, *, is_apart: bool) -> Iterator[Cut]:
         """Add `block`; yield the columns and the metadata of episodes that ended.
 
         Args:
             block: at least one row.
-            row: number of its first row in its file.
             is_apart: whether it begins a new file instead of continuing the block before.
 
         Raises:
             BadInputError: values do not fit their columns, or change in size; lists every fault.
         """
-        columns, bad = self._converter.convert(block)
+        if is_apart or block.starts:
+            yield from self.cut()
+            self._begins = "file" if is_apart else "back" if block.is_back else "source"
+        columns, bad = self.convert(block)
         n, split = len(block), self._mapping.split
         rejected = np.logical_or.reduce([np.zeros(n, bool), *bad.values()])
-        self.tally.count(block, row, bad, rejected, self._mapping.all_fields)
+        self._count(block, bad, rejected)
         if is_apart or not self._parts or self._parts[-1].origin != block.origin:
             self._parts.append(replace(block, values={}, places={}, known=()))
             self._spent.append(np.zeros(3))
-        self._file += is_apart
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
-        first = np.arange(n) == 0
         table = columns | {
             "finite": ~rejected,
-            "row": row + np.arange(n),
+            "row": block.row + np.arange(n),
             "part": np.full(n, len(self._parts) - 1),
-            "in file": np.full(n, self._file),
-            "file": first & is_apart,
-            "source": first & block.starts & (not block.is_back),
-            "back": first & block.is_back,
-            "torn": first & self._was_torn,
+            "torn": (np.arange(n) == 0) & self._was_torn,
         }
         table |= {f"ends {name}": fields[name] for name in split.ends}
-        table |= {f"ends {name}": columns[name] for name in (TERMINATED, TRUNCATED) if name in columns}
+        table |= {
+            f"ends {name}": as_rows(columns[name]) for name in (TERMINATED, TRUNCATED) if name in columns
+        }
         if split.field:
             table["field"] = fields[split.field]
         if self._mapping.time:
@@ -116,96 +184,82 @@ class Cutter:
                 raise BadInputError(f"{block.origin}: split.{key} has {sizes}")
         self._was_torn = block.torn > 0 and self._mapping.not_finite != "drop"
         self._tables.append(table)
-        self._rows += n
-        if self._rows >= max(BLOCK_ROWS, 2 * self._carried):
-            yield from self._cut(is_last=False)
 
-    def finish(self) -> Iterator[Cut]:
-        """Yield the episodes that are left."""
-        yield from self._cut(is_last=True)
-
-    def abandon(self) -> Iterator[Cut]:
-        """Yield the episodes that have ended, and leave out the one that the last file was in."""
-        yield from self._cut(is_last=False)
-        self._tables = [
-            {key: values[table["in file"] != self._file] for key, values in table.items()}
-            for table in self._tables
-        ]
-        self._rows = self._carried = sum(len(table["row"]) for table in self._tables)
-
-    def _cut(self, *, is_last: bool) -> Iterator[Cut]:
-        """Yield the episodes in the rows that are held; hold on to the last one unless it `is_last`."""
-        if not self._rows:
+    def cut(self, *, leaves_last: bool = False) -> Iterator[Cut]:
+        """Yield the episodes in the rows that are held, and hold none; `leaves_last` leaves out the last."""
+        if not self._tables:
             return
         table = {key: np.concatenate([each[key] for each in self._tables]) for key in self._tables[0]}
-        self._tables = [table]
+        self._tables = []
         [kept] = np.nonzero(table["finite"])
-        counts, steps_s = self._reasons(table)
-        changed = np.diff(counts[:, kept], axis=1, prepend=counts[:, kept[:1]]) > 0
-        reasons = np.insert(changed, REASONS.index("jump"), self._jumped(table, kept), axis=0)
+        masks, steps_s = self._boundaries(table)
+        self._count_time(table, steps_s)
+        if not len(kept):
+            return
+        # How often each reason has applied up to each row, but for jumps and what begins the first.
+        counts = np.cumsum([masks[reason] for reason in REASONS], axis=1)
+        reasons = np.diff(counts[:, kept], axis=1, prepend=counts[:, kept[:1]]) > 0
+        reasons[REASONS.index("jump")] = self._jumped(table, kept)
+        reasons[REASONS.index(self._begins), 0] = self._has_rows
+        self._has_rows = True
         [begins] = np.nonzero(reasons.any(axis=0))
-        # Each rejected row belongs to an episode that no reason but rejected rows keeps it apart from.
-        own = counts[:-1].sum(axis=0)
-        before = np.maximum.accumulate(np.where(table["finite"], np.arange(len(own)), -1))
-        follows = (before >= 0) & (own[before] == own)
-        starts: list[int] = [0, *(_first_row(int(kept[at]), before, own) for at in begins), len(own)]
-        self._keep_ends(table, before, follows)
-        ends = len(starts) - 1 if is_last else max(len(starts) - 2, 0)
-        until = len(own) if is_last else starts[ends]
-        self._count(table, steps_s, until, is_last=is_last)
         for reason in np.argmax(reasons[:, begins], axis=0):
             name = REASONS[reason]
             self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
-        is_new = [False, *map(bool, np.atleast_1d(reasons[: REASONS.index("end"), begins].any(axis=0)))]
-        columns = {column.name: table[column.name] for column in self.columns if column.name in table}
-        for number in range(ends):
-            self._ended &= not is_new[number]
-            rows = np.arange(starts[number], starts[number + 1])
-            finite = table["finite"][rows]
-            if finite.any() and not (self._skips and self._has_bad(table, rows[~finite])):
-                rows = rows[finite]
-                part, row = self._parts[table["part"][rows[0]]], int(table["row"][rows[0]])
-                episode = {name: values[rows] for name, values in columns.items()}
-                yield from self._episode(episode, {"source": part.origin, "source_row": row})
-        if not is_last:
-            self._ended &= not is_new[ends]
-        self._tables = [{key: values[until:].copy() for key, values in table.items()}]
-        self._rows = self._carried = len(own) - until
+        starts = [0, *begins[begins > 0].tolist()]
+        # A rejected row is of the episode after it or else before it, by all reasons but rejected rows.
+        rows, apart = np.arange(len(table["row"])), counts[:-1].sum(axis=0)
+        before = np.searchsorted(kept, rows, side="right") - 1
+        after = np.minimum(np.searchsorted(kept, rows), len(kept) - 1)
+        is_of_next = (before < 0) | (apart[kept[after]] == apart)
+        episode = np.searchsorted(starts, np.where(is_of_next, after, before), side="right") - 1
+        [rejected] = np.nonzero(~table["finite"])
+        ends = rejected[(before[rejected] >= 0) & (apart[kept[before[rejected]]] == apart[rejected])]
+        for name in (TERMINATED, SUCCESS):
+            if name in table:  # if a rejected row ends its episode, the last row of it that is kept does so
+                np.logical_or.at(table[name], kept[before[ends]], table[name][ends])
+        bad = {int(episode[at]): at for at in rejected[::-1].tolist()} if self._skips else {}
+        is_new = np.asarray(reasons[: REASONS.index("end")].any(axis=0))
+        for number, part in enumerate(np.split(kept, starts[1:])[: -1 if leaves_last else None]):
+            self._ended &= not is_new[starts[number]]
+            if number in bad:
+                where = self._place(table, bad[number])
+                self.tally.bad_episodes.append(f"{where}: a value is not finite: its episode is left out")
+                continue
+            values = {
+                column.name: table[column.name][part] for column in self.columns if column.name in table
+            }
+            source = {"source": self._parts[table["part"][part[0]]].origin}
+            yield from self._episode(values, source | {"source_row": int(table["row"][part[0]])})
 
-    def _reasons(self, table: Table) -> tuple[NDArray[np.int64], Array]:
-        """Return how often each reason, except jumps, has applied up to each row, (reasons, n).
+    def _boundaries(self, table: Table) -> tuple[dict[str, Array], Array]:
+        """Return to which rows each reason applies, but for jumps and what begins the first, (n,) each.
 
         And the steps in time to each row from the one before, (n, 3): as recorded, held over rows without a
-        time, and held over rows that are dropped, too; NaN where a file or an episode of the format begins.
+        time, and held over rows that are dropped, too; NaN for the first.
         """
         n, split, drops = len(table["row"]), self._mapping.split, self._mapping.not_finite == "drop"
-        masks: dict[str, Array] = {reason: np.zeros(n, bool) for reason in REASONS if reason != "jump"}
-        apart = table["file"] | table["source"] | table["back"]
+        masks: dict[str, Array] = {reason: np.zeros(n, bool) for reason in REASONS}
         for key, values in table.items():
             if key.startswith("ends "):
-                masks["end"][1:] |= (np.nan_to_num(as_rows(values)[:-1]) != 0).any(axis=1)
+                masks["end"][1:] |= (np.nan_to_num(values[:-1]) != 0).any(axis=1)
         if split.field:
             earlier, later = table["field"][:-1], table["field"][1:]
             # What is missing (NaN) is the same value again, as empty cells of CSV are.
             are_missing = (earlier != earlier) & (later != later)
             masks["field"][1:] = ((earlier != later) & ~are_missing).any(axis=1)
-        steps_s = np.full((n, 3), np.nan)
+        steps_s: Array = np.full((n, 3), np.nan)
         if "time" in table:
             times = np.repeat(table["time"][:, None], 3, axis=1)
             times[~table["finite"] & drops, 2] = np.nan
-            times[:, 1:] = _held(times[:, 1:], apart)
+            known = np.where(np.isfinite(times[:, 1:]), np.arange(n)[:, None], 0)
+            times[:, 1:] = np.take_along_axis(times[:, 1:], np.maximum.accumulate(known), axis=0)
             steps_s[1:] = np.diff(times, axis=0)
-            steps_s[apart] = np.nan
             masks["back"] = steps_s[:, 1] < 0
             if split.gap_s is not None:
                 masks["gap"] = np.asarray((steps_s[:, 1:] > split.gap_s).any(axis=1))
-        for reason in ("end", "field"):
-            masks[reason] &= ~apart
-        masks["file"], masks["source"] = table["file"], table["source"]
-        masks["back"] |= table["back"]
         masks["rejected"] = table["torn"] | (~table["finite"] & (self._mapping.not_finite == "split"))
-        counts: NDArray[np.int64] = np.cumsum(list(masks.values()), axis=1)
-        return counts, steps_s
+        return masks, steps_s
 
     def _jumped(self, table: Table, kept: NDArray[np.int64]) -> Mask:
         """Return which of the rows that are kept are a jump away from the one before."""
@@ -217,39 +271,40 @@ class Cutter:
         steps = shortest(np.diff(where, axis=0, prepend=where[:1]), full_turns(column)[list(jump.values)])
         return np.asarray(np.linalg.norm(steps, axis=1) > jump.above)
 
-    def _keep_ends(self, table: Table, before: NDArray[np.int64], follows: Mask) -> None:
-        """Where a rejected row ends an episode or succeeds, let the last row that is kept of it do so."""
-        flags = [name for name in (TERMINATED, SUCCESS) if name in table]
-        rows = np.flatnonzero(~table["finite"] & follows)
-        for name in flags:
-            np.logical_or.at(table[name], before[rows], table[name][rows])
-
-    def _has_bad(self, table: Table, rejected: NDArray[np.int64]) -> bool:
-        """Note an episode that is left out for its `rejected` rows, if there are any."""
-        if not len(rejected):
-            return False
-        where = self._place(table, int(rejected[0]))
-        self.tally.bad_episodes.append(f"{where}: a value is not finite: its episode is left out")
-        return True
-
     def _place(self, table: Table, at: int) -> str:
         """Name the row `at` of the table."""
         named: str = self._parts[table["part"][at]].row_name(int(table["row"][at]))
         return named
 
-    def _count(self, table: Table, steps_s: Array, until: int, *, is_last: bool) -> None:
-        """Tally what the clock does up to the row `until`, and in the step to it."""
-        rows = slice(1, until + (not is_last))
-        recorded, held, kept = steps_s[rows].T
+    def _count(self, block: Block, bad: dict[str, Mask], rejected: Mask) -> None:
+        """Tally the rows of a block: those with a field that is not finite, in `bad`, are rejected."""
+        tally = self.tally
+        tally.rows += len(block) + block.torn
+        tally.rejected_rows += int(rejected.sum()) + block.torn
+        for name, mask in bad.items():
+            first = int(mask.argmax())
+            before, place = tally.not_finite.get(name) or (0, block.place(first))
+            tally.not_finite[name] = before + int(mask.sum()), place
+        if block.torn:
+            tally.torn_rows += block.torn
+            tally.torn_first = tally.torn_first or block.row_name(block.row + len(block))
+        known = {*self._mapping.all_fields, *tally.unused_fields}
+        tally.unused_fields += [name for name in block.known if name not in known]
+        for note in block.notes:
+            tally.topics.setdefault(note.removeprefix(f"{block.origin}: "), []).append(block.origin)
+
+    def _count_time(self, table: Table, steps_s: Array) -> None:
+        """Tally what the clock does."""
+        recorded, held, kept = steps_s.T
         stands = (held == 0) & np.isfinite(recorded)
         for name, mask in (("back", held < 0), ("still", stands)):
             setattr(self.tally, f"{name}_rows", getattr(self.tally, f"{name}_rows") + int(mask.sum()))
             if mask.any() and not getattr(self.tally, f"{name}_first"):
-                setattr(self.tally, f"{name}_first", self._place(table, 1 + int(mask.argmax())))
+                setattr(self.tally, f"{name}_first", self._place(table, int(mask.argmax())))
         longest = self._mapping.split.gap_s or np.inf
         regular = (kept > 0) & ~(held > longest) & ~(kept > longest)
-        for part in np.unique(table["part"][rows][regular]):
-            steps = kept[regular & (table["part"][rows] == part)]
+        for part in np.unique(table["part"][regular]):
+            steps = kept[regular & (table["part"] == part)]
             self._spent[part] += steps.sum(), np.median(steps) * len(steps), len(steps)
             self._clock.count(steps)
 
@@ -306,7 +361,7 @@ class Cutter:
             BadInputError: most steps of large numbers are lost; or both rates differ by more than
                 `RATE_TOLERANCE` over all files; names those that differ.
         """
-        self.tally.notes += self._converter.rounded()
+        self.tally.notes += self.rounded()
         timed = [
             (part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()
         ]
@@ -314,7 +369,7 @@ class Cutter:
             return
         fps, spent = self._mapping.fps, np.array([spent for _, spent in timed])
         rates = spent[:, 2:] / spent[:, :2]
-        off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1) & (spent[:, 2] >= _ENOUGH)
+        off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1) & (spent[:, 2] >= _TIMED)
         named = [f"{timed[at][0]}: {rates[at, 1]:.4g} Hz" for at in np.flatnonzero(off)]
         seconds, usual_seconds, steps = spent.sum(axis=0)
         pooled = steps / seconds, steps / usual_seconds
@@ -326,23 +381,220 @@ class Cutter:
                     "sort them if they belong together"
                 )
             if named and len(timed) > 1:
-                advice += f"; {first_few(named, 8)}"
+                advice += f"; {first_few(named, _SHOWN)}"
             raise BadInputError(
                 f"'{self._mapping.time}' gives {pooled[0]:.4g} rows per second, but fps is {fps}: {advice}"
             )
         self.tally.notes += [f"{name}, {fps} Hz declared" for name in named]
         self.tally.clock = str(self._clock)
 
+    def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Mask]]:
+        """Return the columns of `block` with n rows, (n,) or (n, size), and rows where fields are not finite.
 
-def _held(times: Array, apart: Mask) -> Array:
-    """Replace what is not finite in `times` (n, k) by the last finite one, none from before rows `apart`."""
-    rows = np.arange(len(times))[:, None]
-    known = np.where(np.isfinite(times) | apart[:, None], rows, 0)
-    held: Array = np.take_along_axis(times, np.maximum.accumulate(known, axis=0), axis=0)
-    return held
+        Raises:
+            BadInputError: values do not fit their columns, or change in size; lists every fault.
+        """
+        faults: list[str] = []
+        fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
+        if faults:
+            raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
+        columns, bad = {}, dict[str, Mask]()
+        for name in (*self._mapping.split.ends, *([self._mapping.time] if self._mapping.time else [])):
+            bad[name] = np.asarray(~np.isfinite(fields[name]).all(axis=1))
+        for name, spec in self._mapping.columns.items():
+            try:
+                values = _transformed(np.concatenate([fields[f] for f in spec.fields], axis=1), spec)
+                column = self._converted.get(name) or column_of(name, spec, values.shape[1])
+                if values.shape[1] != column.size:
+                    raise BadInputError(f"{values.shape[1]} values, before there were {column.size}")
+                cast, finite = _cast(values, column)
+                ok = finite.all(axis=1)
+                if column.dtype == "float32" and not np.can_cast(values.dtype, np.float32):
+                    self._rounding.setdefault(name, _Rounding(column, spec)).add(values[ok], cast[ok])
+            except BadInputError as error:
+                faults.append(f"columns.{name}: {error}")
+                continue
+            self._converted[name] = column
+            columns[name] = as_column(cast)
+            widths = [(field, fields[field].shape[1]) for field in spec.fields]
+            sources = [f"{field}[{at}]" if n > 1 else field for field, n in widths for at in range(n)]
+            for entry in np.flatnonzero(~finite.all(axis=0)).tolist():
+                source = sources[spec.take[entry] if spec.take else entry]
+                bad[source] = bad.get(source, False) | ~finite[:, entry]
+        if not faults:
+            faults += self._size_faults()
+        if faults:
+            raise BadInputError(f"{block.origin}: {'; '.join(faults)}")
+        self.columns = self.columns or _complete(self._converted, self._mapping.terminal)
+        return columns, {name: mask for name, mask in bad.items() if mask.any()}
+
+    def rounded(self) -> list[str]:
+        """Return a warning for each column whose steps float32 holds badly; raise if most are lost."""
+        found = [each for rounding in self._rounding.values() if (each := rounding.found())]
+        if lost := [warning for warning, is_lost in found if is_lost]:
+            raise BadInputError("; ".join(lost))
+        return [warning for warning, _ in found]
+
+    def _size_faults(self) -> list[str]:
+        sizes = {name: column.size for name, column in self._converted.items()}
+        faults = []
+        if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
+            faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
+        for name in (REWARD, *MAPPED_FLAGS):
+            if sizes.get(name, 1) > 1:
+                faults.append(f"{name}: {sizes[name]} values, expected 1")
+        jump = self._mapping.split.jump
+        if jump and max(jump.values) >= sizes[jump.column]:
+            size = f"{jump.column} has {sizes[jump.column]} values, counted from 0"
+            faults.append(f"split.jump.values {list(jump.values)}: {size}")
+        return faults
 
 
-def _first_row(row: int, before: NDArray[np.int64], own: NDArray[np.int64]) -> int:
-    """Return the first of the rejected rows right before the kept `row` that belong to its episode."""
-    earlier = int(before[row - 1]) + 1 if row else 0
-    return row - int((own[earlier:row] == own[row]).sum())
+def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
+    """Return the column `name` with `size` values.
+
+    Raises:
+        BadInputError: lists do not have that many entries.
+    """
+    lists: dict[str, Sequence[str]] = {"unit": spec.unit, "frame": spec.frame, "role": spec.role}
+    for key, words in lists.items():
+        if len(words) not in (0, 1, size):
+            raise BadInputError(f"{key} has {len(words)} words for {size} values")
+    astra = {key: list(words) * (size if len(words) == 1 else 1) for key, words in lists.items() if words}
+    dtype = spec.dtype or ("bool" if name in MAPPED_FLAGS else "float32")
+    # Fields of one value each name what they hold; `size` tells that none holds more.
+    names = spec.names or (spec.fields if len(spec.fields) == size > 1 and not spec.take else None)
+    return Column(name, dtype, size, names, spec.meaning, astra or None)
+
+
+def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]:
+    columns = dict(converted)
+    if STATE in columns:
+        following = next_state_of(columns[STATE])
+        if recorded := columns.get(NEXT_STATE):
+            following = replace(
+                following,
+                names=recorded.names or following.names,
+                meaning=recorded.meaning or following.meaning,
+                astra={**(following.astra or {}), **(recorded.astra or {})} or None,
+            )
+        elif TERMINATED in columns and terminal == "stand_still":
+            made_up = "; where an episode terminates, not recorded: the state itself"
+            following = replace(following, meaning=f"{following.meaning}{made_up}")
+        columns[NEXT_STATE] = following
+    return (*columns.values(), *(column for column in DERIVED_FLAGS if column.name not in columns))
+
+
+def _as_rows(name: str, values: Array, faults: list[str]) -> Array:
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        faults.append(f"field '{name}': expected numbers, got {_KINDS.get(array.dtype.kind, array.dtype)}")
+    elif 0 in array.shape:
+        faults.append(f"field '{name}' has no values, its shape is {array.shape}")
+    return array.reshape(len(array), -1)
+
+
+def _transformed(values: Array, spec: ColumnMapping) -> Array:
+    """Apply `take`, `scale`, `offset` and `clip` to `values` (n, width)."""
+    if spec.take:
+        if max(spec.take) >= values.shape[1]:
+            size = f"{', '.join(spec.fields)} hold {values.shape[1]} values, counted from 0"
+            raise BadInputError(f"take {list(spec.take)}: {size}")
+        values = values[:, list(spec.take)]
+    for key, numbers in (("scale", spec.scale), ("offset", spec.offset)):
+        if len(numbers) not in (0, 1, values.shape[1]):
+            raise BadInputError(f"{key} has {len(numbers)} numbers for {values.shape[1]} values")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if spec.scale:
+            values = values * np.array(spec.scale)
+        if spec.offset:
+            values = values + np.array(spec.offset)
+    if spec.clip is not None:
+        values = np.where(np.isfinite(values), np.clip(values, *spec.clip), values)
+    return values
+
+
+def _cast(values: Array, column: Column) -> tuple[Array, Mask]:
+    """Return `values` (n, size) in the column's dtype, and which of them are finite."""
+    finite: Mask = np.asarray(np.isfinite(values))
+    sound = values[finite.all(axis=1)]
+    if column.dtype == "float32":
+        if sound.dtype.kind in "iu" and ((sound > EXACT) | (sound < -EXACT)).any():
+            raise BadInputError(
+                'integers beyond 2^53 do not fit float32; set dtype = "int64", or a scale or an offset that '
+                "makes them small"
+            )
+        with np.errstate(over="ignore"):
+            cast = np.ascontiguousarray(values, np.float32)
+        return cast, finite & np.isfinite(cast)
+    if column.dtype == "bool" and not np.isin(sound, (0, 1)).all():
+        raise BadInputError("expected true and false, or 1 and 0")
+    if column.dtype == "int64" and sound.dtype.kind == "f":
+        if not (sound == np.floor(sound)).all():
+            raise BadInputError("expected whole numbers")
+        if (abs(sound.astype(float)) >= EXACT).any():
+            raise BadInputError(
+                "numbers of 2^53 or more came as floats, which cannot represent them; "
+                "expected integers: no fractions or empty cells among them, no float fields in the column, "
+                "no scale, offset or clip"
+            )
+    elif column.dtype == "int64" and sound.dtype == np.uint64 and (sound >= 2**63).any():
+        raise BadInputError("expected whole numbers below 2^63")
+    whole = np.asarray(finite.all(axis=1))
+    return np.where(whole[:, None], values, 0).astype(column.dtype), finite
+
+
+class _Rounding:
+    """Compares the steps of a column's values (n, size) with those that float32 holds."""
+
+    def __init__(self, column: Column, spec: ColumnMapping) -> None:
+        self._column, self._offset = column, spec.offset
+        self._low, self._high = np.full(column.size, np.inf), np.full(column.size, -np.inf)
+        self._samples: list[Array] = []
+
+    def add(self, values: Array, held: Array) -> None:
+        """Look at consecutive rows, all finite."""
+        exact = values.astype(np.float64)
+        self._low = np.minimum(self._low, exact.min(axis=0, initial=np.inf))
+        self._high = np.maximum(self._high, exact.max(axis=0, initial=-np.inf))
+        rows = np.arange(0, len(exact) - 1, max(1, len(exact) // _SAMPLES))
+        # Between integers first: those of uint64 may be equal as float64.
+        steps = np.where(values[rows + 1] == values[rows], 0.0, exact[rows + 1] - exact[rows])
+        errors = held[rows + 1].astype(np.float64) - held[rows] - steps
+        # Less is the noise of a computation with float64.
+        steps[np.abs(steps) < 64 * np.spacing(np.abs(exact[rows]))] = 0.0
+        self._samples.append(np.abs([steps, errors]))
+        if sum(part.shape[1] for part in self._samples) > _MOST_SAMPLES:
+            self._samples = [np.concatenate(self._samples, axis=1)[:, ::2]]
+
+    def found(self) -> tuple[str, bool] | None:
+        """Return a warning, and whether most steps are lost; None where all are held well enough."""
+        steps, errors = np.concatenate(self._samples, axis=1)
+        lost, helps, coarse = False, True, []
+        offset = np.broadcast_to(self._offset or 0.0, self._column.size).tolist()
+        for entry, (low, high) in enumerate(zip(self._low.tolist(), self._high.tolist(), strict=True)):
+            moved = steps[:, entry] > 0
+            if moved.sum() < _ENOUGH:
+                continue
+            step = float(np.quantile(steps[moved, entry], _TYPICAL))
+            share = float(errors[moved, entry].mean()) / step
+            if share < _ROUNDED:
+                continue
+            largest = max(-low, high)
+            spacing = float(np.spacing(np.float32(largest)))
+            is_count = spacing <= 2 and step == round(step)
+            lost |= share >= _LOST and largest > _LARGE and not is_count
+            digit = 10.0 ** np.floor(np.log10(high - low))
+            offset[entry] = round(offset[entry] - digit * round((low + high) / 2 / digit), 12)
+            helps &= float(np.spacing(np.float32(high - low))) / 3 < _ROUNDED * step
+            name = self._column.names[entry] if self._column.names else f"entry {entry}"
+            coarse.append(
+                f"{name} (up to {largest:.6g}) in steps of {spacing:.2g}, but it moves by {step:.2g}"
+            )
+        if not coarse:
+            return None
+        listed = ", ".join(f"{one:.1f}" if one == round(one) else f"{one:.15g}" for one in offset)
+        advice = f"set offset = [{listed}]" if helps else "leave out what is a time"
+        if lost and helps:
+            advice += ', leave out what is a time, or store counts with dtype = "int64"'
+        return f"columns.{self._column.name}: float32 holds {'; '.join(coarse)}: {advice}", lost

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,31 +18,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from astra_data.core.config import did_you_mean, only_given, validated
-from astra_data.core.durable import files_below
 from astra_data.core.errors import AstraDataError, BadInputError, in_short
 from astra_data.core.naming import first_few
 from astra_data.dataset.columns import TRUNCATED, Episode
+from astra_data.dataset.inspection import Endings
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import home_of
-from astra_data.dataset.writer import DatasetWriter, is_text
-from astra_data.io.cutting import Cut, Cutter
-from astra_data.io.import_report import ImportReport, Tally, losses
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.io.cutting import Cut, Cutter, Tally
 from astra_data.io.importers import csv, hdf5, json, mcap, minari, npz, parquet, torch
 from astra_data.io.mapping import ImportMapping, read_mapping
 from astra_data.io.recording import (
     VALUE_BYTES,
-    ZARR,
     Block,
     Source,
-    bounded,
     find_sources,
-    foreign,
+    format_of,
     identities,
-    is_archive,
-    joined,
-    named_apart,
     other_files,
-    refuse_dataset,
 )
 
 if TYPE_CHECKING:
@@ -58,10 +51,100 @@ FORMATS: Mapping[str, ModuleType] = {
     "parquet": parquet,
     "torch": torch,
 }
-IN_ARCHIVES = ("csv", "json")
-"""Formats that are read sequentially, so that they can be read inside archives."""
+SUFFIXES = {name: getattr(module, "SUFFIXES", ()) for name, module in FORMATS.items()}
+"""The endings of the names of each format's files; a Minari dataset is a folder."""
 _NAMED = 50
 """Files with one and the same fault that are named."""
+_LISTED = 8
+"""Files, fields, and lines on rates, that are listed."""
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """Result of an import.
+
+    Attributes:
+        root: the dataset's folder.
+        episodes: number of episodes.
+        frames: number of steps.
+        tally: of the rows that were read and dropped.
+        wall_seconds: duration of the import.
+        unused: the files of which no episode was made.
+        unread: the files of folders and archives that have other endings than the format's.
+        left_out: what is wrong with each file that was left out.
+        taken: which fields became which columns, where no mapping says so.
+    """
+
+    root: Path
+    episodes: int
+    frames: int
+    tally: Tally
+    wall_seconds: float
+    unused: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+    taken: str = ""
+
+    def __str__(self) -> str:
+        """Summarize it in a few lines."""
+        tally = self.tally
+        points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
+        notes = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
+        more = [f"and {len(notes) - _LISTED} more lines on rates"] if len(notes) > _LISTED else []
+        torn = f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
+        listed = {
+            "fields left out": tally.unused_fields,
+            "files without an episode": self.unused,
+            "files of other endings, not read": self.unread,
+        }
+        left_out, *others = [f"{what}: {first_few(of, _LISTED)}" if of else "" for what, of in listed.items()]
+        lines = [
+            f"{self.root}: {self.episodes} episodes, {self.frames} frames from {tally.rows} rows in "
+            f"{self.wall_seconds:.1f} s",
+            f"taken without a mapping: {self.taken}" if self.taken else "",
+            left_out,
+            f"split points: {points}",
+            f"episodes end: {tally.endings}" if tally.endings != Endings() else "",
+            f"rate: {tally.clock}" if tally.clock else "",
+            *notes[:_LISTED],
+            *more,
+            f"time stands still in {tally.still_rows} rows, first in {tally.still_first}: expected one row "
+            "at a time; they are of several robots, or written twice"
+            if tally.still_rows
+            else "",
+            *others,
+            f"files that cannot be imported, left out: {len(self.left_out)}" if self.left_out else "",
+            *(f"  {fault}" for fault in self.left_out),
+            f"rejected rows: {tally.rejected_rows}{f', {tally.faults}' if tally.not_finite else ''}"
+            f"{torn if tally.torn_rows else ''}",
+            f"last rows without a next state: {_last_rows(tally)}; "
+            f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}",
+        ]
+        return "\n".join(filter(None, lines))
+
+
+def losses(tally: Tally) -> str:
+    """Say what was dropped, in a line."""
+    faults = f" ({tally.faults})" if tally.not_finite else ""
+    return (
+        f"rows {tally.rows}, rejected {tally.rejected_rows}{faults}, last ones without a next state "
+        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}{_after_ends(tally)}"
+    )
+
+
+def _after_ends(tally: Tally) -> str:
+    return f"; terminated rows after the end, dropped: {tally.rows_after_end}" if tally.rows_after_end else ""
+
+
+def _last_rows(tally: Tally) -> str:
+    parts = [
+        f"{tally.last_terminated} of them terminated: the step before takes over how, and the reward"
+        if tally.last_terminated
+        else "",
+        f"with the others a reward of {tally.last_reward:g} in sum" if tally.last_reward else "",
+    ]
+    lost = ", ".join(filter(None, parts))
+    return f"{tally.last_rows} dropped ({lost})" if lost else f"{tally.last_rows} dropped"
 
 
 def import_dataset(
@@ -104,12 +187,12 @@ def import_dataset(
         settings = validated(read_mapping(mapping).model_dump() | options, ImportMapping, str(mapping))
     elif skip_bad:
         raise BadInputError("--skip-bad needs a --mapping, which says what is missing")
-    chosen = (settings.format if settings else file_format) or _common_format(recordings)
+    chosen = (settings.format if settings else file_format) or format_of(recordings, SUFFIXES)
     if chosen not in FORMATS:
         raise BadInputError(f"no format '{chosen}'{did_you_mean(chosen, FORMATS)}")
     if settings:
         settings.refuse_timeless(chosen, str(mapping))
-    sources = _sources(recordings, chosen, settings, max_bytes)
+    sources = find_sources(recordings, chosen, SUFFIXES[chosen], settings, max_bytes)
     taken = ""
     if settings is None:
         settings, taken = _standard(sources[0], chosen, options)
@@ -153,7 +236,7 @@ def import_dataset(
     # Where episodes are parts of files, their origins are no files' names.
     are_files = settings.split.files and origins <= set(names)
     unused = tuple(name for name in names if are_files and name not in origins)
-    unread = () if chosen == "minari" else other_files(recordings, _suffixes(FORMATS[chosen]))
+    unread = () if chosen == "minari" else other_files(recordings, SUFFIXES[chosen])
     seconds = time.perf_counter() - began
     return ImportReport(root, count, frames, cutter.tally, seconds, unused, unread, tuple(bad), taken)
 
@@ -174,75 +257,6 @@ def from_huggingface(table: "datasets.Dataset", mapping: Path | str, *, out: Pat
         path = Path(folder) / "rows.parquet"
         table.to_parquet(path)
         return Dataset.open(import_dataset([path], Path(mapping), out=out).root)
-
-
-def _common_format(recordings: Sequence[Path]) -> str:
-    """Return the format of all `recordings`, by their names."""
-    if not recordings:
-        raise BadInputError("expected one recording or more to import, got none")
-    faults, formats = [], {}
-    for recording in recordings:
-        try:
-            formats[recording] = _format_of(recording)
-        except BadInputError as error:
-            faults.append(str(error))
-    if len(set(formats.values())) > 1:
-        listed = ", ".join(f"{path} {name}" for path, name in formats.items())
-        faults.append(f"expected recordings of one format, got {listed}")
-    if faults:
-        raise BadInputError("\n".join(faults))
-    return next(iter(formats.values()))
-
-
-def _format_of(recording: Path) -> str:
-    refuse_dataset(recording)
-    if minari.is_dataset(recording):
-        return "minari"
-    inside = [str(path) for path in files_below(recording)] if recording.is_dir() else []
-    if any(name.endswith(ZARR) for name in inside):
-        raise BadInputError(f"{recording}: {foreign(inside)}")
-    names = [str(source) for source in find_sources(recording, [""])]
-    for name, module in FORMATS.items():
-        if any(file.lower().endswith(_suffixes(module)) for file in names):
-            return name
-    unknown = f"its format cannot be inferred from its name; pass --format {'|'.join(FORMATS)}"
-    raise BadInputError(f"{recording}: {foreign(names) or unknown}")
-
-
-def _suffixes(module: ModuleType) -> tuple[str, ...]:
-    return tuple(getattr(module, "SUFFIXES", ()))
-
-
-def _sources(
-    recordings: Sequence[Path], file_format: str, mapping: ImportMapping | None, max_bytes: int | None
-) -> list[Source]:
-    """Return the files of `recordings`, named apart, and with the bytes that may be taken from them."""
-    sources: list[Source] = []
-    for recording in recordings:
-        if file_format == "minari":
-            if not minari.is_dataset(recording):
-                raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
-            found = [Source(recording, None, recording)]
-        elif is_archive(recording) and file_format not in IN_ARCHIVES:
-            raise BadInputError(f"{recording}: {file_format} cannot be read from an archive: unpack it")
-        else:
-            suffixes = _suffixes(FORMATS[file_format])
-            if not recording.name.lower().endswith(suffixes) and (hint := foreign([recording.name])):
-                raise BadInputError(f"{recording}: {hint}")
-            found = find_sources(recording, suffixes)
-        if file_format == "mcap" and mapping and not mapping.split.files and len(found) > 1:
-            raise BadInputError(
-                f"{recording}: split.files = false cannot join its {len(found)} MCAP files, each of which is "
-                "resampled separately: join them with `ros2 bag convert` or `mcap merge`, or leave out the "
-                "key, so that an episode ends with each file"
-            )
-        sources += found
-    if file_format == "csv" and mapping and mapping.files:
-        sources = joined(sources, mapping.files)
-    for source in sources:
-        if not is_text(f"{source.path}/{source}"):
-            raise BadInputError(f"{str(source)!r}: expected a name in UTF-8; rename the file to import it")
-    return named_apart(bounded(sources, max_bytes))
 
 
 def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> tuple[ImportMapping, str]:
@@ -299,36 +313,35 @@ def episodes(
         BadInputError: a file cannot be read, or an episode does not fit into memory. The files after it that
             cannot either, as far as their beginnings tell, are listed with it.
     """
-    recording = None
-    size = 0
+    recording, size = None, 0
     try:
         for number, source in enumerate(sources):
             source = replace(source, faults=left_out)
             is_apart = mapping.split.files or source.recording != recording
-            origin, row, is_bad, is_fed = "", 0, False, False
+            is_bad = is_fed = False
             try:
                 for block in _blocks(source, module, mapping):
                     size += VALUE_BYTES * sum(values.size for values in block.values.values())
                     source.refuse_beyond(size)
                     recording = source.recording
-                    row = row if block.origin == origin else 0
                     is_bad &= not block.starts
+                    if is_bad:
+                        continue
                     try:
-                        yield from () if is_bad else cutter.feed(block, row, is_apart=is_apart)
+                        yield from cutter.feed(block, is_apart=is_apart)
+                        is_apart, is_fed = False, True
                     except BadInputError as error:
                         if left_out is None:
                             raise
                         left_out.append(str(error))
                         is_bad = True
-                        yield from cutter.abandon() if is_fed and not block.starts else ()
-                    is_fed |= not is_bad
-                    is_apart, origin, row = is_apart and is_bad, block.origin, row + len(block)
+                        yield from cutter.cut(leaves_last=True) if is_fed else ()
             except BadInputError as error:
                 if left_out is None:
                     raise BadInputError(_all_faults(error, sources[number:], module, mapping)) from error
                 left_out.append(str(error))
-                yield from cutter.abandon() if is_fed else ()
-        yield from cutter.finish()
+                yield from cutter.cut(leaves_last=True) if is_fed else ()
+        yield from cutter.cut()
     except MemoryError as error:
         raise BadInputError(
             f"an episode does not fit into memory ({in_short(error)}): cut it by [split] in the mapping"
@@ -384,7 +397,8 @@ def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Itera
                     f"the mapping if these are the steps of {len(block)} episodes, else stacked = false"
                 )
             if not mapping.stacked:
-                yield block
+                yield replace(block, row=row)
+                row += len(block)
                 continue
             for episode in range(len(block)):
                 values = {field: np.asarray(stack)[episode] for field, stack in block.values.items()}

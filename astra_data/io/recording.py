@@ -16,6 +16,8 @@ from astra_data.core.errors import BadInputError, in_short
 from astra_data.dataset.columns import Array
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.plain import read_object
+from astra_data.dataset.writer import is_text
+from astra_data.io.mapping import ImportMapping
 
 BLOCK_ROWS = 2**13
 """Rows that an importer reads at once, if the format allows it."""
@@ -28,6 +30,8 @@ MOST_UNPACKED = 100
 """Larger than what logs of a robot are compressed by; files made to fill a memory are compressed by more."""
 
 ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
+IN_ARCHIVES = ("csv", "json")
+"""Formats that are read sequentially, so that they can be read inside archives."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,7 @@ class Block:
         places: where the values of some rows were recorded, if the number of the row does not tell.
         line: gives the line of a row of the file by its number, where lines may be empty.
         known: the fields, or topics, that this part of the file has.
+        row: the number of the first in that part; set by what reads them all.
     """
 
     values: Mapping[str, Array]
@@ -141,14 +146,15 @@ class Block:
     places: Mapping[int, str] = field(default_factory=dict)
     line: Callable[[int], int] | None = None
     known: Collection[str] = ()
+    row: int = 0
 
     def __len__(self) -> int:
         """Return n."""
         return len(next(iter(self.values.values())))
 
-    def place(self, row: int, number: int) -> str:
-        """Name a row of the block that has a `number` in its part of the file."""
-        return self.places.get(row) or self.row_name(number)
+    def place(self, at: int) -> str:
+        """Name row `at` of the block."""
+        return self.places.get(at) or self.row_name(self.row + at)
 
     def row_name(self, number: int) -> str:
         """Name the row, or the cut off one after the last, that has a `number` in its part of the file."""
@@ -211,17 +217,103 @@ def foreign(names: Sequence[str]) -> str:
     return ""
 
 
-def find_sources(recording: Path, suffixes: Sequence[str]) -> list[Source]:
-    """List the files of a recording in natural order (2 before 10), without hidden ones.
-
-    Args:
-        recording: a file, a folder, or an archive, whose members must be plain files inside of it.
-        suffixes: endings of the names of files in a folder or archive that are listed, in small letters;
-            names may have capitals.
+def format_of(recordings: Sequence[Path], suffixes: Mapping[str, Sequence[str]]) -> str:
+    """Return the format of all `recordings`, by their names and the `suffixes` of each format.
 
     Raises:
-        BadInputError: it does not exist, cannot be read, is unsafe or holds no such file.
+        BadInputError: there are none, one cannot be told, or they are of several; lists every fault.
     """
+    if not recordings:
+        raise BadInputError("expected one recording or more to import, got none")
+    faults, formats = [], {}
+    for recording in recordings:
+        try:
+            formats[recording] = _format_of(recording, suffixes)
+        except BadInputError as error:
+            faults.append(str(error))
+    if len(set(formats.values())) > 1:
+        listed = ", ".join(f"{path} {name}" for path, name in formats.items())
+        faults.append(f"expected recordings of one format, got {listed}")
+    if faults:
+        raise BadInputError("\n".join(faults))
+    return next(iter(formats.values()))
+
+
+def _format_of(recording: Path, suffixes: Mapping[str, Sequence[str]]) -> str:
+    refuse_dataset(recording)
+    if is_minari(recording):
+        return "minari"
+    inside = [str(path) for path in files_below(recording)] if recording.is_dir() else []
+    if any(name.endswith(ZARR) for name in inside):
+        raise BadInputError(f"{recording}: {foreign(inside)}")
+    names = [str(source) for source in _found(recording, [""])]
+    for name, endings in suffixes.items():
+        if any(file.lower().endswith(tuple(endings)) for file in names):
+            return name
+    unknown = f"its format cannot be inferred from its name; pass --format {'|'.join(suffixes)}"
+    raise BadInputError(f"{recording}: {foreign(names) or unknown}")
+
+
+def is_minari(path: Path) -> bool:
+    """Return whether `path` is the folder of a Minari dataset."""
+    return (path / "data" / "metadata.json").is_file() or (path / "data" / "main_data.hdf5").is_file()
+
+
+def find_sources(
+    recordings: Sequence[Path],
+    file_format: str,
+    suffixes: Sequence[str],
+    mapping: ImportMapping | None = None,
+    max_bytes: int | None = None,
+) -> list[Source]:
+    """List the files of recordings in natural order (2 before 10), without hidden ones, named apart.
+
+    Args:
+        recordings: files, folders, or archives, whose members must be plain files inside of them.
+        file_format: of all of them.
+        suffixes: endings of the format's files in a folder or archive, in small letters; names may have
+            capitals.
+        mapping: says which files are joined.
+        max_bytes: the most bytes of values that may be taken from them, by default in proportion to their
+            sizes.
+
+    Raises:
+        BadInputError: one does not exist, cannot be read, is unsafe or holds no such file.
+    """
+    sources: list[Source] = []
+    for recording in recordings:
+        if file_format == "minari":
+            if not is_minari(recording):
+                raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
+            found = [Source(recording, None, recording)]
+        elif is_archive(recording) and file_format not in IN_ARCHIVES:
+            raise BadInputError(f"{recording}: {file_format} cannot be read from an archive: unpack it")
+        else:
+            if not recording.name.lower().endswith(tuple(suffixes)) and (hint := foreign([recording.name])):
+                raise BadInputError(f"{recording}: {hint}")
+            found = _found(recording, suffixes)
+        if file_format == "mcap" and mapping and not mapping.split.files and len(found) > 1:
+            raise BadInputError(
+                f"{recording}: split.files = false cannot join its {len(found)} MCAP files, each of which is "
+                "resampled separately: join them with `ros2 bag convert` or `mcap merge`, or leave out the "
+                "key, so that an episode ends with each file"
+            )
+        sources += found
+    if file_format == "csv" and mapping and mapping.files:
+        sources = _joined(sources, mapping.files)
+    for source in sources:
+        if not is_text(f"{source.path}/{source}"):
+            raise BadInputError(f"{str(source)!r}: expected a name in UTF-8; rename the file to import it")
+    most = max_bytes or max(
+        SMALL_BYTES, MOST_UNPACKED * sum(file.stat().st_size for file in files_of(sources))
+    )
+    paths = [source.path / (source.member.name if source.member else "") for source in sources]
+    names = _longer([str(source) for source in sources], paths)
+    return [replace(source, name=name, most_bytes=most) for source, name in zip(sources, names, strict=True)]
+
+
+def _found(recording: Path, suffixes: Sequence[str]) -> list[Source]:
+    """List the files of a recording that end with `suffixes`."""
     if not recording.exists():
         raise BadInputError(f"{recording} does not exist")
     if not (recording.is_file() or recording.is_dir()):
@@ -344,7 +436,7 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
     return next(iter(lengths.values()))
 
 
-def joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
+def _joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
     """Group files that are parts of one recording: those in a folder whose names end with `names`.
 
     What precedes that end is the same for all files of a recording: `run3_state.csv`, `run3_control.csv`.
@@ -372,14 +464,6 @@ def joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
     return [replace(found[names[0]], parts=found) for found in groups.values()]
 
 
-def bounded(sources: Sequence[Source], max_bytes: int | None) -> list[Source]:
-    """Let the sources be taken up to `max_bytes`, by default in proportion to the sizes of their files."""
-    if max_bytes is None:
-        size = sum(file.stat().st_size for file in files_of(sources))
-        max_bytes = max(SMALL_BYTES, MOST_UNPACKED * size)
-    return [replace(source, most_bytes=max_bytes) for source in sources]
-
-
 def files_of(sources: Sequence[Source]) -> dict[Path, Path]:
     """Return the files, each with the recording that it is of."""
     files: dict[Path, Path] = {}
@@ -393,15 +477,6 @@ def named(path: Path, recording: Path) -> str:
     """Name a file by its path within a recording that is a folder."""
     within = path.relative_to(recording) if path.is_relative_to(recording) else Path()
     return within.as_posix() if within.parts else path.name
-
-
-def named_apart(sources: Sequence[Source]) -> list[Source]:
-    """Name sources that are called alike by more of their paths."""
-    within = ["" if source.member is None else source.member.name for source in sources]
-    names = _longer(
-        [str(source) for source in sources], [s.path / w for s, w in zip(sources, within, strict=True)]
-    )
-    return [replace(source, name=name) for source, name in zip(sources, names, strict=True)]
 
 
 def identities(sources: Sequence[Source]) -> list[dict[str, str]]:

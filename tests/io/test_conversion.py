@@ -9,16 +9,16 @@ from recordings import MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
-from astra_data.io.conversion import Converter, column_of
+from astra_data.io.cutting import Cutter, column_of
 from astra_data.io.mapping import ColumnMapping, ImportMapping
 from astra_data.io.recording import Block
 
 NAN = np.nan
 
 
-def converter(columns: dict[str, dict[str, Any]], **more: Any) -> Converter:  # noqa: ANN401 - keys of a mapping
+def converter(columns: dict[str, dict[str, Any]], **more: Any) -> Cutter:  # noqa: ANN401 - keys of a mapping
     specs = {name: ColumnMapping.model_validate(spec) for name, spec in columns.items()}
-    return Converter(ImportMapping(name="n", task="t", fps=10, columns=specs, **more))
+    return Cutter(ImportMapping(name="n", task="t", fps=10, columns=specs, **more))
 
 
 def convert(spec: dict[str, Any], values: list[Any], name: str = "c") -> tuple[Array, list[bool]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
@@ -45,9 +45,9 @@ def cut(cutter: Cutter, bounds: Sequence[int] = (), **fields: ArrayLike) -> list
     arrays.setdefault("a", np.arange(n))
     episodes = []
     for first, last in pairwise([0, *bounds, n]):
-        block = Block({name: array[first:last] for name, array in arrays.items()}, "log")
-        episodes += [columns for columns, _ in cutter.feed(block, first, is_apart=first == 0)]
-    return episodes + [columns for columns, _ in cutter.finish()]
+        block = Block({name: array[first:last] for name, array in arrays.items()}, "log", row=first)
+        episodes += [columns for columns, _ in cutter.feed(block, is_apart=first == 0)]
+    return episodes + [columns for columns, _ in cutter.cut()]
 
 
 def rows(episodes: list[dict[str, Array]]) -> list[list[int]]:
@@ -165,8 +165,8 @@ def timed(*files: Array, names: Sequence[str] = ()) -> Cutter:
     for number, times in enumerate(files):
         values = {"x": np.zeros(len(times)), "a": np.zeros(len(times)), "t": times}
         origin = names[number] if names else f"{number}.csv"
-        list(cutting.feed(Block(values, origin), 0, is_apart=True))
-    list(cutting.finish())
+        list(cutting.feed(Block(values, origin), is_apart=True))
+    list(cutting.cut())
     return cutting
 
 
@@ -192,8 +192,8 @@ def test_episodes_of_other_rates_are_named_where_a_format_has_its_own() -> None:
     cutting = cutter(time="t")
     for number, rate in enumerate([10.0] * 20 + [5.0]):
         values = {"x": np.zeros(50), "a": np.zeros(50), "t": np.arange(50) / rate}
-        list(cutting.feed(Block(values, f"demo_{number}", starts=True), 0, is_apart=number == 0))
-    list(cutting.finish())
+        list(cutting.feed(Block(values, f"demo_{number}", starts=True), is_apart=number == 0))
+    list(cutting.cut())
     cutting.check()
     assert cutting.tally.notes == ["demo_20: 5 Hz, 10 Hz declared"]
 
@@ -229,7 +229,7 @@ def test_rejected_rows(not_finite: str, expected: list[list[int]], points: dict[
     episodes = cut(cutting, x=[0, np.nan, np.inf, 3, 4, 5, 1e300])
     assert rows(episodes) == expected
     assert cutting.tally.rejected_rows == 3
-    assert cutting.tally.rejected_first == "log row 1"
+    assert cutting.tally.faults == "x in 3 rows, first log row 1"
     assert cutting.tally.split_points == points
 
 
@@ -249,8 +249,8 @@ def test_a_row_that_is_cut_off_where_the_next_file_goes_on_is_a_rejected_one(
         Block({"x": np.zeros(2), "a": first + np.arange(2)}, f"{first}.csv", torn=torn)
         for first, torn in ((0, 1), (2, 0))
     )
-    cuts = [*cutting.feed(begun, 0, is_apart=True), *cutting.feed(rest, 0, is_apart=False)]
-    assert rows([columns for columns, _ in [*cuts, *cutting.finish()]]) == kept
+    cuts = [*cutting.feed(begun, is_apart=True), *cutting.feed(rest, is_apart=False)]
+    assert rows([columns for columns, _ in [*cuts, *cutting.cut()]]) == kept
     assert (cutting.tally.rows, cutting.tally.torn_rows, cutting.tally.rejected_rows) == (5, 1, 1)
 
 
@@ -312,16 +312,13 @@ lines = st.tuples(cells, steps, cells, cells, cells, st.sampled_from([0, 0, 0, 5
     terminal=st.sampled_from(["drop", "stand_still"]),
     skip_bad=st.booleans(),
 )
-@settings(
-    max_examples=150, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
-)
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
 def test_where_blocks_end_changes_nothing(
     table: list[tuple[float, ...]],
     bounds: list[int],
     not_finite: str,
     terminal: str,
     skip_bad: bool,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     columns = {name: {"fields": (field,)} for name, field in ((STATE, "x"), (ACTION, "a"), (REWARD, "a"))}
     columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("won",)}}
@@ -333,8 +330,7 @@ def test_where_blocks_end_changes_nothing(
     x, t, over, won, k, jump = np.array(table).T
     fields = {"x": x + np.nancumsum(jump), "t": np.nancumsum(t) + 0 * t, "over": over, "won": won, "k": k}
     found = []
-    for block_rows, at in ((2**13, []), (1, sorted({bound for bound in bounds if bound < len(x)}))):
-        monkeypatch.setattr("astra_data.io.cutting.BLOCK_ROWS", block_rows)
+    for at in ([], sorted({bound for bound in bounds if bound < len(x)})):
         cutting = Cutter(mapping, skip_bad=skip_bad)
         found.append((cut(cutting, at, **fields), asdict(cutting.tally)))
     (whole, counts), (parts, others) = found

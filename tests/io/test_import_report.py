@@ -1,6 +1,7 @@
 from pathlib import Path
 
-from astra_data.io.import_report import ImportReport, Tally, losses
+from astra_data.io.cutting import Tally
+from astra_data.io.importing import ImportReport, losses
 
 
 def test_what_was_dropped_is_counted_aloud() -> None:

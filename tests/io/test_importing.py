@@ -11,8 +11,7 @@ from scipy.io import savemat
 
 from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.dataset.columns import REWARD, STATE, TERMINATED
-from astra_data.io.cutting import Cutter
-from astra_data.io.import_report import Tally
+from astra_data.io.cutting import Cutter, Tally
 from astra_data.io.importing import import_dataset
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
@@ -174,11 +173,11 @@ def test_no_recordings_are_refused(tmp_path: Path) -> None:
 def test_an_episode_that_does_not_fit_into_memory_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none_left(_: object) -> Iterator[object]:
+    def none_left(self: object, **_: object) -> Iterator[object]:
         raise MemoryError("Unable to allocate 3.3 GiB")
         yield
 
-    monkeypatch.setattr(Cutter, "finish", none_left)
+    monkeypatch.setattr(Cutter, "cut", none_left)
     with pytest.raises(BadInputError, match=r"does not fit into memory \(Unable to .*\[split\]"):
         imported(tmp_path, write_table(tmp_path / "log.npz", rows()))
 

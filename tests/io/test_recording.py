@@ -1,6 +1,7 @@
 import io
 import os
 import tarfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -10,13 +11,15 @@ from astra_data.io.recording import (
     MOST_UNPACKED,
     SMALL_BYTES,
     Source,
-    bounded,
     find_sources,
     identities,
     is_archive,
-    named_apart,
     row_count,
 )
+
+
+def listed(*paths: Path, suffixes: Sequence[str] = (".csv",), max_bytes: int | None = None) -> list[Source]:
+    return find_sources(paths, "csv", suffixes, max_bytes=max_bytes)
 
 
 def archive(path: Path, *members: tarfile.TarInfo, content: bytes = b"{}") -> Path:
@@ -42,10 +45,10 @@ def test_files_come_in_the_order_of_their_numbers_without_those_that_are_hidden(
     for name in names:
         (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "logs" / name).write_text("")
-    found = find_sources(tmp_path / "logs", [".csv"])
+    found = listed(tmp_path / "logs")
     assert [str(source) for source in found] == ["log_1.csv", "log_2.csv", "log_10.csv"]
     path = archive(tmp_path / "logs.tar.gz", *(member(f"logs/{name}") for name in names))
-    in_archive = find_sources(path, [".csv"])
+    in_archive = listed(path)
     assert [source.member.name for source in in_archive if source.member] == [
         "logs/log_1.csv",
         "logs/log_2.csv",
@@ -56,7 +59,7 @@ def test_files_come_in_the_order_of_their_numbers_without_those_that_are_hidden(
 def test_members_are_read_without_unpacking(tmp_path: Path) -> None:
     path = archive(tmp_path / "logs.tgz", member("a/1.json"), member("a/2.json"), content=b'{"x": [1]}')
     before = sorted(tmp_path.rglob("*"))
-    for source in find_sources(path, [".json"]):
+    for source in listed(path, suffixes=[".json"]):
         with source.open() as stream:
             assert stream.read() == b'{"x": [1]}'
     assert sorted(tmp_path.rglob("*")) == before
@@ -77,7 +80,7 @@ def test_members_are_read_without_unpacking(tmp_path: Path) -> None:
 def test_hostile_members_are_refused(tmp_path: Path, hostile: tarfile.TarInfo, told: str) -> None:
     path = archive(tmp_path / "logs.tar.gz", member("fine.json"), hostile)
     with pytest.raises(BadInputError, match=told):
-        find_sources(path, [".json"])
+        listed(path, suffixes=[".json"])
 
 
 def test_a_member_that_claims_to_be_huge_is_refused(tmp_path: Path) -> None:
@@ -85,36 +88,38 @@ def test_a_member_that_claims_to_be_huge_is_refused(tmp_path: Path) -> None:
     info.size = 2**40
     (tmp_path / "logs.tar").write_bytes(info.tobuf(tarfile.GNU_FORMAT) + b"{}".ljust(512, b"\0"))
     with pytest.raises(BadInputError, match="cannot be read as an archive"):
-        find_sources(tmp_path / "logs.tar", [".json"])
+        listed(tmp_path / "logs.tar", suffixes=[".json"])
 
 
 def test_what_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="does not exist"):
-        find_sources(tmp_path / "none", [".csv"])
+        listed(tmp_path / "none")
     with pytest.raises(BadInputError, match=r"files that end with \.csv or \.tsv, found none"):
-        find_sources(tmp_path, [".csv", ".tsv"])
+        listed(tmp_path, suffixes=[".csv", ".tsv"])
     (tmp_path / "empty").mkdir()
     with pytest.raises(BadInputError, match="empty: expected files, found none"):
-        find_sources(tmp_path / "empty", [""])
+        listed(tmp_path / "empty", suffixes=[""])
 
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "log.csv")
     for path in (tmp_path / "log.csv", Path("/dev/zero")):
         with pytest.raises(BadInputError, match="is a device or a pipe, expected a file or a folder"):
-            find_sources(path, [".csv"])
+            listed(path)
 
 
 def test_small_recordings_may_unpack_to_what_is_small_and_others_to_a_multiple(tmp_path: Path) -> None:
     for name, size in (("small.npz", 10), ("large.npz", SMALL_BYTES)):
         with (tmp_path / name).open("wb") as file:
             file.truncate(size)
-    sources = [Source(tmp_path / name, None, tmp_path) for name in ("small.npz", "large.npz")]
-    assert [source.most_bytes for source in bounded(sources[:1], None)] == [SMALL_BYTES]
-    assert [source.most_bytes for source in bounded(sources, None)] == [
-        MOST_UNPACKED * (10 + SMALL_BYTES)
-    ] * 2
-    assert [source.most_bytes for source in bounded(sources, 7)] == [7, 7]
+    small, large = tmp_path / "small.npz", tmp_path / "large.npz"
+    for paths, given, most in (
+        ([small], None, SMALL_BYTES),
+        ([small, large], None, MOST_UNPACKED * (10 + SMALL_BYTES)),
+        ([small, large], 7, 7),
+    ):
+        found = find_sources(paths, "npz", [".npz"], max_bytes=given)
+        assert [source.most_bytes for source in found] == [most] * len(paths)
 
 
 def test_capitals_and_linked_folders_hide_no_log(tmp_path: Path) -> None:
@@ -129,7 +134,7 @@ def test_capitals_and_linked_folders_hide_no_log(tmp_path: Path) -> None:
     (tmp_path / "logs/up").symlink_to(tmp_path, target_is_directory=True)
     (tmp_path / "logs/deep").mkdir()
     (tmp_path / "logs/deep/d.csv").write_text("d")
-    found = find_sources(tmp_path / "logs", [".csv"])
+    found = listed(tmp_path / "logs")
     assert [str(source) for source in found] == ["a.csv", "b.CSV", "day_2/c.Csv", "deep/d.csv"]
     assert is_archive(Path("LOGS.TGZ"))
 
@@ -140,7 +145,7 @@ def test_of_a_member_that_was_appended_again_the_last_is_read(tmp_path: Path) ->
         for content in (b"first", b"the last one"):
             (tmp_path / "log.csv").write_bytes(content)
             opened.add(tmp_path / "log.csv", "log.csv")
-    (source,) = find_sources(path, [".csv"])
+    (source,) = listed(path)
     with source.open() as stream:
         assert stream.read() == b"the last one"
 
@@ -160,9 +165,9 @@ def test_files_of_one_name_in_several_recordings_are_told_apart_by_their_paths(t
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
     files = ["a/run/log.csv", "b/run/log.csv", "b/log.csv", "c/other.csv", "c/other.csv"]
-    sources = [source for name in files for source in find_sources(tmp_path / name, [])]
+    sources = listed(*(tmp_path / name for name in files))
     expected = ["a/run/log.csv", "b/run/log.csv", "b/log.csv", "other.csv", "other.csv"]
-    assert [str(source) for source in named_apart(sources)] == expected
+    assert [str(source) for source in sources] == expected
     assert [one["name"] for one in identities(sources)] == expected[:4]
-    folders = [*find_sources(tmp_path / "a", [".csv"]), *find_sources(tmp_path / "b", [".csv"])]
-    assert [str(source) for source in named_apart(folders)] == ["a/run/log.csv", "log.csv", "b/run/log.csv"]
+    folders = listed(tmp_path / "a", tmp_path / "b")
+    assert [str(source) for source in folders] == ["a/run/log.csv", "log.csv", "b/run/log.csv"]

@@ -7,7 +7,6 @@ it in all others, and `next_infos` those after it in any.
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,11 +59,6 @@ def layout(source: Source) -> dict[str, Any]:
         TRUNCATED: {"fields": ["truncations"]},
     }
     return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
-
-
-def is_dataset(path: Path) -> bool:
-    """Return whether `path` is the folder of a Minari dataset."""
-    return (path / "data" / "metadata.json").is_file() or (path / "data" / "main_data.hdf5").is_file()
 
 
 def _open(source: Source) -> Any:  # noqa: ANN401 - of minari

@@ -23,7 +23,7 @@ def test_csv_whose_later_blocks_look_different(tmp_path: Path) -> None:
     path.write_text("x,y,command,reward,fell,gait,trial,unused\n" + "".join(lines))
     dataset, report = imported(tmp_path, path, 'not_finite = "drop"\n' + MAPPING)
     assert report.tally.rejected_rows == n
-    assert report.tally.rejected_first == f"log.csv line {n + 2}"
+    assert report.tally.faults == f"y in {n} rows, first log.csv line {n + 2}"
     assert dataset.lengths.tolist() == [n - 1]
 
 
@@ -64,7 +64,7 @@ def test_lines_that_are_empty_are_counted(tmp_path: Path, end: str) -> None:
     timed = 'time = "t"\nnot_finite = "drop"\n' + TORN
     _, report = imported(tmp_path, path, timed)
     tally = report.tally
-    assert tally.rejected_first == "log.csv line 7"
+    assert tally.faults == "x in 1 row, log.csv line 7"
     assert tally.back_first == "log.csv line 12"
     assert tally.torn_first == "log.csv line 15"
     path.write_bytes(path.read_bytes().replace(b"nan", b"oops"))

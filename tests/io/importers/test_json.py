@@ -91,7 +91,7 @@ def test_lines_that_are_blank_are_counted(tmp_path: Path) -> None:
     lines = path.read_text().splitlines()
     path.write_text("\n".join(["", *lines[:2], "", "  ", *lines[2:], "", '{"x": 1']))
     _, report = imported(tmp_path, path, 'not_finite = "split"\n' + MAPPING)
-    assert report.tally.rejected_first == "log.jsonl line 7"
+    assert report.tally.faults == "x in 1 row, log.jsonl line 7"
     assert report.tally.torn_first == f"log.jsonl line {len(lines) + 5}"
 
 
