@@ -159,7 +159,7 @@ def import_dataset(
     max_bytes: int | None = None,
     skip_bad: bool = False,
 ) -> ImportReport:
-    """Turn recordings into one dataset; at most a block of rows and an episode are in memory at once.
+    """Turn recordings into one dataset; at most the rows of one file are in memory at once.
 
     Args:
         recordings: files, folders or archives of one format.
