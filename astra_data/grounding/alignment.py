@@ -101,14 +101,18 @@ def gaussian_mmd(
         MMD² of each pair, (...).
     """
 
-    def mean_kernel(m1: Tensor, v1: Tensor, m2: Tensor, v2: Tensor) -> Tensor:
-        squared = bandwidths.square().unsqueeze(-1)
-        spread = squared + (v1 + v2).unsqueeze(-2)
-        exponent = 0.5 * ((squared / spread).log() - (m1 - m2).unsqueeze(-2).square() / spread)
-        return exponent.sum(-1).exp().mean(-1)
+    squared = bandwidths.square().unsqueeze(-1)
+    apart = (mean_1 - mean_2).square().unsqueeze(-2)
+
+    def mean_kernel(variance: Tensor, *, is_own: bool) -> Tensor:
+        spread = squared + variance.unsqueeze(-2)
+        exponent = (squared / spread).log()
+        if not is_own:
+            exponent = exponent - apart / spread
+        return (0.5 * exponent.sum(-1)).exp().mean(-1)
 
     return (
-        mean_kernel(mean_1, variance_1, mean_1, variance_1)
-        + mean_kernel(mean_2, variance_2, mean_2, variance_2)
-        - 2.0 * mean_kernel(mean_1, variance_1, mean_2, variance_2)
+        mean_kernel(2.0 * variance_1, is_own=True)
+        + mean_kernel(2.0 * variance_2, is_own=True)
+        - 2.0 * mean_kernel(variance_1 + variance_2, is_own=False)
     )

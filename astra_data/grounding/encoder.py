@@ -7,6 +7,7 @@ from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
 _LONGEST_M = 16.0
@@ -112,7 +113,7 @@ class HistoryEncoder(Encoder):
 
     def sequence(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return latents and hidden states (B, T, Z)."""
-        states, _ = self.recurrence(functional.elu(self.embedding(inputs)))
+        states = self._states(inputs, self.initial(len(inputs)))
         return self.latent(states), states
 
     def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
@@ -120,17 +121,85 @@ class HistoryEncoder(Encoder):
 
         They begin with `hidden` (B, Z). `start` (B, T) is 1 where a new episode begins, from zero.
         """
-        embedded = functional.elu(self.embedding(inputs)).unbind(1)
-        keep = (1.0 - start).unsqueeze(-1).unbind(1)
-        states = []
-        for step, kept in zip(embedded, keep, strict=True):
-            hidden = self._next(step, hidden * kept)
-            states.append(hidden)
-        return torch.stack(states, dim=1)
+        return self._states(inputs, hidden, 1.0 - start)
+
+    def _states(self, inputs: Tensor, hidden: Tensor, keep: Tensor | None = None) -> Tensor:
+        """Return the hidden states (B, T, Z); each is multiplied by `keep` (B, T) before its step."""
+        embedded = functional.elu(self.embedding(inputs.transpose(0, 1)))
+        (weights,) = self.recurrence.all_weights
+        kept = torch.ones_like(inputs[..., 0]) if keep is None else keep
+        states = _Recurrence.apply(embedded, hidden, kept.t().unsqueeze(-1), *weights)  # type: ignore[no-untyped-call]
+        return torch.as_tensor(states).transpose(0, 1)
 
     def _next(self, embedded: Tensor, hidden: Tensor) -> Tensor:
         (weights,) = self.recurrence.all_weights
         return torch.gru_cell(embedded, hidden, *weights)
+
+
+class _Recurrence(torch.autograd.Function):
+    """A GRU over T steps, whose gradient takes a third of the time that torch's takes on a CPU.
+
+    Backward in time, only what depends on later steps is computed step by step; all else at once.
+    """
+
+    @staticmethod
+    def forward(
+        context: FunctionCtx,
+        inputs: Tensor,
+        hidden: Tensor,
+        keep: Tensor,
+        input_weight: Tensor,
+        weight: Tensor,
+        input_bias: Tensor,
+        bias: Tensor,
+    ) -> Tensor:
+        """Return the states (T, B, Z) for inputs (T, B, I), from `hidden` (B, Z); `keep` is (T, B, 1)."""
+        states, before = [], []
+        for step, kept in zip(inputs.unbind(), keep.unbind(), strict=True):
+            before.append(hidden * kept)
+            hidden = torch.gru_cell(step, before[-1], input_weight, weight, input_bias, bias)
+            states.append(hidden)
+        stacked = torch.stack(before)
+        context.save_for_backward(inputs, stacked, keep, input_weight, weight, input_bias, bias)
+        return torch.stack(states)
+
+    @staticmethod
+    def backward(context: FunctionCtx, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the gradients of all arguments but `keep`, given that of the states (T, B, Z)."""
+        (gradient,) = gradients
+        inputs, before, keep, input_weight, weight, input_bias, bias = context.saved_tensors  # type: ignore[attr-defined]
+        size = before.shape[-1]
+        given = functional.linear(inputs, input_weight, input_bias)
+        own = functional.linear(before, weight, bias)
+        reset, update = (given[..., : 2 * size] + own[..., : 2 * size]).sigmoid().chunk(2, dim=-1)
+        new = torch.tanh(given[..., 2 * size :] + reset * own[..., 2 * size :])
+        by_new = (1.0 - update) * (1.0 - new * new)
+        by_own_new = by_new * reset
+        by_reset = by_own_new * own[..., 2 * size :] * (1.0 - reset)
+        by_update = (before - new) * update * (1.0 - update)
+        # Per unit of the gradient of the state after the step, that of what its three gates sum up.
+        by_gates = torch.stack([by_reset, by_update, by_own_new], dim=2)
+        of_gates, of_state = torch.empty_like(by_gates), torch.empty_like(before)
+        later = torch.zeros_like(gradient[0])
+        steps = zip(
+            *(values.unbind() for values in (gradient, by_gates, update, keep, of_gates, of_state)),
+            strict=True,
+        )
+        for now, by_gate, share, kept, of_gate, of_this in reversed(list(steps)):
+            torch.add(later, now, out=of_this)
+            torch.mul(by_gate, of_this.unsqueeze(1), out=of_gate)
+            later = torch.addcmul(torch.mm(of_gate.flatten(1), weight), of_this, share) * kept
+        own_gates = of_gates.flatten(2).flatten(0, 1)
+        gates = torch.cat([own_gates[:, : 2 * size], (of_state * by_new).flatten(0, 1)], dim=-1)
+        return (
+            (gates @ input_weight).view(inputs.shape),
+            later,
+            None,
+            gates.t() @ inputs.flatten(0, 1),
+            own_gates.t() @ before.flatten(0, 1),
+            gates.sum(0),
+            own_gates.sum(0),
+        )
 
 
 ENCODERS: dict[str, type[Encoder]] = {HistoryEncoder.kind: HistoryEncoder}

@@ -75,6 +75,36 @@ class FailureShape:
         return _MAGNITUDES * (1 + len(AVERAGED_S)) + walls
 
 
+class Members(nn.Module):
+    """K networks with two hidden layers each, evaluated at once: inputs (..., I) to log-odds (K, ...)."""
+
+    def __init__(self, count: int, input_size: int, hidden_size: int, dropout: float) -> None:
+        super().__init__()
+        self.count, self.dropout = count, nn.Dropout(dropout)
+        # As of one layer, since all see the same.
+        self.first = nn.Linear(input_size, count * hidden_size)
+        least = hidden_size**-0.5  # as torch's layers begin
+        for name, sizes in {
+            "second_weight": (hidden_size, hidden_size),
+            "second_bias": (1, hidden_size),
+            "last_weight": (hidden_size, 1),
+            "last_bias": (1, 1),
+        }.items():
+            self.register_parameter(name, nn.Parameter(torch.empty(count, *sizes).uniform_(-least, least)))
+        self.second_weight: Tensor
+        self.second_bias: Tensor
+        self.last_weight: Tensor
+        self.last_bias: Tensor
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return the log-odds (K, ...) of `inputs` (..., I)."""
+        hidden = self.dropout(functional.elu(self.first(inputs.flatten(0, -2))))
+        hidden = hidden.unflatten(-1, (self.count, -1)).transpose(0, 1)
+        hidden = self.dropout(functional.elu(torch.baddbmm(self.second_bias, hidden, self.second_weight)))
+        odds = torch.baddbmm(self.last_bias, hidden, self.last_weight)
+        return odds.view(self.count, *inputs.shape[:-1])
+
+
 class FailureModel(nn.Module):
     """Estimate the probability of a failure within the shape's `risk_steps`, from before a step is corrected.
 
@@ -85,18 +115,10 @@ class FailureModel(nn.Module):
     def __init__(self, shape: FailureShape) -> None:
         super().__init__()
         self.shape = shape
-        sizes, hidden = shape.input_size, shape.hidden_size
-        self.members = nn.ModuleList(
-            nn.Sequential(
-                *(nn.Linear(sizes, hidden), nn.ELU(), nn.Dropout(shape.dropout)),
-                *(nn.Linear(hidden, hidden), nn.ELU(), nn.Dropout(shape.dropout)),
-                nn.Linear(hidden, 1),
-            )
-            for _ in range(shape.members)
-        )
+        self.members = Members(shape.members, shape.input_size, shape.hidden_size, shape.dropout)
         for name in ("wanted", "moved", "missed"):
             self.register_buffer(f"{name}_std", torch.ones(shape.state_size))
-        add_scales(self, {"input": sizes})
+        add_scales(self, {"input": shape.input_size})
         self.register_buffer("log_odds_shift", torch.zeros(()))
         self.register_buffer("clearance", torch.zeros(shape.maze_cells))
         self.register_buffer("half_extent", torch.zeros(2))
@@ -177,15 +199,14 @@ class FailureModel(nn.Module):
 
         Failures are drawn more often than they come: `log_odds_shift` is not added yet.
         """
-        normal = normalized(inputs, self.input_mean, self.input_std)
-        return torch.stack([member(normal).squeeze(-1) for member in self.members])
+        odds: Tensor = self.members(normalized(inputs, self.input_mean, self.input_std))
+        return odds
 
     @torch.no_grad()
     def calibrate(self, scale: Tensor, shift: Tensor) -> None:
         """Scale the members' log-odds, and shift them by the rate of failures."""
-        for member in self.members:
-            for parameter in list(member.parameters())[-2:]:
-                parameter.mul_(scale)
+        for parameter in (self.members.last_weight, self.members.last_bias):
+            parameter.mul_(scale)
         self.log_odds_shift.copy_(shift)
 
     def hazard(self, probability: Tensor) -> Tensor:
@@ -304,7 +325,7 @@ AHEAD_STEPS = ((1, 20), (11, 30), (21, 40))
 """Windows before a failure, in steps, in which it is to be foreseen."""
 _REPLAYED = 3 * RISK_STEPS
 """Steps of a replay: the last of them come after as long as the averages of a failure model remember."""
-_BATCH = 1024
+_BATCH = 512
 _FAILING_SHARE = 0.25
 """Of each batch: steps that fail soon are too rare to be drawn as often as they come."""
 _WEIGHT_DECAY = 1.0

@@ -104,13 +104,13 @@ class GroundedSimulator(EpisodeSimulator):
         if self.failures is not None:
             soon, self._remembered = self.failures.step(before, action, landed, latent, self._remembered)
             self._hazard = self.failures.hazard(soon)
-        state = corrected = self.model.correct(latent, action, landed)
+        inputs = self.model.correction_inputs(latent, action, landed)
+        state = corrected = self.model.corrected(inputs, landed)
         if self._touches is not None or self.scatter_model is None:
             state = self._settle(before, corrected)
             self._touches = None if self._touches is None else self.simulator.blocked
         if self.scatter_model is not None:
-            scatter = self.scatter_model.draw(self.model.correction_inputs(latent, action, landed))
-            state = self._settle(before, state + scatter)
+            state = self._settle(before, state + self.scatter_model.draw(inputs))
         self.hidden = self._encoded(state, self.goal, action, self.hidden)
         return state
 

@@ -191,7 +191,11 @@ class GroundingModel(nn.Module):
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
-        correction: Tensor = self.correction(self.correction_inputs(latent, action, simulated_next))
+        return self.corrected(self.correction_inputs(latent, action, simulated_next), simulated_next)
+
+    def corrected(self, inputs: Tensor, simulated_next: Tensor) -> Tensor:
+        """Return what `correct` does, given its `correction_inputs` (..., I)."""
+        correction: Tensor = self.correction(inputs)
         return simulated_next + correction * self.correction_std
 
     def correction_inputs(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:

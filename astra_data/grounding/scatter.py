@@ -75,7 +75,7 @@ class ScatterModel(nn.Module):
         return forms * self.usual * self.log_scale(inputs).exp()
 
 
-_DESCENT = DescentConfig(updates=1000, learning_rate=1e-3)
+_DESCENT = DescentConfig(updates=500, learning_rate=2e-3)
 _BATCH = 2048
 _MOST_FORMS = 20_000
 

@@ -236,9 +236,9 @@ _RECENT = 5
 """Points of the learning curve over which success is averaged."""
 MASTERED = 0.95
 """Success of training episodes from which on a simulator counts as mastered."""
-FAST = 3.0
+FAST = 6.0
 """Pace of a training that has mastered its simulator, of one that has not."""
-_GROWTH_SHARE = 0.4
+_GROWTH_SHARE = 0.25
 """Share of the training over which penalties grow from 0 to full size."""
 
 

@@ -1,7 +1,7 @@
 """Proximal policy optimization (Schulman et al. 2017) on a batched environment.
 
-One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are whole
-rollouts of some environments, so the same code trains policies with and without memory.
+One iteration collects a rollout from every environment and makes a few passes over it. Minibatches are short
+segments of the rollouts, so the same code trains policies with and without memory.
 """
 
 import math
@@ -18,7 +18,9 @@ from astra_data.policies.networks import ActorCritic, gaussian_log_prob
 from astra_data.worlds.protocols import BatchedEnv
 
 EPOCHS, MINIBATCHES = 5, 16
-"""Passes over a rollout, and updates per pass, each on the complete rollouts of some environments."""
+"""Passes over a rollout, and updates per pass."""
+_SEGMENT_STEPS = 16
+"""At most, of a segment: it begins with the memory that the policy had there when it acted."""
 GAE_LAMBDA, CLIP, VALUE_WEIGHT, GRADIENT_NORM = 0.95, 0.2, 0.5, 0.5
 _CRITIC_GAIN = 0.01
 """Initial gain of the critic's last layer. With 1, its values exceed small returns, so the first advantages
@@ -111,11 +113,11 @@ class Ppo(Learner):
     def _collect(self) -> dict[str, Tensor]:
         acting, policy = self.acting, self.policy
         columns: dict[str, list[Tensor]] = {}
-        first_hidden = acting.hidden
         for _ in range(self.rollout_steps):
             row = {
                 "observation": acting.observation,
                 "previous_action": acting.previous_action,
+                "hidden": acting.hidden,
                 "start": acting.first.float(),
             }
             features, hidden = policy.remember(acting.observation, acting.previous_action, acting.hidden)
@@ -147,17 +149,19 @@ class Ppo(Learner):
         parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
         advantage = generalized_advantages(*parts, discount=self.config.discount, gae_lambda=GAE_LAMBDA)
         target = advantage + rollout["value"]
-        return rollout | {"advantage": advantage, "value_target": target, "hidden": first_hidden}
+        return rollout | {"advantage": advantage, "value_target": target}
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
         policy = self.policy
         advantage = rollout["advantage"]
         rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        count = len(advantage)
+        steps = math.gcd(self.rollout_steps, _SEGMENT_STEPS)
+        segments = {name: rollout[name].unflatten(1, (-1, steps)).flatten(0, 1) for name in _SEEN + _LEARNED}
+        segments["hidden"] = segments["hidden"][:, 0]
         for _ in range(EPOCHS):
-            order = torch.randperm(count, device=advantage.device)
+            order = torch.randperm(len(segments["action"]), device=advantage.device)
             for rows in order.chunk(MINIBATCHES):
-                loss, moved = self._loss({name: rollout[name][rows] for name in _SEEN + _LEARNED})
+                loss, moved = self._loss({name: values[rows] for name, values in segments.items()})
                 if moved.abs() > _MAX_KL:
                     return
                 self._optimizer.zero_grad()

@@ -3,9 +3,9 @@
     astra-data run recipes/quickstart.toml --until pair
     python recipes/examples/astra_in_one_file.py runs/quickstart/pair recipes/examples/cart/robot.py:TASK
 
-fits ψ^s, P_lat, R_pred and f_abs to a paired dataset (Algorithm 1), trains a policy by PPO in the simulator
-that they ground (Algorithm 2), aligns ψ^t, and tests the policy in the target. It is the package's row
-`astra` for tasks without a maze, but for its failure model, its scatter, checkpoints and restarts.
+fits ψ^s, P_lat, R_pred and f_abs to a paired dataset (Algorithm 1), trains a policy by PPO in the grounded
+simulator (Algorithm 2), aligns ψ^t, and tests the policy in the target. It is the package's row `astra`, less
+failure model, scatter, checkpoints and restarts, for tasks without a maze.
 
 Shapes: B batch, T steps, E episodes, S target state, X abstract state, A action, G goal, Z latent.
 """
@@ -74,7 +74,6 @@ def draw_windows(episodes, count, length):
     return windows
 
 
-# ---- Networks
 def mlp(*sizes):
     layers = [layer for pair in pairwise(sizes) for layer in (nn.Linear(*pair), nn.ELU())]
     return nn.Sequential(*layers[:-1])
@@ -428,9 +427,10 @@ class Ppo:
         return 0.5 * critic_loss - gain + 0.05 * beyond, -moved.mean()
 
     def learn(self, rollout):
+        segments = {name: values.unflatten(1, (-1, 16)).flatten(0, 1) for name, values in rollout.items()}
         for _ in range(5):
-            for rows in torch.randperm(self.env.num_envs).chunk(16):
-                loss, moved = self.loss(selected(rollout, rows))
+            for rows in torch.randperm(len(segments["action"])).chunk(16):
+                loss, moved = self.loss(selected(segments, rows))
                 if moved.abs() > 0.03:
                     return
                 self.optimizer.zero_grad()
@@ -451,12 +451,12 @@ class Ppo:
 
 
 def train(task, model, episodes):
-    """Train a policy in the grounded simulator; one that has mastered it ends three times as fast."""
+    """Train a policy in the grounded simulator; one that has mastered it ends six times as fast."""
     env = GroundedEnv(task, model, episodes)
     ppo = Ppo(env, ActorCritic(env.observe().shape[1], task.objective.action_size))
     recent = []
     while ppo.share < 1.0 - 1e-9:
-        recent = [*recent, ppo.iterate(pace=3.0 if recent and np.nanmean(recent) >= 0.95 else 1.0)][-5:]
+        recent = [*recent, ppo.iterate(pace=6.0 if recent and np.nanmean(recent) >= 0.95 else 1.0)][-5:]
         print(f"  {ppo.share:.0%} of the training: success {np.nanmean(recent):.2f}")
     return ppo.policy
 

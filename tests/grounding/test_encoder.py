@@ -1,6 +1,7 @@
 """Encoders of histories, and another one from a file."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -113,6 +114,30 @@ def test_episodes_in_one_sequence_do_not_touch(encoder: HistoryEncoder) -> None:
     torch.testing.assert_close(states[:1, 0], encoder.step(inputs[:1, 0], hidden[:1]))
     torch.testing.assert_close(states[:1, 4:], encoder.sequence(inputs[:1, 4:])[1])
     torch.testing.assert_close(states[1:], encoder.sequence(inputs[1:])[1])
+
+
+def test_gradients_are_those_of_steps_one_after_another(encoder: HistoryEncoder) -> None:
+    encoder = encoder.double()
+    inputs, hidden = torch.randn(3, 6, 5).double(), torch.randn(3, 32).double()
+    start = torch.zeros(3, 6).double()
+    start[0, 3] = start[1, 0] = 1.0
+    weights = torch.randn(3, 6, 32).double()
+
+    def step_by_step(inputs: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
+        states = []
+        for step in range(6):
+            hidden = encoder.step(inputs[:, step], hidden * (1.0 - start[:, step : step + 1]))
+            states.append(hidden)
+        return torch.stack(states, dim=1)
+
+    def gradients(states_of: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> list[torch.Tensor]:
+        given = inputs.clone().requires_grad_(), hidden.clone().requires_grad_()
+        loss = (states_of(*given).sin() * weights).sum()
+        return [loss, *torch.autograd.grad(loss, [*given, *encoder.parameters()])]
+
+    found = gradients(lambda inputs, hidden: encoder.through_episodes(inputs, hidden, start))
+    torch.testing.assert_close(found, gradients(step_by_step))
+    assert all(gradient.abs().max() > 0 for gradient in found)
 
 
 def test_an_mlp_has_activations_between_its_layers_alone() -> None:

@@ -9,6 +9,7 @@ import torch
 from grounding_models import TASK, model
 from scipy.optimize import minimize
 from torch import Tensor
+from torch.nn.functional import elu
 from toy_episodes import toy_episodes
 
 from astra_data.grounding import failures as module
@@ -18,6 +19,7 @@ from astra_data.grounding.failures import (
     AVERAGED_S,
     FailureModel,
     FailureShape,
+    Members,
     averages_before,
     failing,
     failure_figures,
@@ -93,7 +95,7 @@ def few_updates() -> Iterator[None]:
 def test_failures_of_other_episodes_are_foreseen_as_often_as_they_come() -> None:
     training, fresh = hurried(40, 0), hurried(40, 1)
     made, figures = fit_failures(TASK, GROUNDING, training, seed=0)
-    assert (len(made.members), made.shape.risk_steps, made.training) == (5, 2, False)
+    assert (made.members.count, made.shape.risk_steps, made.training) == (5, 2, False)
     assert not any(parameter.requires_grad for parameter in made.parameters())
     # A constant rate is far from knowing the moment.
     best = max(one["nats_per_failure"] for one in figures["candidates"])
@@ -300,6 +302,19 @@ def test_the_magnitudes_are_moves_in_their_deviations_and_commands() -> None:
             float(action[step].norm()),
         ]
         assert inputs[episode, step, :5].tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def test_members_are_networks_of_two_hidden_layers_each() -> None:
+    members = Members(3, 4, 5, dropout=0.2).eval()
+    inputs, first = torch.randn(2, 7, 4), members.first
+    for number, found in enumerate(members(inputs)):
+        rows = slice(5 * number, 5 * number + 5)
+        hidden = elu(inputs @ first.weight[rows].T + first.bias[rows])
+        hidden = elu(hidden @ members.second_weight[number] + members.second_bias[number])
+        expected = (hidden @ members.last_weight[number] + members.last_bias[number]).squeeze(-1)
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+    members.train()
+    assert not torch.equal(members(inputs), members(inputs))  # entries are dropped at random
 
 
 def test_averages_forget_with_their_time_constants() -> None:

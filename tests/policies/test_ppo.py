@@ -154,6 +154,25 @@ def test_an_update_is_that_of_the_printed_loss(monkeypatch: pytest.MonkeyPatch) 
         torch.testing.assert_close(value, theirs.state_dict()[name], atol=1e-5, rtol=1e-3, msg=name)
 
 
+def test_a_segment_begins_with_the_memory_that_the_policy_acted_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = ppo(Recall(4), 1, horizon=5, memory=8, rollout_steps=48)
+    batches: list[dict[str, torch.Tensor]] = []
+
+    def diverged(batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        batches.append(batch)
+        return torch.zeros(()), torch.tensor(9.0)
+
+    monkeypatch.setattr(learner, "_loss", diverged)
+    learner._learn(learner._collect())
+    (batch,) = batches  # where learning stops
+    assert batch["action"].shape == (6, 16, 1)  # half of the three segments of four environments
+    assert batch["hidden"].abs().amax(1).gt(0.01).any()
+    seen = (batch[name] for name in ("observation", "previous_action", "hidden", "start"))
+    with torch.no_grad():
+        found = learner.policy.log_prob(learner.policy.remember_sequence(*seen), batch["action"])
+    torch.testing.assert_close(found, batch["action_log_prob"], atol=1e-5, rtol=1e-5)
+
+
 def test_the_learning_rate_falls_to_zero_along_a_line() -> None:
     learner = ppo(GoToZero(4), 4, horizon=5)
     rates = []

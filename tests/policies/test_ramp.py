@@ -31,21 +31,21 @@ def test_a_simulator_is_mastered_by_the_mean_of_the_last_five_points(
     [
         ([], 0.0),
         ([0.0, 0.0, None], 0.0),
-        ([0.95], 0.25),
-        ([1.0, 1.0], 0.5),
-        ([1.0, 1.0, 0.7], 0.25),  # a mean of 0.9
+        ([0.95], 0.4),
+        ([1.0, 1.0], 0.8),
+        ([1.0, 1.0, 0.7], 0.4),  # a mean of 0.9
         ([1.0, 1.0, 0.7, 0.0, 0.0], 0.0),
-        ([1.0, None, None], 0.75),
+        ([1.0, None], 0.8),
         ([1.0] * 8, 1.0),
-        ([1.0] * 8 + [0.0], 0.75),
+        ([1.0] * 8 + [0.0], 0.6),
     ],
 )
-def test_penalties_grow_over_four_tenths_while_it_is_mastered_and_shrink_as_fast(
+def test_penalties_grow_over_a_quarter_while_it_is_mastered_and_shrink_as_fast(
     successes: list[float | None], scale: float
 ) -> None:
     assert penalty_scale(curve(*successes)) == pytest.approx(scale)
 
 
 def test_at_a_faster_pace_they_grow_with_the_share() -> None:
-    points = [{"share": 0.1, "success": 1.0}, {"share": 0.25, "success": 1.0}]
-    assert penalty_scale(points) == pytest.approx(0.625)
+    points = [{"share": 0.1, "success": 1.0}, {"share": 0.225, "success": 1.0}]
+    assert penalty_scale(points) == pytest.approx(0.9)

@@ -113,9 +113,9 @@ WALKER = TASKS["humanoid-kinematics"]
 @pytest.mark.parametrize(
     ("task", "is_plus", "success", "scales"),
     [
-        # Mastered from the first point on: penalties grow over four tenths, and then it is thrice as fast.
-        (TASK, True, 1.0, [0.0, 0.25, 0.5, 0.75, 1.0, 1.0]),
-        (TASK, False, 1.0, [1.0] * 4),
+        # Mastered from the first point on: penalties grow over a quarter, and then it is six times as fast.
+        (TASK, True, 1.0, [0.0, 0.4, 0.8, 1.0, 1.0]),
+        (TASK, False, 1.0, [1.0] * 3),
         (TASK, True, 0.9, [0.0] * 10),
         (TASK, False, 0.9, [1.0] * 10),
         # Success that is to last is unknown here: nothing grows, and nothing ends early.
@@ -130,10 +130,10 @@ def test_a_mastered_training_ends_early_and_only_its_penalties_grow(
     figures = {"success": success, "episode_steps": 1000.0}
     learner, curve = counted(replace(given, is_plus=is_plus), lambda step: figures)
     assert learner.scales == pytest.approx(scales)
-    slow = {4: 1, 6: 4}.get(len(scales), 10)
-    assert learner.paces == [1.0] * slow + [3.0] * (len(scales) - slow)
+    slow = {3: 1, 5: 3}.get(len(scales), 10)
+    assert learner.paces == [1.0] * slow + [6.0] * (len(scales) - slow)
     shares = [point["share"] for point in curve["points"]]
-    tenths = [*range(1, slow + 1), *range(slow + 3, 11, 3)]
+    tenths = [*range(1, slow + 1), *([slow + 6, 10] if slow < 10 else [])]
     assert shares == pytest.approx([tenth / 10 for tenth in tenths])
     assert [share for share, _ in notes] == shares
     assert [point["steps"] for point in curve["points"]] == [*range(1, len(scales) + 1)]
