@@ -100,7 +100,6 @@ def gaussian_mmd(
     Returns:
         MMD² of each pair, (...).
     """
-
     squared = bandwidths.square().unsqueeze(-1)
     apart = (mean_1 - mean_2).square().unsqueeze(-2)
 

@@ -27,6 +27,36 @@ def mlp(
     return nn.Sequential(*layers[:-1])
 
 
+class Members(nn.Module):
+    """K networks with two hidden layers each, evaluated at once: inputs (..., I) to log-odds (K, ...)."""
+
+    def __init__(self, count: int, input_size: int, hidden_size: int, dropout: float) -> None:
+        super().__init__()
+        self.count, self.dropout = count, nn.Dropout(dropout)
+        # As of one layer, since all see the same.
+        self.first = nn.Linear(input_size, count * hidden_size)
+        least = hidden_size**-0.5  # as torch's layers begin
+        for name, sizes in {
+            "second_weight": (hidden_size, hidden_size),
+            "second_bias": (1, hidden_size),
+            "last_weight": (hidden_size, 1),
+            "last_bias": (1, 1),
+        }.items():
+            self.register_parameter(name, nn.Parameter(torch.empty(count, *sizes).uniform_(-least, least)))
+        self.second_weight: Tensor
+        self.second_bias: Tensor
+        self.last_weight: Tensor
+        self.last_bias: Tensor
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return the log-odds (K, ...) of `inputs` (..., I)."""
+        hidden = self.dropout(functional.elu(self.first(inputs.flatten(0, -2))))
+        hidden = hidden.unflatten(-1, (self.count, -1)).transpose(0, 1)
+        hidden = self.dropout(functional.elu(torch.baddbmm(self.second_bias, hidden, self.second_weight)))
+        odds = torch.baddbmm(self.last_bias, hidden, self.last_weight)
+        return odds.view(self.count, *inputs.shape[:-1])
+
+
 class PositionFeatures(nn.Module):
     """Sines and cosines of planar positions, so that a smooth network can place sharp walls.
 

@@ -14,12 +14,12 @@ from toy_episodes import toy_episodes
 
 from astra_data.grounding import failures as module
 from astra_data.grounding.descent import DescentConfig
+from astra_data.grounding.encoder import Members
 from astra_data.grounding.failures import (
     AHEAD_S,
     AVERAGED_S,
     FailureModel,
     FailureShape,
-    Members,
     averages_before,
     failing,
     failure_figures,
