@@ -1,5 +1,6 @@
 """Files that the other stages write: a missing key is an error, an extra one is not."""
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal, Self
 
@@ -25,13 +26,12 @@ class WrittenPart(BaseModel):
 
 
 class Machine(WrittenPart):
-    """The machine that a stage ran on."""
+    """The machine that a stage ran on; `gpu` is None where the networks ran on the CPU."""
 
     cpu: str
     cores: int
     memory_gib: float
     gpu: str | None = None
-    """None where the networks ran on the CPU."""
 
 
 class Artifact(WrittenPart):
@@ -39,18 +39,27 @@ class Artifact(WrittenPart):
 
     wall_seconds: float | None = None
     """Run time of the stage, in s."""
-    finished_at: float | None = None
-    """When the stage ended, in s since 1970."""
     cpu_seconds: float | None = None
     """CPU time of all its threads, in s."""
+    finished_at: float | None = None
+    """When the stage ended, in s since 1970."""
     git_commit: str | None = None
     """Ends in "-dirty" if there were uncommitted changes."""
     packages: dict[str, str | None] = Field(default_factory=dict)
     machine: Machine | None = None
 
+    def numbers(self) -> dict[str, float | None]:
+        """Return what the stage recorded of itself, as `Results.lines` hold it: its times and speeds."""
+        times = ("wall_seconds", "cpu_seconds", "finished_at")
+        names = [name for name in type(self).model_fields if name in times or name.endswith("_per_second")]
+        return {name: getattr(self, name) for name in names}
+
 
 class Outcomes(WrittenPart):
-    """Outcomes of a policy's episodes, one number per episode."""
+    """Outcomes of a policy's episodes, one number per episode; further measures are kept as they are."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, list[float]]
 
     success: list[float]
     """1 where the goal was reached, else 0."""
@@ -119,24 +128,26 @@ class Evaluation(Artifact):
 
 
 class CurvePoint(WrittenPart):
-    """One point of a learning curve."""
+    """One point of a learning curve: success and mean length in steps of the episodes that ended, if any."""
 
     steps: float
     success: float | None
-    """Success rate of the training episodes that ended; None without any."""
     episode_steps: float | None = None
-    """Their mean length in control steps; None without any, or if not recorded."""
 
 
 class CurveFile(Artifact):
     """curve.json of one row and seed."""
 
-    steps_per_second: float | None = None
     simulator_steps_per_second: float | None = None
+    steps_per_second: float | None = None
     updates_per_second: float | None = None
     points: list[CurvePoint] = Field(min_length=1)
     tries: list[dict[str, JsonValue]] = Field(default_factory=list)
     """Of a training that may be done again: what each try reached; the points are those of the one kept."""
+
+    def numbers(self) -> dict[str, float | None]:
+        """Return times, speeds and the number of tries."""
+        return {**super().numbers(), "tries": float(len(self.tries)) or None}
 
 
 class Foresight(WrittenPart):
@@ -160,6 +171,23 @@ class Metrics(Artifact):
     failures: dict[str, Foresight] = Field(default_factory=dict)
     """By what predicts them; empty without a failure model."""
 
+    def numbers(self) -> dict[str, float | None]:
+        """Return times, speeds, the last R² and, by dotted names, the figures of predicted failures."""
+        last = self.epochs[-1] if self.epochs else {}
+        explained = dict(_flat({name: value for name, value in last.items() if name.startswith("r2_")}))
+        return super().numbers() | explained | dict(_flat(self.model_dump(include={"failures"})))
+
+
+def _flat(values: object, name: str = "") -> Iterator[tuple[str, float]]:
+    """Yield the numbers in nested mappings and lists by their dotted names."""
+    if isinstance(values, list | tuple):
+        values = dict(enumerate(values))
+    if isinstance(values, Mapping):
+        for key, value in values.items():
+            yield from _flat(value, f"{name}.{key}" if name else f"{key}")
+    elif values is not None:
+        yield name, float(values)  # type: ignore[arg-type]
+
 
 class Band(WrittenPart):
     """An error at each horizon; no interval where a single episode is that long."""
@@ -170,14 +198,15 @@ class Band(WrittenPart):
 
 
 class Gap(Artifact):
-    """gap.json: open-loop error by horizon, for each quantity."""
+    """gap.json: open-loop error by horizon in steps, for each quantity.
+
+    `still` is that of the persistence baseline, which predicts no motion; None where it was not measured.
+    """
 
     horizons: list[int]
-    """Steps ahead."""
     grounded: dict[str, Band]
     raw: dict[str, Band]
     still: dict[str, Band] | None = None
-    """Of the persistence baseline, which predicts no motion; None where it was not measured."""
 
     @model_validator(mode="after")
     def _one_number_per_horizon(self) -> Self:
@@ -201,11 +230,7 @@ class DatasetFile(Artifact):
 
 
 def read_json[T: Artifact](model: type[T], path: Path) -> T:
-    """Read one of the files above.
-
-    Raises:
-        BadInputError: the file was altered, or does not hold what its stage writes; lists mismatches.
-    """
+    """Read one of the files above; raise a BadInputError if it was altered or its stage wrote another."""
     check_intact(path)
     return read_written(model, path, by="its stage", advice="run that stage again")
 

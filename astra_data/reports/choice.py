@@ -1,7 +1,7 @@
 """The choice of a policy without the target, what it is worth there, and trials in the target that end it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from math import ceil, log2
 from pathlib import Path
 from statistics import fmean
@@ -11,8 +11,8 @@ from pydantic import Field
 
 from astra_data.methods import method_title
 from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
-from astra_data.reports.blocks import Section, TableBlock, Text, interval, markdown
-from astra_data.reports.statistics import LEAST_SEEDS, Estimate, mean_interval
+from astra_data.reports.blocks import Section, TableBlock, Text, markdown
+from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summarize
 
 TRIALS = "trials.json"
 PSEUDO_TRIALS = 4
@@ -26,11 +26,9 @@ Attempt = Callable[[int, tuple[int, ...], int], Sequence[int]]
 
 @dataclass(frozen=True)
 class Halving:
-    """What came of it.
+    """The candidates of each round with the trials of each of them, the one that is left, and its mean.
 
-    Attributes:
-        rounds: the candidates of each round, and the trials of each of these.
-        chosen: the candidate that is left. mean: of its success, given the prediction and all of its trials.
+    The mean is that of its success, given the prediction and all of its trials.
     """
 
     rounds: tuple[tuple[tuple[int, ...], int], ...]
@@ -92,7 +90,7 @@ class Tried(WrittenPart):
 
 
 class TrialRound(WrittenPart):
-    """A round. All of its candidates meet the same starts and goals."""
+    """A round, in which all candidates meet the same starts and goals."""
 
     trials: int
     """Of each candidate."""
@@ -126,11 +124,7 @@ class TrialsFile(Artifact):
 
 
 def read_trials(path: Path) -> TrialsFile | None:
-    """Read trials.json; None if it is not there.
-
-    Raises:
-        BadInputError: it is malformed.
-    """
+    """Read trials.json; None if it is not there; raise a BadInputError if it is malformed."""
     return read_json(TrialsFile, path) if path.is_file() else None
 
 
@@ -151,6 +145,16 @@ class Candidate(WrittenPart):
     """Seed of the judge → share of the episodes."""
 
     @property
+    def key(self) -> tuple[str, int, int | None]:
+        """What makes it unique."""
+        return (self.row, self.seed, self.percent)
+
+    @property
+    def name(self) -> str:
+        """What it is called on a page."""
+        return f"{method_title(self.row)}, seed {self.seed}"
+
+    @property
     def predicted(self) -> float:
         """The mean success over the judges."""
         return fmean(self.success.values())
@@ -161,8 +165,8 @@ class Candidate(WrittenPart):
         return float(np.quantile([*self.success.values()], _QUANTILE))
 
 
-class Judged(Artifact):
-    """select.json: all candidates of a recipe; nothing in it comes from the target."""
+class Judgment(WrittenPart):
+    """All candidates of a recipe; nothing in it comes from the target."""
 
     judge: str
     """The method whose groundings judge."""
@@ -182,29 +186,13 @@ class Judged(Artifact):
         those = [one for one in self.candidates if one.percent == percent]
         return sorted(those, key=lambda one: (one.lower, one.predicted), reverse=True)
 
+    def estimate(self, one: Candidate) -> Estimate:
+        """Return the predicted success of a candidate, with its interval over the judges."""
+        return summarize([*one.success.values()], limit=1.0, trials=self.episodes)
 
-@dataclass(frozen=True)
-class Ranked:
-    """A policy as its judges see it.
 
-    Attributes:
-        row: its method. seed: its seed. judges: how many.
-        lower: lower quartile of its success over the judges, by which policies are ranked.
-        predicted: mean over the judges, with its interval.
-        target: success in the target; None where it was not tested there.
-    """
-
-    row: str
-    seed: int
-    judges: int
-    lower: float
-    predicted: Estimate
-    target: float | None
-
-    @property
-    def name(self) -> str:
-        """What it is called on a page."""
-        return f"{method_title(self.row)}, seed {self.seed}"
+class Judged(Judgment, Artifact):
+    """select.json: what the judges found, and where."""
 
 
 @dataclass(frozen=True)
@@ -213,17 +201,47 @@ class Choice:
 
     Attributes:
         judged: what the judges found.
-        candidates: best first; the first is chosen.
-        regret: success in the target of the best there, less that of the chosen.
-        random_regret: the same of one drawn at random, on average.
-        calibration: method → seeds, mean and mean absolute error of the predicted success.
+        candidates: of one size, best first; the first is chosen.
+        measured: row and seed → success in the target; it has no say in the ranking.
     """
 
-    judged: Judged
-    candidates: tuple[Ranked, ...]
-    regret: float | None = None
-    random_regret: float | None = None
-    calibration: Mapping[str, tuple[int, float, float]] = field(default_factory=dict)
+    judged: Judgment
+    candidates: Sequence[Candidate]
+    measured: Mapping[tuple[str, int], float]
+
+    @property
+    def best(self) -> Candidate:
+        """The one that is chosen."""
+        return self.candidates[0]
+
+    def target(self, one: Candidate) -> float | None:
+        """Return the success of a candidate in the target; None where it was not tested there."""
+        return self.measured.get((one.row, one.seed))
+
+    @property
+    def tested(self) -> list[tuple[Candidate, float]]:
+        """The candidates that were tested in the target, with their success there."""
+        return [(one, found) for one in self.candidates if (found := self.target(one)) is not None]
+
+    @property
+    def regret(self) -> float | None:
+        """Success in the target of the best there, less that of the chosen; None where that is not tested."""
+        chosen = self.target(self.best)
+        return None if chosen is None else max(found for _, found in self.tested) - chosen
+
+    @property
+    def random_regret(self) -> float | None:
+        """The same of a policy drawn at random, on average; None where none is tested."""
+        found = [found for _, found in self.tested]
+        return max(found) - fmean(found) if found else None
+
+    @property
+    def calibration(self) -> dict[str, tuple[int, float, float]]:
+        """Row → seeds, mean and mean absolute error of the predicted success."""
+        errors: dict[str, list[float]] = {}
+        for one, found in self.tested:
+            errors.setdefault(one.row, []).append(one.predicted - found)
+        return {row: (len(of), fmean(of), fmean(map(abs, of))) for row, of in errors.items()}
 
 
 def read_judged(root: Path) -> Judged | None:
@@ -237,68 +255,34 @@ def read_judged(root: Path) -> Judged | None:
 
 
 def choice_of(
-    judged: Judged, percent: int | None, *, measured: Mapping[tuple[str, int], float]
+    judged: Judgment, percent: int | None, *, measured: Mapping[tuple[str, int], float]
 ) -> Choice | None:
-    """Return the choice among the policies of a size, and compare it; None where there is no candidate.
-
-    Args:
-        judged: all candidates.
-        percent: the size of the dataset; None where there are no sizes.
-        measured: method and seed → success in the target; it has no say in the ranking.
-    """
-    ranked = tuple(
-        _ranked(one, judged.episodes, measured.get((one.row, one.seed))) for one in judged.ranked(percent)
-    )
-    if not ranked:
-        return None
-    tested = [one for one in ranked if one.target is not None]
-    return _compared(Choice(judged, ranked), tested) if tested else Choice(judged, ranked)
-
-
-def _ranked(one: Candidate, episodes: int, target: float | None) -> Ranked:
-    ends = mean_interval([*one.success.values()], limit=1.0, trials=episodes) or (None, None)
-    return Ranked(one.row, one.seed, len(one.success), one.lower, Estimate(one.predicted, *ends), target)
-
-
-def _compared(choice: Choice, tested: Sequence[Ranked]) -> Choice:
-    """Add what the choice is worth in the target, by the candidates that were tested there."""
-    targets = [one.target for one in tested if one.target is not None]
-    chosen = choice.candidates[0].target
-    errors: dict[str, list[float]] = {}
-    for one in tested:
-        errors.setdefault(one.row, []).append(one.predicted.value - (one.target or 0.0))
-    return replace(
-        choice,
-        regret=None if chosen is None else max(targets) - chosen,
-        random_regret=max(targets) - fmean(targets),
-        calibration={row: (len(of), fmean(of), fmean(map(abs, of))) for row, of in errors.items()},
-    )
+    """Return the choice among the policies of a size, None for the whole; None without a candidate."""
+    ranked = judged.ranked(percent)
+    return Choice(judged, ranked, measured) if ranked else None
 
 
 def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | TableBlock]:
     """Return what a page says of a choice, with the first `shown` of its candidates, by default all."""
-    best, judged = choice.candidates[0], choice.judged
-    predicted = best.predicted
+    judged = choice.judged
     episodes = (
         "the same episodes, from other seeds" if judged.shares_episodes else "the episodes of other seeds"
     )
+    lines = [
+        [
+            *(method_title(one.row), f"{one.seed}", f"{one.lower:.2f}"),
+            *(interval(judged.estimate(one)), f"{len(one.success)}"),
+            "-" if (found := choice.target(one)) is None else f"{found:.2f}",
+        ]
+        for one in choice.candidates[:shown]
+    ]
+    head = ["method", "seed", "lower quartile", "predicted [95 %]", "judges", "in the target"]
     blocks: list[Text | TableBlock] = [
         Text(
-            f"**{best.name}**, chosen from {len(choice.candidates)} policies: predicted success "
-            f"{interval(predicted.value, predicted.low, predicted.high)}."
+            f"**{choice.best.name}**, chosen from {len(choice.candidates)} policies: predicted success "
+            f"{interval(judged.estimate(choice.best))}."
         ),
-        TableBlock(
-            "Best first, ranked by the lower quartile of success over judges",
-            ["method", "seed", "lower quartile", "predicted [95 %]", "judges", "in the target"],
-            [
-                [
-                    *(method_title(one.row), f"{one.seed}", f"{one.lower:.2f}"),
-                    *(interval(one.predicted.value, one.predicted.low, one.predicted.high), f"{one.judges}"),
-                    "-" if one.target is None else f"{one.target:.2f}",
-                ]
-                for one in choice.candidates[:shown]
-            ],
-        ),
+        TableBlock("Best first, ranked by the lower quartile of success over judges", head, lines),
         Text(
             "A judge is a simulator that did not train the policy: a policy's judges are the groundings of "
             f"{method_title(judged.judge)} that were fitted to {episodes}, with {judged.episodes} episodes "
@@ -313,31 +297,25 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
                 "judges: an error that all groundings share goes unnoticed."
             )
         )
-    if not choice.calibration:
-        return blocks
-    regret = (
-        "unknown (the chosen policy was not tested there)"
-        if choice.regret is None
-        else f"{choice.regret:.2f}"
-    )
-    return [
-        *blocks,
-        Text(
-            f"Regret of the chosen policy, in success in the target: {regret}; of a random policy: "
-            f"{choice.random_regret:.2f}."
-        ),
-        TableBlock(
-            "Error of the predicted success, means over seeds",
-            ["method", "seeds", "predicted \N{MINUS SIGN} measured", "absolute error"],
-            [
-                [method_title(row), f"{seeds}", f"{signed:+.2f}", f"{absolute:.2f}"]
-                for row, (seeds, signed, absolute) in choice.calibration.items()
-            ],
-        ),
-    ]
+    if choice.random_regret is not None:
+        regret = "unknown (the chosen policy was not tested there)"
+        regret = regret if choice.regret is None else f"{choice.regret:.2f}"
+        found = [
+            [method_title(row), f"{seeds}", f"{signed:+.2f}", f"{absolute:.2f}"]
+            for row, (seeds, signed, absolute) in choice.calibration.items()
+        ]
+        head = ["method", "seeds", "predicted \N{MINUS SIGN} measured", "absolute error"]
+        blocks += [
+            Text(
+                f"Regret of the chosen policy, in success in the target: {regret}; of a random policy: "
+                f"{choice.random_regret:.2f}."
+            ),
+            TableBlock("Error of the predicted success, means over seeds", head, found),
+        ]
+    return blocks
 
 
-def select_page(recipe: str, judged: Judged, trials: TrialsFile | None = None) -> str:
+def select_page(recipe: str, judged: Judgment, trials: TrialsFile | None = None) -> str:
     """Return the page of all candidates, size by size, and of trials in the target where there are any."""
     sections = [
         Section(f"{percent} %" if percent else "", choice_blocks(choice))
@@ -349,7 +327,7 @@ def select_page(recipe: str, judged: Judged, trials: TrialsFile | None = None) -
     return markdown(f"{recipe}: choice without the target", sections)
 
 
-def _trial_blocks(judged: Judged, trials: TrialsFile) -> list[Text | TableBlock]:
+def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBlock]:
     state = "Not finished: run the same command again."
     if trials.chosen and trials.mean is not None:
         row, seed = trials.chosen
@@ -373,7 +351,7 @@ def _trial_blocks(judged: Judged, trials: TrialsFile) -> list[Text | TableBlock]
     ]
 
 
-def trial_lines(judged: Judged, trials: TrialsFile) -> list[list[str]]:
+def trial_lines(judged: Judgment, trials: TrialsFile) -> list[list[str]]:
     """Return a line for each candidate of each round, as far as it was tried."""
     priors = {(one.row, one.seed): one.lower for one in judged.ranked(trials.percent)}
     counts = dict.fromkeys(priors, (0, 0))

@@ -8,10 +8,9 @@ import numpy as np
 
 from astra_data.core.durable import write_file
 from astra_data.methods import method_title
-from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown, measured
-from astra_data.reports.predicted_failures import all_bins, failure_rates, predicted_failures
-from astra_data.reports.results import Results, judged_horizon
-from astra_data.reports.runs import read_errors, read_grounding
+from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown
+from astra_data.reports.results import Results, all_bins, judged_horizon
+from astra_data.reports.runs import Place, Run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,12 +53,13 @@ def write_held_out(
     Raises:
         BadInputError: a file of errors is malformed.
     """
-    places = [
-        (root, row, seed, percent)
-        for row in groundings
-        for percent in sorted(percents) or (None,)
-        for seed in sorted(seeds)
-    ]
+    run = Run(root)
+    for row in groundings:
+        for percent in sorted(percents) or (None,):
+            for seed in sorted(seeds):
+                run.grounding(Place(row, seed, percent))
+    if not run.errors:
+        return None
     results = Results(
         recipe=recipe,
         task="",
@@ -67,11 +67,9 @@ def write_held_out(
         rows=tuple(groundings),
         episodes=0,
         timestep_s=timestep_s,
-        lines=[line for place in places for line in read_grounding(*place)],
-        errors=[error for place in places for error in read_errors(*place)],
+        lines=run.lines,
+        errors=run.errors,
     )
-    if not results.errors:
-        return None
     seeds_text = ", ".join(map(str, sorted({one.seed for one in results.errors})))
     blocks: list[Block] = [
         Text(
@@ -82,7 +80,7 @@ def write_held_out(
         *gap_blocks(results),
     ]
     figures = {}
-    if rates := failure_rates(results):
+    if rates := results.failure_rates():
         from astra_data.reports.figures.catalog import pictures
         from astra_data.reports.figures.errors import reliability
         from astra_data.reports.figures.style import png
@@ -98,11 +96,9 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     """Yield errors by horizon, what they mean, and how well rewards and failures are predicted."""
     if not results.errors:
         return
-    sizes = results.percents
-    means = {percent: results.mean_errors(percent) for percent in sizes}
+    means = {percent: results.mean_errors(percent) for percent in results.percents}
     horizons = sorted(set.intersection(*(set(of.index.get_level_values("horizon")) for of in means.values())))
     quantities = list(dict.fromkeys(error.quantity for error in results.errors))
-    swept = len(sizes) > 1
     step_s = results.timestep_s
     titles = [
         f"{steps} step{'s' if steps > 1 else ''}{f' ({steps * step_s:.3g} s)' if step_s else ''}"
@@ -110,14 +106,14 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     ]
     for quantity in quantities:
         lines = [
-            [*([f"{percent} %"] if swept else []), *line]
-            for percent in sizes
-            for line in _error_lines(results, means[percent], quantity, horizons)
+            [*_size(results, percent), *line]
+            for percent, of in means.items()
+            for line in _error_lines(results, of, quantity, horizons)
         ]
-        head = [*(["size"] if swept else []), "simulator", *titles]
+        head = [*_size(results), "simulator", *titles]
         yield TableBlock(f"Error of `{quantity}`", head, lines, words=len(head) - len(horizons))
-    last = means[sizes[-1]]
-    if still := no_better_than_still(last):
+    last = means[results.largest]
+    if still := _no_better_than_still(last):
         names = ", ".join(f"`{name}`" for name in still)
         yield Text(
             f"**In {names}, the simulator without grounding is no better than predicting that the state "
@@ -133,14 +129,30 @@ def gap_blocks(results: Results) -> Iterator[Block]:
             worse,
             warns=True,
         )
-    if swept:
+    if results.is_swept:
         yield Text("How much data is enough:", [*_sufficient_sizes(results, means, quantities, horizons)])
         yield Text(
             "Each size holds out a share of its own episodes, so smaller sizes are measured on fewer of "
             "them: compare with the line without grounding of the same size."
         )
-    yield from _fit_blocks(results)
+    rows = results.groundings()
+    found = {row: {name: results.summary(row, name, "ground") for name in _FITS} for row in rows}
+    if shown := [name for name in _FITS if any(of[name] for of in found.values())]:
+        yield TableBlock(
+            "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the "
+            "mean)",
+            ["grounding", *(_FITS[name] for name in shown)],
+            [
+                [method_title(row), *(f"{one.value:.2f}" if (one := of[name]) else "-" for name in shown)]
+                for row, of in found.items()
+            ],
+        )
     yield from _failure_blocks(results)
+
+
+def _size(results: Results, percent: int | None = None) -> list[str]:
+    """Return the cell of a size, or the head of these, where there are several."""
+    return ([f"{percent} %"] if percent else ["size"]) if results.is_swept else []
 
 
 def _error_lines(
@@ -150,43 +162,41 @@ def _error_lines(
     groundings = [row for row in results.groundings() if (row, "grounded") in means.index]
 
     def cells(row: str, simulator: str) -> list[str]:
-        at = [means.loc[(row, simulator, quantity, horizon)] for horizon in horizons]
-        return [measured(one["mean"], one["low"], one["high"]) for one in at]
+        at = [means.loc[(row, simulator, quantity, horizon)].to_numpy() for horizon in horizons]
+        ends = ["" if np.isnan(one[1:]).any() else f" [{one[1]:.3g}, {one[2]:.3g}]" for one in at]
+        return [f"{one[0]:.3g}{end}" for one, end in zip(at, ends, strict=True)]
 
     if (groundings[0], "still") in means.index:
         yield ["No motion (persistence baseline)", *cells(groundings[0], "still")]
     raw = {row: cells(row, "raw") for row in groundings}
-    shared = len(set(map(tuple, raw.values()))) == 1
-    if shared:
+    is_shared = len(set(map(tuple, raw.values()))) == 1
+    if is_shared:
         yield ["No grounding", *raw[groundings[0]]]
     for row in groundings:
-        if not shared:
+        if not is_shared:
             yield [f"{method_title(row)}, no grounding", *raw[row]]
         yield [f"{method_title(row)}, grounded", *cells(row, "grounded")]
 
 
-def no_better_than_still(means: "pd.DataFrame") -> list[str]:
+def _no_better_than_still(means: "pd.DataFrame") -> list[str]:
     """Return the quantities in which the raw simulator is no better than the persistence baseline.
 
     Not after the first step: a robot that lags behind its commands hardly leaves its state in one.
     """
-    found = means["mean"].groupby(["simulator", "quantity", "horizon"], sort=False).first()
-    if "still" not in found.index:
+    of = means["mean"].groupby(["simulator", "quantity", "horizon"], sort=False).first()
+    if "still" not in of.index:
         return []
-    horizon = judged_horizon(found.index.get_level_values("horizon"))
-    raw, still = (found[simulator].xs(horizon, level="horizon") for simulator in ("raw", "still"))
+    horizon = judged_horizon(of.index.get_level_values("horizon"))
+    raw, still = (of[simulator].xs(horizon, level="horizon") for simulator in ("raw", "still"))
     return [quantity for quantity in still.index if raw[quantity] >= still[quantity]]
 
 
 def _regressions(results: Results, means: "pd.DataFrame") -> Iterator[str]:
     """Yield where a grounding, fitted to the most data, has larger errors than the simulator without one."""
-    for row in results.groundings():
-        if row not in means.index:
-            continue
+    for row in (row for row in results.groundings() if row in means.index):
         of = means.loc[row, "mean"].unstack("simulator")
         # What both predict to a thousandth of the baseline, they compute exactly but for rounding.
-        least = _EXACT * of.get("still", 0.0)
-        worse = of[(of["grounded"] > of["raw"]) & (of["grounded"] > least)]
+        worse = of[(of["grounded"] > of["raw"]) & (of["grounded"] > _EXACT * of.get("still", 0.0))]
         for quantity, lines in worse.groupby(level="quantity", sort=False):
             found = [
                 f"{steps} step{'s' if steps > 1 else ''} ahead ({line['grounded']:.3g}, without "
@@ -211,62 +221,36 @@ def _sufficient_sizes(
         for quantity in quantities if smaller else ():
             at = {percent: found.loc[("grounded", quantity, horizon)] for percent, found in of.items()}
             limit, least = at[largest]["high"], largest
-            where = f"{method_title(row)}, `{quantity}`, {horizon} steps ahead: "
-            if np.isnan(limit):
-                yield f"{where}unknown: at {largest} %, a seed has only one held-out episode of that length."
-                continue
             for percent in reversed(smaller):
-                if at[percent]["mean"] > limit:
+                if not at[percent]["mean"] <= limit:
                     break
                 least = percent
-            if least == largest:
-                yield f"{where}the error still decreases up to {largest} %: more data may help."
-            else:
-                yield f"{where}from {least} % on, the error is within the interval of {largest} %."
-
-
-def _fit_blocks(results: Results) -> Iterator[Block]:
-    """Yield the R² of the heads of each grounding on held-out episodes."""
-    rows = results.groundings()
-    found = {row: {name: results.summary(row, name, "ground") for name in _FITS} for row in rows}
-    shown = [name for name in _FITS if any(of[name] for of in found.values())]
-    lines = [
-        [method_title(row), *("-" if (one := of[name]) is None else f"{one.mean:.2f}" for name in shown)]
-        for row, of in found.items()
-    ]
-    if shown:
-        yield TableBlock(
-            "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the "
-            "mean)",
-            ["grounding", *(_FITS[name] for name in shown)],
-            lines,
-        )
+            found = f"from {least} % on, the error is within the interval of {largest} %."
+            if np.isnan(limit):
+                found = f"unknown: at {largest} %, a seed has only one held-out episode of that length."
+            elif least == largest:
+                found = f"the error still decreases up to {largest} %: more data may help."
+            yield f"{method_title(row)}, `{quantity}`, {horizon} steps ahead: {found}"
 
 
 def _failure_blocks(results: Results) -> Iterator[Block]:
-    lines, swept = [], len(results.percents) > 1
-    for (percent, row, part), of in predicted_failures(results).items():
+    lines = []
+    for (percent, row, part), of in results.predicted_failures().items():
         means = of.mean(axis=1)
-        known = (means.get(f"auc.{ahead}") for ahead in ("1-20", "11-30", "21-40"))
-        aucs = ["-" if value is None else f"{value:.2f}" for value in known]
-        skill = f"{means['brier_skill']:.2f}" if "brier_skill" in means else "-"
-        bins = all_bins(of)
-        sure = bins[bins[:, 0] > _SURE]
-        happens = "-"
-        if len(sure):
+        names = (*(f"auc.{ahead}" for ahead in ("1-20", "11-30", "21-40")), "brier_skill")
+        known = [f"{means[name]:.2f}" if name in means else "-" for name in names]
+        bins, happens = all_bins(of), "-"
+        if len(sure := bins[bins[:, 0] > _SURE]):
             predicted, observed = np.average(sure[:, :2], axis=0, weights=sure[:, 2])
             happens = f"{observed:.2f} of {predicted:.2f}"
         title = f"{method_title(row)}: {part.replace('_', ' ')}"
-        size = [f"{percent} %"] if swept else []
-        lines.append([*size, title, f"{of.loc['failures'].sum():.0f}", *aucs, skill, happens])
+        lines.append([*_size(results, percent), title, f"{of.loc['failures'].sum():.0f}", *known, happens])
     if not lines:
         return
     windows = ("AUC 1\N{EN DASH}20 steps", "11\N{EN DASH}30", "21\N{EN DASH}40")
-    head = [*(["size"] if swept else []), "predicted by", "failures", *windows, "Brier skill"]
-    head = [*head, "observed of predicted"]
-    yield TableBlock(
-        "Failures, predicted on held-out episodes; means over seeds", head, lines, words=1 + swept
-    )
+    head = [*_size(results), "predicted by", "failures", *windows, "Brier skill", "observed of predicted"]
+    title = "Failures, predicted on held-out episodes; means over seeds"
+    yield TableBlock(title, head, lines, words=1 + results.is_swept)
     yield Text(
         "AUC: the probability that a step this many steps before a failure ranks above a step with no "
         "failure in the next 40. Brier skill: the share of squared error removed, compared with always "

@@ -11,18 +11,7 @@ import numpy as np
 
 from astra_data.core.naming import base_method, is_plus, reference_of
 from astra_data.methods import grounded_as, method_named, method_role, method_title
-from astra_data.reports.blocks import (
-    Block,
-    Code,
-    Section,
-    TableBlock,
-    Text,
-    code,
-    duration,
-    interval,
-    short,
-    spread,
-)
+from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, code, duration, short
 from astra_data.reports.choice import choice_blocks
 from astra_data.reports.figures.catalog import pictures
 from astra_data.reports.held_out import gap_blocks
@@ -32,7 +21,6 @@ from astra_data.reports.results import (
     WHOLE,
     Origin,
     Results,
-    contenders,
     elapsed_seconds,
     stage_seconds,
     titled,
@@ -40,9 +28,11 @@ from astra_data.reports.results import (
 from astra_data.reports.runs import DATASET_STAGES, SHARED_WORLDS
 from astra_data.reports.statistics import (
     LEAST_SEEDS,
-    Estimate,
     correlation,
+    ends,
+    interval,
     probability_of_improvement,
+    spread,
 )
 from astra_data.reports.verdict import verdict_of
 
@@ -63,13 +53,10 @@ WORDS = {
 
 @dataclass(frozen=True)
 class PageColumn:
-    """A column of the table of methods.
+    """A column of the table of methods: a `measure` of `Results.lines` in a place, its title and digits.
 
-    Attributes:
-        measure: its name in `Results.lines`. title: above it. digits: behind the decimal point.
-        note: what it means; empty where its title says it.
-        negligible: it is left out where no method has more.
-        where: the place of the measure.
+    `note` says what it means where its title does not; without a method that has more than `negligible`, it
+    is left out.
     """
 
     measure: str
@@ -106,7 +93,7 @@ def sections_of(results: Results, run: str) -> list[Section]:
         Section("Methods", [*_methods(results)]),
         Section("The gap", [*_gap(results), *_validity(results)]),
     ]
-    if len(results.percents) > 1 or results.percents[0] != WHOLE:
+    if results.percents != [WHOLE]:
         sections.append(Section("Size of the data", [*_sizes(results)]))
     if choice := results.choice():
         sections.append(Section("Chosen without the target", choice_blocks(choice, shown=8)))
@@ -129,24 +116,23 @@ def _facts(results: Results) -> Iterator[Block]:
         )
     seeds = ", ".join(map(str, results.seeds))
     text = f"Task {code(results.task)}, seeds {seeds}, {results.episodes} episodes per method and seed"
-    if results.percents[-1] != WHOLE:
-        text += f"; unless stated otherwise, with {results.percents[-1]} % of the data"
+    if results.largest != WHOLE:
+        text += f"; unless stated otherwise, with {results.largest} % of the data"
     text += "."
     if results.leg_scale != 1:
         text += f" The target's legs are {results.leg_scale:g} times as long."
-    if unfinished := _unfinished(results):
-        text += f" Not finished yet: {unfinished}."
-    yield Text(text)
-
-
-def _unfinished(results: Results) -> str:
-    every = set(results.rows)
     lacking = {
-        percent: [method_title(row) for row in results.rows if row in every - set(results.tested(percent))]
+        percent: [method_title(row) for row in results.rows if row not in results.tested(percent)]
         for percent in results.percents
     }
-    sizes = {percent: f" at {percent} %" if len(results.percents) > 1 else "" for percent in lacking}
-    return "; ".join(f"{', '.join(rows)}{sizes[percent]}" for percent, rows in lacking.items() if rows)
+    unfinished = [
+        f"{', '.join(titles)}{f' at {percent} %' if results.is_swept else ''}"
+        for percent, titles in lacking.items()
+        if titles
+    ]
+    if unfinished:
+        text += f" Not finished yet: {'; '.join(unfinished)}."
+    yield Text(text)
 
 
 def _verdict(results: Results, run: str) -> Iterator[Block]:
@@ -159,48 +145,32 @@ def _verdict(results: Results, run: str) -> Iterator[Block]:
 
 
 def _methods(results: Results) -> Iterator[Block]:
-    rows, where = results.tested(), results.where
-    percent = results.percents[-1]
-    shown = [column for column in COLUMNS if _is_shown(results, column)]
-    head, lines = ["method"], [[titled(row)] for row in rows]
-    beside = {score.measure for score in results.scores}
-
-    def add(title: str, cells: Sequence[str]) -> None:
-        head.append(title)
-        for line, cell in zip(lines, cells, strict=True):
-            line.append(cell)
-
+    rows, where, headline = results.tested(), results.where, results.headline
+    columns: list[tuple[str, list[str]]] = []
     for score in results.scores:
         found = [results.summary(row, score.measure) for row in rows]
-        add(f"{score.title} {where}", [spread(one, score.digits) for one in found])
-        add("95 % interval", [_ends(one.low, one.high, score.digits) if one else "-" for one in found])
-    if results.paper_success:
-        printed = results.paper_success
-        add("paper", [f"{printed[row]:.2f}" if row in printed else "-" for row in rows])
-    headline = results.headline
-    learned = {row: results.score_of(row, SIMULATED) for row in rows}
-    add("in its simulator", [spread(learned[row], headline.digits) for row in rows])
-    lost = [(learned[row], results.score_of(row)) for row in rows]
-    # A minus sign of a rounded zero says nothing.
-    add(
-        "lost",
-        [
-            f"{round(own.mean - found.mean, headline.digits) + 0.0:.{headline.digits}f}"
-            if own and found
-            else "-"
-            for own, found in lost
-        ],
-    )
+        columns.append((f"{score.title} {where}", [spread(one, score.digits) for one in found]))
+        columns.append(("95 % interval", [ends(one, score.digits) for one in found]))
+    if printed := results.paper_success:
+        columns.append(("paper", [f"{printed[row]:.2f}" if row in printed else "-" for row in rows]))
+    learned = [results.score_of(row, SIMULATED) for row in rows]
+    columns.append(("in its simulator", [spread(one, headline.digits) for one in learned]))
+    lost = []
+    for one, found_there in zip(learned, map(results.score_of, rows), strict=True):
+        # A minus sign of a rounded zero says nothing.
+        less = round(one.value - found_there.value, headline.digits) + 0.0 if one and found_there else None
+        lost.append("-" if less is None else f"{less:.{headline.digits}f}")
+    columns.append(("lost", lost))
+    shown = [column for column in COLUMNS if _is_shown(results, column)]
     for column in shown:
-        if column.measure not in beside:
+        if column.measure not in {score.measure for score in results.scores}:
             found = [results.summary(row, column.measure, column.where) for row in rows]
-            add(column.title, [spread(one, column.digits) for one in found])
-    add("seeds", [f"{len(results.values(row, headline.measure, percent=percent))}" for row in rows])
-    best = max(contenders(results, percent), key=lambda row: _mean(results, row), default=None)
-    for row, line in zip(rows, lines, strict=True):
-        if row == best:
-            line[0] = f"**{line[0]}**"
-    yield TableBlock("", head, lines)
+            columns.append((column.title, [spread(one, column.digits) for one in found]))
+    columns.append(("seeds", [f"{len(results.values(row, headline.measure))}" for row in rows]))
+    best = max(results.contenders(), key=lambda row: _mean(results, row), default=None)
+    names = [f"**{titled(row)}**" if row == best else titled(row) for row in rows]
+    lines = [*zip(names, *(cells for _, cells in columns), strict=True)]
+    yield TableBlock("", ["method", *(title for title, _ in columns)], lines)
     notes = [
         f"Mean ± standard deviation over seeds, {where}, and the 95 % interval of the mean (Student's t, "
         f"for shares of episodes widened to Wilson's), which needs {LEAST_SEEDS} seeds.",
@@ -228,51 +198,31 @@ def _methods(results: Results) -> Iterator[Block]:
 def _is_shown(results: Results, column: PageColumn) -> bool:
     """Return whether a method has values of a column to speak of: a robot without walls touches none."""
     found = [results.summary(row, column.measure, column.where) for row in results.tested()]
-    return any(one is not None and one.mean > column.negligible for one in found)
+    return any(one is not None and one.value > column.negligible for one in found)
 
 
 def _mean(results: Results, row: str) -> float:
     found = results.score_of(row)
-    return found.mean if found else -np.inf
+    return found.value if found else -np.inf
 
 
-def _ends(low: float | None, high: float | None, digits: int) -> str:
-    return "-" if low is None or high is None else f"[{low:.{digits}f}, {high:.{digits}f}]"
-
-
-def compared(results: Results) -> list[tuple[str, str]]:
-    """Return which methods are compared: those of `compare` with all that are trained alike.
+def _comparisons(results: Results) -> Iterator[Block]:
+    """Yield how methods of `compare` do against all others that are trained alike.
 
     That is with the plus settings, or without; those that are trained in no simulator are compared with
     both.
     """
-    rows = [row for row in results.tested() if method_role(row) in (None, "floor")]
-    ours = [row for row in rows if base_method(row) in results.compare]
-    return [
-        (row, other)
-        for row in ours
-        for other in rows
-        if other != row
-        and (is_plus(other) == is_plus(row) or not results.values(other, "success", SIMULATED))
-    ]
-
-
-def _comparisons(results: Results) -> Iterator[Block]:
     headline, lines = results.headline, []
-    for row, other in compared(results):
-        ours, theirs = (np.array([*results.values(one, headline.measure).values()]) for one in (row, other))
-        better, by = probability_of_improvement(ours, theirs), results.difference(row, other)
-        if better and by:
-            lines.append(
-                [
-                    *(
-                        method_title(row),
-                        method_title(other),
-                        interval(better.value, better.low, better.high),
-                    ),
-                    interval(by.value, by.low, by.high, headline.digits),
-                ]
-            )
+    rows = [row for row in results.tested() if method_role(row) in (None, "floor")]
+    scores = {row: np.array([*results.values(row, headline.measure).values()]) for row in rows}
+    for row in (row for row in rows if base_method(row) in results.compare):
+        for other in (other for other in rows if other != row):
+            if is_plus(other) != is_plus(row) and results.values(other, "success", SIMULATED):
+                continue
+            better = probability_of_improvement(scores[row], scores[other])
+            if better and (by := results.difference(row, other)):
+                names = (method_title(row), method_title(other))
+                lines.append([*names, interval(better), interval(by, headline.digits)])
     head = ["method", "beats", "probability [95 %]", "difference, paired by seed [95 %]"]
     yield TableBlock("Probability of improvement", head, lines, words=2)
     if lines:
@@ -325,7 +275,7 @@ def _validity(results: Results) -> Iterator[Block]:
             continue
         sides = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         found = [correlation(*sides), correlation(*sides, ranks=True)]
-        lines.append([world, f"{policies}", *map(_estimate, found)])
+        lines.append([world, f"{policies}", *map(interval, found)])
     title = "Does a simulator show which policy is better? Correlation with the return in the target"
     yield TableBlock(title, ["simulator", "policies", "Pearson [95 %]", "Spearman [95 %]"], lines)
     if lines:
@@ -340,36 +290,29 @@ def _validity(results: Results) -> Iterator[Block]:
     yield from pictures(results, "validity") if lines else ()
 
 
-def _estimate(found: Estimate | None) -> str:
-    return interval(found.value, found.low, found.high) if found else "-"
-
-
 def _sizes(results: Results) -> Iterator[Block]:
     score, seeds = results.headline, len(results.seeds)
     head = ["method", *(f"{percent} %" for percent in results.percents)]
-    means, ends = [], []
+    means, intervals = [], []
     for row in results.tested():
         found = [results.score_of(row, percent=percent) for percent in results.percents]
-        few = [
-            "" if one is None or one.seeds == seeds else f" ({one.seeds} of {seeds} seeds)" for one in found
-        ]
+        few = [f" ({one.seeds} of {seeds} seeds)" if one and one.seeds != seeds else "" for one in found]
         title = method_title(row)
         means.append(
             [title, *(f"{spread(one, score.digits)}{of}" for one, of in zip(found, few, strict=True))]
         )
-        ends.append([title, *(_ends(one.low, one.high, score.digits) if one else "-" for one in found)])
+        intervals.append([title, *(ends(one, score.digits) for one in found)])
     title = f"{score.title.capitalize()} {results.where}, mean ± standard deviation over seeds"
     yield TableBlock(title, head, means)
-    yield TableBlock("95 % interval of the mean", head, ends)
+    yield TableBlock("95 % interval of the mean", head, intervals)
     yield from pictures(results, "sizes")
-    chosen = [(percent, choice) for percent in results.percents if (choice := results.choice(percent))]
     lines = []
-    for percent, choice in chosen:
-        best = choice.candidates[0]
-        known = (best.target, choice.regret, choice.random_regret)
-        predicted = interval(best.predicted.value, best.predicted.low, best.predicted.high)
-        cells = ("-" if value is None else f"{value:.2f}" for value in known)
-        lines.append([f"{percent} %", best.name, predicted, *cells])
+    for percent in results.percents:
+        if choice := results.choice(percent):
+            known = (choice.target(choice.best), choice.regret, choice.random_regret)
+            cells = ("-" if value is None else f"{value:.2f}" for value in known)
+            predicted = interval(choice.judged.estimate(choice.best))
+            lines.append([f"{percent} %", choice.best.name, predicted, *cells])
     head = ["size", "chosen", "predicted [95 %]", "in the target", "regret", "regret at random"]
     yield TableBlock("Chosen without the target, by the groundings of other seeds", head, lines, words=2)
 
@@ -388,7 +331,8 @@ def _costs(results: Results) -> Iterator[Block]:
     yield Text(
         f"Wall time of the whole recipe: {duration(elapsed)}, in which several stages may run at once."
     )
-    yield TableBlock("Time of each stage, added up over methods and seeds", _COST_HEAD, [*lines, total])
+    head = ["stage", "time", "CPU time", "speed"]
+    yield TableBlock("Time of each stage, added up over methods and seeds", head, [*lines, total])
     per_row = []
     for row in results.tested():
         found = [_cost(results, stage, row, "wall_seconds") for stage in COSTED]
@@ -405,16 +349,13 @@ def _costs(results: Results) -> Iterator[Block]:
     )
 
 
-_COST_HEAD = ["stage", "time", "CPU time", "speed"]
-
-
 def _cost(results: Results, stage: str, row: str, clock: str) -> float | None:
     """Return the mean time of a stage for one seed of a method, with the training it starts from."""
     owners = [grounded_as(row) if stage in ("ground", "align") else row]
     if stage == "train" and (initial := method_named(row).initial):
         owners.append(initial)
     found = [results.summary(owner, clock, stage) for owner in owners]
-    known = [one.mean for one in found if one]
+    known = [one.value for one in found if one]
     return sum(known) if known else None
 
 
@@ -439,7 +380,7 @@ def _every_seed(results: Results) -> Iterator[Block]:
     found = table[(table["where"] == TESTED) & table["row"].isin(results.tested())]
     found = found[~found["measure"].isin(left_out)]
     wide = found.pivot_table(index=["row", "percent", "seed"], columns="measure", values="value", sort=False)
-    swept = len(results.percents) > 1
+    swept = results.is_swept
     order = [key for row in results.tested() for key in wide.index if key[0] == row]
     lines = [
         [

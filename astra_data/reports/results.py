@@ -6,22 +6,23 @@ figures are made of these. Results of several places are merged line by line.
 """
 
 import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
-from astra_data.core.config import faults_of
+from astra_data.core.arrays import Floats
+from astra_data.core.config import read_written
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import reference_of
+from astra_data.grounding.failures import BINS
 from astra_data.methods import grounded_as, method_role, method_title
 from astra_data.reports.artifacts import Machine
-from astra_data.reports.choice import Candidate, Choice, Judged, choice_of
-from astra_data.reports.statistics import Estimate, Summary, paired_difference, summarize
+from astra_data.reports.choice import Choice, Judgment, choice_of
+from astra_data.reports.statistics import Estimate, paired_difference, summarize
 from astra_data.worlds.objective import SUCCESS, Score
 
 if TYPE_CHECKING:
@@ -29,9 +30,8 @@ if TYPE_CHECKING:
 
 WHOLE = 100
 """The size of the dataset, in percent, of a recipe that does not sweep over sizes."""
-TESTED, SIMULATED, JUDGED = "tested", "simulated", "judged"
-"""Places: where a method was tested (the target, if there is one); the simulator of its training; its
-judges."""
+TESTED, SIMULATED = "tested", "simulated"
+"""Places: where a method was tested (the target, if there is one), and the simulator of its training."""
 SHARES = ("success", "failed")
 """Measures that are shares of episodes."""
 
@@ -66,30 +66,32 @@ class DatasetUse(Facts):
     name: str = ""
 
 
-class Line(Facts):
-    """What was measured of a method and seed in one place; NaN is left out."""
+class OfSeed(Facts):
+    """What belongs to a row, seed and size of the dataset; an empty row is for what all methods share."""
 
     row: str
-    """Empty for what all methods share, such as datasets; groundings are of the method that fits them."""
     seed: int
     percent: int = WHOLE
-    where: str
-    """`TESTED`, `SIMULATED`, "raw" or "grounded" (test simulators), "encoder …", `JUDGED`, or a stage."""
-    values: dict[str, float]
 
     @property
-    def key(self) -> tuple[str, int, int, str]:
-        """What makes it unique."""
-        return (self.row, self.seed, self.percent, self.where)
+    def key(self) -> tuple[Any, ...]:
+        """What makes it unique: all of its names and whole numbers."""
+        return tuple(
+            value for name in type(self).model_fields if isinstance(value := getattr(self, name), str | int)
+        )
 
 
-class Errors(Facts):
+class Line(OfSeed):
+    """What was measured of a method and seed in one place; NaN is left out."""
+
+    where: str
+    """`TESTED`, `SIMULATED`, "raw" or "grounded" (test simulators), "encoder …", or a stage."""
+    values: dict[str, float]
+
+
+class Errors(OfSeed):
     """Open-loop error of a simulator on held-out episodes: its mean, and the ends of its 95 % interval."""
 
-    row: str
-    """The method that grounds."""
-    seed: int
-    percent: int = WHOLE
     simulator: str
     """"grounded", "raw", or "still" for the persistence baseline, which predicts no motion."""
     quantity: str
@@ -99,43 +101,17 @@ class Errors(Facts):
     low: list[NullableFloat]
     high: list[NullableFloat]
 
-    @property
-    def key(self) -> tuple[str, int, int, str, str]:
-        """What makes it unique."""
-        return (self.row, self.seed, self.percent, self.simulator, self.quantity)
 
+class TrainingFacts(OfSeed):
+    """Learning curve: headline score of the training episodes that ended, from all start states."""
 
-class TrainingFacts(Facts):
-    """Learning curve of a method and seed."""
-
-    row: str
-    seed: int
-    percent: int = WHOLE
     steps: list[float]
     score: list[NullableFloat]
-    """Headline score of the training episodes that ended, from all start states."""
-
-    @property
-    def key(self) -> tuple[str, int, int]:
-        """What makes it unique."""
-        return (self.row, self.seed, self.percent)
-
-
-class JudgeFacts(Facts):
-    """Who judged in the choice without the target."""
-
-    judge: str
-    """The method whose groundings judge."""
-    episodes: int
-    """Of each policy with each judge."""
-    shares_episodes: bool
-    """Whether the judges were fitted to the same episodes as the policies."""
 
 
 class Results(Facts):
     """All numbers on the page and in the figures."""
 
-    format: Literal[2] = 2
     recipe: str
     task: str
     command: str
@@ -158,8 +134,8 @@ class Results(Facts):
     """The simulator that stands in for a physical robot in the target, if any."""
     paper_success: dict[str, float] = Field(default_factory=dict)
     """Method → the success rate that the paper prints for it."""
-    judges: JudgeFacts | None = None
-    """None where `select` was not run."""
+    judged: Judgment | None = None
+    """The choice without the target; None where `select` was not run."""
     settings: dict[str, JsonValue] = Field(default_factory=dict)
     """All settings of the recipe, with defaults filled in."""
     origins: list[Origin] = Field(default_factory=list)
@@ -191,17 +167,13 @@ class Results(Facts):
         """Return a line for each error: row, seed, percent, simulator, quantity, horizon, mean, low, high."""
         import pandas as pd
 
-        return pd.DataFrame(
-            [
-                (*one.key, *values)
-                for one in self.errors
-                for values in zip(one.horizons, one.mean, one.low, one.high, strict=True)
-            ],
-            columns=[
-                *("row", "seed", "percent", "simulator", "quantity"),
-                *("horizon", "mean", "low", "high"),
-            ],
-        )
+        columns = ["row", "seed", "percent", "simulator", "quantity", "horizon", "mean", "low", "high"]
+        lines = [
+            (*one.key, *values)
+            for one in self.errors
+            for values in zip(one.horizons, one.mean, one.low, one.high, strict=True)
+        ]
+        return pd.DataFrame(lines, columns=columns)
 
     @cached_property
     def percents(self) -> list[int]:
@@ -214,58 +186,68 @@ class Results(Facts):
         """The seeds that any method has finished."""
         return sorted({line.seed for line in self.lines if line.where == TESTED})
 
+    @property
+    def is_swept(self) -> bool:
+        """Whether there are several sizes of the dataset."""
+        return len(self.percents) > 1
+
+    @property
+    def largest(self) -> int:
+        """The largest size of the dataset."""
+        return (self.percents or [WHOLE])[-1]
+
     def tested(self, percent: int | None = None) -> list[str]:
         """Return the methods that are tested at a size, by default at any."""
         sizes = self.percents if percent is None else [percent]
         known = {line.row for line in self.lines if line.where == TESTED and line.percent in sizes}
         return [row for row in self.rows if row in known]
 
+    def contenders(self) -> list[str]:
+        """Return the methods tested at the largest size that are no references."""
+        return [row for row in self.tested(self.largest) if not method_role(row)]
+
     def values(
         self, row: str, measure: str, where: str = TESTED, percent: int | None = None
     ) -> dict[int, float]:
         """Return the value of a measure by seed, at a size, by default the largest."""
-        return self._values.get((row, self._size(percent), where, measure), {})
+        return self._values.get((row, percent or self.largest, where, measure), {})
 
     @cached_property
     def _values(self) -> dict[tuple[str, int, str, str], dict[int, float]]:
         found: dict[tuple[str, int, str, str], dict[int, float]] = {}
-        for line in self.lines:
+        for line in sorted(self.lines, key=lambda line: line.seed):
             for measure, value in line.values.items():
                 found.setdefault((line.row, line.percent, line.where, measure), {})[line.seed] = value
-        return {key: dict(sorted(of_seeds.items())) for key, of_seeds in found.items()}
-
-    def _size(self, percent: int | None) -> int:
-        return percent if percent is not None else (self.percents or [WHOLE])[-1]
+        return found
 
     def summary(
         self, row: str, measure: str, where: str = TESTED, percent: int | None = None
-    ) -> Summary | None:
+    ) -> Estimate | None:
         """Return a measure over the seeds that have it; None where there are none."""
         values = self.values(row, measure, where, percent)
-        limit, trials = self._bounds(measure)
-        return summarize([*values.values()], limit=limit, trials=trials) if values else None
+        return summarize([*values.values()], **self._bounds(measure)) if values else None
 
-    def _bounds(self, measure: str) -> tuple[float | None, int]:
+    def _bounds(self, measure: str) -> dict[str, Any]:
         """Return `limit` and `trials` of a measure, as the statistics take them."""
         limits = {score.measure: score.limit for score in self.scores} | dict.fromkeys(SHARES, 1.0)
-        return limits.get(measure), self.episodes if measure in SHARES else 0
+        return {"limit": limits.get(measure), "trials": self.episodes if measure in SHARES else 0}
 
-    def score_of(self, row: str, where: str = TESTED, percent: int | None = None) -> Summary | None:
+    def score_of(self, row: str, where: str = TESTED, percent: int | None = None) -> Estimate | None:
         """Return the headline score of a method."""
         return self.summary(row, self.headline.measure, where, percent)
 
-    def difference(self, row: str, other: str, percent: int | None = None) -> Estimate | None:
+    def difference(self, row: str, other: str) -> Estimate | None:
         """Return by how much a method's headline score is higher, paired by seed."""
-        sides = (self.values(one, self.headline.measure, TESTED, percent) for one in (row, other))
-        limit, trials = self._bounds(self.headline.measure)
-        return paired_difference(*sides, limit=limit, trials=trials)
+        measure = self.headline.measure
+        return paired_difference(
+            self.values(row, measure), self.values(other, measure), **self._bounds(measure)
+        )
 
     def groundings(self) -> list[str]:
         """Return the methods that ground a simulator, those of the tested methods first."""
         known = {one.row for one in self.errors}
-        return [
-            *dict.fromkeys([name for row in self.rows if (name := grounded_as(row)) in known] + sorted(known))
-        ]
+        named = [name for row in self.rows if (name := grounded_as(row)) in known]
+        return [*dict.fromkeys(named + sorted(known))]
 
     def mean_errors(self, percent: int | None = None) -> "pd.DataFrame":
         """Return errors averaged over seeds, of the horizons that all seeds and groundings share.
@@ -273,48 +255,55 @@ class Results(Facts):
         The index is row, simulator, quantity, horizon; the columns are mean, low, high; NaN where a seed has
         none.
         """
+        index, values = ["row", "simulator", "quantity", "horizon"], ["mean", "low", "high"]
         found = self.error_table
-        found = found[found["percent"] == self._size(percent)]
+        found = found[found["percent"] == (percent or self.largest)]
         if found.empty:
-            return found.set_index(["row", "simulator", "quantity", "horizon"])[["mean", "low", "high"]]
+            return found.set_index(index)[values]
         per_fit = found[found["simulator"] == "grounded"].groupby(["row", "seed", "quantity"])["horizon"]
-        shared = set.intersection(*(set(of) for _, of in per_fit))
-        kept = found[found["horizon"].isin(shared)]
-        groups = kept.groupby(["row", "simulator", "quantity", "horizon"], sort=False)
-        return groups[["mean", "low", "high"]].agg(lambda values: values.mean(skipna=False))
+        kept = found[found["horizon"].isin(set.intersection(*(set(of) for _, of in per_fit)))]
+        return kept.groupby(index, sort=False)[values].agg(lambda of: of.mean(skipna=False))
 
-    def judged(self) -> Judged | None:
-        """Return the candidates of the choice without the target; None where there are none."""
-        if self.judges is None:
-            return None
-        candidates = [
-            Candidate(
-                row=line.row,
-                seed=line.seed,
-                percent=line.percent,
-                success={int(judge): value for judge, value in line.values.items()},
-            )
-            for line in self.lines
-            if line.where == JUDGED
-        ]
-        return Judged(candidates=candidates, **self.judges.model_dump()) if candidates else None
+    def predicted_failures(self) -> "dict[tuple[int, str, str], pd.DataFrame]":
+        """Return the figures of predicted failures by size, grounding and part of it: name → seed → value."""
+        of = self.table[(self.table["where"] == "ground") & self.table["measure"].str.startswith("failures.")]
+        if of.empty:
+            return {}
+        names = of["measure"].str.split(".", n=2, expand=True)
+        of = of.assign(part=names[1], measure=names[2])
+        return {
+            key: group.pivot_table(index="measure", columns="seed", values="value", sort=False)
+            for key, group in of.groupby(["percent", "row", "part"], sort=False)
+            if group["measure"].str.startswith("auc").any()
+        }
+
+    def failure_rates(self) -> dict[str, dict[str, Floats]]:
+        """Return rates over all seeds at the largest size: what predicts failures → grounding → (3, bins).
+
+        The three are predicted rate, observed rate and number of steps.
+        """
+        parts: dict[str, dict[str, Floats]] = {}
+        for (percent, row, part), of in self.predicted_failures().items():
+            rows = all_bins(of)
+            if percent == self.largest and len(rows):
+                bins = np.digitize(rows[:, 0], BINS[1:-1])
+                pooled = [rows[bins == one] for one in np.unique(bins)]
+                steps = np.array([of[:, 2].sum() for of in pooled])
+                rates = np.array([of[:, :2].T @ of[:, 2] for of in pooled]).T / steps
+                parts.setdefault(part.replace("_", " "), {})[row] = np.vstack([rates, steps])
+        return parts
 
     def choice(self, percent: int | None = None) -> Choice | None:
         """Return the choice without the target at a size, and what it is worth there; None without one."""
-        return self._choices.get(self._size(percent))
-
-    @cached_property
-    def _choices(self) -> dict[int, Choice]:
-        judged, found = self.judged(), {}
-        for size in self.percents if judged else ():
-            target = {
-                (line.row, line.seed): line.values["success"]
-                for line in self.lines
-                if line.where == TESTED and line.percent == size and self.tested_in == "target"
-            }
-            if judged and (choice := choice_of(judged, size, measured=target)):
-                found[size] = choice
-        return found
+        size = percent or self.largest
+        if self.judged is None or size not in self.percents:
+            return None
+        target = {
+            (line.row, line.seed): line.values["success"]
+            for line in self.lines
+            if line.where == TESTED and line.percent == size and self.tested_in == "target"
+        }
+        return choice_of(self.judged, None if self.judged.percents == [None] else size, measured=target)
 
     @property
     def where(self) -> str:
@@ -346,15 +335,18 @@ class Results(Facts):
         return f"**Nothing was tested on a robot: the task has no target.** {place}"
 
 
+def all_bins(of: "pd.DataFrame") -> Floats:
+    """Return predicted and observed rates and number of steps of all bins and seeds, (N, 3)."""
+    rows = of[of.index.str.startswith("reliability.")]
+    bins = rows.groupby([name.split(".")[1] for name in rows.index], sort=False)
+    stacked = np.concatenate([np.empty((0, 3)), *(values.to_numpy().T for _, values in bins)])
+    return np.asarray(stacked[~np.isnan(stacked).any(axis=1)], dtype=np.float64)
+
+
 def titled(row: str) -> str:
     """Return the title of a method, with what it is to the others: floor, ceiling or trained there."""
     role = method_role(row)
     return f"{method_title(row)} ({role})" if role else method_title(row)
-
-
-def contenders(results: Results, percent: int | None = None) -> list[str]:
-    """Return the tested methods that are no references."""
-    return [row for row in results.tested(percent) if not method_role(row)]
 
 
 def merge(sources: Sequence[Results]) -> Results:
@@ -363,27 +355,35 @@ def merge(sources: Sequence[Results]) -> Results:
     A later line replaces an earlier one of the same method, seed and place.
 
     Raises:
-        BadInputError: the sources differ in task, episodes, robot or data.
+        BadInputError: the sources differ in task, episodes, robot, judges or data.
     """
-    last = sources[-1]
-    for what in ("task", "episodes", "tested_in", "leg_scale", "judges"):
-        known = list(dict.fromkeys(value for one in sources if (value := getattr(one, what)) is not None))
-        if len(known) > 1:
+    last, judged = sources[-1], [one.judged for one in sources if one.judged]
+    facts = {
+        what: [getattr(one, what) for one in sources]
+        for what in ("task", "episodes", "tested_in", "leg_scale")
+    }
+    facts["judges"] = [one.model_dump(exclude={"candidates"}) for one in judged]
+    for what, values in facts.items():
+        if any(value != values[0] for value in values):
             raise BadInputError(
                 f"{last.recipe}: expected all merged results to be made alike, got {what} "
-                f"{' and '.join(map(str, known))}"
+                f"{' and '.join(map(str, values))}"
             )
-    rows = dict.fromkeys([*last.rows, *(row for one in sources for row in one.rows)])
+    parts = {
+        part: [*{one.key: one for source in sources for one in getattr(source, part)}.values()]
+        for part in ("lines", "errors", "trainings")
+    }
+    candidates = {one.key: one for of in judged for one in of.candidates}
     return last.model_copy(
         update={
-            "rows": tuple(rows),
-            "judges": next((one.judges for one in reversed(sources) if one.judges), None),
+            "rows": tuple(dict.fromkeys([*last.rows, *(row for one in sources for row in one.rows)])),
+            "judged": judged[-1].model_copy(update={"candidates": [*candidates.values()]})
+            if judged
+            else None,
             "origins": merged_origins(origin for one in sources for origin in one.origins),
             "user_code": {name: digest for one in sources for name, digest in one.user_code.items()},
             "datasets": _datasets(sources),
-            "lines": [*{line.key: line for one in sources for line in one.lines}.values()],
-            "errors": [*{error.key: error for one in sources for error in one.errors}.values()],
-            "trainings": [*{curve.key: curve for one in sources for curve in one.trainings}.values()],
+            **parts,
         }
     )
 
@@ -434,17 +434,15 @@ def judged_horizon(horizons: Iterable[int]) -> int:
 def elapsed_seconds(results: Results) -> float:
     """Return for how long anything ran, in s: the union of the times of all artifacts.
 
-    What ran at the same time counts once. An artifact without a time of its end, such as one of an older
-    version, counts as if nothing ran beside it.
+    What ran at the same time counts once; an artifact without a time of its end counts by itself.
     """
-    spans, alone = [], 0.0
+    spans, total, last = [], 0.0, -np.inf
     for line in results.lines:
         seconds, end = line.values.get("wall_seconds", 0.0), line.values.get("finished_at")
         if end is None:
-            alone += seconds
+            total += seconds
         else:
             spans.append((end - seconds, end))
-    total, last = alone, -np.inf
     for begin, end in sorted(spans):
         total += max(0.0, end - max(begin, last))
         last = max(last, end)
@@ -453,41 +451,28 @@ def elapsed_seconds(results: Results) -> float:
 
 def stage_seconds(results: Results, clock: str) -> dict[str, float]:
     """Return the time of each stage over all of its artifacts, by "wall_seconds" or "cpu_seconds"."""
-    times: dict[str, float] = {}
-    for line in results.lines:
-        if clock in line.values:
-            times[line.where] = times.get(line.where, 0.0) + line.values[clock]
-    return times
+    of = results.table[results.table["measure"] == clock]
+    return {
+        str(stage): float(total) for stage, total in of.groupby("where", sort=False)["value"].sum().items()
+    }
 
 
 def read_results(path: Path) -> Results:
-    """Read results from a JSON file.
-
-    Raises:
-        BadInputError: the file is missing, or has another layout.
-    """
+    """Read results from a JSON file; raise a BadInputError if it is missing, or no such file."""
     if not path.is_file():
         raise BadInputError(f"expected results in {path}, found none")
-    try:
-        return Results.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise BadInputError(
-            f"{path} does not hold results in the current format: {faults_of(error)}: remove it, or make it "
-            "again"
-        ) from None
+    return read_written(Results, path, by="the report", advice="remove it, or make it again")
 
 
 def results_json(results: Results) -> str:
-    """Return indented JSON in which a list of numbers, and each line of a table, takes one line."""
+    """Return indented JSON in which each line of a table takes one line."""
     values = json.loads(results.model_dump_json())
     tables = {name: values.pop(name) for name in ("lines", "errors", "trainings")}
-    text = json.dumps(values, indent=2, ensure_ascii=False)
-    text = re.sub(r"\[\n[^\[\]{}]*\]", lambda found: re.sub(r"\n *", " ", found[0]), text)
+    text = json.dumps(values, indent=2, ensure_ascii=False).removesuffix("\n}")
     for name, lines in tables.items():
         each = ",\n".join(f"    {json.dumps(line, ensure_ascii=False)}" for line in lines)
-        listed = f"[\n{each}\n  ]" if lines else "[]"
-        text = f'{text[:-2]},\n  "{name}": {listed}\n}}'
-    return text + "\n"
+        text += f',\n  "{name}": [\n{each}\n  ]'
+    return f"{text}\n}}\n"
 
 
 def without_nan(values: Mapping[str, float | None]) -> dict[str, float]:

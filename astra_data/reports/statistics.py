@@ -23,68 +23,68 @@ CONFIDENCE = 0.95
 LEAST_SEEDS = 3
 """Seeds below which no interval is given."""
 
-Ends = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Summary:
-    """A score over its seeds.
-
-    Attributes:
-        mean: over seeds. std: sample standard deviation; None for a single seed.
-        low: lower end of the 95 % interval of the mean. high: upper end; None below `LEAST_SEEDS`.
-        seeds: how many.
-    """
-
-    mean: float
-    std: float | None
-    low: float | None
-    high: float | None
-    seeds: int
-
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its 95 % interval, which is None where there are too few seeds."""
+    """A figure over `seeds` with the ends of its 95 % interval, None where there are too few of them.
+
+    `std` is the sample standard deviation of a mean; None for a single seed, or where it is not of use.
+    """
 
     value: float
     low: float | None = None
     high: float | None = None
+    std: float | None = None
+    seeds: int = 0
 
 
-def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, trials: int = 0) -> Summary:
-    """Summarize the scores of seeds; `limit` and `trials` as for `mean_interval`.
+def spread(found: Estimate | None, digits: int) -> str:
+    """Return a mean ± its standard deviation; a dash for None."""
+    if found is None:
+        return "-"
+    return f"{found.value:.{digits}f}" + ("" if found.std is None else f" ± {found.std:.{digits}f}")
 
-    Raises:
-        BadInputError: there is no score, or one that is not finite.
+
+def ends(found: Estimate | None, digits: int = 2) -> str:
+    """Return the interval of a figure; a dash where it has none."""
+    if found is None or found.low is None or found.high is None:
+        return "-"
+    return f"[{found.low:.{digits}f}, {found.high:.{digits}f}]"
+
+
+def interval(found: Estimate | None, digits: int = 2) -> str:
+    """Return a figure and, if it has one, its interval; a dash for None."""
+    return "-" if found is None else f"{found.value:.{digits}f} {ends(found, digits)}".removesuffix(" -")
+
+
+def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, trials: int = 0) -> Estimate:
+    """Return the mean of values (N,), one per seed or judge.
+
+    Args:
+        scores: finite.
+        limit: values lie between 0 and this; None where they have no bounds.
+        trials: each value is a share of so many episodes; 0 where it is none.
     """
     values = np.asarray(scores, dtype=np.float64)
     if values.size == 0 or not np.isfinite(values).all():
         raise BadInputError(f"expected one finite score per seed, got {values.tolist()}")
-    low, high = mean_interval(values, limit=limit, trials=trials) or (None, None)
-    std = float(values.std(ddof=1)) if len(values) > 1 else None
-    return Summary(float(values.mean()), std, low, high, len(values))
-
-
-def mean_interval(
-    values: Sequence[float] | Floats, *, limit: float | None = None, trials: int = 0
-) -> Ends | None:
-    """Return the 95 % interval of the mean of values (N,); None below `LEAST_SEEDS`.
-
-    Args:
-        values: one per seed, or per judge.
-        limit: values lie between 0 and this; None where they have no bounds.
-        trials: each value is a share of so many episodes; 0 where it is none.
-    """
-    scores = np.asarray(values, dtype=np.float64)
-    if len(scores) < LEAST_SEEDS:
-        return None
-    mean, half = float(scores.mean()), _student(len(scores)) * math.sqrt(_variance(scores))
+    mean, count = float(values.mean()), len(values)
+    if count < LEAST_SEEDS:
+        return Estimate(mean, std=float(values.std(ddof=1)) if count > 1 else None, seeds=count)
+    half = _student(count) * math.sqrt(_variance(values))
     low, high = mean - half, mean + half
     if trials:
-        scored = _score_interval(scores, trials)
-        low, high = min(low, scored[0]), max(high, scored[1])
-    return (low, high) if limit is None else (max(low, 0.0), min(high, limit))
+        # Wilson's interval of as many episodes as spread like the seeds when drawn, as if there were one seed
+        # more; at most all of them, and at least half an episode.
+        drawn, variance = mean * (1 - mean), _variance(values) * (count + 1) / count
+        episodes = min(max(drawn / variance if variance > 0 else math.inf, 0.5), count * trials)
+        extra = _student(count) ** 2 / episodes
+        center = (mean + extra / 2) / (1 + extra)
+        half = math.sqrt(drawn * extra + extra**2 / 4) / (1 + extra)
+        low, high = min(low, center - half), max(high, center + half)
+    if limit is not None:
+        low, high = max(low, 0.0), min(high, limit)
+    return Estimate(mean, low, high, float(values.std(ddof=1)), count)
 
 
 def paired_difference(
@@ -93,23 +93,21 @@ def paired_difference(
     """Return the mean difference on the seeds that both have, with its 95 % interval (Student's t).
 
     What a seed does to both cancels. The variance is at least that of drawing the episodes of shares. None
-    where no seed is shared.
-
-    Args:
-        scores: by seed.
-        others: by seed.
-        limit: as for `mean_interval`; a difference lies within plus and minus it.
-        trials: as for `mean_interval`.
+    where no seed is shared. `limit` and `trials` are as for `summarize`.
     """
     shared = [seed for seed in scores if seed in others]
     if not shared:
         return None
     sides = [np.array([of[seed] for seed in shared], dtype=np.float64) for of in (scores, others)]
     differences = sides[0] - sides[1]
-    mean, count = float(differences.mean()), len(shared)
+    mean, count, drawn = float(differences.mean()), len(shared), 0.0
     if count < LEAST_SEEDS:
         return Estimate(mean)
-    drawn = sum(_drawing_variance(side.mean(), count * trials) for side in sides) if trials else 0.0
+    if trials:
+        episodes = count * trials
+        for side in sides:  # two successes and two failures are added
+            near = (float(side.mean()) * episodes + 2) / (episodes + 4)
+            drawn += near * (1 - near) / episodes
     half = _student(count) * math.sqrt(max(_variance(differences), drawn))
     bound = math.inf if limit is None else limit
     return Estimate(mean, max(mean - half, -bound), min(mean + half, bound))
@@ -130,7 +128,7 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Estimate | Non
         share: Floats = (above + 1).mean(axis=(-2, -1)) / 2
         return share
 
-    ends = bootstrap(
+    found = bootstrap(
         (scores, others),
         share_of_wins,
         vectorized=True,
@@ -138,19 +136,15 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Estimate | Non
         n_resamples=REPLICATES,
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return Estimate(float(share_of_wins(scores, others)), float(ends.low), float(ends.high))
+    return Estimate(float(share_of_wins(scores, others)), float(found.low), float(found.high))
 
 
 def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False) -> Estimate | None:
     """Correlate two scores over all seeds of some rows: Pearson's coefficient, or with `ranks` Spearman's.
 
     The seeds of a row are not independent, so the interval resamples rows, and seeds within each row. None
-    where there are fewer than three seeds in all, or one side does not vary.
-
-    Args:
-        first: one score, an array (seeds,) for each row.
-        second: the other score, of the same shapes.
-        ranks: correlate ranks.
+    where there are fewer than three seeds in all, or one side does not vary. Each score is an array (seeds,)
+    for each row.
     """
     from scipy.stats import rankdata
 
@@ -184,25 +178,3 @@ def _student(count: int) -> float:
 def _variance(values: Floats) -> float:
     """Return the variance of the mean of values (N,)."""
     return float(values.var(ddof=1)) / len(values)
-
-
-def _drawing_variance(share: float, episodes: int) -> float:
-    """Return the variance of a share of so many episodes, two successes and two failures added."""
-    near = (share * episodes + 2) / (episodes + 4)
-    return float(near * (1 - near)) / episodes
-
-
-def _score_interval(shares: Floats, trials: int) -> Ends:
-    """Return Wilson's interval of the mean of shares (N,) of `trials` episodes, with Student's quantile.
-
-    The number of episodes is that whose drawing spreads as much as the seeds do, as if there were one seed
-    more; at most all of them, and at least half an episode.
-    """
-    count, mean = len(shares), float(shares.mean())
-    quantile, drawn = _student(count), mean * (1 - mean)
-    variance = _variance(shares) * (count + 1) / count
-    episodes = min(max(drawn / variance if variance > 0 else math.inf, 0.5), count * trials)
-    extra = quantile**2 / episodes
-    center = (mean + extra / 2) / (1 + extra)
-    half = math.sqrt(drawn * extra + extra**2 / 4) / (1 + extra)
-    return center - half, center + half

@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 from html_pages import read_page
 
@@ -12,15 +11,11 @@ from astra_data.reports.blocks import (
     duration,
     html,
     inline,
-    interval,
     listed,
     markdown,
-    measured,
     short,
-    spread,
     table,
 )
-from astra_data.reports.statistics import Summary
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (400).to_bytes(4) + (200).to_bytes(4)
 
@@ -89,25 +84,8 @@ def test_columns_of_words_are_aligned_left_and_of_numbers_right() -> None:
     assert table(["a", "b", "c"], [], words=2).endswith("| --- | --- | ---: |")
 
 
-def test_spread_is_mean_and_standard_deviation() -> None:
-    assert spread(Summary(0.5, 0.25, 0.1, 0.9, 3), 2) == "0.50 ± 0.25"
-    assert spread(Summary(0.5, None, None, None, 1), 0) == "0"
-    assert spread(None, 2) == "-"
-
-
 def test_words_are_listed_as_in_a_sentence() -> None:
     assert [listed(list("abc")[:count]) for count in (0, 1, 2, 3)] == ["", "a", "a and b", "a, b and c"]
-
-
-def test_a_value_without_an_interval_stands_alone() -> None:
-    assert interval(0.5, 0.125, 1.0) == "0.50 [0.12, 1.00]"
-    assert interval(61.6, 60.4, 70.0, 0) == "62 [60, 70]"
-    assert interval(0.5, None, None, 1) == interval(0.5, None, 1.0, 1) == "0.5"
-
-
-def test_a_measured_value_has_three_digits() -> None:
-    assert measured(0.12345, 0.1, 1234.5) == "0.123 [0.1, 1.23e+03]"
-    assert measured(0.12345, np.nan, np.nan) == "0.123"
 
 
 @pytest.mark.parametrize(

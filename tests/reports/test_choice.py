@@ -30,7 +30,7 @@ from astra_data.reports.choice import (
     select_page,
     widest_field,
 )
-from astra_data.reports.statistics import mean_interval
+from astra_data.reports.statistics import summarize
 
 Line = tuple[str, int, float, float | None]
 
@@ -72,11 +72,9 @@ def test_an_interval_takes_judges_as_the_sampling_unit_and_needs_three() -> None
     ]
     found = choice_of(Judged(judge="nas", episodes=100, candidates=candidates), None, measured={})
     assert found is not None
-    three, two = sorted(found.candidates, key=lambda one: one.seed)
-    assert (three.predicted.low, three.predicted.high) == mean_interval(
-        [0.1, 0.9, 0.5], limit=1.0, trials=100
-    )
-    assert (two.predicted.low, two.predicted.high) == (None, None)
+    three, two = (found.judged.estimate(one) for one in sorted(found.candidates, key=lambda one: one.seed))
+    assert three == summarize([0.1, 0.9, 0.5], limit=1.0, trials=100)
+    assert (two.low, two.high) == (None, None)
 
 
 def test_a_choice_is_worth_its_regret() -> None:

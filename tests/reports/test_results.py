@@ -59,7 +59,7 @@ def test_numbers_are_found_by_method_place_and_size() -> None:
     assert found.values("astra", "success", TESTED, 20) == {0: 0.0}
     assert (found.percents, found.seeds, found.tested()) == ([20, 100], [0, 1], ["astra"])
     summary = found.score_of("astra")
-    assert summary and (summary.mean, summary.seeds) == (0.75, 2)
+    assert summary and (summary.value, summary.seeds) == (0.75, 2)
     assert found.summary("astra", "failed") is None
     assert found.table[found.table["where"] == SIMULATED]["value"].tolist() == [0.25]
 
@@ -84,7 +84,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     assert json.loads(path.read_text())["trainings"][0]["score"] == [None, 0.5]
     assert '    {"row": "astra", "seed": 0, "percent": 100, "where": "tested"' in path.read_text()
     path.write_text("{}")
-    with pytest.raises(BadInputError, match="does not hold results in the current format"):
+    with pytest.raises(BadInputError, match="is not what the report writes"):
         read_results(path)
     with pytest.raises(BadInputError, match="found none"):
         read_results(tmp_path / "none.json")

@@ -9,11 +9,12 @@ from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 from astra_data.reports.statistics import (
     Estimate,
-    Summary,
     correlation,
-    mean_interval,
+    ends,
+    interval,
     paired_difference,
     probability_of_improvement,
+    spread,
     summarize,
 )
 
@@ -30,10 +31,15 @@ SEEDS: dict[str, Draw] = {
 """Success rates that trainings of a method might have."""
 
 
-def ends(values: Floats) -> Floats:
+def tails(values: Floats) -> Floats:
     """Return the ends of the 95 % interval: a fortieth of the replicates lies beyond each."""
     values = np.sort(values)
     return values[[len(values) // 40, -len(values) // 40]]
+
+
+def intervals(shares: Floats, trials: int = 0) -> Floats:
+    found = [summarize(of, limit=1.0, trials=trials) for of in shares]
+    return np.array([(one.low, one.high) for one in found])
 
 
 @pytest.mark.parametrize("count", [3, 10])
@@ -43,12 +49,12 @@ def test_intervals_of_success_rates_cover_their_mean(seeds: str, count: int) -> 
     rng = np.random.default_rng(0)
     mean = SEEDS[seeds](rng, (200_000, 1)).mean()
     shares = rng.binomial(EPISODES, SEEDS[seeds](rng, (1000, count))) / EPISODES
-    found = np.array([mean_interval(of, limit=1.0, trials=EPISODES) for of in shares])
+    found = intervals(shares, trials=EPISODES)
     assert ((found >= 0) & (found <= 1)).all()
     assert np.mean((found[:, 0] <= mean) & (mean <= found[:, 1])) >= 0.93
     # Student's t alone would be too narrow where seeds are near 1.
     if seeds == "good and scattered" and count == 3:
-        student = np.array([mean_interval(of, limit=1.0) for of in shares])
+        student = intervals(shares)
         assert np.mean((student[:, 0] <= mean) & (mean <= student[:, 1])) < 0.93
 
 
@@ -71,25 +77,24 @@ def test_a_summary_is_the_one_worked_out_by_hand() -> None:
     # Squares of the deviations from 0.4: 0.09 + 0.04 + 0 + 0.01 + 0.16 = 0.30, over 4.
     low, high = stats.t.interval(0.95, 4, loc=0.4, scale=np.sqrt(0.075 / 5))
     found = summarize(values)
-    assert [found.mean, found.std, found.low, found.high] == pytest.approx([0.4, np.sqrt(0.075), low, high])
+    assert [found.value, found.std, found.low, found.high] == pytest.approx([0.4, np.sqrt(0.075), low, high])
     assert summarize(values, limit=0.7).high == 0.7
 
 
 @pytest.mark.parametrize("values", [[0.7], [0.1, 0.1]])
 def test_below_three_seeds_there_is_no_interval(values: list[float]) -> None:
     std = None if len(values) == 1 else 0.0
-    alone = Summary(values[0], std, None, None, len(values))
-    assert summarize(values, limit=1.0, trials=EPISODES) == alone
+    alone = Estimate(values[0], std=std, seeds=len(values))
+    assert summarize(values, limit=1.0, trials=EPISODES) == alone and ends(alone) == "-"
     here, there = dict(enumerate(values)), dict(enumerate([0.0] * len(values)))
     assert paired_difference(here, there, limit=1.0) == Estimate(values[0])
     assert probability_of_improvement(np.array(values), np.array([0.1, 0.2, 0.3])) is None
 
 
 def test_equal_shares_have_an_interval_as_wide_as_drawing_their_episodes() -> None:
-    low, high = mean_interval([1.0] * 3, limit=1.0, trials=EPISODES) or (None, None)
-    assert high == 1.0 and low is not None
     quantile = stats.t.ppf(0.975, 2)  # Wilson's of 360 successes of 360, with this quantile
-    assert low == pytest.approx(1 / (1 + quantile**2 / 360))
+    equal = summarize([1.0] * 3, limit=1.0, trials=EPISODES)
+    assert (equal.low, equal.high) == (pytest.approx(1 / (1 + quantile**2 / 360)), 1.0)
     found = paired_difference(dict.fromkeys(range(3), 0.6), dict.fromkeys(range(3), 0.5), trials=EPISODES)
     assert found and found.low is not None and found.low < 0.05
 
@@ -99,10 +104,10 @@ def test_a_difference_is_that_of_a_paired_t_test_on_the_seeds_that_both_have() -
     seeds = rng.normal(0, 1, 7)
     ours, theirs = seeds + rng.normal(0.3, 0.1, 7), seeds + rng.normal(0, 0.1, 7)
     found = paired_difference(dict(enumerate(ours)) | {9: 5.0}, dict(enumerate(theirs)))
-    interval = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
+    expected = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
     assert found is not None
     assert [found.value, found.low, found.high] == pytest.approx(
-        [(ours - theirs).mean(), interval.low, interval.high]
+        [(ours - theirs).mean(), expected.low, expected.high]
     )
     assert paired_difference({0: 0.1}, {1: 0.2}) is None
 
@@ -120,7 +125,7 @@ def test_the_probability_of_improvement_counts_pairs_and_has_a_95_percent_interv
     scores, others = rng.normal(0.6, 1, 20), rng.normal(0, 1, 14)
     found = probability_of_improvement(scores, others)
     ours, theirs = (of[rng.integers(len(of), size=(8000, len(of)))] for of in (scores, others))
-    expected = ends((ours[:, :, None] > theirs[:, None]).mean(axis=(1, 2)))
+    expected = tails((ours[:, :, None] > theirs[:, None]).mean(axis=(1, 2)))
     assert found is not None
     assert [found.low, found.high] == pytest.approx(expected, abs=0.08 * float(np.ptp(expected)) / 2)
     assert probability_of_improvement(scores, others) == found
@@ -141,7 +146,7 @@ def test_correlations_are_those_of_scipy(
     assert found.value == pytest.approx(reference(first, second).statistic)  # type: ignore[attr-defined]
     pairs = rng.integers(30, size=(4000, 30))
     one, other = (rankdata(of[pairs], axis=1) if ranks else of[pairs] for of in (first, second))
-    expected = ends(np.array([np.corrcoef(*pair)[0, 1] for pair in zip(one, other, strict=True)]))
+    expected = tails(np.array([np.corrcoef(*pair)[0, 1] for pair in zip(one, other, strict=True)]))
     assert [found.low, found.high] == pytest.approx(expected, abs=0.1 * float(np.ptp(expected)) / 2)
 
 
@@ -164,3 +169,14 @@ def test_what_does_not_vary_correlates_with_nothing() -> None:
     # Nor do the resamples in which chance left no variation.
     found = correlation(three, three)
     assert found is not None and [found.low, found.high] == pytest.approx([1.0, 1.0])
+
+
+def test_figures_are_written_with_deviation_or_interval() -> None:
+    found = Estimate(0.5, 0.125, 1.0, std=0.25, seeds=3)
+    assert (spread(found, 2), ends(found), interval(found)) == (
+        "0.50 ± 0.25",
+        "[0.12, 1.00]",
+        "0.50 [0.12, 1.00]",
+    )
+    assert (spread(Estimate(0.5), 0), interval(Estimate(0.5), 1)) == ("0", "0.5")
+    assert (spread(None, 2), ends(None), interval(None)) == ("-", "-", "-")

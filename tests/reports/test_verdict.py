@@ -7,16 +7,8 @@ from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.cli.recipes import show_made
-from astra_data.reports.results import (
-    JUDGED,
-    SIMULATED,
-    TESTED,
-    Errors,
-    JudgeFacts,
-    Line,
-    Results,
-    results_json,
-)
+from astra_data.reports.choice import Candidate, Judgment
+from astra_data.reports.results import SIMULATED, TESTED, Errors, Line, Results, results_json
 from astra_data.reports.verdict import Verdict, verdict_of
 from astra_data.worlds.objective import SURVIVED_STEPS
 
@@ -127,23 +119,18 @@ def test_a_score_without_limit_is_compared_with_the_floor_alone() -> None:
     assert found.row == "astra" and "survived steps 23" in found.text
 
 
-def judged(*shares: tuple[str, int, float]) -> list[Line]:
-    return [
-        Line(row=row, seed=seed, where=JUDGED, values={"7": share, "8": share, "9": share})
-        for row, seed, share in shares
-    ]
-
-
 def test_judges_choose_the_seed_and_without_a_target_the_method() -> None:
     of = {"nas": (0.6, 0.6, 0.6), "astra": (0.8, 0.9, 1.0)}
-    judges = JudgeFacts(judge="nas", episodes=50, shares_episodes=False)
-    base = results(of)
-    lines = [*base.lines, *judged(("astra", 0, 0.7), ("astra", 1, 0.4), ("nas", 0, 0.9))]
-    found = verdict_of(base.model_copy(update={"lines": lines, "judges": judges}))
+    shares = {("astra", 0): 0.7, ("astra", 1): 0.4, ("nas", 0): 0.9}
+    candidates = [
+        Candidate(row=row, seed=seed, success=dict.fromkeys((7, 8, 9), share))
+        for (row, seed), share in shares.items()
+    ]
+    judged = Judgment(judge="nas", episodes=50, candidates=candidates)
+    found = verdict_of(results(of, judged=judged))
     assert (found.row, found.seed) == ("astra", 0)
     assert "choose NAS, seed 0, with a predicted success of 0.90" in words(found)
-    nowhere = {"lines": lines, "judges": judges, "tested_in": "simulators"}
-    found = verdict_of(base.model_copy(update=nowhere))
+    found = verdict_of(results(of, judged=judged, tested_in="simulators"))
     assert (found.row, found.seed) == ("nas", 0) and "predicted success 0.90" in found.text
 
 

@@ -82,7 +82,7 @@ def report(
         BadInputError: an artifact is malformed, or methods differ in task, episodes, robot or data.
     """
     from astra_data.reports.figures.catalog import FIGURES, drawn
-    from astra_data.reports.figures.scene import Scene
+    from astra_data.reports.figures.style import Scene
     from astra_data.reports.page import sections_of
 
     for row in (*config.trajectory_methods, *config.paper_success, *config.compare):

@@ -11,40 +11,16 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from astra_data.reports.blocks import Picture
-from astra_data.reports.figures.errors import (
-    open_loop_error,
-    predictive_validity,
-    reliability,
-    reliability_of,
-)
+from astra_data.reports.figures.errors import open_loop_error, predictive_validity, reliability_of
 from astra_data.reports.figures.motion import mismatch, strips, trajectories
-from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import data_efficiency, learning_curves, score_bars
-from astra_data.reports.figures.style import coverage, method_color, method_title, png
+from astra_data.reports.figures.style import Scene, png
 from astra_data.reports.results import Results
-
-__all__ = [
-    "FIGURES",
-    "Drawing",
-    "Scene",
-    "coverage",
-    "drawn",
-    "method_color",
-    "method_title",
-    "pictures",
-    "png",
-    "reliability",
-]
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure of the report.
-
-    Attributes:
-        draw: it, or returns None. title: above it. caption: below it; "{where}" stands for where methods were
-        tested. section: of the page. photo: it keeps its colors on a dark page.
-    """
+    """A figure of a section of the report; "{where}" in its words is where methods were tested."""
 
     draw: Callable[[Results, Scene], Figure | None]
     title: str
@@ -138,13 +114,13 @@ def drawn(results: Results, scene: Scene) -> dict[str, bytes]:
 
 def pictures(results: Results, section: str) -> list[Picture]:
     """Return the figures of a section as blocks of a page."""
-    found = {name: figure for name, figure in FIGURES.items() if figure.section == section}
     return [
         Picture(
             name,
             figure.title.replace("{where}", results.where),
             figure.caption.replace("{where}", results.where),
-            photo=figure.photo,
+            figure.photo,
         )
-        for name, figure in found.items()
+        for name, figure in FIGURES.items()
+        if figure.section == section
     ]

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES, Evaluation, read_json, read_tensors
-from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import (
     DEPLOYED,
     FAINT,
     INK,
     SIMULATED,
     WALL,
+    Scene,
     method_color,
     method_title,
     style,
@@ -85,23 +85,14 @@ def replay_commands(task: Task) -> CommandReplay:
     )
 
 
-COLUMNS = 4
-"""Panels side by side, at most."""
-
-PANEL_INCHES = 2.0
-"""Width of a panel."""
-
-TITLE_POINTS = 10.0
-"""Font size of a panel's title; one of more than `TITLE_LETTERS` letters is smaller."""
-
-TITLE_LETTERS = 17
-
+COLUMNS, PANEL_INCHES = 4, 2.0
+"""Panels side by side, at most, and the width of one."""
+TITLE_POINTS, TITLE_LETTERS = 10.0, 17
+"""Font size of a panel's title; one of more letters is smaller."""
 TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
 """Times at which pictures of an episode are taken, in addition to the time limit."""
-
 PICTURE_INCHES = 0.95
 """Width of such a picture."""
-
 RIM = 0.35
 """Visible width of the outer walls, in cells."""
 
@@ -126,7 +117,7 @@ def trajectories(results: Results, scene: Scene) -> Figure | None:
             size = TITLE_POINTS * min(1.0, TITLE_LETTERS / len(title))
             axes.set_title(title, loc="left", fontsize=size)
             success = results.summary(row, "success")
-            axes.set_title(f"{success.mean:.2f}" if success else "", loc="right", fontweight="normal")
+            axes.set_title(f"{success.value:.2f}" if success else "", loc="right", fontweight="normal")
         handles = [
             Line2D([], [], color=SIMULATED, ls="--", label="in its simulator"),
             Line2D([], [], color=DEPLOYED, label=results.where),

@@ -13,11 +13,13 @@ from astra_data.core.arrays import Floats
 from astra_data.core.naming import artifact_key, base_method, is_plus
 from astra_data.dataset.inspection import Map, visited
 from astra_data.dataset.reader import Dataset
-from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.style import (
     FAINT,
     INK,
+    Scene,
+    draw_band,
     draw_visits,
+    look,
     method_color,
     method_title,
     score_axis,
@@ -29,6 +31,8 @@ CURVE_POINTS = 200
 """Points at which curves of different seeds are interpolated."""
 PANELS_ACROSS = 4
 """Learning-curve panels side by side, at most."""
+_DOT = {"mfc": "white", "mec": INK, "clip_on": False}
+"""Not clipped: the axis would cut what lies on 0 in half."""
 
 
 def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
@@ -42,16 +46,24 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
         with style():
             figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(rows)), layout="constrained")
             axes = figure.add_subplot()
-            labels, diamonds = [], False
+            labels, drawn = [], {"mean over seeds": Patch(fc=FAINT, ec="none")}
+            drawn["95 % interval"] = Line2D([], [], color=INK, lw=1.6)
             for place, row in enumerate(rows):
                 found, own = results.summary(row, measure), results.summary(row, measure, SIMULATED)
                 # Beside the title, where no dot or diamond can stand in front of it or be taken for it.
-                labels.append(f"{titled(row)}   {score.text(found.mean) if found else '-'}")
-                _bar(axes, place, row, results, measure)
-                if own is not None and score == results.headline:
-                    diamonds = True
-                    (diamond,) = axes.plot(own.mean, place, "D", mfc="white", mec=INK, ms=5, zorder=5)
-                    diamond.set_clip_on(False)
+                labels.append(f"{titled(row)}   {score.text(found.value) if found else '-'}")
+                if found:
+                    hatch = "////" if is_plus(row) else None
+                    bar = {"color": method_color(row), "ec": (1, 1, 1, 0.4), "hatch": hatch}
+                    axes.barh(place, found.value, height=0.68, lw=0, zorder=2, **bar)
+                    if found.low is not None and found.high is not None:
+                        axes.plot([found.low, found.high], [place, place], color=INK, lw=1.6, zorder=3)
+                    seeds = [*results.values(row, measure).values()]
+                    at = place + (np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1))
+                    (drawn["one seed"],) = axes.plot(seeds, at, "o", mew=0.9, ms=3.5, zorder=4, **_DOT)
+                if own and score == results.headline:
+                    diamond = axes.plot(own.value, place, "D", ms=5, zorder=5, **_DOT)
+                    drawn["in its own simulator"] = diamond[0]
             axes.set_yticks(range(len(rows)), labels)
             axes.tick_params(axis="y", length=0)
             axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -61,33 +73,13 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
             axes.set_xlabel(f"{score.quantity} {results.where}")
             axes.grid(visible=False, axis="y")
             axes.grid(visible=True, axis="x")
-            handles = [
-                Patch(fc=FAINT, ec="none", label="mean over seeds"),
-                Line2D([], [], color=INK, lw=1.6, label="95 % interval"),
-                Line2D([], [], marker="o", ls="", mfc="white", mec=INK, mew=0.9, ms=4.5, label="one seed"),
-            ]
-            if diamonds:
-                label = "in its own simulator"
-                handles.append(Line2D([], [], marker="D", ls="", mfc="white", mec=INK, ms=5, label=label))
-            figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
+            names = [*drawn]
+            figure.legend(
+                [*drawn.values()], names, loc="outside upper center", ncols=len(names), columnspacing=1.4
+            )
             return figure
 
     return draw
-
-
-def _bar(axes: Axes, place: int, row: str, results: Results, measure: str) -> None:
-    found = results.summary(row, measure)
-    if found is None:
-        return
-    color, hatch = method_color(row), "////" if is_plus(row) else None
-    axes.barh(place, found.mean, height=0.68, color=color, ec=(1, 1, 1, 0.4), hatch=hatch, lw=0, zorder=2)
-    if found.low is not None and found.high is not None:
-        axes.plot([found.low, found.high], [place, place], color=INK, lw=1.6, zorder=3)
-    seeds = [*results.values(row, measure).values()]
-    spread = np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1)
-    # Not clipped: the axis would cut what lies on 0 in half.
-    (dots,) = axes.plot(seeds, place + spread, "o", mfc="white", mec=INK, mew=0.9, ms=3.5, zorder=4)
-    dots.set_clip_on(False)
 
 
 def learning_curves(results: Results, _: Scene) -> Figure | None:
@@ -96,15 +88,12 @@ def learning_curves(results: Results, _: Scene) -> Figure | None:
     Each method has a panel; its variant with the plus settings is dashed. Methods with a seed without
     scores are left out.
     """
-    curves: dict[str, list[tuple[Floats, Floats]]] = {}
-    for one in results.trainings:
-        if one.percent == results.percents[-1] and one.row in results.rows:
-            curves.setdefault(one.row, []).append((np.array(one.steps), np.array(one.score)))
-    curves = {
-        row: curves[row]
-        for row in results.rows
-        if row in curves and all(np.isfinite(scores).any() for _, scores in curves[row])
-    }
+    curves = {}
+    for row in results.rows:
+        of = [one for one in results.trainings if (one.row, one.percent) == (row, results.largest)]
+        seeds = [(np.array(one.steps), np.array(one.score)) for one in of]
+        if seeds and all(np.isfinite(scores).any() for _, scores in seeds):
+            curves[row] = seeds
     if not curves:
         return None
     panels = list(dict.fromkeys(map(base_method, curves)))
@@ -122,10 +111,7 @@ def learning_curves(results: Results, _: Scene) -> Figure | None:
         for row, seeds in curves.items():
             axes = every[panels.index(base_method(row))]
             steps, scores = on_one_grid(seeds)
-            color = method_color(row)
-            if len(seeds) > 1:
-                axes.fill_between(steps, scores.min(0), scores.max(0), color=color, alpha=0.15, lw=0)
-            axes.plot(steps, scores.mean(axis=0), "--" if is_plus(row) else "-", color=color)
+            draw_band(axes, steps, scores.mean(axis=0), scores.min(0), scores.max(0), **look(row))
         score_axis(every[0], results.headline)
         every[0].set_xlim(0, max(float(steps[-1]) for seeds in curves.values() for steps, _ in seeds))
         every[0].xaxis.set_major_formatter(_steps_label)
@@ -173,12 +159,19 @@ def data_efficiency(results: Results, scene: Scene) -> Figure | None:
             shared = {"sharex": first, "sharey": first}
             others = [figure.add_subplot(grid[line, k], **shared) for k in range(1, len(percents))]
             _maps([first, *others], visits, label)
-            if line == 0:
-                for axes, percent in zip([first, *others], percents, strict=True):
-                    axes.set_title(f"{percent} %")
+            for axes, percent in zip([first, *others], percents if line == 0 else (), strict=False):
+                axes.set_title(f"{percent} %")
         axes = figure.add_subplot(grid[len(covered), :])
         for row in results.tested():
-            _band(axes, results, row)
+            every = {percent: results.score_of(row, TESTED, percent) for percent in percents}
+            known = {percent: one for percent, one in every.items() if one}
+            means = [one.value for one in known.values()]
+            ends = [(one.low, one.high) for one in known.values()]
+            low, high = zip(*(pair if None not in pair else (np.nan, np.nan) for pair in ends), strict=True)
+            draw_band(axes, [*known], means, low, high, marker="o", ms=4, **look(row))
+            for percent in known:
+                seeds = [*results.values(row, score.measure, TESTED, percent).values()]
+                axes.plot([percent] * len(seeds), seeds, ".", color=method_color(row), alpha=0.45, ms=4)
         axes.set_xticks(percents, [f"{percent} %" for percent in percents])
         axes.set_xlabel("size of the dataset")
         score_axis(axes, score)
@@ -190,16 +183,14 @@ def data_efficiency(results: Results, scene: Scene) -> Figure | None:
 
 def _covered(results: Results, scene: Scene) -> Mapping[str, list[Map]]:
     """Return the visits of each size of the first seed that has all of them; empty without one."""
+    roles = {"position (m)": "position", "velocity (m/s)": "vector"}
     for seed in results.seeds:
         folders = [scene.root / artifact_key("subset", "", seed, percent) for percent in results.percents]
         if all(folder.is_dir() for folder in folders):
-            break
-    else:
-        return {}
-    datasets = [Dataset.open(folder) for folder in folders]
-    roles = {"position (m)": "position", "velocity (m/s)": "vector"}
-    found = {label: [visited(dataset, role) for dataset in datasets] for label, role in roles.items()}
-    return {label: [one for one in of if one] for label, of in found.items() if all(of)}
+            datasets = [Dataset.open(folder) for folder in folders]
+            found = {label: [visited(dataset, role) for dataset in datasets] for label, role in roles.items()}
+            return {label: [one for one in of if one] for label, of in found.items() if all(of)}
+    return {}
 
 
 def _maps(panels: Sequence[Axes], visits: Sequence[Map], label: str) -> None:
@@ -212,18 +203,3 @@ def _maps(panels: Sequence[Axes], visits: Sequence[Map], label: str) -> None:
     panels[0].set_xlim(extents[:, 0].min(), extents[:, 1].max())
     panels[0].set_ylim(extents[:, 2].min(), extents[:, 3].max())
     panels[0].set_ylabel(label)
-
-
-def _band(axes: Axes, results: Results, row: str) -> None:
-    found = {percent: results.score_of(row, TESTED, percent) for percent in results.percents}
-    known = {percent: one for percent, one in found.items() if one}
-    color, percents = method_color(row), [*known]
-    if all(one.low is not None for one in known.values()):
-        low, high = ([getattr(one, end) for one in known.values()] for end in ("low", "high"))
-        axes.fill_between(percents, low, high, color=color, alpha=0.18, lw=0)
-    dashes = "--" if is_plus(row) else "-"
-    means = [one.mean for one in known.values()]
-    axes.plot(percents, means, dashes, color=color, marker="o", ms=4, label=method_title(row))
-    for percent in percents:
-        seeds = [*results.values(row, results.headline.measure, TESTED, percent).values()]
-        axes.plot([percent] * len(seeds), seeds, ".", color=color, alpha=0.45, ms=4, zorder=1)

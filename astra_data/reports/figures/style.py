@@ -1,10 +1,12 @@
-"""One style for all figures; each method has its color and title wherever it appears."""
+"""What all figures share: a style, each method's color and title, what they draw besides results."""
 
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,25 +16,21 @@ from matplotlib.image import AxesImage
 from matplotlib.style import context
 from PIL import Image
 
-from astra_data.core.arrays import Ints
-from astra_data.core.naming import base_method, is_plus
+from astra_data.core.arrays import Floats, Ints
+from astra_data.core.naming import artifact_key, base_method, is_plus
+from astra_data.reports.artifacts import TRAJECTORIES
 
-if TYPE_CHECKING:
-    from astra_data.worlds.objective import Score  # loads torch, which a dataset's figures can do without
+if TYPE_CHECKING:  # these load torch, which a dataset's figures can do without
+    from astra_data.reports.results import Results
+    from astra_data.worlds.objective import Score
+    from astra_data.worlds.task import Task
 
 SPARE_COLORS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
 """For methods without a color of their own. The others are Okabe and Ito's palette and shades that
 color-blind readers can tell from it."""
-
-SIMULATED = "#E07B00"
-"""A simulator, in every figure (as in the paper's Fig. 3)."""
-
-DEPLOYED = "#0060A8"
-"""The target environment, likewise."""
-
-INK = "#2B2B2B"
-FAINT = "#8A8A8A"
-WALL = "#D9D9D6"
+SIMULATED, DEPLOYED = "#E07B00", "#0060A8"
+"""A simulator and the target environment, in every figure (as in the paper's Fig. 3)."""
+INK, FAINT, WALL = "#2B2B2B", "#8A8A8A", "#D9D9D6"
 
 _RC = {
     "font.family": "DejaVu Sans",
@@ -66,6 +64,31 @@ _RC = {
 }
 
 
+@dataclass(frozen=True)
+class Scene:
+    """What figures are drawn from besides the results.
+
+    Attributes:
+        root: the recipe's folder of runs. task: the recipe's.
+        methods: whose trajectories are drawn; all methods if none of these is in the results.
+        episodes: how many of each.
+    """
+
+    root: Path
+    task: "Task"
+    methods: tuple[str, ...] = ()
+    episodes: int = 12
+
+    def folders(self, results: "Results") -> dict[str, Path]:
+        """Return method → evaluation of its first seed with trajectories; empty if any method has none."""
+        rows = [row for row in self.methods if row in results.tested()] or results.tested()
+        found = {}
+        for row in rows:
+            folders = (self.root / artifact_key("evaluate", row, seed) for seed in results.seeds)
+            found[row] = next((folder for folder in folders if (folder / TRAJECTORIES).exists()), None)
+        return {row: folder for row, folder in found.items() if folder and None not in found.values()}
+
+
 @contextmanager
 def style() -> Iterator[None]:
     """Draw in the figures' style, whatever the caller's matplotlib settings are."""
@@ -91,6 +114,17 @@ def method_title(method: str) -> str:
     from astra_data import methods
 
     return methods.method_title(method)
+
+
+def look(row: str) -> dict[str, Any]:
+    """Return color, dashes and label of a method's lines."""
+    return {"color": method_color(row), "ls": "--" if is_plus(row) else "-", "label": method_title(row)}
+
+
+def draw_band(axes: Axes, at: Floats, mean: Floats, low: Floats, high: Floats, **look: Any) -> None:  # noqa: ANN401
+    """Draw a line over a band between `low` and `high`; all are of the same shape (K,)."""
+    axes.fill_between(at, low, high, color=look["color"], alpha=0.15, lw=0)
+    axes.plot(at, mean, **look)
 
 
 def score_axis(axes: Axes, score: "Score") -> None:

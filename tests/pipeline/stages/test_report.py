@@ -188,7 +188,7 @@ def test_publishing_adds_to_what_is_there(
     assert "new results replace those of astra seed 2 (success 0.75, now 0)" in caplog.text
     assert read_results(file).values("astra_plus", "success") == {0: 1.0, 1: 0.75}
     (tmp_path / "broken.json").write_text("{}")
-    with pytest.raises(BadInputError, match=r"broken.json does not hold results in the current format"):
+    with pytest.raises(BadInputError, match=r"broken.json is not what the report writes"):
         make(root, published=(tmp_path / "broken.json",))
 
 

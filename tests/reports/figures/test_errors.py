@@ -4,8 +4,7 @@ import numpy as np
 from figures_shown import legend
 
 from astra_data.reports.figures.errors import open_loop_error, predictive_validity, reliability
-from astra_data.reports.figures.scene import Scene
-from astra_data.reports.figures.style import method_color, png
+from astra_data.reports.figures.style import Scene, method_color, png
 from astra_data.reports.results import TESTED, Errors, Line, Results
 from astra_data.robots.registry import TASKS
 

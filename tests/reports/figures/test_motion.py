@@ -22,8 +22,7 @@ from astra_data.reports.figures.motion import (
     strips,
     trajectories,
 )
-from astra_data.reports.figures.scene import Scene
-from astra_data.reports.figures.style import DEPLOYED, SIMULATED
+from astra_data.reports.figures.style import DEPLOYED, SIMULATED, Scene
 from astra_data.reports.results import TESTED, Line, Results
 from astra_data.robots.nao.target import NaoEnv
 from astra_data.robots.registry import TASKS

@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from astra_data.methods import METHODS
-from astra_data.reports.figures.scene import Scene
 from astra_data.reports.figures.scores import score_bars
-from astra_data.reports.figures.style import coverage, method_color, method_title, png, style
+from astra_data.reports.figures.style import Scene, coverage, method_color, method_title, png, style
 from astra_data.reports.results import TESTED, Line, Results
 from astra_data.robots.registry import TASKS
 
