@@ -70,6 +70,11 @@ def finished_folder(
         DiskError: it cannot be written.
     """
     partial, old = (out.parent / f".{out.name}.{state}" for state in ("partial", "old"))
+    settings = partial / _SETTINGS
+
+    def is_begun() -> bool:
+        return any(path != settings for path in partial.iterdir())
+
     with writing(out), ExitStack() as stack:
         made = make_folder(partial)
         if not stack.enter_context(held(partial)):
@@ -79,18 +84,22 @@ def finished_folder(
             if old.exists() and not out.exists():  # a kill came between the two renames below
                 move(old, out)
             if replace:
-                _empty(partial)
+                for path in partial.iterdir():
+                    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
                 if old.exists():
                     discard(old, out)
             else:
                 refuse_finished(out)
             clean(partial)
-            if config is not None:
-                _begin(partial, config)
+            if config is not None and not is_begun():
+                write_file(settings, config)
+            elif config is not None and not (settings.is_file() and settings.read_text() == config):
+                said = "was started with other settings (see its config.json if it has one)"
+                raise BadInputError(f"{partial} {said}: remove it")
             yield partial
         except BaseException:
             with suppress(OSError):
-                if {path.name for path in partial.iterdir()} <= {_SETTINGS}:
+                if not is_begun():
                     discard(partial, out)
                     remove_empty(made)
             raise
@@ -100,51 +109,21 @@ def finished_folder(
             write_manifest(partial, made_from)
         clean(partial)
         sync_tree(partial)
-        _put(partial, out, old)
-
-
-def _empty(folder: Path) -> None:
-    """Remove all that `folder` holds."""
-    for path in folder.iterdir():
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-
-
-def _put(partial: Path, out: Path, old: Path) -> None:
-    """Rename `partial` to `out`; an older `out` is `old` in between, and comes back after an error."""
-    if out.exists():
-        move(out, old)
-    try:
-        move(partial, out)
-    finally:
-        with suppress(OSError):
-            if out.exists():
-                discard(old, out)
-            else:
-                os.replace(old, out)
-
-
-def _begin(partial: Path, config: str) -> None:
-    """Write the settings to `partial`, unless it was begun with them."""
-    settings = partial / _SETTINGS
-    if {path.name for path in partial.iterdir()} <= {_SETTINGS}:
-        write_file(settings, config)
-    elif not (settings.is_file() and settings.read_text() == config):
-        raise BadInputError(
-            f"{partial} was started with other settings (see its config.json if it has one): remove it"
-        )
+        if out.exists():
+            move(out, old)
+        try:
+            move(partial, out)
+        finally:
+            with suppress(OSError):
+                if out.exists():
+                    discard(old, out)
+                else:
+                    os.replace(old, out)
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a finished artifact consists of.
-
-    Attributes:
-        files: path inside the folder → its size in bytes and its sha256.
-        made_from: what the artifact was made from → the digest of that.
-    """
+    """What an artifact consists of: path → size in bytes and sha256; what it was made from → digest."""
 
     files: Mapping[str, tuple[int, str]]
     made_from: Mapping[str, str]

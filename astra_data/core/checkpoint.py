@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from astra_data.core.artifact import check_intact
 from astra_data.core.durable import write_file
 from astra_data.core.errors import BadInputError
+from astra_data.core.naming import first_few
 from astra_data.core.progress import Alarm, Stopwatch
 
 type Nested = (
@@ -67,8 +68,8 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def save_state(checkpoint: Path, state: Nested, metadata: Mapping[str, Any]) -> None:
     """Write the state of a training and `metadata` (JSON values) to `checkpoint`, for `resumed`."""
     tensors: dict[str, Tensor] = {}
-    apart = _taken_apart(state, tensors)
-    save_tensors(checkpoint, tensors, {**metadata, "state": apart})
+    plain = _to_json(state, tensors)
+    save_tensors(checkpoint, tensors, {**metadata, "state": plain})
 
 
 @contextmanager
@@ -79,7 +80,7 @@ def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]
     except BadInputError as error:
         raise BadInputError(f"{error}: remove {checkpoint.parent}") from None
     try:
-        yield _put_together(metadata["state"], tensors), metadata
+        yield _from_json(metadata["state"], tensors), metadata
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise BadInputError(
             f"{checkpoint}: expected a checkpoint of this version, found something else ({error}): "
@@ -93,11 +94,7 @@ def understood(
 ) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
     """Yield the tensors (on `device`) and the metadata of `path`, from which the block builds `what`.
 
-    Args:
-        path: written by `save_tensors`.
-        what: for messages, such as "a policy".
-        kinds: accepted values of the metadata's "kind".
-        device: torch device.
+    The metadata's "kind" is one of `kinds`.
     """
     tensors, metadata = load_tensors(path)
     kind = metadata.get("kind")
@@ -106,10 +103,16 @@ def understood(
         raise BadInputError(
             f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again"
         )
-    if not_finite := [name for name, tensor in tensors.items() if not _is_usable(name, tensor)]:
+    # An infinite deviation is how networks leave out a part of their input.
+    not_finite = [
+        name
+        for name, tensor in tensors.items()
+        if (tensor.isnan() if name.endswith("_std") else ~tensor.isfinite()).any()
+    ]
+    if not_finite:
         raise BadInputError(
-            f"{path}: expected finite weights, found NaN or infinity in {', '.join(not_finite[:3])}"
-            f"{', …' if len(not_finite) > 3 else ''}: run that stage again"
+            f"{path}: expected finite weights, found NaN or infinity in {first_few(not_finite, 3)}: "
+            "run that stage again"
         )
     moved = {name: tensor.to(device) for name, tensor in tensors.items()}
     try:
@@ -138,13 +141,8 @@ def loaded[Module: nn.Module](model: Module, weights: Mapping[str, Tensor], devi
     return model.to(device).requires_grad_(False).eval()
 
 
-def _is_usable(name: str, tensor: Tensor) -> bool:
-    # An infinite deviation is how networks leave out a part of their input.
-    return not (tensor.isnan() if name.endswith("_std") else ~tensor.isfinite()).any()
-
-
-def _taken_apart(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 - a JSON value
-    """Add the tensors of a training state to `tensors`; return all else as JSON, for `_put_together`."""
+def _to_json(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 - a JSON value
+    """Add the tensors of a training state to `tensors`; return all else as a JSON value."""
     match value:
         case Tensor():
             name = str(len(tensors))
@@ -153,45 +151,35 @@ def _taken_apart(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN
         case None | bool() | int() | float():
             return value
         case list():
-            return [_taken_apart(item, tensors) for item in value]
+            return [_to_json(item, tensors) for item in value]
         case tuple():
-            return {"tuple": [_taken_apart(item, tensors) for item in value]}
+            return {"tuple": [_to_json(item, tensors) for item in value]}
         case Mapping() if all(isinstance(key, str | int) for key in value):
-            return {"items": [[key, _taken_apart(item, tensors)] for key, item in value.items()]}
+            return {"items": [[key, _to_json(item, tensors)] for key, item in value.items()]}
     raise BadInputError(
         f"expected tensors, numbers, and containers of them by str or int, got {type(value).__name__}"
     )
 
 
-def _put_together(state: Any, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - a training state
-    """Return the training state that `_taken_apart` was given."""
+def _from_json(state: Any, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - a training state
+    """Return the training state that `_to_json` was given."""
     match state:
         case {"tensor": name}:
             return tensors[name]
         case {"tuple": items}:
-            return tuple(_put_together(item, tensors) for item in items)
+            return tuple(_from_json(item, tensors) for item in items)
         case {"items": items}:
-            return {key: _put_together(item, tensors) for key, item in items}
+            return {key: _from_json(item, tensors) for key, item in items}
         case list():
-            return [_put_together(item, tensors) for item in state]
+            return [_from_json(item, tensors) for item in state]
     return state
 
 
 class Logbook:
-    """The log of a training run that can be interrupted.
-
-    Attributes:
-        points: measurements, of JSON values.
-        stopwatch: measures from the start, including the time before an interruption.
-    """
+    """The log of a training run that can be interrupted: its `points` (JSON values) and `stopwatch`."""
 
     def __init__(self, checkpoint: Path | None, go_on: Callable[[dict[str, Any]], object]) -> None:
-        """Start, or resume from `checkpoint` if it exists.
-
-        Args:
-            checkpoint: the file that `keep` writes; None to write none.
-            go_on: restores a state that was passed to `keep`.
-        """
+        """Start, or resume: `go_on` restores the state that `keep` wrote to `checkpoint`, if that exists."""
         self._checkpoint = checkpoint
         self.points, spent = list[dict[str, Any]](), None
         if checkpoint and checkpoint.exists():

@@ -91,11 +91,7 @@ def in_full(settings: object) -> Any:  # noqa: ANN401 - as json takes them
 
 
 def load_recipe[M: BaseModel](path: Path, model: type[M]) -> M:
-    """Read the recipe at `path` into `model`; TOML arrays become tuples.
-
-    Raises:
-        RecipeError: the file is missing or not TOML, or `model` refuses it; one message holds every fault.
-    """
+    """Read the recipe at `path` into `model`; a RecipeError holds all faults. TOML arrays become tuples."""
     return validated(load_tables(path), model, str(path))
 
 
@@ -118,7 +114,10 @@ def load_tables(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise RecipeError(_syntax_fault(path, text, str(error))) from None
+        place = re.search(r" \(at line (\d+).*\)$| \(at end of document\)$", str(error))
+        line = place[1] if place and place[1] else text.count("\n") + 1
+        fault = str(error)[: place.start()] if place else error
+        raise RecipeError(f"{path}, line {line}: not valid TOML: {fault}") from None
     except ValueError as error:  # a number of more digits than Python takes
         raise RecipeError(f"{path} cannot be read as TOML: {error}") from None
     except RecursionError:
@@ -179,10 +178,7 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
         return message
     key = ".".join(str(part) for part in location if not _is_choice(part))
     if kind == "extra_forbidden":
-        hint = _choice_hint(location, model) or _key_hint(
-            str(location[-1]), _section(model, location[:-1]), model
-        )
-        return f"{key}: unknown key{hint}"
+        return f"{key}: unknown key{_key_hint(location, model)}"
     if kind == "union_tag_invalid":
         context = error["ctx"]
         known, got = (context[name].replace("<", "").replace(">", "") for name in ("expected_tags", "tag"))
@@ -198,30 +194,27 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
     expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
     if expected == message:
         return f"{key}: {message[0].lower()}{message[1:]}"
-    return f"{key}: expected {expected}, got {_shown(error['input'])}"
+    given = list(error["input"]) if isinstance(error["input"], tuple) else error["input"]
+    return f"{key}: expected {expected}, got {shortened(repr(given), 60)}"
 
 
-def _choice_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
-    """Return a clause that names another alternative of the table which has the key at `location`, if any."""
-    if len(location) < 2 or not _is_choice(location[-2]):
-        return ""
-    parent = _section(model, location[:-3])
-    field = parent.model_fields.get(str(location[-3])) if parent else None
-    for name, other in _nested_models(field.annotation if field else None).items():
-        if location[-1] in other.model_fields:
-            return f": '{name.strip('<>')}' has it, not '{str(location[-2]).strip('<>')}'"
-    return ""
-
-
-def _key_hint(key: str, section: type[BaseModel] | None, model: type[BaseModel]) -> str:
-    fields = list(section.model_fields) if section else []
+def _key_hint(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    """Return a clause on where an unknown key belongs, or which known one is like it."""
+    key, section = str(location[-1]), _section(model, location[:-1])
+    if len(location) > 2 and _is_choice(location[-2]):  # another alternative of the table may have it
+        parent = _section(model, location[:-3])
+        field = parent.model_fields.get(str(location[-3])) if parent else None
+        for name, other in _nested_models(field.annotation if field else None).items():
+            if key in other.model_fields:
+                return f": '{name.strip('<>')}' has it, not '{str(location[-2]).strip('<>')}'"
     if section is not model and key in model.model_fields:
         return f": '{key}' belongs to no table: move it above the first [table]"
-    if get_close_matches(key, fields):
-        return did_you_mean(key, fields)
+    fields = list(section.model_fields) if section else []
     elsewhere = {dotted.rpartition(".")[2]: dotted for dotted in _dotted_keys(model)}
     close = get_close_matches(key, elsewhere, n=1, cutoff=0.8)
-    return f": did you mean '{elsewhere[close[0]]}'?" if close else did_you_mean(key, fields)
+    if close and not get_close_matches(key, fields):
+        return f": did you mean '{elsewhere[close[0]]}'?"
+    return did_you_mean(key, fields)
 
 
 def _section(model: type[BaseModel], location: Iterable[int | str]) -> type[BaseModel] | None:
@@ -257,19 +250,9 @@ def _dotted_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
             yield from _dotted_keys(nested, f"{prefix}{name}.")
 
 
-def _syntax_fault(path: Path, text: str, message: str) -> str:
-    place = re.search(r" \(at line (\d+).*\)$| \(at end of document\)$", message)
-    line = place[1] if place and place[1] else text.count("\n") + 1
-    return f"{path}, line {line}: not valid TOML: {message[: place.start()] if place else message}"
-
-
 def _with_tuples(value: object) -> object:
     if isinstance(value, dict):
         return {key: _with_tuples(item) for key, item in value.items()}
     if isinstance(value, list):
         return tuple(_with_tuples(item) for item in value)
     return value
-
-
-def _shown(value: object) -> str:
-    return shortened(repr(list(value) if isinstance(value, tuple) else value), 60)

@@ -26,25 +26,15 @@ _HIDDEN = re.compile(r"\..+\.tmp-\d+(-\d+)?")
 _RESUMABLE = re.compile(r"\..+\.(staged|partial|pull-\d+\.\d+\.\d+)")
 """Names of folders with which a command goes on."""
 
-_PERMISSIONS = ("permission is denied", "change the permissions or choose another folder")
-_IN_THE_WAY = ("a file is where its folder would be", "choose another folder")
-_GONE = ("the disk is gone", "connect it again")
 _OF_THE_DISK = {
-    errno.ENOSPC: ("the disk is full", "free space"),
-    errno.EDQUOT: ("the quota is exceeded", "free space"),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), ("the disk is full", "free space")),
     errno.EFBIG: ("a file would be larger than is allowed", "raise the limit (ulimit -f)"),
     errno.EROFS: ("the disk is read-only", "make it writable or choose another folder"),
-    errno.EIO: ("the disk reports an error", "check it"),
-    **dict.fromkeys((errno.ENODEV, errno.ENXIO, errno.ESTALE), _GONE),
+    **dict.fromkeys(
+        (errno.EIO, errno.ENODEV, errno.ENXIO, errno.ESTALE), ("the disk failed", "check that it is there")
+    ),
 }
 """Faults that are the disk's whatever was written: why, and what to do."""
-_OF_THE_PLACE = {
-    **dict.fromkeys((errno.EACCES, errno.EPERM), _PERMISSIONS),
-    **dict.fromkeys((errno.ENOTDIR, errno.EEXIST), _IN_THE_WAY),
-    errno.ENOENT: ("its folder is gone", "check that its disk is there"),
-    errno.EISDIR: ("a folder has its name", "choose another name"),
-    errno.ENAMETOOLONG: ("its name is too long", "choose a shorter one"),
-}
 
 
 @contextmanager
@@ -70,8 +60,7 @@ def disk_error(error: Exception) -> DiskError | None:
 
 
 def _report(fault: str, code: int) -> str:
-    known = _OF_THE_DISK | _OF_THE_PLACE
-    why, advice = known.get(code, (os.strerror(code).lower(), "choose another place"))
+    why, advice = _OF_THE_DISK.get(code, (os.strerror(code).lower(), "choose another place"))
     return f"{fault}: {why}. What was finished before is safe: {advice}, then run the same command again."
 
 
@@ -132,9 +121,9 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def sync_tree(folder: Path) -> None:
-    """Flush `folder` and everything in it to the disk."""
-    for path in (*folder.rglob("*"), folder):
+def sync_tree(root: Path) -> None:
+    """Flush a file, or a folder and everything in it, to the disk."""
+    for path in (*root.rglob("*"), root):
         if path.is_file() or path.is_dir():
             sync(path)
 
@@ -226,25 +215,20 @@ def atomic_file(target: Path) -> Iterator[Path]:
     """Yield the path of a file in a hidden folder, which is renamed to `target` as `atomic_folder` does."""
     refuse_existing(target)
     with hidden_folder(target) as folder:
-        path = folder / target.name
-        yield path
-        sync(path)
-        refuse_existing(target)
-        move(path, target)
+        yield folder / target.name
+        publish(folder / target.name, target)
 
 
-def publish(folder: Path, target: Path) -> None:
-    """Rename the finished `folder` to `target` beside it, unless that exists, once it is on the disk."""
+def publish(finished: Path, target: Path) -> None:
+    """Rename a finished file or folder to `target` beside it, unless that exists, once it is on the disk."""
     with writing(target):
-        sync_tree(folder)
+        sync_tree(finished)
         refuse_existing(target)
         try:
-            os.replace(folder, target)
+            move(finished, target)
         except OSError:
-            # Another process may have created it in between.
-            refuse_existing(target)
+            refuse_existing(target)  # another process may have created it in between
             raise
-        sync(target.parent)
 
 
 def refuse_existing(target: Path) -> None:
@@ -318,9 +302,8 @@ def _locked_folder(target: Path) -> Iterator[Path]:
         try:
             folder.mkdir(parents=True)  # another process may have removed a folder that it had made
         except FileExistsError:
-            raise BadInputError(
-                f"{target} is being written right now; wait or choose another folder."
-            ) from None
+            message = f"{target} is being written right now; wait or choose another folder."
+            raise BadInputError(message) from None
         with ExitStack() as stack:
             # Between mkdir and lock another process's sweep may have locked or removed the folder.
             try:

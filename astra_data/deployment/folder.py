@@ -74,28 +74,25 @@ _POSITIONS = {"m", "cm", "mm", "rad", "deg", "°"}
 
 def page(about: Mapping[str, Any]) -> str:
     """Return the page, in Markdown, of a policy with the description `about`."""
+    state, goal, command = (about[name] for name in ("state", "goal", "command"))
+    # A command that tells a position has no value that stops the robot.
+    is_position = _POSITIONS.intersection(command.get("units", ()))
     return _PAGE.format(
         **{key: about[key] for key in ("task", "row", "seed", "rate_hz")},
         minute=round(60 * about["rate_hz"]),
-        stop=_stop(about["command"]),
-        state_names=about["state"]["names"],
-        goal_names=about["goal"]["names"],
-        state=_table(about["state"]),
-        goal=_table(about["goal"]) if about["goal"]["names"] else "None: all episodes have the same.",
-        command=_table(about["command"]),
-        states=len(about["state"]["names"]),
-        goals=len(about["goal"]["names"]),
-        commands=len(about["command"]["names"]),
+        stop=None if is_position else [0.0] * len(command["names"]),
+        state_names=state["names"],
+        goal_names=goal["names"],
+        state=_table(state),
+        goal=_table(goal) if goal["names"] else "None: all episodes have the same.",
+        command=_table(command),
+        states=len(state["names"]),
+        goals=len(goal["names"]),
+        commands=len(command["names"]),
         hidden=about["hidden"]["size"],
         dataset=about["trained_on"]["dataset"],
         hash=about["trained_on"]["hash"],
     )
-
-
-def _stop(command: Mapping[str, Any]) -> list[float] | None:
-    """Return the command that stops the robot: None where the units of any tell a position."""
-    is_position = _POSITIONS.intersection(command.get("units", ()))
-    return None if is_position else [0.0] * len(command["names"])
 
 
 def _table(values: Mapping[str, Any]) -> str:
@@ -103,12 +100,11 @@ def _table(values: Mapping[str, Any]) -> str:
     lists = {key: entries for key, entries in values.items() if not isinstance(entries, str)}
     one = {"names": "name", "units": "unit", "frames": "frame"}
     titles = [one.get(key, key.replace("_", " ")) for key in lists]
-    rows = (map(_text, row) for row in zip(*lists.values(), strict=True))
+    rows = [
+        [f"{value:.4g}" if isinstance(value, float) else str(value) for value in row]
+        for row in zip(*lists.values(), strict=True)
+    ]
     return table(titles, rows, words=len(titles))
-
-
-def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 DESCRIPTION, LOOP, PAGE = "policy.json", "run_policy.py", "README.md"
@@ -135,15 +131,15 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
     deployed = trained.running()
     digests = {stage: file_digest(path) for stage, path in trained.files.items()}
     with atomic_folder(out) as folder:
-        written = write_graph(deployed, folder)
+        parts, apart = write_graph(deployed, folder)
         about = {
             "format": FORMAT,
             "row": row,
             "seed": seed,
             **({} if percent is None else {"percent": percent}),
             "trained_on": {"dataset": trained.file.dataset, "hash": trained.file.content_hash},
-            **describe(deployed, written.parts, trained.recorded()),
-            "largest_difference": written.apart,
+            **describe(deployed, parts, trained.recorded()),
+            "largest_difference": apart,
             "made_from": digests | file_of(trained.settings["task"]),
             **origin(),
         }
@@ -161,15 +157,12 @@ def describe(
     parts: Mapping[str, int],
     recorded: tuple[Sequence[float], Sequence[float]] | None = None,
 ) -> dict[str, Any]:
-    """Return what one has to know to run a policy.
+    """Return what one has to know to run a policy whose hidden state has `parts` of these sizes.
 
-    Args:
-        deployed: the policy.
-        parts: the sizes of the parts of its hidden state.
-        recorded: least and largest of each value of the state in the data it was learned from, if known.
+    `recorded` are least and largest of each value of the state in the data it was learned from, if known.
     """
     task = deployed.task
-    encoder = "target" if deployed.target_encoder is not None else "source"
+    encoders = {"target": deployed.target_encoder, "source": deployed.source_encoder}
     least, largest = zip(*task.limits.values(), strict=True)
     ranges = {"recorded_least": recorded[0], "recorded_largest": recorded[1]} if recorded else {}
     return {
@@ -183,7 +176,7 @@ def describe(
         "goal": _values(task.goal, "goal") if task.goal else {"names": []},
         "command": _values(task.action, "command") | {"least": least, "largest": largest},
         "hidden": {"size": sum(parts.values()), "start": 0.0, "parts": dict(parts)},
-        "encoder": encoder if deployed.source_encoder is not None else None,
+        "encoder": next((name for name, encoder in encoders.items() if encoder is not None), None),
         "observed": deployed.observed,
         "command_limit": deployed.command_limit if task.plane else None,
     }

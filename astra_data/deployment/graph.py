@@ -1,11 +1,10 @@
 """A policy with its encoder and memory as one ONNX graph, without state."""
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,8 +29,7 @@ Graph = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 class PolicyGraph(nn.Module):
     """One step of a policy on one robot: its hidden state is an argument and a result, zeros at the start.
 
-    Attributes:
-        parts: the parts of the hidden state, (1, H), one after the other: each with its size.
+    `parts` are the sizes of the parts of the hidden state, (1, H), one after the other.
     """
 
     def __init__(self, deployed: RunningPolicy) -> None:
@@ -61,20 +59,11 @@ class PolicyGraph(nn.Module):
         return command, torch.cat(robot.memory, dim=-1)
 
 
-class Written(NamedTuple):
-    """What was written.
-
-    Attributes:
-        parts: the parts of the hidden state, with their sizes.
-        apart: the largest difference from the policy's commands, in half ranges of these.
-    """
-
-    parts: dict[str, int]
-    apart: float
-
-
-def write_graph(deployed: RunningPolicy, folder: Path) -> Written:
+def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], float]:
     """Write the policy as ONNX into `folder`, and compare the file with it.
+
+    Returns:
+        the sizes of the parts of the hidden state, and the largest difference of commands, in half ranges.
 
     Raises:
         BadInputError: code of the task cannot be traced, or the graph gives other commands than the policy.
@@ -86,22 +75,18 @@ def write_graph(deployed: RunningPolicy, folder: Path) -> Written:
             "its own library, or act with astra_data.load_policy"
         )
     graph = PolicyGraph(deployed).eval()
-    example = graph.example
-    with _quiet():
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # of torch's exporters, about torch's own code
         try:
-            model = _onnx(graph, example, input_names=INPUTS, output_names=OUTPUTS)
+            model = _onnx(graph, graph.example, input_names=INPUTS, output_names=OUTPUTS)
         except Exception as error:
             raise _not_traceable(deployed, error) from error
         (folder / ONNX).write_bytes(model.SerializeToString(deterministic=True))
-    return Written(graph.parts, _apart(graph, load_onnx(folder / ONNX), ONNX))
+    return graph.parts, _apart(graph, load_onnx(folder / ONNX), ONNX)
 
 
 def load_onnx(path: Path) -> Graph:
-    """Return the graph of an ONNX file, run on one core.
-
-    Raises:
-        BadInputError: onnxruntime is not installed.
-    """
+    """Return the graph of an ONNX file, run on one core."""
     runtime = optional("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -113,14 +98,6 @@ def load_onnx(path: Path) -> Graph:
         return torch.from_numpy(command), torch.from_numpy(hidden)
 
     return run
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Hide the warnings of torch's exporters about torch's own code."""
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def _onnx(module: nn.Module, example: tuple[Tensor, ...], **names: Sequence[str]) -> Any:  # noqa: ANN401
@@ -135,31 +112,29 @@ def _onnx(module: nn.Module, example: tuple[Tensor, ...], **names: Sequence[str]
     return model
 
 
-def _hypot(x: Tensor, y: Tensor) -> Tensor:
-    return (x.square() + y.square()).sqrt()
-
-
-_DECOMPOSED: dict[Any, Callable[..., Any]] = {torch.ops.aten.hypot.default: _hypot}
+_DECOMPOSED: dict[Any, Callable[..., Any]] = {
+    torch.ops.aten.hypot.default: lambda x, y: (x.square() + y.square()).sqrt()
+}
 """Operations that ONNX has not."""
 
 
 def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
     """Return the error that names the task's function which cannot be traced."""
     task, (state, goal, _) = deployed.task, PolicyGraph(deployed).example
-    action = torch.zeros(1, task.objective.action_size)
-    functions: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        "abstraction": (task.abstraction, (state,)),
-        "objective.observe": (task.objective.observe, (torch.zeros(1, task.abstract_state.size), goal)),
-        "beyond": (task.beyond, (state,)),
-        "objective.limit_command": (
-            lambda given: task.objective.limit_command(given, deployed.command_limit),
-            (action,),
+    objective = task.objective
+    given = torch.zeros(1, objective.action_size), torch.zeros(1, task.abstract_state.size)
+    functions: dict[str, Callable[[], Any]] = {
+        "abstraction": lambda: _onnx(_Call(task.abstraction), (state,)),
+        "objective.observe": lambda: _onnx(_Call(objective.observe), (given[1], goal)),
+        "beyond": lambda: _onnx(_Call(task.beyond), (state,)),
+        "objective.limit_command": lambda: _onnx(
+            _Call(lambda action: objective.limit_command(action, deployed.command_limit)), (given[0],)
         ),
     }
     name, cause = "the policy", error
-    for candidate, (function, given) in functions.items():
+    for candidate, trace in functions.items():
         try:
-            _onnx(_Call(function), given)
+            trace()
         except Exception as found:  # noqa: BLE001 - it is the user's code
             name, cause = candidate, found
             break

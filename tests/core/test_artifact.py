@@ -12,7 +12,6 @@ from failing_disk import failing
 from astra_data.core.artifact import (
     CHECKPOINT,
     MANIFEST,
-    Manifest,
     finished_folder,
     read_manifest,
     write_manifest,
@@ -21,24 +20,16 @@ from astra_data.core.checkpoint import save_tensors
 from astra_data.core.errors import BadInputError, DiskError
 
 
-def test_a_folder_appears_when_it_is_finished(tmp_path: Path) -> None:
-    out = tmp_path / "train" / "seed_0"
-    with finished_folder(out) as folder:
-        (folder / "a").touch()
-        assert not out.exists()
-        assert folder == tmp_path / "train" / ".seed_0.partial"
-    assert [path.name for path in out.iterdir()] == ["a"]
-    assert not folder.exists()
-
-
 def test_a_finished_folder_says_what_it_was_made_from_and_has_no_checkpoints(tmp_path: Path) -> None:
-    with finished_folder(tmp_path / "out", made_from={"dataset": "d1", "initial": None}) as folder:
+    out = tmp_path / "train/out"
+    with finished_folder(out, made_from={"dataset": "d1", "initial": None}) as folder:
         for name in ("weights", CHECKPOINT, f"adaptation_{CHECKPOINT}"):
             (folder / name).touch()
-    manifest = read_manifest(tmp_path / "out")
+        assert folder == tmp_path / "train/.out.partial" and not out.exists() and not read_manifest(folder)
+    manifest = read_manifest(out)
     assert manifest is not None and manifest.made_from == {"dataset": "d1"}
-    assert manifest.files.keys() == {"weights"}
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"weights", MANIFEST}
+    assert manifest.files.keys() == {"weights"} and not folder.exists()
+    assert {path.name for path in out.iterdir()} == {"weights", MANIFEST}
 
 
 def test_a_folder_begun_with_another_config_is_refused(tmp_path: Path) -> None:
@@ -81,28 +72,21 @@ def test_what_another_is_making_is_left_to_it(tmp_path: Path, replace: bool) -> 
     assert sorted(path.name for path in out.iterdir()) == ["config.json", "model"]
 
 
-def test_a_finished_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
+def test_a_finished_folder_is_replaced_only_on_request_and_after_success(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").touch()
     with pytest.raises(BadInputError, match="already finished"), finished_folder(tmp_path / "out"):
         pass
+    with pytest.raises(KeyboardInterrupt), finished_folder(tmp_path / "out", replace=True) as folder:
+        (folder / "half").touch()
+        raise KeyboardInterrupt
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["old"]
     with finished_folder(tmp_path / "out", replace=True) as folder:
         (folder / "new").touch()
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
         "out",
         "out/new",
     ]
-
-
-def test_a_failed_replacement_leaves_the_old_folder_and_is_not_gone_on_with(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "old").touch()
-    with pytest.raises(KeyboardInterrupt), finished_folder(tmp_path / "out", replace=True) as folder:
-        (folder / "half").touch()
-        raise KeyboardInterrupt
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["old"]
-    with finished_folder(tmp_path / "out", replace=True) as folder:
-        assert not list(folder.iterdir())
 
 
 @pytest.mark.parametrize("renames", [0, 1, 2])
@@ -183,47 +167,30 @@ def test_the_disk_has_what_a_folder_holds_before_its_name(tmp_path: Path, disk_o
     assert sorted(before) == ["fsync .out.partial", "fsync model"]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def test_a_manifest_holds_sizes_and_sums_by_which_damage_is_found(tmp_path: Path) -> None:
     (tmp_path / "plots").mkdir()
     (tmp_path / "weights").write_bytes(b"abc")
     (tmp_path / "plots/one.png").write_bytes(b"")
     write_manifest(tmp_path, {"dataset": "d1", "grounding": None})
-    return tmp_path
-
-
-def read(folder: Path) -> Manifest:
-    manifest = read_manifest(folder)
-    assert manifest is not None
-    return manifest
-
-
-def test_a_manifest_holds_sizes_sums_and_what_was_read(folder: Path) -> None:
-    assert json.loads((folder / MANIFEST).read_text()) == {
+    assert json.loads((tmp_path / MANIFEST).read_text()) == {
         "files": {
             "plots/one.png": {"bytes": 0, "sha256": hashlib.sha256(b"").hexdigest()},
             "weights": {"bytes": 3, "sha256": hashlib.sha256(b"abc").hexdigest()},
         },
         "made_from": {"dataset": "d1"},
     }
-    assert read(folder).faults(folder, verify=True) == read(folder).foreign(folder) == []
-
-
-def test_damage_is_found(folder: Path) -> None:
-    manifest = read(folder)
-    (folder / "weights").write_bytes(b"abd")
-    assert manifest.faults(folder, verify=False) == []
-    assert manifest.faults(folder, verify=True) == ["weights was altered"]
-    (folder / "weights").write_bytes(b"")
-    (folder / "plots/one.png").unlink()
+    manifest = read_manifest(tmp_path)
+    assert manifest is not None
+    assert manifest.faults(tmp_path, verify=True) == manifest.foreign(tmp_path) == []
+    (tmp_path / "weights").write_bytes(b"abd")
+    assert manifest.faults(tmp_path, verify=False) == []
+    assert manifest.faults(tmp_path, verify=True) == ["weights was altered"]
+    (tmp_path / "weights").write_bytes(b"")
+    (tmp_path / "plots/one.png").unlink()
+    (tmp_path / "plots/notes").touch()
     faults = ["plots/one.png is missing", "weights has 0 bytes, expected 3"]
-    assert manifest.faults(folder, verify=False) == manifest.faults(folder, verify=True) == faults
-    (folder / "plots/notes").touch()
-    assert manifest.foreign(folder) == ["plots/notes"]
-
-
-def test_a_folder_without_a_manifest_has_none(tmp_path: Path) -> None:
-    assert read_manifest(tmp_path) is None
+    assert manifest.faults(tmp_path, verify=False) == manifest.faults(tmp_path, verify=True) == faults
+    assert manifest.foreign(tmp_path) == ["plots/notes"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"files": {"a": 3}, "made_from": {}}', "\udcff"])

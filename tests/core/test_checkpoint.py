@@ -40,16 +40,6 @@ def assert_same(actual: object, expected: object) -> None:
         assert actual == expected
 
 
-def test_tensors_and_metadata_come_back(tmp_path: Path) -> None:
-    whole = torch.arange(6.0).reshape(2, 3)
-    tensors = {"whole": whole, "view": whole.T, "step": torch.tensor(3), "mask": torch.tensor([True])}
-    metadata = {"config": {"sizes": [8, 8], "rate": 0.1}, "steps": 2**70, "name": "ä"}
-    save_tensors(tmp_path / "a.safetensors", tensors, metadata)
-    loaded, loaded_metadata = load_tensors(tmp_path / "a.safetensors")
-    assert loaded_metadata == metadata
-    assert_same(dict(sorted(loaded.items())), dict(sorted(tensors.items())))
-
-
 def test_nothing_is_not_saved(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="at least one tensor"):
         save_tensors(tmp_path / "a.safetensors", {}, {})
@@ -103,8 +93,8 @@ def test_weights_that_are_not_finite_are_refused(
     refusal = pytest.raises(
         BadInputError, match=rf"expected finite weights, found NaN or infinity in {name}: "
     )
-    with refusal if is_refused else nullcontext(), understood(path, "a toy", ["toy"], "cpu") as (tensors, _):
-        assert tensors[name][0] == 1
+    with refusal if is_refused else nullcontext(), understood(path, "a toy", ["toy"], "meta") as (tensors, _):
+        assert tensors[name].device.type == "meta"
 
 
 @pytest.mark.parametrize(
@@ -133,49 +123,17 @@ def test_what_cannot_come_back_is_refused(nested: dict[Any, Any], tmp_path: Path
     assert not list(tmp_path.iterdir())
 
 
-def _train(network: nn.Module, optimizer: torch.optim.Optimizer, steps: int) -> None:
-    for step in range(steps):
-        optimizer.zero_grad()
-        loss: Tensor = (network(torch.full((4, 3), float(step))) ** 2).sum()
-        loss.backward()
-        optimizer.step()
-
-
-def _network() -> tuple[nn.Module, torch.optim.Optimizer]:
-    torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(3, 3), nn.Linear(3, 1))
-    return network, torch.optim.AdamW(network.parameters(), betas=(0.8, 0.9))
-
-
-def test_a_resumed_training_equals_one_that_was_never_interrupted(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint.safetensors"
-    network, optimizer = _network()
-    _train(network, optimizer, 3)
-    save_state(path, {"network": network.state_dict(), "optimizer": optimizer.state_dict()}, {})
-    _train(network, optimizer, 3)
-
-    again, again_optimizer = _network()
-    with resumed(path) as (state, _):
-        assert_same(state["optimizer"]["param_groups"][0]["betas"], (0.8, 0.9))
-        again.load_state_dict(state["network"])
-        again_optimizer.load_state_dict(state["optimizer"])
-    _train(again, again_optimizer, 3)
-    assert_same(dict(again.state_dict()), dict(network.state_dict()))
-
-
-def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
-    metadata = {name: ["ä", {"of": name}] for name in "abcdefgh"}
+def test_the_same_content_comes_back_and_gives_the_same_bytes(tmp_path: Path) -> None:
+    whole = torch.arange(6.0).reshape(2, 3)
+    tensors = {"whole": whole, "view": whole.T, "step": torch.tensor(3), "mask": torch.tensor([True])}
+    metadata = {name: ["ä", 2**70, {"of": name}] for name in "abcdefgh"}
     paths = [tmp_path / f"{number}.safetensors" for number in range(4)]
     for path in paths:
-        save_tensors(path, {"x": torch.arange(3.0), "y": torch.ones(2, 2)}, metadata)
+        save_tensors(path, tensors, metadata)
     assert len({path.read_bytes() for path in paths}) == 1
-    assert load_tensors(paths[0])[1] == metadata
-
-
-def test_tensors_come_to_the_device_that_is_asked_for(tmp_path: Path) -> None:
-    save_tensors(tmp_path / "a.safetensors", {"weight": torch.ones(2)}, {"kind": "toy"})
-    with understood(tmp_path / "a.safetensors", "a toy", ["toy"], "meta") as (tensors, _):
-        assert tensors["weight"].device.type == "meta"
+    loaded, loaded_metadata = load_tensors(paths[0])
+    assert loaded_metadata == metadata
+    assert_same(dict(sorted(loaded.items())), dict(sorted(tensors.items())))
 
 
 def test_a_network_of_another_size_does_not_go_on(tmp_path: Path) -> None:

@@ -6,19 +6,13 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from astra_data.core.config import (
     Config,
-    did_you_mean,
     faults_of,
     in_full,
     load_recipe,
-    only_given,
     own_settings,
     validated,
 )
 from astra_data.core.errors import BadInputError, RecipeError
-
-
-def test_an_option_of_0_or_false_is_given() -> None:
-    assert only_given(steps=0, resume=False, name="", out=None) == {"steps": 0, "resume": False, "name": ""}
 
 
 class Late(Config):
@@ -133,11 +127,6 @@ def test_a_missing_or_unreadable_recipe_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(RecipeError, match="cannot be read as a text file"):
         load_recipe(tmp_path / "binary.toml", Experiment)
-
-
-def test_names_without_a_close_match_are_all_listed() -> None:
-    assert did_you_mean("nass", ("nas", "astra")) == ": did you mean 'nas'?"
-    assert did_you_mean("x", ("nas", "astra")) == "; known: nas, astra"
 
 
 def test_a_component_takes_its_own_settings_or_the_usual_ones() -> None:

@@ -11,30 +11,19 @@ from astra_data.deployment.lerobot.files import TYPE
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
 class AstraDataConfig(PreTrainedConfig):  # type: ignore[misc]
-    """The sizes of state, goal and command, as they lie in the policy's folder."""
+    """The sizes of state, goal and command, as they lie in the policy's folder.
 
-    @property
-    def observation_delta_indices(self) -> None:
-        """None: the policy remembers by itself."""
+    The policy remembers by itself, so no other steps are asked for; LeRobot does not train it.
+    """
 
-    @property
-    def action_delta_indices(self) -> None:
-        """None: LeRobot does not train it."""
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """None, likewise."""
+    observation_delta_indices = action_delta_indices = reward_delta_indices = None
 
     def get_optimizer_preset(self) -> NoReturn:
-        """Refuse.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Refuse with a NotImplementedError."""
         raise NotImplementedError("LeRobot does not train this policy: astra-data train does")
 
     def get_scheduler_preset(self) -> None:
-        """None, likewise."""
+        """Return None."""
 
     def validate_features(self) -> None:
         """Do nothing: the policy compares what it is shown."""

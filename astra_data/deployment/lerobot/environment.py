@@ -25,9 +25,6 @@ from astra_data.worlds.task import Task
 
 Array = NDArray[Any]
 
-_BLANK = (64, 64, 3)
-"""The size of the pictures where a task has no `photograph`."""
-
 
 @EnvConfig.register_subclass(TYPE)
 @dataclass
@@ -38,11 +35,7 @@ class AstraDataEnv(EnvConfig):  # type: ignore[misc]
     """
 
     def __post_init__(self) -> None:
-        """Take rate and sizes from the task.
-
-        Raises:
-            BadInputError: none is named, or it is not known.
-        """
+        """Take rate and sizes from the task; raise a BadInputError if none is named, or it is not known."""
         if self.task is None:
             raise BadInputError("--env.task: expected a task, such as antmaze-umaze or cart.py:TASK")
         task = task_named(self.task)
@@ -75,18 +68,10 @@ class AstraDataEnv(EnvConfig):  # type: ignore[misc]
 
 
 class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
-    """One robot of a task's target; commands (A,) are in their units, and clipped to their bounds.
-
-    Attributes:
-        task: the task's name. task_description: in words.
-    """
+    """One robot of a task's target; commands (A,) are in their units, and clipped to their bounds."""
 
     def __init__(self, task: Task) -> None:
-        """Build the target of `task`, with a seed of its own until `reset` gives one.
-
-        Raises:
-            BadInputError: it has none.
-        """
+        """Build the target of `task`, with a seed of its own until `reset` gives one."""
         self._env, self._task = task.target(1, seed=fresh_seed(), num_threads=1), task
         self.task, self.task_description = task.name, task.instruction
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": task.fps}
@@ -118,18 +103,13 @@ class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
         objective = self._task.objective
         success = objective.succeeded(step.success, self._env.failed, self._age)
         truncated = self._age >= objective.horizon
-        return (
-            self._observe(),
-            float(step.reward[0]),
-            bool(step.terminated[0]),
-            truncated,
-            {"is_success": bool(success[0])},
-        )
+        info = {"is_success": bool(success[0])}
+        return self._observe(), float(step.reward[0]), bool(step.terminated[0]), truncated, info
 
     def render(self) -> Array:
         """Return a picture (height, width, 3) of the state; a blank one, if the task has no `photograph`."""
         if self._task.photograph is None:
-            return np.full(_BLANK, 255, np.uint8)
+            return np.full((64, 64, 3), 255, np.uint8)
         picture: Array = self._task.photograph(self._env.state.double().numpy())[0]
         return picture
 

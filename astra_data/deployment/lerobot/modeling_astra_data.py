@@ -46,11 +46,7 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def from_pretrained(
         cls, pretrained_name_or_path: str | Path, *, config: AstraDataConfig | None = None, **_: object
     ) -> "AstraDataPolicy":
-        """Return the policy in a folder, ready to act.
-
-        Raises:
-            BadInputError: it is not the folder of a policy.
-        """
+        """Return the policy in a folder, ready to act."""
         config = config or AstraDataConfig.from_pretrained(pretrained_name_or_path)
         config.pretrained_path = Path(pretrained_name_or_path)
         policy: AstraDataPolicy = cls(config).eval()
@@ -94,11 +90,7 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return self.select_action(batch).unsqueeze(1)
 
     def forward(self, batch: dict[str, Tensor]) -> NoReturn:
-        """Refuse.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Refuse with a NotImplementedError."""
         raise NotImplementedError("LeRobot does not train this policy: astra-data train does")
 
     def get_optim_params(self) -> NoReturn:

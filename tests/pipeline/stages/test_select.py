@@ -198,3 +198,12 @@ def test_what_is_not_there_is_asked_for(root: Path) -> None:
         select(reported(root), root=alone)
     shutil.rmtree(root / "ground/nas/seed_1")
     assert len(judged(root, reported(root)).candidates) == 5  # of NAS, seed 1 has no encoder
+
+
+def test_groundings_that_were_swapped_are_noticed(root: Path) -> None:
+    one, other, aside = (root / "ground/nas" / name for name in ("seed_0", "seed_1", "aside"))
+    one.rename(aside)
+    other.rename(one)
+    aside.rename(other)
+    with pytest.raises(BadInputError, match="was made from another grounding than the one used with it"):
+        judged(root)
