@@ -220,21 +220,6 @@ def test_every_fence_is_a_block_of_a_known_language() -> None:
         assert {block.language for block in blocks(page)} <= {"python", "sh", "toml", "text"}, page
 
 
-@pytest.mark.parametrize("page", [page for page, text in PAGES.items() if "load_policy(" in text])
-def test_a_policy_is_started_before_it_commands(page: str) -> None:
-    assert ").command(" not in PAGES[page]
-    assert 0 < PAGES[page].find("policy.start(") < PAGES[page].index("policy.command(")
-
-
-@pytest.mark.parametrize("command", [SET_UP, TEST])
-def test_the_set_up_commands_stand_alone_on_a_line(command: str) -> None:
-    assert command in README.splitlines()
-
-
-def test_the_checks_call_the_test_command() -> None:
-    assert TEST in (ROOT / ".ci" / "run").read_text().splitlines()
-
-
 def words(text: str) -> int:
     return len([word for word in text.split() if re.search(r"\w", word)])
 
@@ -297,3 +282,18 @@ def test_nothing_that_no_registry_has_is_installed() -> None:
 def test_nothing_is_left_to_fill_in() -> None:
     for page, text in PAGES.items():
         assert re.findall(r"^[A-Z_]{4,}$|\b[A-Z]+_MINUTES\b|\bTODO\b", text, re.MULTILINE) == [], page
+
+
+def checks() -> list[str]:
+    lines = map(str.strip, (ROOT / ".ci" / "run").read_text().splitlines())
+    return [line for line in lines if line.startswith("uv run")]
+
+
+def test_what_is_checked_before_a_change_is_taken_is_the_same_everywhere() -> None:
+    assert SET_UP in README.splitlines()
+    for page in (".ci/run", "README.md", "CONTRIBUTING.md"):
+        assert TEST in (ROOT / page).read_text().splitlines()
+    named = re.findall(r"^uv run .+$", PAGES["CONTRIBUTING.md"], re.MULTILINE)
+    assert named[: len(checks()) + 1] == [*checks(), "uv run pytest"]
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    assert re.findall(r"^ +entry: (.+)$", hooks, re.MULTILINE) == checks()

@@ -11,7 +11,7 @@ from disks.failing_disk import FAILURES, Kind, Operation, why_not
 from disks.lost_power import OUTCOMES, Memory, Outcome
 
 TOOLS = Path(__file__).parents[1] / "tools"
-COMMANDS = ("export robomimic", "collect")
+COMMANDS = ("export robomimic",)
 FAULTLESS = {"command", "failure", "tried"}
 
 WRITES = """

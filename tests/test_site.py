@@ -17,9 +17,6 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from markdown_it import MarkdownIt
-from mkdocs.config import load_config
-from mkdocs.structure.files import get_files
-from mkdocs.structure.pages import Page as SitePage
 from typer.testing import CliRunner
 
 import astra_data
@@ -184,19 +181,6 @@ def test_every_key_of_recipes_has_its_default_and_meaning(site: Path, table: str
         assert not faults
 
 
-@pytest.mark.parametrize(
-    ("table", "key", "unit"),
-    [
-        ("collect", "hold_s", "s"),
-        ("augment", "margin_m", "m"),
-        ("sweep", "percent", "%"),
-        ("pair", "reset_tolerance", ""),
-    ],
-)
-def test_units_are_those_of_names(site: Path, table: str, key: str, unit: str) -> None:
-    assert page(site / "reference/recipe_keys/index.html").keys(f"[{table}]")[key][2] == unit
-
-
 def named_by_help(*words: str) -> list[str]:
     """Return the commands, arguments and options that `--help` lists, as they are written there."""
     text = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "400", "TERM": "dumb"}).output
@@ -230,27 +214,6 @@ def test_every_public_name_is_in_the_reference_with_its_docstring(site: Path) ->
         public = getattr(astra_data, name)
         about = (inspect.getdoc(public) or "").partition("\n")[0].replace("`", "")
         assert isinstance(public, dict) or about in text
-
-
-def test_pages_have_no_links_to_edit_them_until_an_address_is_set(site: Path) -> None:
-    assert 'rel="edit"' not in (site / "results/cart/index.html").read_text()
-    edited = {
-        "docs/results/cart.md": "edit/main/docs/results/cart.md",
-        "docs/guide/notebooks/csv_to_card.ipynb": "edit/main/docs/guide/notebooks/csv_to_card.ipynb",
-        "CONTRIBUTING.md": "edit/main/CONTRIBUTING.md",
-        "docs/reference/python.md": None,
-        "recipes/examples/cart": None,
-    }
-    address = "https://github.com/somebody/astra-data"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("NO_MKDOCS_2_WARNING", "1")
-        config = load_config(str(ROOT / "mkdocs.yml"), repo_url=address)
-        config = config.plugins.on_config(config)
-        files = config.plugins.on_files(get_files(config), config=config)
-    for name, place in edited.items():
-        file = files.get_file_from_path(name)
-        assert file is not None, name
-        assert SitePage(None, file, config).edit_url == (place and f"{address}/{place}")
 
 
 def test_search_finds_guides_before_results_and_no_sources(site: Path) -> None:

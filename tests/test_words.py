@@ -56,12 +56,9 @@ def holds(name: str, avoided: str) -> bool:
     [
         ("doubt_penalty", "doubt", True),
         ("DoubtPenalty", "doubt", True),
-        ("_opinion", "opinions", True),
         ("what_rewards_lack", "what_rewards_lack", True),
         ("rewards_lacking", "what_rewards_lack", False),
-        ("undoubted", "doubt", False),
         ("width", "dt", False),
-        ("DT", "dt", True),
     ],
 )
 def test_words_are_found_in_names(name: str, avoided: str, found: bool) -> None:

@@ -115,8 +115,8 @@ def load_tables(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         place = re.search(r" \(at line (\d+).*\)$| \(at end of document\)$", str(error))
-        line = place[1] if place and place[1] else text.count("\n") + 1
-        fault = str(error)[: place.start()] if place else error
+        line = (place and place[1]) or str(text.count("\n") + 1)
+        fault = str(error)[: place.start()] if place else str(error)
         raise RecipeError(f"{path}, line {line}: not valid TOML: {fault}") from None
     except ValueError as error:  # a number of more digits than Python takes
         raise RecipeError(f"{path} cannot be read as TOML: {error}") from None

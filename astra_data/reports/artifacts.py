@@ -20,7 +20,7 @@ GAP = "gap.json"
 
 
 class WrittenPart(BaseModel):
-    """A part of a file that a stage wrote; frozen."""
+    """A part of a file that a stage wrote."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -35,16 +35,16 @@ class Machine(WrittenPart):
 
 
 class Artifact(WrittenPart):
-    """A file that a stage wrote, with its time and origin if recorded."""
+    """A file that a stage wrote, with its times and origin if recorded.
+
+    The times are its run time and the CPU time of all threads, in s, and its end, in s since 1970. The commit
+    ends in "-dirty" if there were uncommitted changes.
+    """
 
     wall_seconds: float | None = None
-    """Run time of the stage, in s."""
     cpu_seconds: float | None = None
-    """CPU time of all its threads, in s."""
     finished_at: float | None = None
-    """When the stage ended, in s since 1970."""
     git_commit: str | None = None
-    """Ends in "-dirty" if there were uncommitted changes."""
     packages: dict[str, str | None] = Field(default_factory=dict)
     machine: Machine | None = None
 
@@ -56,21 +56,20 @@ class Artifact(WrittenPart):
 
 
 class Outcomes(WrittenPart):
-    """Outcomes of a policy's episodes, one number per episode; further measures are kept as they are."""
+    """Outcomes of a policy's episodes, one number per episode; further measures are kept as they are.
+
+    Whether it succeeded and failed (1 or 0), its share of steps in contact with a wall, its length in control
+    steps, and its undiscounted sum of rewards.
+    """
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, list[float]]
 
     success: list[float]
-    """1 where the goal was reached, else 0."""
     failed: list[float]
-    """1 where the episode ended in failure, else 0."""
     wall_contact: list[float]
-    """Share of the episode's steps in contact with a wall."""
     steps: list[float]
-    """Length of the episode in control steps."""
     returns: list[float] = Field(alias="return")
-    """Undiscounted sum of rewards."""
 
     def means(self) -> dict[str, float]:
         """Return the mean of each measure over the episodes, by its name in the file."""
@@ -151,13 +150,15 @@ class CurveFile(Artifact):
 
 
 class Foresight(WrittenPart):
-    """How well failures are predicted on held-out episodes."""
+    """How well failures are predicted on held-out episodes.
+
+    `reliability` is predicted and observed rate, and number of steps, by predicted probability.
+    """
 
     failures: int
     auc: dict[str, float | None] | None = None
     brier_skill: float | None = None
     reliability: list[tuple[float, float, int]] | None = None
-    """Predicted and observed rate, and number of steps, by predicted probability."""
 
 
 class Metrics(Artifact):
@@ -236,11 +237,7 @@ def read_json[T: Artifact](model: type[T], path: Path) -> T:
 
 
 def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
-    """Read a safetensors file that holds at least `names`.
-
-    Raises:
-        BadInputError: the file was altered, is no safetensors file, or lacks a tensor.
-    """
+    """Read a safetensors file that holds at least `names`, or raise a BadInputError."""
     from safetensors import SafetensorError  # noqa: PLC0415
     from safetensors.numpy import load_file  # noqa: PLC0415
 

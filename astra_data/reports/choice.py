@@ -90,32 +90,31 @@ class Tried(WrittenPart):
 
 
 class TrialRound(WrittenPart):
-    """A round, in which all candidates meet the same starts and goals."""
+    """A round of so many trials of each candidate (row and seed, the preferred first), and those finished.
+
+    All candidates meet the same starts and goals.
+    """
 
     trials: int
-    """Of each candidate."""
     candidates: list[tuple[str, int]]
-    """Row and seed of each, as the prediction prefers them."""
     tried: list[Tried] = Field(default_factory=list)
-    """Those that are finished."""
 
 
 class TrialsFile(Artifact):
-    """trials.json: trials of candidates in the target."""
+    """trials.json: trials of candidates in the target.
+
+    The trials that may be spent, the candidates of the first round, their size of the dataset if there are
+    several, and the trials that the prediction counts as; after all rounds row and seed of the chosen one,
+    and its mean success, given the prediction and its trials.
+    """
 
     trials: int
-    """That may be spent."""
     field: int
-    """Candidates of the first round."""
     percent: int | None = None
-    """Their size of the dataset, if there are several."""
     pseudo_trials: int
-    """What the prediction counts as."""
     rounds: list[TrialRound] = Field(default_factory=list)
     chosen: tuple[str, int] | None = None
-    """Row and seed; None until all rounds are finished."""
     mean: float | None = None
-    """Of its success, given the prediction and its trials."""
 
     @property
     def spent(self) -> int:
@@ -245,11 +244,7 @@ class Choice:
 
 
 def read_judged(root: Path) -> Judged | None:
-    """Read what the stage `select` left in a run's folder; None if it was not run.
-
-    Raises:
-        BadInputError: it is malformed.
-    """
+    """Read what the stage `select` left in a run's folder; None if it was not run."""
     path = root / FOLDER / SELECTED
     return read_json(Judged, path) if path.is_file() else None
 
@@ -300,7 +295,7 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
     if choice.random_regret is not None:
         regret = "unknown (the chosen policy was not tested there)"
         regret = regret if choice.regret is None else f"{choice.regret:.2f}"
-        found = [
+        errors = [
             [method_title(row), f"{seeds}", f"{signed:+.2f}", f"{absolute:.2f}"]
             for row, (seeds, signed, absolute) in choice.calibration.items()
         ]
@@ -310,7 +305,7 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
                 f"Regret of the chosen policy, in success in the target: {regret}; of a random policy: "
                 f"{choice.random_regret:.2f}."
             ),
-            TableBlock("Error of the predicted success, means over seeds", head, found),
+            TableBlock("Error of the predicted success, means over seeds", head, errors),
         ]
     return blocks
 

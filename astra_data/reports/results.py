@@ -46,14 +46,12 @@ class Facts(BaseModel):
 
 
 class Origin(Facts):
-    """Code, machine and packages that some stages ran with; None or empty where not recorded."""
+    """Code, machine and packages that some stages, or the report, ran with; None or empty if not recorded."""
 
     commit: str | None
-    """Ends in "-dirty" if there were uncommitted changes."""
     machine: Machine | None
     packages: dict[str, str | None]
     stages: list[str]
-    """Names of those stages; "report" is the report itself."""
 
 
 class DatasetUse(Facts):

@@ -70,11 +70,7 @@ class Reported:
 
 
 def recorded_code(root: Path) -> dict[str, str]:
-    """Return what the run at `root` recorded of the user's code and its settings; empty where it has none.
-
-    Raises:
-        BadInputError: the record is damaged.
-    """
+    """Return what the run at `root` recorded of the user's code and its settings; empty where it has none."""
     if not (root / CODE).is_file():
         return {}
     advice = "restore it from a copy, or remove it if the code is still what the run was made with"
@@ -110,7 +106,7 @@ class Run:
         """Return the place of an artifact's file."""
         return self._root / artifact_key(stage, *place) / name
 
-    def _read[A: Artifact](self, stage: str, place: Place, name: str, model: type[A]) -> A | None:
+    def read[A: Artifact](self, stage: str, place: Place, name: str, model: type[A]) -> A | None:
         """Read an artifact's file, and write down its origin and numbers; None where there is none."""
         path = self.path(stage, place, name)
         if not path.is_file():
@@ -129,7 +125,7 @@ class Run:
 
     def evaluation(self, place: Place) -> None:
         """Read how a method was tested."""
-        file = self._read("evaluate", place, EVALUATION, Evaluation)
+        file = self.read("evaluate", place, EVALUATION, Evaluation)
         assert file is not None
         self.evaluations.append(file)
         values: dict[str, float | None] = {**file.outcomes.means(), "beyond_recorded": file.beyond_recorded}
@@ -147,7 +143,7 @@ class Run:
 
     def training(self, place: Place, score: Score, *, is_shown: bool) -> None:
         """Read how a method was trained."""
-        file = self._read("train", place, CURVE, CurveFile)
+        file = self.read("train", place, CURVE, CurveFile)
         if file and is_shown:
             steps = [point.steps for point in file.points]
             scores = [point.success if score == SUCCESS else point.episode_steps for point in file.points]
@@ -157,22 +153,22 @@ class Run:
 
     def grounding(self, place: Place) -> None:
         """Read times, R², predicted failures and open-loop errors on held-out episodes of a grounding."""
-        self._read("ground", place, METRICS, Metrics)
+        self.read("ground", place, METRICS, Metrics)
         if not self.path("ground", place, GAP).is_file():
             return
         gap = read_json(Gap, self.path("ground", place, GAP))
         for simulator, of in {"still": gap.still or {}, "raw": gap.raw, "grounded": gap.grounded}.items():
             for quantity, band in of.items():
-                given = {"simulator": simulator, "quantity": quantity, "horizons": gap.horizons}
+                given: dict[str, Any] = {
+                    "simulator": simulator,
+                    "quantity": quantity,
+                    "horizons": gap.horizons,
+                }
                 self.errors.append(Errors(**place.facts(), **given, **band.model_dump()))
-
-    def alignment(self, place: Place) -> None:
-        """Read how an encoder was aligned."""
-        self._read("align", place, METRICS, Metrics)
 
     def dataset(self, stage: str, place: Place) -> None:
         """Read which dataset a stage made."""
-        file = self._read(stage, place, str(DATASET_PATH), DatasetFile)
+        file = self.read(stage, place, str(DATASET_PATH), DatasetFile)
         if file and place.percent is None:
             facts = file.model_dump(include={"name", "version", "content_hash"})
             self.datasets.append(DatasetUse(stage=stage, seed=place.seed, **facts))
@@ -221,7 +217,7 @@ def read_run(
             run.training(place, scores[0], is_shown=place in finished)
         for place in dict.fromkeys(place._replace(row=grounded_as(place.row)) for place in finished):
             run.grounding(place)
-            run.alignment(place)
+            run.read("align", place, METRICS, Metrics)
     for stage in DATASET_STAGES:
         percents = reported.percents if stage == "subset" else (None,)
         for place in (Place("", seed, percent) for seed in seeds for percent in percents):

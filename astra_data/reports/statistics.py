@@ -10,6 +10,7 @@ seeds in 93 % of the cases or more. Below three seeds there is no interval.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -168,6 +169,7 @@ def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: boo
     return Estimate(value, float(low), float(high))
 
 
+@cache
 def _student(count: int) -> float:
     """Return the quantile of Student's t that a 95 % interval of `count` values takes."""
     from scipy.stats import t

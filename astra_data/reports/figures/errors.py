@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
 from astra_data.core.arrays import Floats
@@ -90,7 +91,7 @@ def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
         above, below = figure.subplots(
             2, len(parts), squeeze=False, sharex=True, sharey="row", height_ratios=[2.6, 1.0]
         )
-        handles = {}
+        handles: dict[str, Line2D] = {}
         for (title, rates), axes, counts in zip(parts.items(), above, below, strict=True):
             axes.plot([0, 1], [0, 1], color=FAINT, ls="--", lw=0.9, zorder=1)
             for row, (predicted, observed, steps) in rates.items():
@@ -131,7 +132,7 @@ def predictive_validity(results: Results, _: Scene) -> Figure | None:
         height = max(3.7, 0.6 + 0.19 * len(rows))
         figure = Figure(figsize=(2.4 + 3.0 * len(worlds), height), layout="constrained")
         grid = figure.subplots(1, len(worlds), squeeze=False, sharey=True)[0]
-        handles = {}
+        handles: dict[str, Line2D] = {}
         for axes, world in zip(grid, worlds, strict=True):
             axes.axline((0, 0), slope=1, color=FAINT, ls="--", lw=0.9, zorder=1)
             for row in rows:

@@ -1,8 +1,10 @@
 """Scores of each method: final, during training, and over the size of the dataset."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -31,7 +33,7 @@ CURVE_POINTS = 200
 """Points at which curves of different seeds are interpolated."""
 PANELS_ACROSS = 4
 """Learning-curve panels side by side, at most."""
-_DOT = {"mfc": "white", "mec": INK, "clip_on": False}
+_DOT: dict[str, Any] = {"mfc": "white", "mec": INK, "clip_on": False}
 """Not clipped: the axis would cut what lies on 0 in half."""
 
 
@@ -46,7 +48,8 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
         with style():
             figure = Figure(figsize=(7.6, 0.9 + 0.38 * len(rows)), layout="constrained")
             axes = figure.add_subplot()
-            labels, drawn = [], {"mean over seeds": Patch(fc=FAINT, ec="none")}
+            labels, drawn = [], dict[str, Artist]()
+            drawn["mean over seeds"] = Patch(fc=FAINT, ec="none")
             drawn["95 % interval"] = Line2D([], [], color=INK, lw=1.6)
             for place, row in enumerate(rows):
                 found, own = results.summary(row, measure), results.summary(row, measure, SIMULATED)
@@ -54,16 +57,17 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
                 labels.append(f"{titled(row)}   {score.text(found.value) if found else '-'}")
                 if found:
                     hatch = "////" if is_plus(row) else None
-                    bar = {"color": method_color(row), "ec": (1, 1, 1, 0.4), "hatch": hatch}
+                    bar: dict[str, Any] = {"color": method_color(row), "ec": (1, 1, 1, 0.4), "hatch": hatch}
                     axes.barh(place, found.value, height=0.68, lw=0, zorder=2, **bar)
                     if found.low is not None and found.high is not None:
                         axes.plot([found.low, found.high], [place, place], color=INK, lw=1.6, zorder=3)
                     seeds = [*results.values(row, measure).values()]
                     at = place + (np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1))
-                    (drawn["one seed"],) = axes.plot(seeds, at, "o", mew=0.9, ms=3.5, zorder=4, **_DOT)
+                    drawn["one seed"] = axes.plot(seeds, at, "o", mew=0.9, ms=3.5, zorder=4, **_DOT)[0]
                 if own and score == results.headline:
-                    diamond = axes.plot(own.value, place, "D", ms=5, zorder=5, **_DOT)
-                    drawn["in its own simulator"] = diamond[0]
+                    drawn["in its own simulator"] = axes.plot(own.value, place, "D", ms=5, zorder=5, **_DOT)[
+                        0
+                    ]
             axes.set_yticks(range(len(rows)), labels)
             axes.tick_params(axis="y", length=0)
             axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -165,10 +169,8 @@ def data_efficiency(results: Results, scene: Scene) -> Figure | None:
         for row in results.tested():
             every = {percent: results.score_of(row, TESTED, percent) for percent in percents}
             known = {percent: one for percent, one in every.items() if one}
-            means = [one.value for one in known.values()]
-            ends = [(one.low, one.high) for one in known.values()]
-            low, high = zip(*(pair if None not in pair else (np.nan, np.nan) for pair in ends), strict=True)
-            draw_band(axes, [*known], means, low, high, marker="o", ms=4, **look(row))
+            bands = np.array([(one.value, one.low, one.high) for one in known.values()], np.float64).T
+            draw_band(axes, np.array([*known]), *bands, marker="o", ms=4, **look(row))
             for percent in known:
                 seeds = [*results.values(row, score.measure, TESTED, percent).values()]
                 axes.plot([percent] * len(seeds), seeds, ".", color=method_color(row), alpha=0.45, ms=4)

@@ -84,9 +84,6 @@ def test_observed_rates_stand_over_predicted_ones_above_their_numbers_of_steps()
     assert png(figure).startswith(b"\x89PNG")
 
 
-SCENE_validity = Scene(Path(), TASKS["antmaze-umaze"])
-
-
 def test_validity_draws_a_dot_per_policy_in_its_methods_color() -> None:
     returns = [
         *(("nas", 0, TESTED, 3.0), ("nas", 1, TESTED, 4.0), ("astra_plus", 0, TESTED, 6.0)),
@@ -97,7 +94,7 @@ def test_validity_draws_a_dot_per_policy_in_its_methods_color() -> None:
         Line(row=row, seed=seed, where=where, values={"return": one}) for row, seed, where, one in returns
     ]
     found = Results(recipe="r", task="t", command="", rows=("nas", "astra_plus"), episodes=1, lines=lines)
-    figure = predictive_validity(found, SCENE_validity)
+    figure = predictive_validity(found, SCENE)
     assert figure is not None
     raw, grounded = figure.axes
     titles = [axes.get_title(loc="left") for axes in (raw, grounded)]
@@ -111,4 +108,4 @@ def test_validity_draws_a_dot_per_policy_in_its_methods_color() -> None:
     assert len(grounded.lines) == 2
     assert png(figure).startswith(b"\x89PNG")
     nowhere = found.model_copy(update={"tested_in": "simulators"})
-    assert predictive_validity(nowhere, SCENE_validity) is None
+    assert predictive_validity(nowhere, SCENE) is None

@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from astra_data.methods import METHODS
 from astra_data.reports.figures.scores import score_bars
-from astra_data.reports.figures.style import Scene, coverage, method_color, method_title, png, style
+from astra_data.reports.figures.style import Scene, coverage, method_color, png, style
 from astra_data.reports.results import TESTED, Line, Results
 from astra_data.robots.registry import TASKS
 
@@ -23,19 +23,6 @@ def bars(*rows: str) -> Figure:
     figure = score_bars("success")(results, Scene(Path(), TASKS["antmaze-umaze"]))
     assert figure is not None
     return figure
-
-
-def test_titles_follow_from_the_names() -> None:
-    assert [method_title(row) for row in ROWS] == [
-        "Direct transfer",
-        "NAS",
-        "ASTRA",
-        "Direct transfer+",
-        "NAS+",
-        "ASTRA+",
-        "Careful follower",
-    ]
-    assert method_title("my_own_plus") == "My own+"
 
 
 def test_every_row_has_its_own_color_and_a_plus_row_its_base_rows_darker() -> None:
