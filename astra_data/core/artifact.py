@@ -94,8 +94,8 @@ def finished_folder(
             if config is not None and not is_begun():
                 write_file(settings, config)
             elif config is not None and not (settings.is_file() and settings.read_text() == config):
-                said = "was started with other settings (see its config.json if it has one)"
-                raise BadInputError(f"{partial} {said}: remove it")
+                fault = "was started with other settings (see its config.json if it has one)"
+                raise BadInputError(f"{partial} {fault}: remove it")
             yield partial
         except BaseException:
             with suppress(OSError):

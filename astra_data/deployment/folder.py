@@ -10,9 +10,8 @@ from typing import Any
 from astra_data.core.artifact import write_manifest
 from astra_data.core.durable import atomic_folder, file_digest, refuse_existing
 from astra_data.core.provenance import origin
-from astra_data.dataset.columns import Column
+from astra_data.dataset.columns import ACTION, GOAL, STATE, Column
 from astra_data.deployment.graph import INPUTS, ONNX, OUTPUTS, write_graph
-from astra_data.deployment.lerobot.files import write_lerobot_files
 from astra_data.pipeline.trained_policy import trained_policy
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.reports.blocks import table
@@ -188,3 +187,35 @@ def _values(column: Column, called: str) -> dict[str, Any]:
     known = column.astra or {}
     kept = {f"{key}s": known[key] for key in ("unit", "frame") if key in known}
     return {"column": column.name, "names": list(names), **kept}
+
+
+TYPE = "astra_data"
+"""The name under which LeRobot knows the policy and the environment."""
+
+_ON_CPU = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
+_BATCHED: list[dict[str, Any]] = [
+    {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
+    {"registry_name": "to_batch_processor", "config": {}},
+    _ON_CPU,
+]
+_PIPELINES = {"policy_preprocessor": _BATCHED, "policy_postprocessor": [_ON_CPU]}
+"""Scaling is inside the policy."""
+
+
+def write_lerobot_files(about: Mapping[str, Any], folder: Path) -> None:
+    """Write what LeRobot reads of a policy with the description `about`: settings, and its pipelines."""
+
+    def features(kind: str, name: str, column: str) -> dict[str, Any]:
+        size = len(about[column]["names"])
+        return {name: {"type": kind, "shape": [size]}} if size else {}
+
+    config = {
+        "type": TYPE,
+        "input_features": features("STATE", STATE, "state") | features("ENV", GOAL, "goal"),
+        "output_features": features("ACTION", ACTION, "command"),
+        "device": "cpu",
+        "push_to_hub": False,
+    }
+    written = {name: {"name": name, "steps": steps} for name, steps in _PIPELINES.items()}
+    for name, values in (written | {"config": config}).items():
+        (folder / f"{name}.json").write_text(json.dumps(values, indent=1))

@@ -10,7 +10,7 @@ from astra_data.core.durable import write_file
 from astra_data.methods import method_title
 from astra_data.reports.blocks import Block, Section, TableBlock, Text, markdown
 from astra_data.reports.results import Results, all_bins, judged_horizon
-from astra_data.reports.runs import Place, Run
+from astra_data.reports.runs import Owner, RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,11 +53,11 @@ def write_held_out(
     Raises:
         BadInputError: a file of errors is malformed.
     """
-    run = Run(root)
+    run = RunReader(root)
     for row in groundings:
         for percent in sorted(percents) or (None,):
             for seed in sorted(seeds):
-                run.grounding(Place(row, seed, percent))
+                run.grounding(Owner(row, seed, percent))
     if not run.errors:
         return None
     results = Results(

@@ -77,7 +77,7 @@ def recorded_code(root: Path) -> dict[str, str]:
     return read_written(dict[str, str], root / CODE, by="a run", advice=advice)
 
 
-class Place(NamedTuple):
+class Owner(NamedTuple):
     """Whose artifacts: a row (empty for datasets), a seed, and a size of the dataset if there are several."""
 
     row: str
@@ -89,7 +89,7 @@ class Place(NamedTuple):
         return self._asdict() | {"percent": WHOLE if self.percent is None else self.percent}
 
 
-class Run:
+class RunReader:
     """What is read of the artifacts at `root`, each once: the parts of Results."""
 
     def __init__(self, root: Path) -> None:
@@ -102,61 +102,61 @@ class Run:
         self.errors: list[Errors] = []
         self.trainings: list[TrainingFacts] = []
 
-    def path(self, stage: str, place: Place, name: str) -> Path:
+    def path(self, stage: str, owner: Owner, name: str) -> Path:
         """Return the place of an artifact's file."""
-        return self._root / artifact_key(stage, *place) / name
+        return self._root / artifact_key(stage, *owner) / name
 
-    def read[A: Artifact](self, stage: str, place: Place, name: str, model: type[A]) -> A | None:
+    def read[A: Artifact](self, stage: str, owner: Owner, name: str, model: type[A]) -> A | None:
         """Read an artifact's file, and write down its origin and numbers; None where there is none."""
-        path = self.path(stage, place, name)
+        path = self.path(stage, owner, name)
         if not path.is_file():
             return None
         file = read_json(model, path)
-        self._add(stage, place, file)
+        self._add(stage, owner, file)
         return file
 
-    def _add(self, stage: str, place: Place, file: Artifact) -> None:
+    def _add(self, stage: str, owner: Owner, file: Artifact) -> None:
         self.origins.append(_origin_of(stage, file))
-        self._line(place, stage, file.numbers())
+        self._line(owner, stage, file.numbers())
 
-    def _line(self, place: Place, where: str, values: Mapping[str, float | None]) -> None:
+    def _line(self, owner: Owner, where: str, values: Mapping[str, float | None]) -> None:
         if known := without_nan(values):
-            self.lines.append(Line(**place.facts(), where=where, values=known))
+            self.lines.append(Line(**owner.facts(), where=where, values=known))
 
-    def evaluation(self, place: Place) -> None:
+    def evaluation(self, owner: Owner) -> None:
         """Read how a method was tested."""
-        file = self.read("evaluate", place, EVALUATION, Evaluation)
+        file = self.read("evaluate", owner, EVALUATION, Evaluation)
         assert file is not None
         self.evaluations.append(file)
         values: dict[str, float | None] = {**file.outcomes.means(), "beyond_recorded": file.beyond_recorded}
-        trajectories = self.path("evaluate", place, TRAJECTORIES)
+        trajectories = self.path("evaluate", owner, TRAJECTORIES)
         if trajectories.is_file():
             values["distance"] = way_to_success(trajectories, file)
-        self._line(place, TESTED, values)
+        self._line(owner, TESTED, values)
         # A hand-written row has no simulator of its own.
         simulated = file.grounded if file.simulated is None and file.encoder is None else file.simulated
         for where, outcomes in {SIMULATED: simulated, "raw": file.raw, "grounded": file.grounded}.items():
             if outcomes is not None:
-                self._line(place, where, outcomes.means())
+                self._line(owner, where, outcomes.means())
         for encoder, means in file.encoders.items():
-            self._line(place, f"encoder {encoder}", means)
+            self._line(owner, f"encoder {encoder}", means)
 
-    def training(self, place: Place, score: Score, *, is_shown: bool) -> None:
+    def training(self, owner: Owner, score: Score, *, is_shown: bool) -> None:
         """Read how a method was trained."""
-        file = self.read("train", place, CURVE, CurveFile)
+        file = self.read("train", owner, CURVE, CurveFile)
         if file and is_shown:
             steps = [point.steps for point in file.points]
             scores = [point.success if score == SUCCESS else point.episode_steps for point in file.points]
             self.trainings.append(
-                TrainingFacts.model_validate(place.facts() | {"steps": steps, "score": scores})
+                TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": scores})
             )
 
-    def grounding(self, place: Place) -> None:
+    def grounding(self, owner: Owner) -> None:
         """Read times, R², predicted failures and open-loop errors on held-out episodes of a grounding."""
-        self.read("ground", place, METRICS, Metrics)
-        if not self.path("ground", place, GAP).is_file():
+        self.read("ground", owner, METRICS, Metrics)
+        if not self.path("ground", owner, GAP).is_file():
             return
-        gap = read_json(Gap, self.path("ground", place, GAP))
+        gap = read_json(Gap, self.path("ground", owner, GAP))
         for simulator, of in {"still": gap.still or {}, "raw": gap.raw, "grounded": gap.grounded}.items():
             for quantity, band in of.items():
                 given: dict[str, Any] = {
@@ -164,19 +164,19 @@ class Run:
                     "quantity": quantity,
                     "horizons": gap.horizons,
                 }
-                self.errors.append(Errors(**place.facts(), **given, **band.model_dump()))
+                self.errors.append(Errors(**owner.facts(), **given, **band.model_dump()))
 
-    def dataset(self, stage: str, place: Place) -> None:
+    def dataset(self, stage: str, owner: Owner) -> None:
         """Read which dataset a stage made."""
-        file = self.read(stage, place, str(DATASET_PATH), DatasetFile)
-        if file and place.percent is None:
+        file = self.read(stage, owner, str(DATASET_PATH), DatasetFile)
+        if file and owner.percent is None:
             facts = file.model_dump(include={"name", "version", "content_hash"})
-            self.datasets.append(DatasetUse(stage=stage, seed=place.seed, **facts))
+            self.datasets.append(DatasetUse(stage=stage, seed=owner.seed, **facts))
 
     def choice(self, rows: Sequence[str], seeds: Sequence[int]) -> None:
         """Read the choice without the target among the policies of rows and seeds."""
         if judged := read_judged(self._root):
-            self._add("select", Place("", seeds[0], None), judged)
+            self._add("select", Owner("", seeds[0], None), judged)
             known = [one for one in judged.candidates if one.row in rows and one.seed in seeds]
             facts = judged.model_dump(include={"judge", "episodes", "shares_episodes"})
             self.judged = Judgment(**facts, candidates=known) if known else None
@@ -203,25 +203,25 @@ def read_run(
         MissingStageError: no method has an evaluation.
         BadInputError: an artifact is malformed, or methods differ in task, episodes, robot or quantities.
     """
-    rows, seeds, run = reported.methods, reported.seeds, Run(root)
+    rows, seeds, run = reported.methods, reported.seeds, RunReader(root)
     if not rows or not seeds:
         raise BadInputError(f"{reported.name}: expected methods and seeds, got none; name some in the recipe")
     for percent in reported.percents or (None,):
-        places = [Place(row, seed, percent) for row in rows for seed in seeds]
-        finished = [place for place in places if run.path("evaluate", place, EVALUATION).is_file()]
-        for place in finished:
-            run.evaluation(place)
+        owners = [Owner(row, seed, percent) for row in rows for seed in seeds]
+        finished = [owner for owner in owners if run.path("evaluate", owner, EVALUATION).is_file()]
+        for owner in finished:
+            run.evaluation(owner)
         # Fine-tuned policies start from those of a method that need not be reported.
-        initial = [(method_named(place.row).initial, place) for place in finished]
-        for place in dict.fromkeys([*finished, *(place._replace(row=row) for row, place in initial if row)]):
-            run.training(place, scores[0], is_shown=place in finished)
-        for place in dict.fromkeys(place._replace(row=grounded_as(place.row)) for place in finished):
-            run.grounding(place)
-            run.read("align", place, METRICS, Metrics)
+        initial = [(method_named(owner.row).initial, owner) for owner in finished]
+        for owner in dict.fromkeys([*finished, *(owner._replace(row=row) for row, owner in initial if row)]):
+            run.training(owner, scores[0], is_shown=owner in finished)
+        for owner in dict.fromkeys(owner._replace(row=grounded_as(owner.row)) for owner in finished):
+            run.grounding(owner)
+            run.read("align", owner, METRICS, Metrics)
     for stage in DATASET_STAGES:
         percents = reported.percents if stage == "subset" else (None,)
-        for place in (Place("", seed, percent) for seed in seeds for percent in percents):
-            run.dataset(stage, place)
+        for owner in (Owner("", seed, percent) for seed in seeds for percent in percents):
+            run.dataset(stage, owner)
     run.choice(rows, seeds)
     files = run.evaluations
     if not files:

@@ -3,7 +3,6 @@
 configuration_astra_data    the policy's settings, registered as `astra_data`
 modeling_astra_data         the policy: what `astra-data deploy` wrote
 environment                 the target of a task, registered as `astra_data`
-files                       what LeRobot reads beside the policy; the one file that does not import LeRobot
 
     lerobot-eval --env.discover_packages_path=astra_data.deployment.lerobot \
         --env.type=astra_data --env.task=antmaze-umaze --policy.path=policy

@@ -5,7 +5,7 @@ from typing import NoReturn
 
 from lerobot.configs import PreTrainedConfig
 
-from astra_data.deployment.lerobot.files import TYPE
+from astra_data.deployment.folder import TYPE
 
 
 @PreTrainedConfig.register_subclass(TYPE)

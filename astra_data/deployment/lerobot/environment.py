@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import fresh_seed
 from astra_data.dataset.columns import ACTION, GOAL, STATE
-from astra_data.deployment.lerobot.files import TYPE
+from astra_data.deployment.folder import TYPE
 from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
 

@@ -11,10 +11,9 @@ from torch import Tensor
 from astra_data.core.artifact import check_intact
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import GOAL, STATE
-from astra_data.deployment.folder import DESCRIPTION
+from astra_data.deployment.folder import DESCRIPTION, TYPE
 from astra_data.deployment.graph import ONNX, load_onnx
 from astra_data.deployment.lerobot.configuration_astra_data import AstraDataConfig
-from astra_data.deployment.lerobot.files import TYPE
 from astra_data.deployment.run_policy import refuse_far
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from astra_data.deployment.lerobot.files import write_lerobot_files
+from astra_data.deployment.folder import write_lerobot_files
 
 NAMES = {"state": ["x", "v"], "goal": ["dock"], "command": ["push"]}
 
