@@ -52,8 +52,7 @@ class McapFile:
         self.is_cut = False
         self.streams: dict[str, Callable[[Any], list[str]]] = {}
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
-        self._source = source
-        self._wanted = topics
+        self._source, self._wanted = source, topics
         self._channels: dict[int, Any] = {}
         self._schemas: dict[int, Any] = {}
         self._chunks: list[Any] | None = None
@@ -105,21 +104,16 @@ class McapFile:
         Raises:
             BadInputError: they have an encoding that cannot be read, or a package is missing.
         """
-        if number not in self._decoders:
-            self._decoders[number] = self._decoder(number)
-        return self._decoders[number]
-
-    def _decoder(self, number: int) -> Callable[[bytes], Any]:
-        packages = "mcap_protobuf", "mcap_ros2"
-        factories = [optional(f"{package}.decoder").DecoderFactory() for package in packages]
+        if number in self._decoders:
+            return self._decoders[number]
         channel = self._channels[number]
-        if channel.message_encoding == "json":
-            return json.loads
         schema = self._schemas.get(channel.schema_id)
-        for factory in factories:
-            decoder: Callable[[bytes], Any] | None = factory.decoder_for(channel.message_encoding, schema)
-            if decoder is not None:
-                return decoder
+        for package in ("mcap_protobuf", "mcap_ros2"):
+            factory = optional(f"{package}.decoder").DecoderFactory()
+            if decoder := factory.decoder_for(channel.message_encoding, schema):
+                return self._decoders.setdefault(number, decoder)
+        if channel.message_encoding == "json":
+            return self._decoders.setdefault(number, json.loads)
         encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} schema"
         raise BadInputError(
             f"{self._source}: messages of {channel.topic} are {encoding}, expected json, protobuf, or cdr "
@@ -246,45 +240,31 @@ def _whole_bytes(stream: IO[bytes], content: int) -> int:
 
 
 class McapMessage(NamedTuple):
-    """A message.
-
-    Attributes:
-        topic: where it was sent.
-        time: when, in ns, on a clock that only goes forward.
-        log_time: when by the recorder's clock.
-        content: the decoded message.
-        is_back: whether it is the first after the clock was set back.
-    """
+    """A message: its topic, its times in ns, and what it holds."""
 
     topic: str
     time: int
+    """On a clock that only goes forward."""
     log_time: int
+    """By the recorder's clock."""
     content: Any
     is_back: bool
+    """Whether it is the first after the clock was set back."""
 
 
 class _Stretch:
-    """What comes in a file before its clock goes back, or until its end.
-
-    Attributes:
-        times: topic to the log times of its messages, in ns, in the file's order.
-        latest: the largest of them.
-        late_ns: how far they are out of order.
-    """
+    """The times of messages before the clock goes back, or until the end of the file."""
 
     def __init__(self) -> None:
-        """Begin it."""
         self.times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
-        self.latest = 0
-        self.late_ns = 0
+        self.latest = self.late_ns = 0
+        """The largest of them, and how far they are out of order."""
 
     def add(self, topic: str, time: int) -> None:
         """Add a message."""
         self.times[topic].append(time)
-        if time >= self.latest:
-            self.latest = time
-        elif self.latest - time > self.late_ns:
-            self.late_ns = self.latest - time
+        self.late_ns = max(self.late_ns, self.latest - time)
+        self.latest = max(self.latest, time)
 
     @property
     def earliest(self) -> int:
@@ -315,20 +295,23 @@ class Timeline:
             BadInputError: the file lacks topics; lists all of them.
         """
         self._file = file
-        self._gap_ns = round(gap_s * 1e9)
-        self._pause_ns = 2 * round(pause_s * 1e9) + 1
-        self._stretches = self._survey()
+        self._stretches = self._survey(round(gap_s * 1e9))
         file.check_topics()
-        self._shifts = self._shifted()
-        self.moments = self._moments()
+        self._shifts = [0]
+        """What is added to the times of each stretch, so that it begins a pause after the one before."""
+        for before, stretch in pairwise(self._stretches):
+            pause_ns = 2 * round(pause_s * 1e9) + 1
+            self._shifts.append(before.latest + self._shifts[-1] + pause_ns - stretch.earliest)
+        parts: defaultdict[str, list[NDArray[np.int64]]] = defaultdict(list)
+        for stretch, shift in zip(self._stretches, self._shifts, strict=True):
+            for topic, times in stretch.times.items():
+                parts[topic].append(np.sort(np.asarray(times, np.int64)) + shift)
+        self.moments = {topic: np.concatenate(each) for topic, each in parts.items()}
 
     def messages(self) -> Iterator[McapMessage]:
         """Yield the messages, by their times, and in the file's order where these are equal.
 
         Only those that may be out of order are held in memory.
-
-        Raises:
-            BadInputError: messages have an encoding that cannot be read.
         """
         held: list[tuple[int, int, str, Any]] = []
         messages = enumerate(self._file.messages(checked=True))
@@ -345,12 +328,12 @@ class Timeline:
                     is_back = False
         next(messages, None)  # the sums at the end of the file
 
-    def _survey(self) -> list[_Stretch]:
+    def _survey(self, gap_ns: int) -> list[_Stretch]:
         stretches = [_Stretch()]
         highest: dict[str, int] = {}
         for topic, message in self._file.messages(checked=False):
             time = message.log_time
-            if time < highest.get(topic, 0) - self._gap_ns:
+            if time < highest.get(topic, 0) - gap_ns:
                 stretches.append(_Stretch())
                 highest = {}
             highest[topic] = max(time, highest.get(topic, 0))
@@ -364,17 +347,3 @@ class Timeline:
         whole.latest = max(stretch.latest for stretch in stretches)
         whole.late_ns = whole.latest - whole.earliest
         return [whole]
-
-    def _shifted(self) -> list[int]:
-        """Return what to add to the times of each stretch, so that it begins a pause after the one before."""
-        shifts = [0]
-        for before, stretch in pairwise(self._stretches):
-            shifts.append(before.latest + shifts[-1] + self._pause_ns - stretch.earliest)
-        return shifts
-
-    def _moments(self) -> dict[str, NDArray[np.int64]]:
-        parts: defaultdict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for stretch, shift in zip(self._stretches, self._shifts, strict=True):
-            for topic, times in stretch.times.items():
-                parts[topic].append(np.sort(np.asarray(times, np.int64)) + shift)
-        return {topic: np.concatenate(each) for topic, each in parts.items()}

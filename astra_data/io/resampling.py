@@ -49,52 +49,38 @@ class Resampler:
         topics: topic to its fields.
         times: topic to the time of its last message, in ns.
         silences: topic to how often it ended an episode: it was silent for too long, and others were not.
-        repeated: topic to how many rows of an episode hold the same message as the row before.
-        skipped: topic to how many messages within episodes are in no row.
     """
 
     def __init__(self, mapping: ImportMapping, origin: str, moments: Mapping[str, ArrayLike]) -> None:
-        """Sample the fields of `mapping` from the file `origin`.
-
-        Args:
-            mapping: says which fields of which topics become which columns.
-            origin: the file's name, for messages.
-            moments: topic to the times of all its messages, in their order, in ns.
+        """Sample the fields of `mapping` from the file `origin`, with the times of messages by topic, in ns.
 
         Raises:
             BadInputError: a topic begins when another has ended, as where their clocks differ.
         """
-        self._origin = origin
+        self._origin, self._fps = origin, mapping.fps
         self.topics: dict[str, list[str]] = {}
-        self.times: dict[str, int] = {}
-        self.silences: Counter[str] = Counter()
-        self.repeated: Counter[str] = Counter()
-        self.skipped: Counter[str] = Counter()
-        self._messages: Counter[str] = Counter()
-        self._dropped: Counter[str] = Counter()
-        self._rows = 0
-        self._fresh: set[str] = set()
         for field in mapping.all_fields:
             self.topics.setdefault(topic_of(field), []).append(field)
+        self.times: dict[str, int] = {}
+        self.silences: Counter[str] = Counter()
+        self._repeated: Counter[str] = Counter()
+        self._skipped: Counter[str] = Counter()
+        self._messages: Counter[str] = Counter()
+        self._fresh: set[str] = set()
         self._gap_ns: dict[str, int] = {}
-        self._own_gap: dict[str, str] = {}
         self._has_own_gap: set[str] = set()
-        for name, column in mapping.columns.items():
+        for column in mapping.columns.values():
             gap_ns = round((column.gap_s or mapping.split.gap_s or 0) * 1e9)
             for topic in () if column.latched else topics_of(column.fields):
-                if gap_ns < self._gap_ns.get(topic, gap_ns + 1):
-                    self._gap_ns[topic] = gap_ns
-                    self._own_gap[topic] = name if column.gap_s else ""
-                if column.gap_s:
-                    self._has_own_gap.add(topic)
+                self._gap_ns[topic] = min(gap_ns, self._gap_ns.get(topic, gap_ns))
+                self._has_own_gap |= {topic} if column.gap_s else set()
         self._expiring = set(self._gap_ns)
         self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
         self._refuse_apart()
         self._periods = usual_periods(self._moments, round((mapping.split.gap_s or 0) * 1e9))
-        self._fps = mapping.fps
         self._values: dict[str, Array] = {}
         self._start: int | None = None
-        self._row = 0
+        self._row = self._rows = self._delay_ns = 0
         often = {
             topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()
         }
@@ -103,26 +89,23 @@ class Resampler:
         most = max((often[topic] for topic in self._states), default=0)
         self._in_step = [topic for topic in self._expiring if 0 < often.get(topic, 0) <= most]
         self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
-        self._delay_ns = 0
-        self._observed: dict[str, str] = {}
-        for name, column in mapping.columns.items():
-            if name.startswith("observation"):
-                self._observed |= dict.fromkeys(column.fields, name)
+        columns = mapping.columns.items()
+        self._observed = {f: n for n, c in columns if n.startswith("observation") for f in c.fields}
         observed = topics_of(self._observed) & self._expiring & self._periods.keys()
-        self._silent_ns: dict[str, dict[int, int]] = {topic: {} for topic in observed}
-        commands = [name for name in mapping.columns if name.startswith(ACTION)]
-        self._commands = {topic: n for n in commands for topic in topics_of(mapping.columns[n].fields)}
+        self._silent_ns: dict[str, list[int]] = {topic: [] for topic in observed}
+        self._commands = {t: n for n, c in columns if n.startswith(ACTION) for t in topics_of(c.fields)}
         self._lossy = self._commands.keys() | topics_of(mapping.flag_fields)
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
         """Update the values of `topic` with a message at `time` ns."""
         if self._start is not None:
             self._messages[topic] += 1
-            self.skipped[topic] += topic in self._fresh
+            self._skipped[topic] += topic in self._fresh
         self._fresh.add(topic)
         self._values |= values
         self.times[topic] = time
-        if self._start is None and self._is_complete(time):
+        is_complete = self.times.keys() == self.topics.keys() and not self._silent(time)
+        if self._start is None and is_complete:
             self._delay_ns = self._midway(time)
             self._start, self._row = time + self._delay_ns, 0
 
@@ -132,51 +115,61 @@ class Resampler:
         Raises:
             BadInputError: these are more than `MOST_HELD_ROWS`.
         """
-        if self._start is not None and self._is_pause(time):
+        # A pause: all topics that are not latched are silent for too long.
+        if self._start is not None and len(self._silent(time)) == len(self._expiring):
             yield from self._sampled(self._end(max(self.times[topic] for topic in self._expiring)))
             self._start = None
         yield from self._sampled(time)
 
     def last_rows(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
-        """Yield the rows that are left after the last message, at `time` ns.
-
-        Raises:
-            BadInputError: as `rows_before`.
-        """
+        """Yield the rows that are left after the last message, at `time` ns."""
         if self._start is not None:
             yield from self._sampled(self._end(time))
 
-    def endings(self) -> tuple[str, ...]:
-        """Tell each topic that ended episodes, and what to do where it should not."""
-        return tuple(
-            f"{self._origin}: "
-            + ended(topic, times, self._gap_ns[topic] / 1e9, self._own_gap[topic], self._commands.get(topic))
-            for topic, times in self.silences.items()
-        )
+    def endings(self) -> Iterator[str]:
+        """Yield what ended episodes: each topic that was silent alone, and what to do if it should not."""
+        for topic, times in self.silences.items():
+            key = "gap_s of its column" if topic in self._has_own_gap else "split.gap_s"
+            told = (
+                f"{self._origin}: {topic} is silent for over {self._gap_ns[topic] / 1e9:g} s ({key}) {times} "
+                "times while others are not; episodes end there"
+            )
+            if command := self._commands.get(topic):
+                yield (
+                    f"{told}. That is right if the robot stops by itself without commands; if it continues "
+                    f'with the last one, set latched = true in [columns."{command}"], or a longer gap_s'
+                )
+            else:
+                yield f"{told}: set latched = true if it is sent on change, or a longer gap_s"
 
     def unevenness(self) -> tuple[str, ...]:
-        """Tell each topic that many rows repeat, or of which many messages are in no row.
+        """Return a line for each topic that many rows repeat, or of which many messages are in no row.
 
         Of a topic without commands, flags and outcomes, messages may be in no row, as where fps is lower than
-        its rate; where it is observed, uneven steps are told, and dropouts, unless a column has its own gap.
+        its rate; if it is observed, uneven steps are told, and dropouts, unless a column has its own gap.
         """
         notes = []
         for topic in sorted(self._expiring & self._periods.keys()):
             rate = 1e9 / self._periods[topic]
             if topic in self._silent_ns and (odd := uneven_steps(topic, rate, self._fps)):
                 notes.append(odd)
-            elif self.repeated[topic] > MOST_UNEVEN * self._rows or (
-                topic in self._lossy and self.skipped[topic] > MOST_UNEVEN * self._messages[topic]
+            elif self._repeated[topic] > MOST_UNEVEN * self._rows or (
+                topic in self._lossy and self._skipped[topic] > MOST_UNEVEN * self._messages[topic]
             ):
                 notes.append(
-                    f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {self.repeated[topic]} of "
-                    f"{self._rows} rows repeat its message before, {self.skipped[topic]} of "
+                    f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {self._repeated[topic]} "
+                    f"of {self._rows} rows repeat its message before, {self._skipped[topic]} of "
                     f"{self._messages[topic]} messages are in no row"
                 )
             if topic not in self._has_own_gap and (silences := self._silent_ns.get(topic)):
                 column = next(self._observed[f] for f in self.topics[topic] if f in self._observed)
-                ns = list(silences.values())
-                notes.append(dropouts(topic, column, rate, self._fps, ns, self._dropped[topic]))
+                # A message that a row repeats is at least 1 / fps - 1 / rate old.
+                gap_ms = math.floor(1000 * max(2 / rate, 1 / self._fps - 1 / rate))
+                notes.append(
+                    f"{topic} is silent for up to {max(silences) / 1e9:.2g} s, where {len(silences)} rows "
+                    f'repeat its message before: gap_s = {gap_ms / 1000:g} in [columns."{column}"] ends '
+                    "episodes there"
+                )
         return tuple(f"{self._origin}: {note}" for note in notes)
 
     def _sampled(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
@@ -192,7 +185,7 @@ class Resampler:
             if self._row:
                 self._rows += 1
                 repeated = self.topics.keys() - self._fresh
-                self.repeated.update(repeated)
+                self._repeated.update(repeated)
                 for topic in repeated & self._silent_ns.keys():
                     self._note_silence(topic, moment - self._delay_ns)
             self._fresh.clear()
@@ -207,8 +200,7 @@ class Resampler:
         until = later[0] if len(later) else max(each[-1] for each in self._moments.values())
         silence = min(int(until) - since, self._gap_ns[topic])
         if silence > MISSED * period and time - since > DUE * period:
-            self._silent_ns[topic][since] = silence
-            self._dropped[topic] += 1
+            self._silent_ns[topic].append(silence)
 
     def _midway(self, time: int) -> int:
         """Return how long after `time` the widest gap between the messages that are in step is half over."""
@@ -256,13 +248,6 @@ class Resampler:
                 f"equal rows, expected at most {MOST_HELD_ROWS}: a time is wrong, or split.gap_s is too long"
             )
 
-    def _is_pause(self, time: int) -> bool:
-        """Return whether all topics that are not latched are silent too long at `time`; all were heard."""
-        return len(self._silent(time)) == len(self._expiring)
-
-    def _is_complete(self, time: int) -> bool:
-        return self.times.keys() == self.topics.keys() and not self._silent(time)
-
     def _silent(self, time: int) -> list[str]:
         """Return the topics that may not be silent for so long as they were before `time`; all were heard."""
         return [topic for topic in self._expiring if time - self.times[topic] > self._gap_ns[topic]]
@@ -303,10 +288,9 @@ def _messages_per_row(ratio: float) -> int:
 
 
 def uneven_steps(topic: str, rate: float, fps: int) -> str:
-    """Tell that `topic` comes `rate` times a second, of which `fps` is no whole fraction, and what to do.
+    """Return a warning if `fps` is no whole fraction of the `rate` of `topic` in Hz, with better ones.
 
-    Nothing is told where so few steps are odd, or odd by so little, that it does not matter, nor where fewer
-    messages come than rows.
+    Few odd steps, or steps that are odd by little, do not matter; nor do fewer messages than rows.
     """
     whole = round(rate)
     if whole and abs(rate / whole - 1) < _WHOLE:
@@ -317,69 +301,8 @@ def uneven_steps(topic: str, rate: float, fps: int) -> str:
     short, long = (f"{1000 * messages / rate:.0f}" for messages in (fewest, fewest + 1))
     near = range(math.ceil(fps / _NEAR), min(_NEAR * fps, whole) + 1)
     even = sorted((each for each in near if rate % each == 0), key=lambda each: abs(math.log(each / fps)))
-    comes = f"{topic} comes {rate:.4g} times a second, of which"
-    if even:
-        *others, last = map(str, sorted(even[:3]))
-        take = f"{', '.join(others)} or {last}" if others else last
-        return (
-            f"{comes} {fps} fps is no whole fraction: steps of {short} and {long} ms alternate; take {take}"
-        )
-    best = min(near, key=lambda each: (_share_odd(rate / each), abs(math.log(each / fps))))
+    take = f"; take {' or '.join(map(str, sorted(even[:3])))}" if even else ""
     return (
-        f"{comes} no fps nearby is a whole fraction: at {fps}, {share_long:.0%} of the steps are of "
-        f"{long} ms, the others of {short}; at {best} only {_share_odd(rate / best):.0%} are odd, "
-        "or publish it a whole number of times a second"
+        f"{topic} comes {rate:.4g} times a second, of which {fps} fps is no whole fraction: steps of {short} "
+        f"and {long} ms alternate{take}"
     )
-
-
-def dropouts(topic: str, column: str, rate: float, fps: int, silences_ns: list[int], rows: int) -> str:
-    """Tell that `topic` was silent, and the `gap_s` of its `column` that ends episodes there.
-
-    Args:
-        topic: the topic.
-        column: a column of the mapping that it gives values to.
-        rate: how often it usually comes in a second.
-        fps: rows in a second.
-        silences_ns: how long it was silent, each time.
-        rows: how many rows repeat its message meanwhile.
-    """
-    places = f"in {len(silences_ns)} places" if len(silences_ns) > 1 else "once"
-    # A message that a row repeats is at least 1 / fps - 1 / rate old, of topics that come more often.
-    gap_ms = math.floor(1000 * max(2 / rate, 1 / fps - 1 / rate))
-    repeat = f"{rows} rows repeat" if rows > 1 else "a row repeats"
-    return (
-        f"{topic} is silent for up to {max(silences_ns) / 1e9:.2g} s {places}, where {repeat} its message "
-        f'before: gap_s = {gap_ms / 1000:g} in [columns."{column}"] ends episodes there'
-    )
-
-
-def ended(topic: str, times: int, gap_s: float, column: str, commanded: str | None) -> str:
-    """Tell that `topic` ended episodes, and what to do where that is not right.
-
-    Args:
-        topic: the topic.
-        times: how often it was silent for too long, and others were not.
-        gap_s: the longest silence that is no end.
-        column: the column whose own `gap_s` that is; "" if it is that of `split`.
-        commanded: the column of commands that the topic gives values to, if any.
-    """
-    key = f'gap_s in [columns."{column}"]' if column else "split.gap_s"
-    often = "once" if times == 1 else f"{times} times"
-    silence = (
-        f"{topic} is silent for over {gap_s:g} s ({key}) {often} while others are not; episodes end there"
-    )
-    # A column with a gap of its own cannot be latched.
-    if commanded:
-        latched = "" if column else f'latched = true in [columns."{commanded}"], or '
-        return (
-            f"{silence}. That is right if the robot stops by itself without commands; if it continues with "
-            f"the last one, set {latched}a longer gap_s"
-        )
-    if column:
-        return f"{silence}; if values may be held for longer, set a longer one"
-    return f"{silence}: set latched = true if it is sent on change, or a longer gap_s"
-
-
-def _share_odd(messages_per_row: float) -> float:
-    """Return the share of the rows that have one message more, or less, than most."""
-    return abs(messages_per_row - round(messages_per_row))

@@ -39,11 +39,7 @@ def delimiter_of(name: str) -> tuple[str, str]:
 
 
 def check_header(name: str, stream: IO[bytes]) -> None:
-    """Refuse the file `name`, read from its beginning, if its header is no UTF-8 or is parted by other marks.
-
-    Raises:
-        BadInputError: it is; says by which.
-    """
+    """Raise BadInputError if the file `name` is no UTF-8, or its header no names parted as it tells."""
     line = _first_line(stream)
     if line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise BadInputError(f"{name}: expected text in UTF-8, got UTF-16: {_SAVE}")
@@ -73,11 +69,7 @@ def _first_line(stream: IO[bytes]) -> bytes:
 
 @contextmanager
 def explained(name: str, source: Source) -> Iterator[None]:
-    """Say of the file `name` what makes it no CSV, in which line, and what to do.
-
-    Raises:
-        BadInputError: what was raised in place of it.
-    """
+    """Raise BadInputError with what makes the file `name` no CSV, in which line, and what to do."""
     try:
         yield
     except UnicodeDecodeError as error:
@@ -86,23 +78,18 @@ def explained(name: str, source: Source) -> Iterator[None]:
     except pa.ArrowInvalid as error:
         if "UTF8" in str(error):
             raise BadInputError(f"{name}: expected text in UTF-8 ({in_short(error)}): {_SAVE}") from None
-        if fault := _uneven_line(source):
-            raise BadInputError(f"{name} cannot be read as csv: {fault}") from None
+        with suppress(python_csv.Error), _lines(source) as lines:
+            header = next(lines, (1, []))[1]
+            for number, cells in lines:
+                if len(cells) != len(header):
+                    advice = "write as many fields there as in the header, or leave the line out"
+                    if len(header) == 1 or header[0].startswith("#"):
+                        advice = f"leave out what is above the header, {shortened(repr(header[0]), _SHOWN)}"
+                    raise BadInputError(
+                        f"{name} cannot be read as csv: line {number}: Expected {len(header)} columns, got "
+                        f"{len(cells)}: {advice}"
+                    ) from None
         raise BadInputError(f"{name}: expected CSV with a header ({in_short(error)})") from None
-
-
-def _uneven_line(source: Source) -> str:
-    """Say which line has more or fewer fields than the header, and what to do; nothing where none does."""
-    with suppress(python_csv.Error), _lines(source) as lines:
-        header = next(lines, (1, []))[1]
-        for number, cells in lines:
-            if len(cells) == len(header):
-                continue
-            advice = "write as many fields there as in the header, or leave the line out"
-            if len(header) == 1 or header[0].startswith("#"):
-                advice = f"leave out what is above the header, {shortened(repr(header[0]), _SHOWN)}"
-            return f"line {number}: Expected {len(header)} columns, got {len(cells)}: {advice}"
-    return ""
 
 
 def line_of(source: Source, row: int) -> int:
@@ -121,11 +108,7 @@ def _lines(source: Source) -> Iterator[Iterator[tuple[int, list[str]]]]:
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows; fields are whole numbers, numbers, lists, or true and false, and an empty cell is NaN.
-
-    Raises:
-        BadInputError: fields are missing, duplicated or not numeric.
-    """
+    """Yield the rows: whole numbers, numbers, lists, or true and false; an empty cell is NaN."""
     return _joined(source, mapping) if source.parts else _read(source, mapping.all_fields, mapping.fields)
 
 
@@ -133,9 +116,6 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows of the file that has the state, each with the last ones of the other files.
 
     Rows without such ones, or with ones older than `split.gap_s`, are left out, and an episode ends there.
-
-    Raises:
-        BadInputError: as `read`; or times of a file go back.
     """
     time = mapping.time
     if time is None:
@@ -145,51 +125,44 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             f"{source}: {', '.join(apart)}: expected the file of each field, such as state.csv:x"
         )
     numbers = [time, *_plain(mapping.fields)]
-    fields = {
-        name: _plain(f for f in mapping.all_fields if f.startswith(f"{name}:")) for name in source.parts
-    }
     main, *rest = mapping.files
-    others: list[tuple[Array, dict[str, Array]]] = []
+    tables: dict[str, dict[str, Array]] = {}
+    for name in (main, *rest):
+        fields = [time, *_plain(f for f in mapping.all_fields if f.startswith(f"{name}:"))]
+        blocks = [block.values for block in _read(source.parts[name], fields, numbers)]
+        tables[name] = {
+            f"{name}:{field}" if field != time else time: np.concatenate([each[field] for each in blocks])
+            if blocks
+            else np.empty(0)
+            for field in fields
+        }
+    values = tables[main]
+    now = values[time]
+    is_known = np.isfinite(now)
     for name in rest:
-        wanted = [time, *fields[name]]
-        blocks = [block.values for block in _read(source.parts[name], wanted, numbers)] or [
-            dict.fromkeys(wanted, np.empty(0))
-        ]
-        found = {field: np.concatenate([values[field] for values in blocks]) for field in wanted}
-        times = found.pop(time)
+        times = tables[name].pop(time)
         if not (np.diff(times) >= 0).all():
             raise BadInputError(
                 f"{source.parts[name]}: '{time}' goes back or is missing: sort its rows by it"
             )
-        others.append((times, {f"{name}:{field}": values for field, values in found.items()}))
-    gap = (mapping.split.gap_s or np.inf) / mapping.time_scale
-    kept: list[int] = []
-    first = 0
-    for block in _read(source.parts[main], [time, *fields[main]], numbers):
-        now = np.asarray(block.values[time])
-        values = {f"{main}:{field}": np.asarray(block.values[field]) for field in fields[main]} | {time: now}
-        is_known = np.isfinite(now)
-        for times, found in others:
-            last = np.searchsorted(times, now, side="right") - 1
-            is_known &= last >= 0
-            is_known[is_known] &= now[is_known] - times[last[is_known]] <= gap
-            values |= {field: column[last] for field, column in found.items() if len(times)}
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], is_known, [False]])))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            starts = bool(kept) and kept[-1] != first + begin - 1
-            kept += range(first + begin, first + end)
-            part = {field: column[begin:end] for field, column in values.items()}
-            yield Block(part, str(source), starts, line=partial(_line_in, source.parts[main], kept))
-        first += len(block)
-    if first and not kept:
+        last = np.searchsorted(times, now, side="right") - 1
+        is_known &= last >= 0
+        gap = (mapping.split.gap_s or np.inf) / mapping.time_scale
+        is_known[is_known] &= now[is_known] - times[last[is_known]] <= gap
+        values |= {field: column[last] for field, column in tables[name].items() if len(times)}
+    kept = np.flatnonzero(is_known)
+    if len(now) and not len(kept):
         raise BadInputError(
             f"{source}: no row has rows of {', '.join(rest)} before it that are recent enough"
         )
-
-
-def _line_in(source: Source, kept: list[int], row: int) -> int:
-    """Return the number of the line of a row that is kept."""
-    return line_of(source, kept[row])
+    for rows in np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else ():
+        part = {field: column[rows] for field, column in values.items()}
+        yield Block(
+            part,
+            str(source),
+            starts=bool(rows[0] != kept[0]),
+            line=lambda row: line_of(source.parts[main], int(kept[row])),
+        )
 
 
 def _plain(fields: Iterable[str]) -> list[str]:
@@ -199,8 +172,10 @@ def _plain(fields: Iterable[str]) -> list[str]:
 
 def _read(source: Source, fields: Sequence[str], numbers: Sequence[str]) -> Iterator[Block]:
     """Yield the rows of `fields`; those that are not among `numbers` stay text."""
-    if _is_cut_in_header(source):
-        return
+    with source.open() as stream:
+        first = stream.readline(_LONGEST_HEADER)
+    if len(first) < _LONGEST_HEADER and b"\n" not in first and b"\r" not in first:
+        return  # only just begun
     torn = torn_bytes(source)
     last: Block | None = None
     with explained(str(source), source), without_end(source, torn) as stream:
@@ -259,13 +234,6 @@ def without_end(source: Source, size: int) -> Iterator[IO[bytes]]:
             yield stream
 
 
-def _is_cut_in_header(source: Source) -> bool:
-    """Return whether a file ends before the end of its first line, as one that was only just begun."""
-    with source.open() as stream:
-        first = stream.readline(_LONGEST_HEADER)
-    return len(first) < _LONGEST_HEADER and b"\n" not in first and b"\r" not in first
-
-
 def _checked(source: Source, fields: Sequence[str], torn: int) -> list[str]:
     with source.open() as stream:
         check_header(str(source), stream)
@@ -281,7 +249,8 @@ def _checked(source: Source, fields: Sequence[str], torn: int) -> list[str]:
 
 def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Array:
     """Return the numbers of a field's `texts`, without blanks around them; the first is in `row`."""
-    texts = without_blanks(texts)
+    trimmed = pc.utf8_trim_whitespace(texts)
+    texts = pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
     whole = [] if texts.null_count else [pa.int64()]  # An empty cell has no integer value.
     for kind in (*whole, pa.float64(), pa.bool_()):
         try:
@@ -294,8 +263,8 @@ def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Arr
     if (lists := _lists(texts, source, field, row)) is not None:
         return lists
     cells = list(enumerate(texts.to_pylist()))
-    odd = [cell for cell in cells if not any(_is(cell[1], kind) for kind in (pa.float64(), pa.bool_()))]
-    number, text = (odd or [cell for cell in cells if not _is(cell[1], pa.float64())])[0]
+    words = [cell for cell in cells if cell[1] and not _NUMBER.fullmatch(cell[1])]
+    number, text = ([cell for cell in words if cell[1].lower() not in ("true", "false")] or words or cells)[0]
     raise BadInputError(
         f"{source} line {line_of(source, row + number)}: field '{field}': "
         f"expected numbers, or true and false, got '{text}'"
@@ -322,18 +291,3 @@ def _lists(texts: pa.StringArray, source: Source, field: str, row: int) -> Array
                 f"{len(rows[0]) or 'some'} numbers as in the rows before, got '{found}'"
             )
     return np.array(rows)
-
-
-def without_blanks(texts: pa.StringArray | pa.ChunkedArray) -> pa.StringArray | pa.ChunkedArray:
-    """Return cells without blanks around them; those of nothing else are empty."""
-    trimmed = pc.utf8_trim_whitespace(texts)
-    return pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
-
-
-def _is(text: str | None, kind: pa.DataType) -> bool:
-    """Return whether a cell is empty or of a kind."""
-    try:
-        pc.cast(pa.array([text], pa.string()), kind)
-    except pa.ArrowInvalid:
-        return False
-    return True

@@ -7,7 +7,7 @@ when rows are taken (`io/resampling.py`).
 import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -30,16 +30,13 @@ _log = logging.getLogger(__name__)
 
 
 class MessageField:
-    """A field of a mapping: what it takes of each message of a topic.
+    """What a field takes of each message: `/topic:path.in.message`, or `/topic:path.in.message[name]`.
 
     Attributes:
-        name: the field.
-        topic: that it is of.
         wanted: the name of the value in a list with names beside it; "" where it is no such one.
     """
 
     def __init__(self, name: str) -> None:
-        """Take the field `name`, `/topic:path.in.message` or `/topic:path.in.message[name of the value]`."""
         self.name = name
         self.topic, _, path = name.partition(":")
         named = re.fullmatch(r"(.+?)\[(.+)\]", path)
@@ -118,16 +115,6 @@ def check(source: Source, mapping: ImportMapping) -> None:
     McapFile(source, {name.partition(":")[0] for name in mapping.all_fields})
 
 
-@dataclass
-class _Rows:
-    """Rows of one block, the topics' times in each, and how the block begins."""
-
-    values: list[dict[str, Array]] = field(default_factory=list)
-    times: list[dict[str, int]] = field(default_factory=list)
-    starts: bool = False
-    is_back: bool = False
-
-
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield rows at the rate `mapping.fps`.
 
@@ -142,19 +129,19 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     timeline = Timeline(file, gaps_s[0], max(gaps_s))
     resampler = Resampler(mapping, str(source), timeline.moments)
     topic_of = {field.name: topic for topic, each in fields.items() for field in each}
-    rows, known = _Rows(), sorted(file.topics - {field.topic for each in fields.values() for field in each})
+    known = sorted(file.topics - {field.topic for each in fields.values() for field in each})
+    rows: list[tuple[dict[str, Array], dict[str, int]]] = []
+    starts = goes_back = False
     for begins, is_back, row, times in _rows(source, resampler, timeline, fields):
-        if rows.values and (begins or len(rows.values) == BLOCK_ROWS):
-            yield _block(source, rows, known, topic_of)
-            rows = _Rows()
-        rows.starts |= begins
-        rows.is_back |= is_back
-        rows.values.append(row)
-        rows.times.append(times)
-    if rows.values:
-        yield replace(
-            _block(source, rows, known, topic_of), torn=int(file.is_cut), notes=resampler.unevenness()
-        )
+        if rows and (begins or len(rows) == BLOCK_ROWS):
+            block = _block(source, rows, topic_of)
+            yield replace(block, starts=starts, is_back=goes_back, known=known)
+            rows, starts, goes_back = [], False, False
+        starts, goes_back = starts or begins, goes_back or is_back
+        rows.append((row, times))
+    if rows:
+        block = replace(_block(source, rows, topic_of), starts=starts, is_back=goes_back, known=known)
+        yield replace(block, torn=int(file.is_cut), notes=resampler.unevenness())
 
 
 def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
@@ -242,15 +229,18 @@ def _rows(
         _log.warning("%s", silence)
 
 
-def _block(source: Source, rows: _Rows, known: list[str], topic_of: Mapping[str, str]) -> Block:
-    values = {name: np.stack([row[name] for row in rows.values]) for name in rows.values[0]}
+def _block(
+    source: Source, rows: list[tuple[dict[str, Array], dict[str, int]]], topic_of: Mapping[str, str]
+) -> Block:
+    """Return rows, each with the times of its topics, which name the places of values that are not finite."""
+    values = {name: np.stack([row[name] for row, _ in rows]) for name in rows[0][0]}
     places = {
-        row: f"{source} at {rows.times[row][topic_of[name]]} ns"
+        row: f"{source} at {rows[row][1][topic_of[name]]} ns"
         for name, column in reversed(values.items())
         if column.dtype.kind == "f"
         for row in np.flatnonzero(~np.isfinite(column.reshape(len(column), -1)).all(axis=1)).tolist()
     }
-    return Block(values, str(source), rows.starts, is_back=rows.is_back, places=places, known=known)
+    return Block(values, str(source), places=places)
 
 
 def _check_mapping(mapping: ImportMapping, origin: str) -> None:
