@@ -122,7 +122,7 @@ class Tally:
 
 
 class Cutter:
-    """Cuts consecutive blocks into episodes.
+    """Cuts consecutive blocks into episodes; `skip_bad` leaves out those with a value that is not finite.
 
     Attributes:
         tally: of the rows so far.
@@ -130,7 +130,6 @@ class Cutter:
     """
 
     def __init__(self, mapping: ImportMapping, *, skip_bad: bool = False) -> None:
-        """Cut by `mapping`; `skip_bad` leaves out whole episodes with a value that is not finite."""
         self.tally = Tally()
         self.columns: tuple[Column, ...] = ()
         self._mapping, self._skips = mapping, skip_bad and mapping.not_finite == "refuse"

@@ -162,10 +162,6 @@ def _minari(dataset: Dataset, path: Path, out: Path) -> None:
     With goals, observations are a dict of "observation" and "desired_goal" (T + 1, G). The end of `out` is
     the id: its path in Minari's folder, or its name elsewhere. `minari.create_dataset_from_buffers`
     would hold all episodes in memory, write into Minari's folder alone, and not notice a full disk.
-
-    Raises:
-        BadInputError: a next state is not the state of the following step, as Minari assumes, or the name of
-            `out` is not a valid id.
     """
     minari = optional("minari")
     from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here

@@ -86,7 +86,6 @@ class ImportReport:
     taken: str = ""
 
     def __str__(self) -> str:
-        """Summarize it in a few lines."""
         tally = self.tally
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
         notes = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
@@ -373,11 +372,7 @@ def refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
 
 
 def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the blocks of a file; where fields are (episodes, steps, ...), one for each episode.
-
-    Raises:
-        BadInputError: it cannot be read; or fields may be so, and the mapping does not say whether they are.
-    """
+    """Yield the blocks of a file; where fields are (episodes, steps, ...), one for each episode."""
     row, origin = 0, ""
     with explained(source, module):
         for block in module.read(source, mapping):

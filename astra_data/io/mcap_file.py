@@ -272,7 +272,6 @@ class _Stretch:
         return min(map(min, self.times.values()))
 
     def __len__(self) -> int:
-        """Return how many messages it has."""
         return sum(map(len, self.times.values()))
 
 

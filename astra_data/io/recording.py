@@ -80,7 +80,6 @@ class Source:
             self.faults.append(str(error))
 
     def __str__(self) -> str:
-        """Name the file within its recording, for messages and for the episodes' metadata."""
         if self.name:
             return self.name
         if self.member is not None:
@@ -105,7 +104,6 @@ class Part(io.RawIOBase):
     """The first `size` bytes of a stream, from where it is."""
 
     def __init__(self, stream: IO[bytes], size: int) -> None:
-        """Read from `stream`."""
         self._stream, self._left = stream, size
 
     def readable(self) -> bool:
@@ -149,7 +147,6 @@ class Block:
     row: int = 0
 
     def __len__(self) -> int:
-        """Return n."""
         return len(next(iter(self.values.values())))
 
     def place(self, at: int) -> str:
@@ -440,9 +437,6 @@ def _joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
     """Group files that are parts of one recording: those in a folder whose names end with `names`.
 
     What precedes that end is the same for all files of a recording: `run3_state.csv`, `run3_control.csv`.
-
-    Raises:
-        BadInputError: a recording lacks a file; lists all that are missing.
     """
     groups: dict[tuple[str, str], dict[str, Source]] = {}
     for source in sources:

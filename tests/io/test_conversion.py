@@ -1,11 +1,9 @@
 """Fields become columns: order of the operations, types, and what is refused."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from recordings import MAPPING, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
@@ -135,13 +133,6 @@ def test_values_are_called_as_their_fields_are_unless_the_mapping_says() -> None
     assert column_of("c", spec, 3).names is None
     assert column_of("c", spec.model_copy(update={"take": (0, 2)}), 2).names is None
     assert column_of("c", ColumnMapping(fields=("reward",)), 1).names is None
-
-
-def test_large_integers_need_a_dtype_that_holds_them(tmp_path: Path) -> None:
-    fields = rows() | {"stamp": np.full(20, 2**60 + 1)}
-    mapping = MAPPING.replace('fields = ["gait"]\ndtype = "int64"', 'fields = ["stamp"]')
-    with pytest.raises(BadInputError, match=r"gait: integers beyond 2\^53 do not fit float32; set dtype"):
-        imported(tmp_path, write_table(tmp_path / "log.npz", fields), mapping)
 
 
 def test_whole_numbers_are_exact_to_their_bounds() -> None:

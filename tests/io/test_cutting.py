@@ -233,27 +233,6 @@ def test_rejected_rows(not_finite: str, expected: list[list[int]], points: dict[
     assert cutting.tally.split_points == points
 
 
-def test_a_rejected_row_still_ends_its_episode() -> None:
-    cutting = cutter(not_finite="drop", split={"ends": ("end",)})
-    episodes = cut(cutting, x=[0, 0, np.nan, 0, 0], end=[0, 0, 1, 0, 0])
-    assert rows(episodes) == [[0], [3]]
-    assert cutting.tally.split_points == {"end": 1}
-
-
-@pytest.mark.parametrize(("not_finite", "kept"), [("drop", [[0, 1, 2]]), ("split", [[0], [2]])])
-def test_a_row_that_is_cut_off_where_the_next_file_goes_on_is_a_rejected_one(
-    not_finite: str, kept: list[list[int]]
-) -> None:
-    cutting = cutter(not_finite=not_finite)
-    begun, rest = (
-        Block({"x": np.zeros(2), "a": first + np.arange(2)}, f"{first}.csv", torn=torn)
-        for first, torn in ((0, 1), (2, 0))
-    )
-    cuts = [*cutting.feed(begun, is_apart=True), *cutting.feed(rest, is_apart=False)]
-    assert rows([columns for columns, _ in [*cuts, *cutting.cut()]]) == kept
-    assert (cutting.tally.rows, cutting.tally.torn_rows, cutting.tally.rejected_rows) == (5, 1, 1)
-
-
 def test_a_rejected_row_that_ends_its_episode_is_no_gap_and_changes_no_rate() -> None:
     cutting = cutter(time="t", not_finite="split", split={"gap_s": 0.15})
     x = np.where(np.arange(60) % 3 == 2, np.nan, 0.0)

@@ -1,10 +1,7 @@
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
-import full_disk
 import h5py
 import numpy as np
 import pytest
@@ -101,24 +98,6 @@ def test_one_value_a_step_is_a_vector_of_one(
     width = 2 if format == "d3rlpy" else 1
     assert {shape[1:] for field, shape in shapes.items() if "actions" not in field} == {(width,)}
     assert {shape[1:] for field, shape in shapes.items() if "actions" in field} == {(1,)}
-
-
-def test_a_full_disk_leaves_one_line_and_nothing_else(dataset: Dataset, tmp_path: Path) -> None:
-    cases = []
-    for format, name in FILES.items():
-        whole = tmp_path / "whole" / format / name
-        export(dataset, whole, format=format)
-        size = (whole / "data/main_data.hdf5" if whole.is_dir() else whole).stat().st_size
-        cases += [(format, name, int(size * share)) for share in (0, 0.5, 0.97)]
-    command = [sys.executable, full_disk.__file__, str(dataset.root), str(tmp_path), json.dumps(cases)]
-    settings = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # it forks
-    done = subprocess.run(command, env=settings, capture_output=True, text=True, check=True)
-    results = json.loads(done.stdout)
-    assert len(results) == len(cases) == 12
-    for number, (status, line) in enumerate(results):
-        assert (status, line.count("\n")) == (1, 1), (cases[number], line)
-        assert "cannot be written: a file would be larger than is allowed" in line
-        assert not (tmp_path / str(number)).exists()
 
 
 @pytest.mark.parametrize("format", sorted(EXPORTERS))

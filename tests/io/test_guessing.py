@@ -51,10 +51,6 @@ ROLES: dict[str, tuple[dict[str, object], dict[str, str]]] = {
         {"stamp_motors": "left out", "t": "time s 1", "gps_time_utc_usec": "left out"}
         | {"ros_timestamp_setpoint": "left out", "time_to_goal": "state time_to_goal 1 1"},
     ),
-    "PX4": (
-        {"timestamp": 1e5 * RAMP, "timestamp_sample": 1e5 * RAMP - 300, "x": RAMP, "vx_sp": RAMP},
-        {"timestamp": "time us 1e-06", "timestamp_sample": "left out", "vx_sp": "command vx 1 1"},
-    ),
     "ROS": (
         {"header.stamp": 5e7 * RAMP, "pose.position.x": RAMP, "cmd_vel.angular.z": RAMP, "done": LATE},
         {
@@ -68,11 +64,6 @@ ROLES: dict[str, tuple[dict[str, object], dict[str, str]]] = {
         {"q": RAMP, "torque_roll": RAMP, "thrust": RAMP, "cmd_q": RAMP},
         {"torque_roll": "state torque_roll N m 1", "thrust": "state thrust N 1"},
     ),
-    "torques alone": ({"q1": RAMP, "tau1": RAMP}, {"q1": "state q1 rad 1", "tau1": "command tau1 N m 1"}),
-    "pedals": (
-        {"x": RAMP, "throttle": RAMP, "steering_angle": -RAMP},
-        {"throttle": "command throttle 1 1", "steering_angle": "command steering_angle rad 1"},
-    ),
     "positions": (
         {"east": RAMP, "gps_northing": RAMP, "altitude": RAMP, "angular_x": RAMP, "cmd": RAMP},
         {"east": "state east m 1", "gps_northing": "state gps_northing m 1", "altitude": "state altitude m 1"}
@@ -82,10 +73,6 @@ ROLES: dict[str, tuple[dict[str, object], dict[str, str]]] = {
         {"gps_latitude": 60 + RAMP / 1e5, "gps_longitude": RAMP / 1e5, "lat": RAMP, "cmd": RAMP},
         {"gps_latitude": "state gps_latitude m 1.112e+05", "gps_longitude": "state gps_longitude m 5.56e+04"}
         | {"lat": "state lat 1 1"},  # may be lateral
-    ),
-    "latitude of PX4": (
-        {"lat": 6e8 + RAMP, "lon": 1e8 + RAMP, "cmd": RAMP},
-        {"lat": "state lat m 0.01112", "lon": "state lon m 0.00556"},
     ),
     "headings": (
         {"compass": 70 * RAMP, "cog": RAMP, "Heading [°]": RAMP, "cmd": RAMP},
@@ -97,10 +84,6 @@ ROLES: dict[str, tuple[dict[str, object], dict[str, str]]] = {
         {"e_stop": "failure", "fell": "left out", "docked": "success", "reward": "reward"},
     ),
     "a flag that ends its log": ({"x": RAMP, "cmd": RAMP, "folded": LATE}, {"folded": "failure"}),
-    "a flag beside a failure": (
-        {"x": RAMP, "cmd": RAMP, "folded": LATE, "fell": LATE},
-        {"folded": "left out", "fell": "failure"},
-    ),
     "a flag that ends nothing": ({"x": RAMP, "cmd": RAMP, "grip": RAMP == 2}, {"grip": "left out"}),
     "goals": (
         {"x": RAMP, "cmd": RAMP, "goal_x_cm": 4, "target_y": 7, "dist_to_goal": RAMP, "waypoint": RAMP},

@@ -10,9 +10,9 @@ from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 from scipy.io import savemat
 
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.dataset.columns import REWARD, STATE, TERMINATED
+from astra_data.dataset.columns import REWARD, STATE
 from astra_data.io.cutting import Cutter, Tally
-from astra_data.io.importing import import_dataset
+from astra_data.io.importing import ImportReport, import_dataset
 
 PER_FILE = MAPPING.replace('field = "trial"', "")
 ONE_LOG = PER_FILE.replace('[columns."next.terminated"]\nfields = ["fell"]\n', "") + "files = false\n"
@@ -137,15 +137,6 @@ def test_a_mapping_with_a_format_that_does_not_exist_is_told(tmp_path: Path) -> 
     path = write_table(tmp_path / "a.csv", rows())
     with pytest.raises(BadInputError, match="no format 'cvs': did you mean 'csv'"):
         imported(tmp_path, path, 'format = "cvs"\n' + MAPPING)
-
-
-def test_mapped_flags_split_a_log_of_many_episodes(tmp_path: Path) -> None:
-    done = np.isin(np.arange(20), (4, 9, 14, 18))
-    path = write_table(tmp_path / "log.csv", rows() | {"fell": done})
-    dataset, report = imported(tmp_path, path, PER_FILE)
-    assert dataset.lengths.tolist() == [5, 5, 5, 4]
-    assert report.tally.split_points == {"end": 4}
-    np.testing.assert_array_equal(dataset.columns([TERMINATED])[TERMINATED], done[:19])
 
 
 def test_rewards_of_rows_that_are_dropped_are_told(tmp_path: Path) -> None:
@@ -365,3 +356,16 @@ def test_fields_that_are_not_finite_are_named_with_their_places(tmp_path: Path) 
         match=r"2 of 20 rows .*: x\[2\] in 1 row, log\.npz row 2; x\[0\] in 1 row, log\.npz row 0",
     ):
         imported(tmp_path / "wide", wide, mapping.replace('role = ["position"]\n', ""))
+
+
+def test_what_is_strange_about_topics_of_several_files_is_told_once() -> None:
+    tally = Tally(topics={"/odom is late": ["0.mcap"], "/odom is slow": [f"{k}.mcap" for k in range(9)]})
+    tally.notes += ["0.csv: 40 Hz, 20 Hz declared"]
+    lines = [
+        "",
+        "0.mcap: /odom is late",
+        "0.mcap, 1.mcap and 7 more: /odom is slow",
+        *tally.notes,
+        "rejected",
+    ]
+    assert "\n".join(lines) in str(ImportReport(Path("out"), 2, 7, tally, 0.25))

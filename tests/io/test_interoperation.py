@@ -55,7 +55,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     reading.write_text(READING)
     edit = ["lerobot-edit-dataset", "--repo_id=a/b", *at]
     commands = {
-        "info": [*edit, "--operation.type=info"],
         "delete": [
             *edit,
             "--operation.type=delete_episodes",
@@ -101,12 +100,6 @@ def assert_succeeded(runs: Runs, name: str) -> str:
     code, output = runs.results[name]
     assert code == 0, output
     return output
-
-
-def test_lerobots_editor_reads_it(runs: Runs) -> None:
-    output = assert_succeeded(runs, "info")
-    assert "Total episode: 5" in output
-    assert "Actual Count): 55(55)" in output
 
 
 def test_our_metadata_is_joined_again_after_lerobot_deleted_episodes(runs: Runs, tmp_path: Path) -> None:

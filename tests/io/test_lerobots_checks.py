@@ -37,25 +37,22 @@ def lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespac
 
 
 @pytest.fixture(scope="module")
-def paired(tmp_path_factory: pytest.TempPathFactory) -> list[Dataset]:
-    """Two datasets of a task of a user's own, collected and paired, of two seeds."""
+def paired(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """A dataset of a task of a user's own, collected and paired."""
     folder = tmp_path_factory.mktemp("paired")
     config = CollectConfig(episodes=6, max_steps=40, start="task", hold_s=(0.1, 0.4))
-    for seed in (0, 1):
-        collect(TASK, config, seed=seed, out=folder / f"collect_{seed}", progress=silent)
-        pair(TASK, dataset=folder / f"collect_{seed}", out=folder / f"pair_{seed}")
-    return [Dataset.open(folder / f"pair_{seed}") for seed in (0, 1)]
+    collect(TASK, config, seed=0, out=folder / "collect", progress=silent)
+    pair(TASK, dataset=folder / "collect", out=folder / "pair")
+    return Dataset.open(folder / "pair")
 
 
 def opened(lerobot: SimpleNamespace, root: Path) -> Any:  # noqa: ANN401 - lerobot has no types
     return lerobot.lerobot_dataset.LeRobotDataset("a/b", root=root, video_backend="pyav")
 
 
-def test_every_frame_is_one_that_lerobot_would_record(
-    lerobot: SimpleNamespace, paired: list[Dataset]
-) -> None:
-    features = opened(lerobot, paired[0].root).meta.features
-    for episode in paired[0].episodes():
+def test_every_frame_is_one_that_lerobot_would_record(lerobot: SimpleNamespace, paired: Dataset) -> None:
+    features = opened(lerobot, paired.root).meta.features
+    for episode in paired.episodes():
         for step in range(len(episode)):
             frame = {name: np.atleast_1d(values[step]) for name, values in episode.columns.items()}
             frame["episode_uid"] = np.array([episode.uid])
@@ -66,9 +63,9 @@ def test_every_frame_is_one_that_lerobot_would_record(
 
 
 def test_statistics_are_those_that_lerobot_computes_anew(
-    lerobot: SimpleNamespace, paired: list[Dataset], tmp_path: Path
+    lerobot: SimpleNamespace, paired: Dataset, tmp_path: Path
 ) -> None:
-    shutil.copytree(paired[0].root, tmp_path / "copy")
+    shutil.copytree(paired.root, tmp_path / "copy")
     ours = json.loads((tmp_path / "copy/meta/stats.json").read_text())
     lerobot.dataset_tools.recompute_stats(opened(lerobot, tmp_path / "copy"))
     theirs = json.loads((tmp_path / "copy/meta/stats.json").read_text())
@@ -81,26 +78,14 @@ def test_statistics_are_those_that_lerobot_computes_anew(
 
 
 def test_statistics_have_the_shapes_and_quantiles_that_lerobots_policies_take(
-    lerobot: SimpleNamespace, paired: list[Dataset]
+    lerobot: SimpleNamespace, paired: Dataset
 ) -> None:
-    meta = opened(lerobot, paired[0].root).meta
+    meta = opened(lerobot, paired.root).meta
     lerobot.compute_stats._assert_type_and_shape([meta.stats])
     lerobot.compute_stats.aggregate_stats([meta.stats, meta.stats])
     assert lerobot.augment.has_quantile_stats(meta.stats)
-    values = paired[0].columns(["action", "abstract.state"])
+    values = paired.columns(["action", "abstract.state"])
     for name, column in values.items():
         for key, share in QUANTILES.items():
             expected = np.quantile(column.reshape(len(column), -1), share, axis=0)
             np.testing.assert_allclose(meta.stats[name][key], expected, rtol=1e-4, atol=1e-5, err_msg=key)
-
-
-def test_the_sampler_finds_every_frame_once_and_leaves_out_last_ones(
-    lerobot: SimpleNamespace, paired: list[Dataset]
-) -> None:
-    dataset = paired[0]
-    ends = opened(lerobot, dataset.root).meta.episodes
-    given = ends["dataset_from_index"], ends["dataset_to_index"]
-    sampled = lerobot.sampler.EpisodeAwareSampler(*given, shuffle=True)
-    assert sorted(sampled) == [*range(int(dataset.lengths.sum()))]
-    shorter = lerobot.sampler.EpisodeAwareSampler(*given, drop_n_last_frames=2)
-    assert len(list(shorter)) == int((dataset.lengths - 2).clip(0).sum())

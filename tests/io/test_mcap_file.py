@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, Writer
 from mcap_recordings import Message, command, ns, pose, write_json
 
 from astra_data.core.errors import BadInputError
@@ -44,18 +44,7 @@ def numbers(path: Path, *, checked: bool = True) -> tuple[list[int], bool]:
 WANTED = [number for number in range(LENGTH) if number % 5 and not 100 < number < 200]
 FORMS: dict[str, dict[str, Any]] = {
     "usual": {},
-    "lz4": {"compression": CompressionType.LZ4},
     "without chunks": {"use_chunking": False},
-    "without indexes of messages": {"index_types": IndexType.CHUNK},
-    "without an index": {"index_types": IndexType.NONE},
-    "without channels in the summary": {"repeat_channels": False, "repeat_schemas": False},
-    "without a summary": {
-        "index_types": IndexType.NONE,
-        "repeat_channels": False,
-        "repeat_schemas": False,
-        "use_statistics": False,
-        "use_summary_offsets": False,
-    },
 }
 
 
@@ -111,12 +100,12 @@ def test_chunks_without_wanted_messages_are_not_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["usual", "without chunks"])
-@pytest.mark.parametrize("zeros", [0, 1, 8, 9, 1000, 200_000])
+@pytest.mark.parametrize("zeros", [0, 9, 70_000])
 def test_a_file_that_is_cut_off_is_read_up_to_there(tmp_path: Path, form: str, zeros: int) -> None:
     whole = write(tmp_path / "whole.mcap", **FORMS[form]).read_bytes()
     path = tmp_path / "log.mcap"
     lengths = set()
-    for cut in range(200, len(whole) - 1, 97):
+    for cut in range(200, len(whole) - 1, 397):
         path.write_bytes(whole[:cut] + bytes(zeros))
         try:
             read, is_cut = numbers(path)

@@ -27,6 +27,8 @@ from astra_data.io.hub.sums import SUMS_PATH, Listed, altered, make_sums, parse_
 
 MOST_BYTES = 100 * 10**9
 """Most bytes that are downloaded unless more are asked for; a robot's logs stay far below."""
+MOST_NAMED = 20
+"""Folders in which datasets are looked for, each with a request of its own."""
 
 
 def push(
@@ -153,8 +155,12 @@ def pull(
         )
     known = place.versions()
     if not known:
-        if isinstance(place, UrlStore) and (inside := place.datasets()):
-            raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
+        if isinstance(place, UrlStore):
+            inside = [
+                f"{place}/{name}" for name in place.names()[:MOST_NAMED] if place.below(name).versions()
+            ]
+            if inside:
+                raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
         raise SharingError(
             f"{place} has no dataset of astra-data: no tag or folder such as data-1.2.0. "
             "A plain LeRobot dataset is opened with lerobot; otherwise check the spelling."
@@ -183,11 +189,7 @@ def pull(
 
 
 def opened(data: str | Path) -> Dataset:
-    """Open a dataset here, or pull it.
-
-    Raises:
-        BadInputError, CorruptDatasetError, SharingError: as `open_dataset` and `pull`.
-    """
+    """Open a dataset here, or pull it."""
     return pull(str(data)) if is_address(data) else open_dataset(data)
 
 
@@ -232,12 +234,7 @@ def _fetch_all(
 
 
 def fetch(remote: RemoteFolder, path: str, folder: Path, size: int) -> None:
-    """Download the file `path` into `folder`: never more than one byte over its listed `size`.
-
-    Raises:
-        DiskError: it cannot be written.
-        SharingError: it cannot be read.
-    """
+    """Download the file `path` into `folder`: never more than one byte over its listed `size`."""
     target = folder / path
     with explained(f"{remote.name}: {path}"), writing(target, place=False):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -247,11 +244,7 @@ def fetch(remote: RemoteFolder, path: str, folder: Path, size: int) -> None:
 
 
 def refuse_planted(folder: Path) -> None:
-    """Look for what no pull leaves in its unfinished `folder`, through which one would write elsewhere.
-
-    Raises:
-        SharingError: there is a link, a device or a pipe, or a file that has another name besides.
-    """
+    """Raise SharingError if an unfinished `folder` has links, devices, pipes or files with a second name."""
     for entry in [folder, *folder.rglob("*")]:
         is_plain = entry.is_file() and entry.lstat().st_nlink == 1
         if entry.is_symlink() or not (entry.is_dir() or is_plain):
@@ -286,11 +279,7 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Li
 
 
 def _check(folder: Path, sums: Mapping[str, Listed], description: Mapping[str, Any], name: str) -> None:
-    """Check that the downloaded files are the complete dataset; they may have been written by anybody.
-
-    Raises:
-        SharingError: they are not; what differs from its sum is deleted, or everything.
-    """
+    """Check that the downloaded files are the complete dataset; they may have been written by anybody."""
     if wrong := altered(folder, sums):
         for path in wrong:
             (folder / path).unlink(missing_ok=True)

@@ -30,9 +30,6 @@ TEXT_BYTES = 2**26
 """Most bytes of a description or of SHA256SUMS; some hundred thousand recordings or files fit into it."""
 BLOCK_BYTES = 2**24
 """Bytes per request."""
-MOST_FOLDERS = 20
-"""Folders in which datasets are looked for, each with a request of its own."""
-MOST_VERSIONS = 1000
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 """Protocol → the extra of this package that is needed for it."""
 
@@ -104,9 +101,8 @@ class RemoteFolder:
                 facts = dict(self.filesystem.info(f"{self.path}/{path}"))
             except FileNotFoundError:
                 return {}
-            is_linked = self._is_here and os.path.realpath(f"{self.path}/{path}") != os.path.join(
-                os.path.realpath(self.path), path
-            )
+            root = os.path.realpath(self.path)
+            is_linked = self._is_here and os.path.realpath(f"{self.path}/{path}") != os.path.join(root, path)
         if facts.get("type") != "file" or facts.get("islink") or is_linked:
             raise SharingError(f"{self.name}: {path} is a link, a device or a pipe, expected a file.")
         return facts
@@ -120,11 +116,7 @@ class RemoteFolder:
                 yield block
 
     def read_text(self, path: str) -> str:
-        """Return the text of the small file `path`.
-
-        Raises:
-            SharingError: it cannot be read, is not there, or is larger than `TEXT_BYTES`.
-        """
+        """Return the text of the small file `path`, or raise a SharingError."""
         if not self.facts(path):
             raise SharingError(f"{self.name} has no {path}: it was not pushed by astra-data.")
         with explained(f"{self.name}: {path}"):
@@ -134,11 +126,7 @@ class RemoteFolder:
             return content.decode()
 
     def description(self) -> dict[str, Any]:
-        """Return meta/astra/dataset.json.
-
-        Raises:
-            SharingError: it cannot be read.
-        """
+        """Return meta/astra/dataset.json, or raise a SharingError."""
         text = self.read_text(layout.DATASET_PATH)
         try:
             return dict(json.loads(text))
@@ -151,9 +139,6 @@ class RemoteFolder:
         """Return which files of `sums` are missing here or differ, as far as is known without a download.
 
         Sizes are compared everywhere, the sha256 of large files on the Hub and of all in folders here.
-
-        Raises:
-            SharingError: the place cannot be reached, or something is no plain file.
         """
         found = {path: self.facts(path) for path in sums}
         return [
@@ -172,8 +157,7 @@ class RemoteFolder:
 
     @property
     def _is_here(self) -> bool:
-        protocol = self.filesystem.protocol
-        return "file" in ((protocol,) if isinstance(protocol, str) else protocol)
+        return "file" in str(self.filesystem.protocol)
 
 
 @dataclass(frozen=True)
@@ -183,16 +167,10 @@ class HubStore:
     repo: str
 
     def __str__(self) -> str:
-        """Return it as a URL."""
         return f"hf://datasets/{self.repo}"
 
     def create(self, *, private: bool) -> None:
-        """Create the repository unless it exists.
-
-        Raises:
-            BadInputError: the repository is public and should be private.
-            SharingError: the Hub refuses or cannot be reached.
-        """
+        """Create the repository unless it exists; raise BadInputError if it is public but should not be."""
         with self._api() as api:
             # None stands for the default of the user or the organization.
             api.create_repo(self.repo, repo_type=KIND, private=private or None, exist_ok=True)
@@ -217,21 +195,24 @@ class HubStore:
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
         """Add `dataset`: its files and card, then the tag "v3.0", then the tag that marks it as complete.
 
-        `upload_folder` may make several commits, of which the first would leave a mixture behind.
-
-        Args:
-            dataset: complete and verified.
-            card: a folder with SHA256SUMS, README.md and perhaps its figure.
-            progress: called with the fraction done.
+        `upload_folder` may make several commits, of which the first would leave a mixture behind. The folder
+        `card` has SHA256SUMS, README.md and perhaps its figure.
 
         Raises:
             BadInputError: the Hub refuses the card, or the repository holds another dataset or a newer one.
-            SharingError: the Hub refuses or cannot be reached.
         """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
 
         version = Version.parse(dataset.description["version"])
-        self._refuse_mixing(dataset, version)
+        if known := self.versions():
+            name = self.folder(known[-1]).description().get("name")
+            if name != dataset.description["name"]:
+                raise BadInputError(f"{self.repo} holds the dataset {name!r}; choose another repository.")
+            if known[-1] > version:
+                raise BadInputError(
+                    f"{self.repo} has {known[-1].tag} already, and main shows the newest version: "
+                    f"{version.tag} can no longer be added. Push it to another place."
+                )
         with self._api() as api:
             progress(0.0, "files")
             # If somebody else commits from here on, this commit fails.
@@ -261,19 +242,6 @@ class HubStore:
             for tag in (layout.CODEBASE_VERSION, version.tag):
                 api.create_tag(self.repo, tag=tag, revision=commit.oid, repo_type=KIND)
         progress(1.0, version.tag)
-
-    def _refuse_mixing(self, dataset: Dataset, version: Version) -> None:
-        known = self.versions()
-        if not known:
-            return
-        name = self.folder(known[-1]).description().get("name")
-        if name != dataset.description["name"]:
-            raise BadInputError(f"{self.repo} holds the dataset {name!r}; choose another repository.")
-        if known[-1] > version:
-            raise BadInputError(
-                f"{self.repo} has {known[-1].tag} already, and main shows the newest version: "
-                f"{version.tag} can no longer be added. Push it to another place."
-            )
 
     def _commits(self) -> dict[Version, str]:
         with self._api() as api:
@@ -317,7 +285,6 @@ class UrlStore:
             raise BadInputError(f"{url}: {how}") from error
 
     def __str__(self) -> str:
-        """Return the URL."""
         return self.url
 
     def below(self, name: str) -> "UrlStore":
@@ -328,26 +295,19 @@ class UrlStore:
         """Return the complete versions, the oldest first."""
         with explained(self.url):
             self._filesystem.invalidate_cache()
-            versions = {version for name in self._listed() if (version := Version.from_tag(name))}
-            if len(versions) > MOST_VERSIONS:  # each is a request
-                raise SharingError(f"{self.url} lists more than {MOST_VERSIONS} versions")
-            marks = {version: f"{self.folder(version).path}/{layout.DATASET_PATH}" for version in versions}
-            return sorted(version for version, mark in marks.items() if self._filesystem.exists(mark))
+            found = (version for name in self.names() if (version := Version.from_tag(name)))
+            return sorted(
+                v for v in found if self._filesystem.exists(f"{self.folder(v).path}/{layout.DATASET_PATH}")
+            )
 
-    def datasets(self) -> list[str]:
-        """Return the URLs of the datasets that the first of its folders are, where it holds several."""
-        with explained(self.url):
-            inside = [self.below(name) for name in sorted(self._listed())[:MOST_FOLDERS]]
-        return [store.url for store in inside if store.versions()]
-
-    def _listed(self) -> list[str]:
+    def names(self) -> list[str]:
         """Return the names of the folders in it."""
         try:
             found = self._filesystem.ls(self._path, detail=True)
         except FileNotFoundError:
             return []
-        paths = [str(facts["name"]).rstrip("/") for facts in found if facts["type"] == "directory"]
-        return [path.rpartition("/")[2] for path in paths]
+        paths = (str(facts["name"]).rstrip("/") for facts in found if facts["type"] == "directory")
+        return sorted({path.rpartition("/")[2] for path in paths})
 
     def folder(self, version: Version) -> RemoteFolder:
         """Return the folder with the files of `version`."""
@@ -357,11 +317,7 @@ class UrlStore:
         """Upload `dataset`: `layout.DATASET_PATH` is written last and marks it as complete.
 
         SHA256SUMS is written first and identifies the upload: the next push of the same files repeats an
-        interrupted one, and no existing file is ever deleted.
-
-        Raises:
-            BadInputError: the folder holds other files.
-            SharingError: the place denies access or cannot be reached.
+        interrupted one, and no existing file is ever deleted. Raise BadInputError if the folder holds others.
         """
         remote = self.folder(Version.parse(dataset.description["version"]))
         sums = (card / SUMS_PATH).read_bytes()
@@ -370,7 +326,9 @@ class UrlStore:
         mark = files.pop(layout.DATASET_PATH)
         with explained(self.url):
             self._filesystem.invalidate_cache()
-            if not self._is_begun(remote):
+            # Hidden files may be left in a folder by a killed push.
+            there = (str(path).removeprefix(remote.path) for path in self._filesystem.find(remote.path))
+            if not any("/." not in path for path in there):
                 self._write(f"{remote.path}/{SUMS_PATH}", sums)
             for number, (path, file) in enumerate(files.items()):
                 # Checked before every file: a push of other values may have begun at the same time.
@@ -385,11 +343,6 @@ class UrlStore:
             self._refuse_others(remote, sums)
             self._write(f"{remote.path}/{layout.DATASET_PATH}", mark.read_bytes())
         progress(1.0, f"{len(files) + 1} files")
-
-    def _is_begun(self, remote: RemoteFolder) -> bool:
-        """Return whether there are files, but for hidden ones, which a killed push may leave in a folder."""
-        found = (str(path).removeprefix(remote.path) for path in self._filesystem.find(remote.path))
-        return any("/." not in path for path in found)
 
     def _write(self, path: str, content: bytes) -> None:
         """Write a small file; in a folder of this machine it is there whole, or not at all."""

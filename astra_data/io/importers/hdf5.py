@@ -75,11 +75,7 @@ def _blocks(
 
 @contextmanager
 def _opened(source: Source) -> Iterator[tuple[Any, Any]]:
-    """Open a file; yield h5py and it.
-
-    Raises:
-        BadInputError: it is of MATLAB's older format; says what to do.
-    """
+    """Open a file; yield h5py and it."""
     with source.open() as stream:
         if stream.read(10) == b"MATLAB 5.0":
             raise BadInputError(

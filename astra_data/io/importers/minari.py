@@ -92,11 +92,7 @@ def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
 
 
 def _after_steps(fields: dict[str, Array], mapping: ImportMapping, origin: str) -> tuple[str, ...]:
-    """Let infos with an entry of the reset be those after each step, but for observations; return a note.
-
-    Raises:
-        BadInputError: an observation and another column take the same one.
-    """
+    """Let infos with an entry of the reset be those after each step, but for observations; return a note."""
     observed, others = set[str](), set(mapping.split.ends)
     for name, column in mapping.columns.items():
         (observed if name.startswith("observation") else others).update(column.fields)

@@ -6,9 +6,7 @@ import pytest
 from fake_dataset import DESCRIPTION, write_fake
 from fake_hub import Hub, Repository
 from shared_files import contents
-from typer.testing import CliRunner
 
-from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError, SharingError
 from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.sharing import pull, push
@@ -71,16 +69,6 @@ def test_every_version_keeps_its_tag_and_main_shows_the_newest(
         BadInputError, match=r"has data-1\.10\.0 already.*data-1\.9\.0 can no longer be added"
     ):
         push(versioned(tmp_path / "late", "1.9.0").root, "me/it")
-
-
-def test_a_version_there_never_changes(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
-    push(fake.root, "me/it")
-    repo = hub.repos["me/it"]
-    before = (dict(repo.tags), list(repo.history))
-    push(fake.root, "hf://datasets/me/it")
-    with pytest.raises(BadInputError, match=r"data-1\.0\.0 holds other values"):
-        push(write_fake(tmp_path / "changed", fps=10).root, "me/it")
-    assert (repo.tags, repo.history) == before
 
 
 def test_an_altered_file_there_is_told_without_a_download(hub: Hub, fake: Dataset) -> None:
@@ -215,27 +203,3 @@ def test_another_dataset_is_not_mixed_with_the_one_there(hub: Hub, fake: Dataset
     other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other", "version": "2.0.0"})
     with pytest.raises(BadInputError, match="holds the dataset 'fake'"):
         push(other.root, "me/it")
-
-
-def test_the_command_line_shares_and_fetches(
-    hub: Hub, fake: Dataset, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("notes.toml").write_text('license = "mit"\n')
-
-    def call(*words: str) -> str:
-        result = CliRunner().invoke(app, words, catch_exceptions=False)
-        assert result.exit_code == 0
-        return result.stdout
-
-    pushed = call("push", str(fake.root), "me/it", "--notes", "notes.toml", "--private")
-    assert pushed == "shared: hf://datasets/me/it@data-1.0.0\n"
-    repo = hub.repos["me/it"]
-    assert repo.private
-    assert b"license: mit" in repo.commits[repo.head]["README.md"]
-    assert call("pull", "me/it") == f"fake@data-1.0.0: {home}/fake/data-1.0.0\n"
-    assert contents(home / "fake/data-1.0.0") == contents(fake.root)
-    assert call("export", "fake", "--format", "card", "--out", "fake.md", "--notes", "notes.toml") == (
-        "written: fake.md\nwritten: fake-coverage.png\n"
-    )
-    assert "license: mit" in Path("fake.md").read_text()

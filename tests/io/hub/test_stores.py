@@ -184,16 +184,6 @@ def test_a_second_push_at_once_takes_nothing_from_the_first(
     assert contents(pull(f"file://{tmp_path}/shared/fake", out=tmp_path / "out").root) == contents(fake.root)
 
 
-def test_a_push_stops_where_another_began_with_it(
-    fake: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sums = tmp_path / "shared/fake/data-1.0.0/SHA256SUMS"
-    sent = at_the_third_file(monkeypatch, lambda: sums.write_text("of other values"))
-    with pytest.raises(BadInputError, match="a part of another push of this version"):
-        push(fake.root, f"file://{tmp_path}/shared")
-    assert len(sent) == 3
-
-
 def test_missing_rights_are_told(s3: str, fake: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     store = UrlStore(f"{s3}/fake")
 

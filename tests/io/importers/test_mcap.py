@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.writer import Writer as McapWriter
 from mcap_recordings import MAPPING, command, log, ns, pose, write_json, write_protobuf, write_ros2
 from mcap_ros2.writer import Writer
@@ -12,6 +13,7 @@ from recordings import imported
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.dataset.reader import Dataset
+from astra_data.io.importers.mcap import MessageField
 from astra_data.io.importing import import_dataset
 
 
@@ -293,3 +295,79 @@ def test_publishers_of_one_topic_are_held_apart(tmp_path: Path, shared: bool) ->
     assert alone.schema[0].size == 2
     with pytest.raises(BadInputError, match=r"no 'thumb' in /joints:position"):
         imported(tmp_path / "none", path, mapping.replace("[grip]", "[thumb]"))
+
+
+def named(names: list[str], velocity: list[float]) -> dict[str, Any]:
+    return {"name": names, "velocity": velocity}
+
+
+TWIST = {"linear": {"x": 0.5, "y": 0.0, "z": 0.0}}
+STAMPED = {"header": {"stamp": {"sec": 1_764_000_000, "nanosec": 123_456_789}}}
+
+
+@pytest.mark.parametrize(
+    ("field", "content", "expected"),
+    [
+        ("/cmd_vel:linear.x", TWIST, 0.5),
+        ("/joints:velocity", named(["a", "b"], [1.0, 2.0]), [1.0, 2.0]),
+        ("/joints:velocity.1", named(["a", "b"], [1.0, 2.0]), 2.0),
+        ("/joints:velocity[b]", named(["a", "b"], [1.0, 2.0]), 2.0),
+        ("/joints:velocity[arm/b.1]", named(["arm/b.1", "b"], [1.0, 2.0]), 1.0),
+        ("/joints:arms.0.velocity[b]", {"arms": [named(["a", "b"], [1.0, 2.0])]}, 2.0),
+        ("/odom:header.stamp.sec", STAMPED, 1_764_000_000),
+        ("/mode:name", {"name": "walk"}, "walk"),
+    ],
+)
+def test_a_path_leads_to_a_value(field: str, content: Any, expected: Any) -> None:  # noqa: ANN401
+    np.testing.assert_array_equal(MessageField(field).value(content), expected)
+
+
+@pytest.mark.parametrize(
+    ("field", "content", "fault"),
+    [
+        (
+            "/cmd_vel:linear.xx",
+            TWIST,
+            "no part 'xx' in /cmd_vel:linear, which has x, y, z: did you mean 'x'?",
+        ),
+        (
+            "/clock:secs",
+            Timestamp(seconds=1),
+            "no part 'secs' in /clock, which has seconds, nanos: did you mean 'seconds'?",
+        ),
+        (
+            "/joints:velocity.2",
+            named(["a"], [1.0]),
+            "no part '2' in /joints:velocity, which has 1 values, counted from 0",
+        ),
+        (
+            "/joints:velocity[left_weel]",
+            named(["left_wheel"], [1.0]),
+            "no 'left_weel' in /joints:velocity: did you mean 'left_wheel'?",
+        ),
+        ("/cmd_vel:linear", TWIST, "'/cmd_vel:linear' is neither a number nor a list of numbers"),
+    ],
+)
+def test_what_a_message_lacks_is_told_with_what_it_has(field: str, content: Any, fault: str) -> None:  # noqa: ANN401
+    with pytest.raises(BadInputError) as error:
+        MessageField(field).value(content)
+    assert str(error.value) == fault
+
+
+@pytest.mark.parametrize(
+    ("field", "left"), [("velocity[left]", 1.0), ("velocity", None), ("velocity.0", None)]
+)
+def test_joints_in_another_order_are_told_apart_by_name_alone(field: str, left: float | None) -> None:
+    of_joint = MessageField(f"/joints:{field}")
+    of_joint.value(named(["left", "right"], [1.0, 2.0]))
+    of_joint.value(named(["left", "right"], [3.0, 4.0]))
+    swapped = named(["right", "left"], [2.0, 1.0])
+    if left is not None:
+        assert float(of_joint.value(swapped)) == left
+        return
+    with pytest.raises(BadInputError) as error:
+        of_joint.value(swapped)
+    assert str(error.value) == (
+        f"'/joints:{field}' is in another order than before: its names are right, left, and were left, "
+        "right; take each value by its name, '/joints:velocity[left]'"
+    )

@@ -3,14 +3,17 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import datasets
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from recordings import rows
+from fake_dataset import write_fake
 
 from astra_data.core.errors import BadInputError
+from astra_data.dataset.columns import ACTION, STATE
 from astra_data.io.importers import parquet
+from astra_data.io.importing import from_huggingface
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Source
 
@@ -80,23 +83,6 @@ def test_what_is_no_number_in_each_row_is_told(
         read(tmp_path / "log.parquet", {"a": column})
 
 
-def test_files_that_unpack_to_more_than_logs_do_are_refused(tmp_path: Path) -> None:
-    table = pa.table({name: np.zeros(10**6) for name in rows()})
-    pq.write_table(table, tmp_path / "log.parquet", compression="zstd")
-    mapping = {
-        "name": "n",
-        "task": "t",
-        "fps": 1,
-        "columns": {"x": {"fields": ("x",)}, "y": {"fields": ("y",)}},
-    }
-    path = tmp_path / "log.parquet"
-    few = Source(path, None, path, most_bytes=2 * 8 * 10**6 - 1)
-    with pytest.raises(BadInputError, match="holds values of 16000000 bytes or more"):
-        next(parquet.read(few, ImportMapping.model_validate(mapping)))
-    enough = Source(path, None, path, most_bytes=2 * 8 * 10**6)
-    assert len(next(parquet.read(enough, ImportMapping.model_validate(mapping)))) == 2
-
-
 def test_the_values_of_lists_count_and_those_of_other_columns_do_not(tmp_path: Path) -> None:
     lists = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(3000)), 3)
     path = tmp_path / "log.parquet"
@@ -107,3 +93,35 @@ def test_the_values_of_lists_count_and_those_of_other_columns_do_not(tmp_path: P
     with pytest.raises(BadInputError, match="holds values of 24000 bytes or more"):
         next(parquet.read(Source(path, None, path, most_bytes=23_999), mapping))
     assert len(next(parquet.read(Source(path, None, path, most_bytes=24_000), mapping)))
+
+
+FRAMES = """
+name = "again"
+task = "walk"
+fps = 20
+[columns."observation.state"]
+fields = ["observation.state"]
+[columns.action]
+fields = ["action"]
+[split]
+field = "episode_index"
+"""
+
+
+def test_a_dataset_comes_back_but_for_last_rows_without_a_next_state(tmp_path: Path) -> None:
+    fake = write_fake(tmp_path / "fake")
+    (tmp_path / "mapping.toml").write_text(FRAMES)
+    again = from_huggingface(fake.to_huggingface(), tmp_path / "mapping.toml", out=tmp_path / "out")
+    assert again.lengths.tolist() == [length - 1 for length in fake.lengths if length > 1]
+    last = np.cumsum(fake.lengths) - 1
+    for name, values in fake.columns([STATE, ACTION]).items():
+        np.testing.assert_array_equal(again.columns([name])[name], np.delete(values, last, axis=0))
+    assert again.reference == "again@data-1.0.0"
+
+
+def test_rows_that_do_not_fit_are_told(tmp_path: Path) -> None:
+    (tmp_path / "mapping.toml").write_text(FRAMES)
+    rows = datasets.Dataset.from_dict({"observation.state": [[0.0]], "episode_index": [0]})
+    with pytest.raises(BadInputError, match="no field 'action'"):
+        from_huggingface(rows, tmp_path / "mapping.toml", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
