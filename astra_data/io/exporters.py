@@ -210,7 +210,7 @@ def _minari(dataset: Dataset, path: Path, out: Path) -> None:
 
 
 def _minari_id(out: Path) -> str:
-    """Return the id of a dataset in folder `out`: its path in Minari's folder, or its name elsewhere."""
+    """Return the id of a dataset in folder `out`."""
     from minari.dataset.minari_dataset import parse_dataset_id  # noqa: PLC0415 - an extra
     from minari.storage.datasets_root_dir import get_dataset_path  # noqa: PLC0415 - an extra
 
@@ -253,18 +253,9 @@ def _episodes(dataset: Dataset, disk: "Disk") -> Iterator[tuple[int, Episode, di
 
 
 class Disk(io.RawIOBase):
-    """A new file that keeps the first error of writing instead of raising it.
-
-    Attributes:
-        failure: that error; None while all is well.
-    """
+    """A new file at `path` that keeps its first error of writing as `failure` instead of raising it."""
 
     def __init__(self, path: Path) -> None:
-        """Create the file at `path`.
-
-        Raises:
-            OSError: it cannot be created.
-        """
         self.failure: OSError | None = None
         self._file = path.open("w+b", buffering=0)
         self.seek, self.tell, self.readinto = self._file.seek, self._file.tell, self._file.readinto  # type: ignore[method-assign]
@@ -300,15 +291,9 @@ class Disk(io.RawIOBase):
 
 @contextmanager
 def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[tuple[Any, Disk]]:
-    """Yield a new HDF5 file at `path`, and the disk that it is written to.
+    """Yield a new HDF5 file at `path`, and the disk that it is written to; raise OSError if that failed.
 
-    Args:
-        path: where to.
-        track_order: list groups in the order of their making instead of by name.
-
-    Raises:
-        BadInputError: h5py is not installed.
-        OSError: something could not be written; what there is at `path` is of no use.
+    `track_order` lists groups in the order of their making instead of by name.
     """
     h5py = optional("h5py")
     disk = Disk(path)

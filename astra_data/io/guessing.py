@@ -129,19 +129,15 @@ class Field:
 
 @dataclass(frozen=True)
 class Logs:
-    """Logs and what their fields are.
-
-    Attributes:
-        fields: in the order of the logs.
-        episodes: scaled values (T,) of each by a field's name, in rows whose states and commands are numbers.
-        left_out: how many rows lack a number, by the name of the field.
-        cut_off: files whose last line is cut off and left out.
-    """
+    """Logs and what their fields are, in the order of the logs."""
 
     fields: tuple[Field, ...]
     episodes: tuple[dict[str, Floats], ...]
+    """Scaled values (T,) of each by a field's name, in rows whose states and commands are numbers."""
     left_out: dict[str, int]
+    """How many rows lack a number, by the name of the field."""
     cut_off: tuple[str, ...] = ()
+    """Files whose last line is cut off and left out."""
 
     def of(self, role: Role) -> tuple[Field, ...]:
         """Return the fields with a role."""
@@ -205,10 +201,8 @@ def guess(paths: Sequence[Path]) -> Logs:
     fields: list[Field] = []
     for name in (name for name in tables[0] if all(name in table for table in tables)):
         found = _field(name, [episode[name] for episode in raw])
-        taken = any(
-            found.taken_for == other.taken_for for other in fields if other.role in ("state", "command")
-        )
-        fields.append(replace(found, short=plain_name(name)) if taken else found)
+        taken = [other.taken_for for other in fields if other.role in ("state", "command")]
+        fields.append(replace(found, short=plain_name(name)) if found.taken_for in taken else found)
     fields = _places(_roles(_times(fields, raw)), raw)
     needed = [field.name for field in fields if field.role in ("time", "state", "command")]
     gaps = {name: sum(int((~np.isfinite(episode[name])).sum()) for episode in raw) for name in needed}
@@ -256,18 +250,13 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
     body, ending = _without_unit(plain, UNITS)
     if ending in ("n", "v", "a") and re.fullmatch(f"{COMMANDED}|u", body):
         body, ending = plain, None  # an axis, as in cmd_v
-    is_flag, is_constant = (
-        bool(np.isin(values, (0, 1)).all()),
-        not np.ptp(values[finite]) if finite.any() else True,
-    )
+    is_flag, is_constant = bool(np.isin(values, (0, 1)).all()), not finite.any() or not np.ptp(values[finite])
     role: Role = "left out"
     why = "its name"
-    if not plain or not finite.any():
-        why = (
-            "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"
-            if plain
-            else "no letter a to z"
-        )
+    if not plain:
+        why = "no letter a to z"
+    elif not finite.any():
+        why = "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"
     elif (STAMP.fullmatch(clock) or time_unit) and (steps >= 0).all() and (steps > 0).any():
         step = float(np.median(steps))
         unit = time_unit or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
@@ -294,17 +283,14 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
     elif is_constant:
         why = "never changes"
     elif COMMAND.fullmatch(body):
-        return _with_unit(
-            name, "command", COMMAND_WORD.sub("_", body).strip("_") or "command", ending, values
-        )
+        short = COMMAND_WORD.sub("_", body).strip("_") or "command"
+        return _with_unit(name, "command", short, ending, values)
     elif is_flag:
         flags = [one for one in series if one.any()]
         why = "0 or 1: name it success or failed if it is an end"
         if all(one[-1] and one[np.argmax(one > 0) :].all() and one.sum() <= MOST_END_ROWS for one in flags):
-            role, why = (
-                "failure",
-                f"0 or 1, and it ends all {len(flags)} of {len(series)} episodes that have a 1 (CHECK)",
-            )
+            role = "failure"
+            why = f"0 or 1, and it ends all {len(flags)} of {len(series)} episodes that have a 1 (CHECK)"
     elif finite.mean() <= MOSTLY:
         why = f"no number in {(~finite).sum()} rows"
     else:
@@ -348,16 +334,15 @@ def _times(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> li
 def _roles(fields: Sequence[Field]) -> list[Field]:
     """Return the fields, with forces and pedals as commands if there are no others, one of each outcome."""
     is_commanded = any(field.role == "command" for field in fields)
-    found: list[Field] = []
+    found: dict[str, Field] = {}
     for field in sorted(fields, key=lambda field: field.why.endswith("(CHECK)")):
-        if field.role in ("failure", "success", "reward") and field.role in [one.role for one in found]:
+        if field.role in ("failure", "success", "reward") and field.role in [f.role for f in found.values()]:
             field = replace(field, role="left out", why=f"a second {field.role}: combine both into one field")
         acts = any(pattern.fullmatch(field.short) for pattern in (TORQUE, FORCE, PEDAL))
         if acts and field.role == "state" and not is_commanded:
             field = replace(field, role="command", why=f"{field.why}, and no other command")
-        found.append(field)
-    by_name = {field.name: field for field in found}
-    return [by_name[field.name] for field in fields]
+        found[field.name] = field
+    return [found[field.name] for field in fields]
 
 
 def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
@@ -381,9 +366,8 @@ def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> l
             why, offset = "degrees, to m from the first row", offsets.setdefault(at["axis"], -first * scale)
             placed[field.name] = replace(field, unit="m", scale=scale, offset=offset, why=why)
         elif place and field.unit == "m":
-            steps = (
-                np.abs(np.concatenate([np.diff(episode[field.name]) for episode in episodes])) * field.scale
-            )
+            steps = np.concatenate([np.diff(episode[field.name]) for episode in episodes])
+            steps = np.abs(steps) * field.scale
             step = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.inf
             if field.role == "state" and np.spacing(np.float32(largest * field.scale)) > step / 100:
                 offsets[place["axis"]] = -float(round(first * field.scale))
@@ -406,11 +390,7 @@ def _without_unit(name: str, endings: Iterable[str]) -> tuple[str, str | None]:
 
 
 def csv_files(place: Path) -> list[Path]:
-    """Return the CSV files in a folder, or the one that `place` is.
-
-    Raises:
-        BadInputError: there is none; says what to do.
-    """
+    """Return the CSV files in a folder, or the one that `place` is; raise BadInputError if there is none."""
     if not place.exists():
         raise BadInputError(f"{place}: no such file, folder or dataset")
     inside = sorted(place.iterdir()) if place.is_dir() else [place]
@@ -435,10 +415,8 @@ def plain_name(name: str) -> str:
 def read_numbers(source: Source) -> dict[str, Floats]:
     """Return the fields (T,) of a CSV file as numbers; true and false are 1 and 0, texts and dates NaN.
 
-    Equal texts of an episode's name have the same number. A last line that is cut off is left out.
-
-    Raises:
-        BadInputError: it is no CSV, has too few rows, or a field of numbers has a text or is there twice.
+    Equal texts of an episode's name have the same number. A last line that is cut off is left out. Raise
+    BadInputError if it is no CSV, has too few rows, or a field of numbers has a text or is there twice.
     """
     delimiter, mark = delimiter_of(source.path.name)
     with explained(str(source.path), source):
@@ -453,9 +431,9 @@ def read_numbers(source: Source) -> dict[str, Floats]:
     for name, values in zip(table.column_names, table.columns, strict=True):
         series: Floats = np.full(len(table), np.nan)
         if pa.types.is_string(values.type):
-            texts = values.to_pylist()
-            series = np.array([_number(text) for text in texts])
-            wrong = [row for row, text in enumerate(texts) if text and text.strip() and not _is_number(text)]
+            texts = [text if text and text.strip() else "nan" for text in values.to_pylist()]
+            wrong = [row for row, text in enumerate(texts) if not _NUMBER.fullmatch(text)]
+            series = np.array([float(text) if _NUMBER.fullmatch(text) else math.nan for text in texts])
             if wrong and len(wrong) < (1 - MOSTLY) * len(texts):
                 where = f"{source.path} line {line_of(source, wrong[0])}: {name}"
                 raise BadInputError(f"{where}: expected a number, got {texts[wrong[0]]!r}")
@@ -473,14 +451,6 @@ def read_numbers(source: Source) -> dict[str, Floats]:
     if not any(np.isfinite(values).any() for values in numbers.values()):
         raise BadInputError(f"{source.path}: expected rows of numbers separated by {mark} below a header")
     return numbers
-
-
-def _number(text: str | None) -> float:
-    return float(text) if text and _is_number(text) else math.nan
-
-
-def _is_number(text: str) -> bool:
-    return _NUMBER.fullmatch(text) is not None
 
 
 def logs_of(data: Dataset) -> Logs:

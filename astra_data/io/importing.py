@@ -61,19 +61,7 @@ _LISTED = 8
 
 @dataclass(frozen=True)
 class ImportReport:
-    """Result of an import.
-
-    Attributes:
-        root: the dataset's folder.
-        episodes: number of episodes.
-        frames: number of steps.
-        tally: of the rows that were read and dropped.
-        wall_seconds: duration of the import.
-        unused: the files of which no episode was made.
-        unread: the files of folders and archives that have other endings than the format's.
-        left_out: what is wrong with each file that was left out.
-        taken: which fields became which columns, where no mapping says so.
-    """
+    """Result of an import."""
 
     root: Path
     episodes: int
@@ -81,69 +69,57 @@ class ImportReport:
     tally: Tally
     wall_seconds: float
     unused: tuple[str, ...] = ()
+    """The files of which no episode was made."""
     unread: tuple[str, ...] = ()
+    """The files of folders and archives that have other endings than the format's."""
     left_out: tuple[str, ...] = ()
+    """What is wrong with each file that was left out."""
     taken: str = ""
+    """Which fields became which columns, where no mapping says so."""
 
     def __str__(self) -> str:
         tally = self.tally
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
         notes = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
-        more = [f"and {len(notes) - _LISTED} more lines on rates"] if len(notes) > _LISTED else []
-        torn = f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
-        listed = {
-            "fields left out": tally.unused_fields,
-            "files without an episode": self.unused,
-            "files of other endings, not read": self.unread,
+        last = {
+            f"{tally.last_terminated} of them terminated: the step before takes over how, and the reward": (
+                tally.last_terminated
+            ),
+            f"with the others a reward of {tally.last_reward:g} in sum": tally.last_reward,
         }
-        left_out, *others = [f"{what}: {first_few(of, _LISTED)}" if of else "" for what, of in listed.items()]
-        lines = [
+        lost = ", ".join(what for what, is_any in last.items() if is_any)
+        lines = {
             f"{self.root}: {self.episodes} episodes, {self.frames} frames from {tally.rows} rows in "
-            f"{self.wall_seconds:.1f} s",
-            f"taken without a mapping: {self.taken}" if self.taken else "",
-            left_out,
-            f"split points: {points}",
-            f"episodes end: {tally.endings}" if tally.endings != Endings() else "",
-            f"rate: {tally.clock}" if tally.clock else "",
-            *notes[:_LISTED],
-            *more,
+            f"{self.wall_seconds:.1f} s": True,
+            f"taken without a mapping: {self.taken}": self.taken,
+            f"fields left out: {first_few(tally.unused_fields, _LISTED)}": tally.unused_fields,
+            f"split points: {points}": True,
+            f"episodes end: {tally.endings}": tally.endings != Endings(),
+            f"rate: {tally.clock}": tally.clock,
+            "\n".join(notes[:_LISTED]): notes,
+            f"and {len(notes) - _LISTED} more lines on rates": len(notes) > _LISTED,
             f"time stands still in {tally.still_rows} rows, first in {tally.still_first}: expected one row "
-            "at a time; they are of several robots, or written twice"
-            if tally.still_rows
-            else "",
-            *others,
-            f"files that cannot be imported, left out: {len(self.left_out)}" if self.left_out else "",
-            *(f"  {fault}" for fault in self.left_out),
-            f"rejected rows: {tally.rejected_rows}{f', {tally.faults}' if tally.not_finite else ''}"
-            f"{torn if tally.torn_rows else ''}",
-            f"last rows without a next state: {_last_rows(tally)}; "
-            f"rows of episodes that were too short: {tally.short_rows}{_after_ends(tally)}",
-        ]
-        return "\n".join(filter(None, lines))
-
-
-def losses(tally: Tally) -> str:
-    """Say what was dropped, in a line."""
-    faults = f" ({tally.faults})" if tally.not_finite else ""
-    return (
-        f"rows {tally.rows}, rejected {tally.rejected_rows}{faults}, last ones without a next state "
-        f"{_last_rows(tally)}, in episodes that were too short {tally.short_rows}{_after_ends(tally)}"
-    )
-
-
-def _after_ends(tally: Tally) -> str:
-    return f"; terminated rows after the end, dropped: {tally.rows_after_end}" if tally.rows_after_end else ""
-
-
-def _last_rows(tally: Tally) -> str:
-    parts = [
-        f"{tally.last_terminated} of them terminated: the step before takes over how, and the reward"
-        if tally.last_terminated
-        else "",
-        f"with the others a reward of {tally.last_reward:g} in sum" if tally.last_reward else "",
-    ]
-    lost = ", ".join(filter(None, parts))
-    return f"{tally.last_rows} dropped ({lost})" if lost else f"{tally.last_rows} dropped"
+            "at a time; they are of several robots, or written twice": tally.still_rows,
+            f"files without an episode: {first_few(self.unused, _LISTED)}": self.unused,
+            f"files of other endings, not read: {first_few(self.unread, _LISTED)}": self.unread,
+            f"files that cannot be imported, left out: {len(self.left_out)}": self.left_out,
+            "\n".join(f"  {fault}" for fault in self.left_out): self.left_out,
+            f"rejected rows: {tally.rejected_rows}"
+            + (f", {tally.faults}" if tally.not_finite else "")
+            + (
+                f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
+                if tally.torn_rows
+                else ""
+            ): True,
+            f"last rows without a next state: {tally.last_rows} dropped{f' ({lost})' if lost else ''}; "
+            f"rows of episodes that were too short: {tally.short_rows}"
+            + (
+                f"; terminated rows after the end, dropped: {tally.rows_after_end}"
+                if tally.rows_after_end
+                else ""
+            ): True,
+        }
+        return "\n".join(line for line, is_told in lines.items() if is_told)
 
 
 def import_dataset(
@@ -200,11 +176,16 @@ def import_dataset(
     cuts = episodes(sources, FORMATS[chosen], settings, cutter, left_out)
     first = next(cuts, None)
     if first is None:
-        if faults := [*(left_out or ()), *cutter.tally.bad_episodes]:
-            raise BadInputError("\n".join(faults))
+        if bad := [*(left_out or ()), *cutter.tally.bad_episodes]:
+            raise BadInputError("\n".join(bad))
         refuse_rejected(cutter.tally, settings)
         why = _why_none(cutter.tally, settings)
-        raise BadInputError(f"{', '.join(map(str, recordings))}: no episodes, {why} ({losses(cutter.tally)})")
+        faults = f" ({cutter.tally.faults})" if cutter.tally.not_finite else ""
+        raise BadInputError(
+            f"{', '.join(map(str, recordings))}: no episodes, {why} (rows {cutter.tally.rows}, rejected "
+            f"{cutter.tally.rejected_rows}{faults}, last ones without a next state {cutter.tally.last_rows}, "
+            f"in episodes that were too short {cutter.tally.short_rows})"
+        )
     description = {
         "name": settings.name,
         "version": settings.version,
@@ -298,15 +279,9 @@ def episodes(
     cutter: Cutter,
     left_out: list[str] | None = None,
 ) -> Iterator[Cut]:
-    """Yield the episodes of `sources`, as the format's `module` reads them.
+    """Yield the episodes of `sources`, as the format's `module` reads them and the `cutter` cuts their rows.
 
-    Args:
-        sources: the files.
-        module: the importer of their format.
-        mapping: says which fields become which columns.
-        cutter: cuts their rows.
-        left_out: what is wrong with files and episodes that are left out is added to it; without it, they are
-            refused.
+    What is wrong with files and episodes is added to `left_out`, and they are; without it, they are refused.
 
     Raises:
         BadInputError: a file cannot be read, or an episode does not fit into memory. The files after it that

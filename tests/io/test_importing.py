@@ -10,7 +10,7 @@ from recordings import LENGTHS, MAPPING, STEPS, imported, rows, write_table
 from scipy.io import savemat
 
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.dataset.columns import REWARD, STATE
+from astra_data.dataset.columns import STATE
 from astra_data.io.cutting import Cutter, Tally
 from astra_data.io.importing import ImportReport, import_dataset
 
@@ -51,14 +51,6 @@ def test_the_files_of_a_folder_or_archive_continue_one_another(tmp_path: Path) -
     both, report = imported(tmp_path / "both", [folder, tmp_path / "logs.tar.gz"], ONE_LOG)
     assert len(both) == 2
     assert report.tally.split_points == {"file": 1}
-
-
-def test_sources_of_one_name_are_told_apart_in_the_metadata(tmp_path: Path) -> None:
-    paths = [write_table(tmp_path / folder / "log.csv", rows()) for folder in ("a", "b")]
-    dataset, _ = imported(tmp_path, [*paths, *parts(tmp_path / "logs")[:1]], PER_FILE)
-    names = ["a/log.csv", "b/log.csv", "part_8.csv"]
-    assert list(dict.fromkeys(dataset.metadata["source"])) == names
-    assert [one["name"] for one in dataset.description["config"]["recordings"]] == names
 
 
 def with_times(tmp_path: Path, seconds: np.ndarray[Any, Any]) -> Tally:
@@ -114,17 +106,6 @@ def test_a_dataset_needs_no_import(tmp_path: Path) -> None:
             imported(tmp_path / "again", dataset.root, mapping)
 
 
-def test_the_tables_of_an_older_dataset_are_imported_where_their_format_is_given(tmp_path: Path) -> None:
-    table = write_table(tmp_path / "old/data/episode_0.parquet", rows())
-    (tmp_path / "old/meta").mkdir()
-    (tmp_path / "old/meta/info.json").write_text('{"codebase_version": "v2.1"}')
-    dataset, _ = imported(tmp_path, tmp_path / "old", MAPPING, file_format="parquet")
-    assert dataset.lengths.tolist() == list(STEPS)
-    (tmp_path / "old/meta/info.json").write_text("[]")  # no dataset
-    with pytest.raises(BadInputError, match="json has no standard fields"):
-        imported(tmp_path, table.parents[1], None)
-
-
 def test_formats_that_need_seeking_are_not_read_from_archives(tmp_path: Path) -> None:
     path = write_table(tmp_path / "a.npz", rows())
     with tarfile.open(tmp_path / "a.tar", "w") as archive:
@@ -137,16 +118,6 @@ def test_a_mapping_with_a_format_that_does_not_exist_is_told(tmp_path: Path) -> 
     path = write_table(tmp_path / "a.csv", rows())
     with pytest.raises(BadInputError, match="no format 'cvs': did you mean 'csv'"):
         imported(tmp_path, path, 'format = "cvs"\n' + MAPPING)
-
-
-def test_rewards_of_rows_that_are_dropped_are_told(tmp_path: Path) -> None:
-    reward = np.zeros(20)
-    reward[[5, 14, 19]] = (1, 1, 0.5)
-    dataset, report = imported(tmp_path, write_table(tmp_path / "log.csv", rows() | {"reward": reward}))
-    assert dataset.columns([REWARD])[REWARD].sum() == 1
-    assert "last rows without a next state: 2 dropped (with the others a reward of 1.5 in sum); rows" in str(
-        report
-    )
 
 
 def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -43,11 +43,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def _blocks(
-    source: Source,
-    mapping: ImportMapping,
-    origin: str,
-    datasets: dict[str, Any],
-    attributes: dict[str, Any],
+    source: Source, mapping: ImportMapping, origin: str, datasets: dict[str, Any], attributes: dict[str, Any]
 ) -> Iterator[Block]:
     """Yield the rows of an episode, or of a file."""
     if mapping.episodes is None:

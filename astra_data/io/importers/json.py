@@ -66,11 +66,8 @@ def _flat(value: Any) -> Any:  # noqa: ANN401 - any JSON
     flat: dict[str, Any] = {}
     for name, part in value.items():
         inner = _flat(part)
-        flat |= (
-            {f"{name}/{key}": each for key, each in inner.items()}
-            if isinstance(inner, dict)
-            else {name: part}
-        )
+        is_object = isinstance(inner, dict)
+        flat |= {f"{name}/{key}": each for key, each in inner.items()} if is_object else {name: part}
     return flat
 
 
@@ -137,12 +134,10 @@ def _block(fields: dict[str, list[Any]], mapping: ImportMapping, origin: str) ->
 
 def _is_torn(line: bytes) -> bool:
     """Return whether a line has no end and is no JSON, as one that was written when a battery went empty."""
-    if line.endswith(b"\n") or not line.strip():
-        return False
     try:
         json.loads(line)
     except ValueError:
-        return True
+        return bool(line.strip()) and not line.endswith(b"\n")
     return False
 
 
