@@ -200,20 +200,6 @@ class ImportMapping(Config):
         more = [*self.split.ends, *([self.time] if self.time else [])]
         return list(dict.fromkeys([field for c in self.columns.values() for field in c.fields] + more))
 
-    def renamed(self, names: Mapping[str, str]) -> "ImportMapping":
-        """Return the mapping with other names of fields."""
-        columns = {
-            key: column.model_copy(
-                update={"fields": tuple(names.get(field, field) for field in column.fields)}
-            )
-            for key, column in self.columns.items()
-        }
-        ends = tuple(names.get(field, field) for field in self.split.ends)
-        split = self.split.model_copy(
-            update={"ends": ends, "field": names.get(self.split.field or "", self.split.field)}
-        )
-        return self.model_copy(update={"columns": columns, "split": split})
-
     @property
     def files(self) -> list[str]:
         """The CSV files that fields such as "control.csv:rudder" are of, that of the state first."""

@@ -12,7 +12,7 @@ most of its step.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -28,10 +28,6 @@ MOST_HELD_ROWS = 10**6
 """Most rows in which the same values may be held: five hours at 50 Hz."""
 MOST_UNEVEN = 0.05
 """Largest share of a topic's rows, steps or messages that are odd and not told."""
-MISSED = 2.5
-"""Silent for more of its periods, a topic has dropped out: two of its messages or more are missing."""
-DUE = 0.75
-"""Periods after a message from which on a row should hold the next one."""
 _WHOLE = 0.005
 """Relative error of a measured rate that is taken for a whole number."""
 _SMOOTH = 10
@@ -51,16 +47,25 @@ class Resampler:
         silences: topic to how often it ended an episode: it was silent for too long, and others were not.
     """
 
-    def __init__(self, mapping: ImportMapping, origin: str, moments: Mapping[str, ArrayLike]) -> None:
+    def __init__(
+        self,
+        mapping: ImportMapping,
+        origin: str,
+        moments: Mapping[str, ArrayLike],
+        topic_of: Mapping[str, str] | None = None,
+    ) -> None:
         """Sample the fields of `mapping` from the file `origin`, with the times of messages by topic, in ns.
+
+        `topic_of` gives the topic of each field where names do not.
 
         Raises:
             BadInputError: a topic begins when another has ended, as where their clocks differ.
         """
         self._origin, self._fps = origin, mapping.fps
+        of = topic_of or {field: field.partition(":")[0] for field in mapping.all_fields}
         self.topics: dict[str, list[str]] = {}
         for field in mapping.all_fields:
-            self.topics.setdefault(topic_of(field), []).append(field)
+            self.topics.setdefault(of[field], []).append(field)
         self.times: dict[str, int] = {}
         self.silences: Counter[str] = Counter()
         self._repeated: Counter[str] = Counter()
@@ -71,7 +76,7 @@ class Resampler:
         self._has_own_gap: set[str] = set()
         for column in mapping.columns.values():
             gap_ns = round((column.gap_s or mapping.split.gap_s or 0) * 1e9)
-            for topic in () if column.latched else topics_of(column.fields):
+            for topic in () if column.latched else {of[field] for field in column.fields}:
                 self._gap_ns[topic] = min(gap_ns, self._gap_ns.get(topic, gap_ns))
                 self._has_own_gap |= {topic} if column.gap_s else set()
         self._expiring = set(self._gap_ns)
@@ -84,17 +89,18 @@ class Resampler:
         often = {
             topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()
         }
-        states = self._expiring & topics_of(mapping.columns[STATE].fields if STATE in mapping.columns else ())
+        state = mapping.columns[STATE].fields if STATE in mapping.columns else ()
+        states = self._expiring & {of[field] for field in state}
         self._states = [topic for topic in states if often.get(topic)]
         most = max((often[topic] for topic in self._states), default=0)
         self._in_step = [topic for topic in self._expiring if 0 < often.get(topic, 0) <= most]
         self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
         columns = mapping.columns.items()
-        self._observed = {f: n for n, c in columns if n.startswith("observation") for f in c.fields}
-        observed = topics_of(self._observed) & self._expiring & self._periods.keys()
-        self._silent_ns: dict[str, list[int]] = {topic: [] for topic in observed}
-        self._commands = {t: n for n, c in columns if n.startswith(ACTION) for t in topics_of(c.fields)}
-        self._lossy = self._commands.keys() | topics_of(mapping.flag_fields)
+        self._observed = {of[f] for n, c in columns if n.startswith("observation") for f in c.fields}
+        self._commands = {
+            t: n for n, c in columns if n.startswith(ACTION) for t in map(of.__getitem__, c.fields)
+        }
+        self._lossy = self._commands.keys() | {of[field] for field in mapping.flag_fields}
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
         """Update the values of `topic` with a message at `time` ns."""
@@ -146,12 +152,12 @@ class Resampler:
         """Return a line for each topic that many rows repeat, or of which many messages are in no row.
 
         Of a topic without commands, flags and outcomes, messages may be in no row, as where fps is lower than
-        its rate; if it is observed, uneven steps are told, and dropouts, unless a column has its own gap.
+        its rate; if it is observed, uneven steps are told.
         """
         notes = []
         for topic in sorted(self._expiring & self._periods.keys()):
             rate = 1e9 / self._periods[topic]
-            if topic in self._silent_ns and (odd := uneven_steps(topic, rate, self._fps)):
+            if topic in self._observed and (odd := uneven_steps(topic, rate, self._fps)):
                 notes.append(odd)
             elif self._repeated[topic] > MOST_UNEVEN * self._rows or (
                 topic in self._lossy and self._skipped[topic] > MOST_UNEVEN * self._messages[topic]
@@ -160,15 +166,6 @@ class Resampler:
                     f"{topic} comes {rate:.4g} times a second, fps is {self._fps}: {self._repeated[topic]} "
                     f"of {self._rows} rows repeat its message before, {self._skipped[topic]} of "
                     f"{self._messages[topic]} messages are in no row"
-                )
-            if topic not in self._has_own_gap and (silences := self._silent_ns.get(topic)):
-                column = next(self._observed[f] for f in self.topics[topic] if f in self._observed)
-                # A message that a row repeats is at least 1 / fps - 1 / rate old.
-                gap_ms = math.floor(1000 * max(2 / rate, 1 / self._fps - 1 / rate))
-                notes.append(
-                    f"{topic} is silent for up to {max(silences) / 1e9:.2g} s, where {len(silences)} rows "
-                    f'repeat its message before: gap_s = {gap_ms / 1000:g} in [columns."{column}"] ends '
-                    "episodes there"
                 )
         return tuple(f"{self._origin}: {note}" for note in notes)
 
@@ -186,21 +183,9 @@ class Resampler:
                 self._rows += 1
                 repeated = self.topics.keys() - self._fresh
                 self._repeated.update(repeated)
-                for topic in repeated & self._silent_ns.keys():
-                    self._note_silence(topic, moment - self._delay_ns)
             self._fresh.clear()
             yield self._row == 0, dict(self._values)
             self._row += 1
-
-    def _note_silence(self, topic: str, time: int) -> None:
-        """Count a row at `time` that repeats a message of `topic`, if the next ones are missing."""
-        since, period = self.times[topic], self._periods[topic]
-        moments = self._moments[topic]
-        later = moments[np.searchsorted(moments, since, side="right") :]
-        until = later[0] if len(later) else max(each[-1] for each in self._moments.values())
-        silence = min(int(until) - since, self._gap_ns[topic])
-        if silence > MISSED * period and time - since > DUE * period:
-            self._silent_ns[topic].append(silence)
 
     def _midway(self, time: int) -> int:
         """Return how long after `time` the widest gap between the messages that are in step is half over."""
@@ -267,16 +252,6 @@ def usual_periods(moments: Mapping[str, NDArray[np.int64]], gap_ns: int) -> dict
             usual = steps[steps <= GAP * np.median(steps)]
             periods[topic] = float((usual if 2 * usual.sum() >= steps.sum() else steps).mean())
     return periods
-
-
-def topic_of(field: str) -> str:
-    """Return the topic of a field."""
-    return field.partition(":")[0]
-
-
-def topics_of(fields: Iterable[str]) -> set[str]:
-    """Return the topics of fields."""
-    return set(map(topic_of, fields))
 
 
 def _messages_per_row(ratio: float) -> int:

@@ -148,28 +148,6 @@ def test_messages_in_no_row_are_told_where_commands_flags_outcomes_or_ends_are_l
     assert resampler.unevenness() == (told if counts else ())
 
 
-def with_dropouts() -> tuple[Array, Array]:
-    """Return the times of states at 50 Hz, with three holes of up to 0.36 s, and of commands at 10 Hz."""
-    odom = 20.0 * np.arange(1000)
-    holes = ((odom > at) & (odom < at + 340) for at in (4000, 9010, 15030))
-    return odom[~np.any(list(holes), axis=0)], 100.0 * np.arange(200)
-
-
-def test_dropouts_of_a_state_are_told_with_the_gap_that_ends_episodes_there() -> None:
-    odom, commands = with_dropouts()
-    resampler, rows = sampled(10, odom, commands)
-    states = [k for k, _ in rows]
-    repeats = int((np.diff(states) == 0).sum())
-    assert repeats >= 6
-    told = f"log: /odom is silent for up to 0.36 s, where {repeats} rows repeat its message before: "
-    assert resampler.unevenness() == (
-        told + 'gap_s = 0.08 in [columns."observation.state"] ends episodes there',
-    )
-    cut, rows = sampled(10, odom, commands, state_gap_s=0.08)
-    assert cut.silences == {"/odom": 3} and cut.unevenness() == ()
-    assert len({k for k, _ in rows}) == len(rows) > 180
-
-
 @pytest.mark.parametrize("gap_s", [0.13, 0.31])
 def test_the_gap_of_a_column_is_that_of_its_topics_alone(gap_s: float) -> None:
     """Each row after a state that is the last holds it for so long, while commands may be held for longer."""

@@ -405,10 +405,11 @@ def _of_the_hub(place: str, error: Exception) -> AstraDataError | None:
         )
     if isinstance(cause, HfHubHTTPError):
         status = cause.response.status_code
-        why = f"it answered {status}: {cause.server_message or cause}"
-        if status in (401, 403):
-            why = "no rights to do this; log in with `hf auth login` and a token that may write."
-        elif status in (409, 412):
-            why = "it was changed by somebody else at the same time; run the same command again."
-        return SharingError(f"{place}: {why}")
+        told = dict.fromkeys(
+            (401, 403), "no rights to do this; log in with `hf auth login` and a token that may write."
+        ) | dict.fromkeys(
+            (409, 412), "it was changed by somebody else at the same time; run the same command again."
+        )
+        answered = f"it answered {status}: {cause.server_message or cause}"
+        return SharingError(f"{place}: {told.get(status, answered)}")
     return None

@@ -124,11 +124,11 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     _check_mapping(mapping, str(source))
     fields = _fields(mapping)
     file = McapFile(source, fields.keys())
-    mapping, fields = _by_publisher(file, mapping, fields)
+    fields = _by_publisher(file, fields)
     gaps_s = [mapping.split.gap_s or 0, *(column.gap_s or 0 for column in mapping.columns.values())]
     timeline = Timeline(file, gaps_s[0], max(gaps_s))
-    resampler = Resampler(mapping, str(source), timeline.moments)
     topic_of = {field.name: topic for topic, each in fields.items() for field in each}
+    resampler = Resampler(mapping, str(source), timeline.moments, topic_of)
     known = sorted(file.topics - {field.topic for each in fields.values() for field in each})
     rows: list[tuple[dict[str, Array], dict[str, int]]] = []
     starts = goes_back = False
@@ -153,22 +153,17 @@ def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
     return fields
 
 
-def _by_publisher(
-    file: McapFile, mapping: ImportMapping, fields: dict[str, list[MessageField]]
-) -> tuple[ImportMapping, dict[str, list[MessageField]]]:
+def _by_publisher(file: McapFile, fields: dict[str, list[MessageField]]) -> dict[str, list[MessageField]]:
     """Treat what several publishers send to one topic, each its own joints, as topics of their own.
 
-    They are called by the topic and the joints. Returns the mapping and the fields of each.
+    They are called by the topic and the joints. Returns the fields of each.
     """
     named = {topic for topic, each in fields.items() if any(field.wanted for field in each)}
     sent: dict[str, set[frozenset[str]]] = {topic: set() for topic in named}
     for topic, message in file.messages(checked=False) if named else ():
         if topic in named:
             sent[topic].add(_sent(file, fields[topic], message))
-    streams: dict[str, str] = {}
-    split: dict[str, list[MessageField]] = {
-        topic: each for topic, each in fields.items() if topic not in named
-    }
+    split = {topic: each for topic, each in fields.items() if topic not in named}
     for topic, groups in sent.items():
         wanted = {field.wanted for field in fields[topic] if field.wanted}
         if len(groups) < 2 or not wanted <= set().union(*groups):
@@ -177,11 +172,9 @@ def _by_publisher(
         is_apart = sum(map(len, groups)) == len(wanted)
         of = {n: f"{topic}[{','.join(sorted(group)) if is_apart else n}]" for group in groups for n in group}
         for each in fields[topic]:
-            stream = of.get(each.wanted) or min(of.values())
-            split.setdefault(stream, []).append(each)
-            streams[each.name] = stream + each.name.removeprefix(topic)
+            split.setdefault(of.get(each.wanted) or min(of.values()), []).append(each)
         file.streams[topic] = partial(_streams, file, fields[topic], of)
-    return mapping.renamed(streams), split
+    return split
 
 
 def _sent(file: McapFile, fields: Sequence[MessageField], message: Any) -> frozenset[str]:  # noqa: ANN401
