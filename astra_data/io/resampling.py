@@ -276,8 +276,8 @@ def uneven_steps(topic: str, rate: float, fps: int) -> str:
     short, long = (f"{1000 * messages / rate:.0f}" for messages in (fewest, fewest + 1))
     near = range(math.ceil(fps / _NEAR), min(_NEAR * fps, whole) + 1)
     even = sorted((each for each in near if rate % each == 0), key=lambda each: abs(math.log(each / fps)))
-    take = f"; take {' or '.join(map(str, sorted(even[:3])))}" if even else ""
+    best = even[:3] or [min(near, key=lambda each: abs(rate / each - round(rate / each)))]
     return (
         f"{topic} comes {rate:.4g} times a second, of which {fps} fps is no whole fraction: steps of {short} "
-        f"and {long} ms alternate{take}"
+        f"and {long} ms alternate; take {' or '.join(map(str, sorted(best)))}"
     )
