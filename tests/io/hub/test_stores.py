@@ -49,12 +49,17 @@ def s3(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str
     return f"s3://{bucket}/shared"
 
 
-@pytest.fixture(params=["file", "memory", "s3"])
+@pytest.fixture(params=["file", "memory"])
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty place of each kind."""
-    if request.param == "s3":
-        return str(request.getfixturevalue("s3"))
+    """An empty place of each kind without a server."""
     return f"file://{tmp_path}/shared" if request.param == "file" else f"memory://{tmp_path.name}"
+
+
+@pytest.fixture(params=["file", "memory", "s3"])
+def any_place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty place of each kind."""
+    kinds = {"file": f"file://{tmp_path}/shared", "memory": f"memory://{tmp_path.name}"}
+    return kinds.get(request.param) or str(request.getfixturevalue("s3"))
 
 
 def changed(root: Path) -> Dataset:
@@ -62,29 +67,29 @@ def changed(root: Path) -> Dataset:
     return write_fake(root, fps=10)
 
 
-def test_what_is_pulled_is_what_was_pushed(place: str, fake: Dataset, home: Path) -> None:
-    assert push(fake.root, place) == f"{place}/fake@data-1.0.0"
-    pulled = pull(f"{place}/fake")
+def test_what_is_pulled_is_what_was_pushed(any_place: str, fake: Dataset, home: Path) -> None:
+    assert push(fake.root, any_place) == f"{any_place}/fake@data-1.0.0"
+    pulled = pull(f"{any_place}/fake")
     assert pulled.root == home / "fake/data-1.0.0"
     assert contents(pulled.root) == contents(fake.root)
     assert os.listdir(home / "fake") == ["data-1.0.0"]
-    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0")
+    filesystem, path = fsspec.core.url_to_fs(f"{any_place}/fake/data-1.0.0")
     assert "# fake" in filesystem.cat_file(f"{path}/README.md").decode()
     assert filesystem.cat_file(f"{path}/README-coverage.png").startswith(b"\x89PNG")
 
 
-def test_a_version_there_never_changes(place: str, fake: Dataset, tmp_path: Path) -> None:
-    push(fake.root, place)
-    filesystem, path = fsspec.core.url_to_fs(f"{place}/fake/data-1.0.0/SHA256SUMS")
-    push(fake.root, place)
+def test_a_version_there_never_changes(any_place: str, fake: Dataset, tmp_path: Path) -> None:
+    push(fake.root, any_place)
+    filesystem, path = fsspec.core.url_to_fs(f"{any_place}/fake/data-1.0.0/SHA256SUMS")
+    push(fake.root, any_place)
     filesystem.pipe_file(path, b"altered")
     with pytest.raises(SharingError, match=r"SHA256SUMS cannot be trusted"):
-        push(fake.root, place)
+        push(fake.root, any_place)
     assert filesystem.cat_file(path) == b"altered"
     filesystem.rm_file(path)
-    filesystem.rm_file(path.replace("SHA256SUMS", "meta/info.json"))
+    filesystem.rm_file(path.reany_place("SHA256SUMS", "meta/info.json"))
     with pytest.raises(SharingError, match=r"data-1\.0\.0 has no SHA256SUMS"):
-        push(changed(tmp_path / "changed").root, place)
+        push(changed(tmp_path / "changed").root, any_place)
 
 
 def test_the_newest_version_is_pulled_unless_another_is_named(
