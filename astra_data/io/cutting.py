@@ -450,11 +450,7 @@ class Cutter:
 
 
 def column_of(name: str, spec: ColumnMapping, size: int) -> Column:
-    """Return the column `name` with `size` values.
-
-    Raises:
-        BadInputError: lists do not have that many entries.
-    """
+    """Return the column `name` with `size` values, or raise BadInputError."""
     lists: dict[str, Sequence[str]] = {"unit": spec.unit, "frame": spec.frame, "role": spec.role}
     for key, words in lists.items():
         if len(words) not in (0, 1, size):

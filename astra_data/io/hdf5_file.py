@@ -46,11 +46,7 @@ def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - 
 
 
 def refuse_links(h5py: Any, file: Any, origin: str) -> None:  # noqa: ANN401 - of h5py
-    """Refuse a file with links, which may lead into other files.
-
-    Raises:
-        BadInputError: it has links; lists them.
-    """
+    """Raise BadInputError if a file has links, which may lead into other files."""
     links: list[str] = []
 
     def visit(name: str, link: object) -> None:
@@ -65,11 +61,7 @@ def refuse_links(h5py: Any, file: Any, origin: str) -> None:  # noqa: ANN401 - o
 
 
 def check_storage(datasets: Mapping[str, Any], origin: str) -> None:
-    """Check that all `datasets` are in their own file, as large as they claim, and written as a whole.
-
-    Raises:
-        BadInputError: one is not; lists every fault.
-    """
+    """Raise BadInputError unless all `datasets` are in their own file, as large as claimed, and written."""
     faults = []
     for field, dataset in datasets.items():
         if dataset.external or dataset.is_virtual:

@@ -228,11 +228,7 @@ def refuse_mapping(tables: Mapping[str, Any], path: Path) -> None:
 
 
 def read_mapping(path: Path) -> ImportMapping:
-    """Read the mapping in the file `path`.
-
-    Raises:
-        RecipeError: it is missing, not TOML or a recipe, or has faults; one message holds them all.
-    """
+    """Read the mapping in the file `path`, or raise a RecipeError with all of its faults."""
     tables = load_tables(path)
     if "columns" not in tables and _OF_RECIPES & tables.keys():
         raise RecipeError(

@@ -84,11 +84,7 @@ class McapFile:
         return {channel.topic for channel in self._channels.values()}
 
     def check_topics(self) -> None:
-        """Refuse a file that lacks wanted topics, once its index or its messages were read.
-
-        Raises:
-            BadInputError: it does; lists all of them.
-        """
+        """Raise BadInputError if wanted topics are missing, once the index or the messages were read."""
         known = sorted(self.topics)
         if self.is_cut and not known:
             raise BadInputError(f"{self._source} is cut off before its first message ends: leave it out")
@@ -99,11 +95,7 @@ class McapFile:
             raise BadInputError(f"{self._source}: {'; '.join(missing)}")
 
     def decoder(self, number: int) -> Callable[[bytes], Any]:
-        """Return the decoder of the messages of channel `number`.
-
-        Raises:
-            BadInputError: they have an encoding that cannot be read, or a package is missing.
-        """
+        """Return the decoder of the messages of channel `number`, or raise BadInputError."""
         if number in self._decoders:
             return self._decoders[number]
         channel = self._channels[number]

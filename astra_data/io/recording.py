@@ -23,7 +23,7 @@ BLOCK_ROWS = 2**13
 """Rows that an importer reads at once, if the format allows it."""
 
 VALUE_BYTES = 8
-"""What a value is counted as, whatever its type: as much as it may take when it is converted."""
+"""What a value is counted as, whatever its type."""
 SMALL_BYTES = 2**28
 """Values of so many bytes are taken from recordings of any size."""
 MOST_UNPACKED = 100
@@ -58,11 +58,7 @@ class Source:
     faults: list[str] | None = field(default=None, compare=False)
 
     def refuse_beyond(self, size: int) -> None:
-        """Refuse to take values of `size` bytes, if these are too many.
-
-        Raises:
-            BadInputError: they are; says how to take them.
-        """
+        """Raise BadInputError if values of `size` bytes are too many to be taken."""
         if size > self.most_bytes:
             raise BadInputError(
                 f"{self} holds values of {size} bytes or more, but at most {self.most_bytes} are accepted: "
@@ -161,42 +157,24 @@ class Block:
 
 
 ZARR = (".zgroup", ".zarray", ".zattrs", "zarr.json")
-FOREIGN = (
-    (
-        (".npy",),
-        "a NumPy array without a name: save it beside others under names, numpy.savez('log.npz', state=..., "
-        "action=...), and import that",
-    ),
-    (
-        (".db3", ".db3.zstd"),
-        "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, storage_id: mcap, all: "
-        "true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and import NEW",
-    ),
-    (
-        (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"),
-        "compressed: unpack it (gunzip, bunzip2, unxz, unzstd, unzip)",
-    ),
-    (
-        (".bag",),
-        "a bag of ROS 1: run `uvx --from rosbags rosbags-convert --src FILE --dst NEW --dst-storage mcap`, "
-        "and import NEW with a mapping like recipes/imports/ros2_base.toml",
-    ),
-    (
-        (".ulg",),
-        "a log of PX4: run `uvx --from pyulog ulog2csv FILE`, and import the folder of its CSVs, joined by "
-        'time (fields such as "vehicle_odometry_0.csv:q[0]", time = "timestamp", time_scale = 1e-6)',
-    ),
-    (
-        ZARR,
-        "Zarr: save its arrays by numpy.savez('log.npz', **{name: array[:] for name, array in "
-        "zarr.open(FOLDER).arrays()}), and import that",
-    ),
-    (
-        (".pkl", ".pickle", ".joblib"),
-        "a pickle, which is code and never run: load it where you trust it, and numpy.savez its arrays",
-    ),
-    ((".xlsx", ".xls", ".ods"), "a spreadsheet: save it as CSV"),
-)
+FOREIGN = {
+    (".npy",): "a NumPy array without a name: save it beside others under names, numpy.savez('log.npz', "
+    "state=..., action=...), and import that",
+    (".db3", ".db3.zstd"): "a bag of ROS 2 in SQLite, expected MCAP: write `output_bags: [{uri: NEW, "
+    "storage_id: mcap, all: true}]` to a file new.yaml, run `ros2 bag convert -i BAG -o new.yaml`, and "
+    "import NEW",
+    (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".7z"): "compressed: unpack it (gunzip, bunzip2, unxz, "
+    "unzstd, unzip)",
+    (".bag",): "a bag of ROS 1: run `uvx --from rosbags rosbags-convert --src FILE --dst NEW --dst-storage "
+    "mcap`, and import NEW with a mapping like recipes/imports/ros2_base.toml",
+    (".ulg",): "a log of PX4: run `uvx --from pyulog ulog2csv FILE`, and import the folder of its CSVs, "
+    'joined by time (fields such as "vehicle_odometry_0.csv:q[0]", time = "timestamp", time_scale = 1e-6)',
+    ZARR: "Zarr: save its arrays by numpy.savez('log.npz', **{name: array[:] for name, array in "
+    "zarr.open(FOLDER).arrays()}), and import that",
+    (".pkl", ".pickle", ".joblib"): "a pickle, which is code and never run: load it where you trust it, and "
+    "numpy.savez its arrays",
+    (".xlsx", ".xls", ".ods"): "a spreadsheet: save it as CSV",
+}
 """Endings of files that are not read, and what they are and what to do."""
 
 
@@ -208,18 +186,14 @@ def foreign(names: Sequence[str]) -> str:
             "numpy.savez('0.npz', state=..., action=..., reward=...), then import the folder"
         )
     for name in names:
-        for endings, advice in FOREIGN:
+        for endings, advice in FOREIGN.items():
             if name.lower().endswith(endings) and not is_archive(Path(name)):
                 return f"{PurePosixPath(name).name} is {advice}"
     return ""
 
 
 def format_of(recordings: Sequence[Path], suffixes: Mapping[str, Sequence[str]]) -> str:
-    """Return the format of all `recordings`, by their names and the `suffixes` of each format.
-
-    Raises:
-        BadInputError: there are none, one cannot be told, or they are of several; lists every fault.
-    """
+    """Return the format of all `recordings`, by the `suffixes` of each, or raise BadInputError."""
     if not recordings:
         raise BadInputError("expected one recording or more to import, got none")
     faults, formats = [], {}
@@ -338,11 +312,7 @@ def other_files(recordings: Sequence[Path], suffixes: Sequence[str]) -> tuple[st
 
 
 def refuse_dataset(place: Path) -> None:
-    """Refuse a folder that is a dataset already, ours or one that LeRobot recorded.
-
-    Raises:
-        BadInputError: it is; says how to name it.
-    """
+    """Raise BadInputError if a folder is a dataset already, ours or one that LeRobot recorded."""
     info = read_object(place / INFO_PATH)
     if isinstance(info, dict) and "codebase_version" in info:
         raise BadInputError(
@@ -406,12 +376,7 @@ def row_name(origin: str, row: int) -> str:
 
 
 def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int, ...]]) -> int:
-    """Return how many rows `fields` have.
-
-    Args:
-        origin: the file, for the message.
-        fields: those to be read.
-        shapes: the shape of every field in the file.
+    """Return how many rows `fields` have, of the `shapes` of every field in the file `origin`.
 
     Raises:
         BadInputError: lists the fields that are missing or have no rows, and differing numbers of rows.

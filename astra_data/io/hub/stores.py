@@ -40,11 +40,7 @@ _VERSION = re.compile(rf"[@/](data-)?(?P<version>{VERSION.pattern})/?$")
 
 
 def parse_place(text: str) -> "HubStore | UrlStore":
-    """Read "user/name", "hf://datasets/user/name", another URL, or a folder that begins with a dot, / or ~.
-
-    Raises:
-        BadInputError: it is none of these.
-    """
+    """Read "user/name", "hf://datasets/user/name", a URL, or a folder that begins with a dot, / or ~."""
     if hub := _HUB.fullmatch(text):
         return HubStore(hub["repo"])
     if text.startswith(("/", "./", "../", "~/")):
@@ -58,11 +54,7 @@ def parse_place(text: str) -> "HubStore | UrlStore":
 
 
 def parse_source(text: str) -> "tuple[HubStore | UrlStore, Version | None]":
-    """Read a place, and the version where one is named: "user/name@data-1.2.0", "s3://…/name/data-1.2.0".
-
-    Raises:
-        BadInputError: it is not an address.
-    """
+    """Read a place and, if named, a version: "user/name@data-1.2.0", "s3://…/name/data-1.2.0"."""
     named = _VERSION.search(text)
     if named is None:
         return parse_place(text), None

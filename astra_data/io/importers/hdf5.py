@@ -31,11 +31,7 @@ _COMMANDS = re.compile(r"(?<![a-z])actions?(?![a-z])")
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows of each episode's group, or of the file where `mapping.episodes` is left out.
-
-    Raises:
-        BadInputError: groups or fields are missing, or are stored in another file.
-    """
+    """Yield the rows of each episode's group, or of the file where `mapping.episodes` is left out."""
     with _opened(source) as (h5py, file):
         for origin, datasets, attributes in _episodes(h5py, file, mapping.episodes, str(source)):
             with source.tolerant():

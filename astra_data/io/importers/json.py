@@ -26,11 +26,7 @@ LIMIT_BYTES = 2**28
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield all rows as one block, or lines in several.
-
-    Raises:
-        BadInputError: the file is too large or no object; fields are missing, doubled or differ in length.
-    """
+    """Yield all rows as one block, or lines in several."""
     if str(source).lower().endswith(LINES):
         yield from _read_lines(source, mapping)
         return

@@ -116,11 +116,7 @@ def check(source: Source, mapping: ImportMapping) -> None:
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield rows at the rate `mapping.fps`.
-
-    Raises:
-        BadInputError: topics or parts of messages are missing; lists all of them.
-    """
+    """Yield rows at the rate `mapping.fps`."""
     _check_mapping(mapping, str(source))
     fields = _fields(mapping)
     file = McapFile(source, fields.keys())

@@ -27,12 +27,7 @@ GOAL_FIELD = "observations/desired_goal"
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield each episode as one block.
-
-    Raises:
-        BadInputError: fields are missing or differ in length, or the files lead elsewhere or unpack to too
-            much.
-    """
+    """Yield each episode as one block."""
     for episode in _open(source).iterate_episodes():
         origin = f"{source}/episode_{episode.id}"
         with source.tolerant():

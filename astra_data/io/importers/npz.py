@@ -17,11 +17,7 @@ SUFFIXES = (".npz",)
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows, read from all arrays in parallel.
-
-    Raises:
-        BadInputError: fields are missing, differ in length, or hold Python objects.
-    """
+    """Yield the rows, read from all arrays in parallel."""
     with source.open() as stream, ZipFile(stream) as archive, ExitStack() as exits:
         known = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
         source.refuse_beyond(

@@ -17,13 +17,7 @@ _ONE_LENGTH = "expected lists of one length, without missing ones"
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows of the fields.
-
-    Missing numbers become NaN, and times whole numbers of their own unit.
-
-    Raises:
-        BadInputError: fields are missing, have lists of several lengths, or lack what has no NaN.
-    """
+    """Yield the rows of the fields; missing numbers are NaN, and times whole numbers of their own unit."""
     fields = list(mapping.all_fields)
     with source.open() as stream, pq.ParquetFile(stream) as file:
         shapes = dict.fromkeys(file.schema_arrow.names, (file.metadata.num_rows,))

@@ -24,11 +24,7 @@ TIME = "time"
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows.
-
-    Raises:
-        BadInputError: it is no dictionary of tensors, or fields are missing or differ in length.
-    """
+    """Yield the rows."""
     tensors = _tensors(source)
     n = row_count(str(source), mapping.all_fields, {name: value.shape for name, value in tensors.items()})
     used = {field: tensors[field] for field in mapping.all_fields}
@@ -40,11 +36,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
 
 
 def layout(source: Source) -> dict[str, Any]:
-    """Return the keys of a mapping for a joint log of PACE; fps is measured from its times.
-
-    Raises:
-        BadInputError: it is none.
-    """
+    """Return the keys of a mapping for a joint log of PACE; fps is measured from its times."""
     tensors = _tensors(source)
     missing = [field for field in (TIME, *PACE.values()) if field not in tensors]
     if missing:
