@@ -55,7 +55,7 @@ class Rows:
                 sources.add(names.STATE)
             elif name in (*ENDS, names.DONE):
                 sources.update(ENDS)
-            elif name == names.SUCCESS:
+            elif name in (names.SUCCESS, names.REWARD):
                 sources.update((name, names.TERMINATED, names.DONE))
             elif name == RECORDED_TASK:
                 sources.add(names.TASK_INDEX)
@@ -80,6 +80,9 @@ class Rows:
             values = run.columns[names.STATE][1:]
         else:
             values = run.columns[names.TASK_INDEX if spec.name == RECORDED_TASK else spec.name][:steps]
+        if spec.name == names.REWARD and self._hands_on(run):
+            values = values.astype(np.float64)
+            values[-1] += run.columns[names.REWARD][-1]
         with np.errstate(over="ignore", invalid="ignore"):
             return values.astype(spec.dtype)
 
@@ -92,8 +95,9 @@ class Rows:
         return bool(successes[-1] and not successes[:-1].any() and not is_handed_on)
 
     def lost_reward(self, run: Run) -> float:
-        """Return the reward of the row that is left out."""
-        return float(run.columns[names.REWARD][-1]) if self.dropped and names.REWARD in self.stored else 0.0
+        """Return the reward of the row that is left out, 0 where the step before takes it over."""
+        is_lost = self.dropped and names.REWARD in self.stored and not self._hands_on(run)
+        return float(run.columns[names.REWARD][-1]) if is_lost else 0.0
 
     def is_done_early(self, run: Run) -> bool:
         """Whether `next.done`, of which no end of an episode is made, is set before the last row."""
@@ -123,6 +127,10 @@ class Rows:
         elif self._ends_with(names.DONE, run):
             success[-1] |= stored[-1]
         return success
+
+    def _hands_on(self, run: Run) -> bool:
+        """Whether a row is left out that terminates the episode, whose outcome the step before takes over."""
+        return bool(self.dropped) and len(run) > 1 and self._ends_with(names.TERMINATED, run)
 
     def _ends_with(self, flag: str, run: Run) -> bool:
         """Whether the last row of an episode has this flag, (T,)."""

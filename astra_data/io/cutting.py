@@ -62,7 +62,7 @@ Mask = NDArray[np.bool_]
 Cut = tuple[dict[str, Array], dict[str, Scalar]]
 """The columns and the metadata of an episode."""
 Table = dict[str, Array]
-"""Rows: columns by name and, by words without a dot, what decides where they are cut."""
+"""Rows: columns by name and, by words that begin with "/" as no column does, what decides their cuts."""
 
 
 @dataclass
@@ -164,23 +164,23 @@ class Cutter:
             self._spent.append(np.zeros(3))
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
         table = columns | {
-            "finite": ~rejected,
-            "row": block.row + np.arange(n),
-            "part": np.full(n, len(self._parts) - 1),
-            "torn": (np.arange(n) == 0) & self._was_torn,
+            "/finite": ~rejected,
+            "/row": block.row + np.arange(n),
+            "/part": np.full(n, len(self._parts) - 1),
+            "/torn": (np.arange(n) == 0) & self._was_torn,
         }
-        table |= {f"ends {name}": fields[name] for name in split.ends}
+        table |= {f"/ends {name}": fields[name] for name in split.ends}
         table |= {
-            f"ends {name}": as_rows(columns[name]) for name in (TERMINATED, TRUNCATED) if name in columns
+            f"/ends {name}": as_rows(columns[name]) for name in (TERMINATED, TRUNCATED) if name in columns
         }
         if split.field:
-            table["field"] = fields[split.field]
+            table["/field"] = fields[split.field]
         if self._mapping.time:
-            table["time"] = fields[self._mapping.time][:, 0].astype(np.float64) * self._mapping.time_scale
+            table["/time"] = fields[self._mapping.time][:, 0].astype(np.float64) * self._mapping.time_scale
         for key, values in self._tables[-1].items() if self._tables else ():
             if values.shape[1:] != table[key].shape[1:]:
                 sizes = f"{table[key].shape[1]} values, before there were {values.shape[1]}"
-                raise BadInputError(f"{block.origin}: split.{key} has {sizes}")
+                raise BadInputError(f"{block.origin}: split.{key[1:]} has {sizes}")
         self._was_torn = block.torn > 0 and self._mapping.not_finite != "drop"
         self._tables.append(table)
 
@@ -190,7 +190,7 @@ class Cutter:
             return
         table = {key: np.concatenate([each[key] for each in self._tables]) for key in self._tables[0]}
         self._tables = []
-        [kept] = np.nonzero(table["finite"])
+        [kept] = np.nonzero(table["/finite"])
         masks, steps_s = self._boundaries(table)
         self._count_time(table, steps_s)
         if not len(kept):
@@ -207,12 +207,12 @@ class Cutter:
             self.tally.split_points[name] = self.tally.split_points.get(name, 0) + 1
         starts = [0, *begins[begins > 0].tolist()]
         # A rejected row is of the episode after it or else before it, by all reasons but rejected rows.
-        rows, apart = np.arange(len(table["row"])), counts[:-1].sum(axis=0)
+        rows, apart = np.arange(len(table["/row"])), counts[:-1].sum(axis=0)
         before = np.searchsorted(kept, rows, side="right") - 1
         after = np.minimum(np.searchsorted(kept, rows), len(kept) - 1)
         is_of_next = (before < 0) | (apart[kept[after]] == apart)
         episode = np.searchsorted(starts, np.where(is_of_next, after, before), side="right") - 1
-        [rejected] = np.nonzero(~table["finite"])
+        [rejected] = np.nonzero(~table["/finite"])
         ends = rejected[(before[rejected] >= 0) & (apart[kept[before[rejected]]] == apart[rejected])]
         for name in (TERMINATED, SUCCESS):
             if name in table:  # if a rejected row ends its episode, the last row of it that is kept does so
@@ -228,8 +228,8 @@ class Cutter:
             values = {
                 column.name: table[column.name][part] for column in self.columns if column.name in table
             }
-            source = {"source": self._parts[table["part"][part[0]]].origin}
-            yield from self._episode(values, source | {"source_row": int(table["row"][part[0]])})
+            source = {"source": self._parts[table["/part"][part[0]]].origin}
+            yield from self._episode(values, source | {"source_row": int(table["/row"][part[0]])})
 
     def _boundaries(self, table: Table) -> tuple[dict[str, Array], Array]:
         """Return to which rows each reason applies, but for jumps and what begins the first, (n,) each.
@@ -237,27 +237,27 @@ class Cutter:
         And the steps in time to each row from the one before, (n, 3): as recorded, held over rows without a
         time, and held over rows that are dropped, too; NaN for the first.
         """
-        n, split, drops = len(table["row"]), self._mapping.split, self._mapping.not_finite == "drop"
+        n, split, drops = len(table["/row"]), self._mapping.split, self._mapping.not_finite == "drop"
         masks: dict[str, Array] = {reason: np.zeros(n, bool) for reason in REASONS}
         for key, values in table.items():
-            if key.startswith("ends "):
+            if key.startswith("/ends "):
                 masks["end"][1:] |= (np.nan_to_num(values[:-1]) != 0).any(axis=1)
         if split.field:
-            earlier, later = table["field"][:-1], table["field"][1:]
+            earlier, later = table["/field"][:-1], table["/field"][1:]
             # What is missing (NaN) is the same value again, as empty cells of CSV are.
             are_missing = (earlier != earlier) & (later != later)
             masks["field"][1:] = ((earlier != later) & ~are_missing).any(axis=1)
         steps_s: Array = np.full((n, 3), np.nan)
-        if "time" in table:
-            times = np.repeat(table["time"][:, None], 3, axis=1)
-            times[~table["finite"] & drops, 2] = np.nan
+        if "/time" in table:
+            times = np.repeat(table["/time"][:, None], 3, axis=1)
+            times[~table["/finite"] & drops, 2] = np.nan
             known = np.where(np.isfinite(times[:, 1:]), np.arange(n)[:, None], 0)
             times[:, 1:] = np.take_along_axis(times[:, 1:], np.maximum.accumulate(known), axis=0)
             steps_s[1:] = np.diff(times, axis=0)
             masks["back"] = steps_s[:, 1] < 0
             if split.gap_s is not None:
                 masks["gap"] = np.asarray((steps_s[:, 1:] > split.gap_s).any(axis=1))
-        masks["rejected"] = table["torn"] | (~table["finite"] & (self._mapping.not_finite == "split"))
+        masks["rejected"] = table["/torn"] | (~table["/finite"] & (self._mapping.not_finite == "split"))
         return masks, steps_s
 
     def _jumped(self, table: Table, kept: NDArray[np.int64]) -> Mask:
@@ -272,7 +272,7 @@ class Cutter:
 
     def _place(self, table: Table, at: int) -> str:
         """Name the row `at` of the table."""
-        named: str = self._parts[table["part"][at]].row_name(int(table["row"][at]))
+        named: str = self._parts[table["/part"][at]].row_name(int(table["/row"][at]))
         return named
 
     def _count(self, block: Block, bad: dict[str, Mask], rejected: Mask) -> None:
@@ -302,8 +302,8 @@ class Cutter:
                 setattr(self.tally, f"{name}_first", self._place(table, int(mask.argmax())))
         longest = self._mapping.split.gap_s or np.inf
         regular = (kept > 0) & ~(held > longest) & ~(kept > longest)
-        for part in np.unique(table["part"][regular]):
-            steps = kept[regular & (table["part"] == part)]
+        for part in np.unique(table["/part"][regular]):
+            steps = kept[regular & (table["/part"] == part)]
             self._spent[part] += steps.sum(), np.median(steps) * len(steps), len(steps)
             self._clock.count(steps)
 

@@ -30,7 +30,7 @@ from astra_data.io.importers.csv import (
     torn_bytes,
     without_end,
 )
-from astra_data.io.recording import Source, refuse_dataset
+from astra_data.io.recording import Source, foreign, refuse_dataset
 
 Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
 TURNED = "heading|yaw|theta|psi|compass|course|cog|azimuth|hdg"
@@ -399,8 +399,10 @@ def csv_files(place: Path) -> list[Path]:
     refuse_versions(place)
     refuse_dataset(place)
     refuse_run(place)
+    hint = foreign([str(path) for path in inside])
     raise BadInputError(
-        f"{place}: expected files that end in {' or '.join(SUFFIXES)}, or a dataset: make one of other "
+        f"{place}: {hint}{'; ' if hint else ''}expected files that end in {' or '.join(SUFFIXES)}, or a "
+        "dataset: make one of other "
         "recordings with `astra-data import LOGS --mapping FILE` (`astra-data recipes list` shows mappings, "
         "such as ros2_base), then name it: --from NAME"
     )

@@ -353,19 +353,26 @@ def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Itera
         for block in module.read(source, mapping):
             row, origin = (row if block.origin == origin else 0), block.origin
             shapes = [values.shape[1:] for values in map(np.asarray, block.values.values())]
-            steps = shapes[0][0] if shapes[0] else 1
-            may_be = steps > 1 and {shape[:1] for shape in shapes} == {(steps,)} and max(map(len, shapes)) > 1
-            if mapping.stacked and not may_be:
+            several = [shape for shape in shapes if shape]
+            steps = several[0][0] if several else 1
+            may_be = steps > 1 and {shape[:1] for shape in several} == {(steps,)}
+            if mapping.stacked and not (may_be and several == shapes):
                 raise BadInputError(
                     f"{origin}: stacked = true, but the fields' rows have the shapes "
                     f"{', '.join(map(str, shapes))}; expected (steps, ...) with as many steps in each"
                 )
-            if may_be and mapping.stacked is None and (len(shapes) > 1 or len(block) < steps):
-                raise BadInputError(
-                    f"{origin}: all fields have {steps} rows in each of their rows, such as "
-                    f"{next(iter(block.values))} of shape {(len(block), *shapes[0])}: set stacked = true in "
-                    f"the mapping if these are the steps of {len(block)} episodes, else stacked = false"
-                )
+            if mapping.stacked is None and may_be:
+                has_matrix, are_all = max(map(len, several)) > 1, several == shapes
+                is_short, is_sure = len(block) < steps, has_matrix and are_all
+                # With single numbers among them, or without a matrix, only too few rows give them away.
+                is_odd = is_short and row == 0 and not block.starts and (has_matrix or are_all)
+                if (is_sure and is_short) or (len(shapes) > 1 and (is_sure or is_odd)):
+                    name, shape = next(each for each in zip(block.values, shapes, strict=True) if each[1])
+                    raise BadInputError(
+                        f"{origin}: {'all' if are_all else 'many'} fields have {steps} rows in each of their "
+                        f"rows, such as {name} of shape {(len(block), *shape)}: set stacked = true in the "
+                        f"mapping if these are the steps of {len(block)} episodes, else stacked = false"
+                    )
             if not mapping.stacked:
                 yield replace(block, row=row)
                 row += len(block)

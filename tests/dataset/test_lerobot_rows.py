@@ -90,6 +90,19 @@ def test_a_terminated_row_that_is_left_out_hands_its_flags_to_the_step_before() 
     assert values(names.SUCCESS, "bool", more=with_next).tolist() == [False, False, False, True]
 
 
+def test_a_terminated_row_that_is_left_out_hands_its_reward_to_the_step_before() -> None:
+    last = np.arange(STEPS) == STEPS - 1
+    sparse: dict[str, Array] = {names.REWARD: 5.0 * last, names.TERMINATED: last}
+    assert values(names.REWARD, more=sparse).tolist() == [0, 0, 5]
+    rows, run = rows_and_run(dict(sparse))
+    assert rows.lost_reward(run) == 0.0
+    assert names.TERMINATED in [column.name for column in rows.stored_for([names.REWARD])]
+    cut_off = sparse | {names.TERMINATED: ~last & last}
+    assert values(names.REWARD, more=cut_off).tolist() == [0, 0, 0]
+    rows, run = rows_and_run(cut_off)
+    assert rows.lost_reward(run) == 5.0
+
+
 def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_over() -> None:
     last = np.arange(STEPS) == STEPS - 1
     for more, lost in (

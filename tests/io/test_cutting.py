@@ -279,6 +279,19 @@ def test_rows_without_a_value_of_the_field_are_one_episode_as_empty_cells_are() 
     assert made.tally.split_points == {"field": 2}
 
 
+def test_columns_may_have_any_names() -> None:
+    """Also those of what decides where rows are cut."""
+    names = ("time", "row", "part", "finite", "torn", "field")
+    columns = {name: {"fields": ("x",)} for name in (STATE, ACTION, *names)}
+    cutting = cutter(columns=columns, time="t", split={"field": "k"})
+    x = np.arange(60.0)[::-1]
+    episodes = cut(cutting, x=x, t=np.arange(60) / 10, k=np.arange(60) // 30)
+    for name in names:
+        for episode, first in zip(episodes, (0, 30), strict=True):
+            np.testing.assert_array_equal(episode[name], x[first : first + 29])
+    cutting.check()
+
+
 cells = st.sampled_from([0.0, 0.0, 0.0, 1.0, np.nan])
 steps = st.sampled_from([0.1, 0.1, 0.1, 0.0, -0.3, 2.0, np.nan])
 lines = st.tuples(cells, steps, cells, cells, cells, st.sampled_from([0, 0, 0, 5]))

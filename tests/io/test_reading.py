@@ -173,3 +173,18 @@ def test_rows_of_matrices_are_no_episodes(tmp_path: Path, command: tuple[int, ..
         BadInputError, match=r"stacked = true, but the fields' rows have the shapes \(4, 3\), \("
     ):
         imported(tmp_path / "stacked", path, "stacked = true\n" + STACKED)
+
+
+@pytest.mark.parametrize("widths", [((8, 50, 3), (8, 50), (8,)), ((8, 50), (8, 50), (8, 50))])
+def test_arrays_of_few_episodes_are_told_whatever_lies_beside_them(
+    tmp_path: Path, widths: tuple[tuple[int, ...], ...]
+) -> None:
+    """Such as a return of each episode; or numbers alone, which may be imported as episodes."""
+    fields = {name: np.ones(shape) for name, shape in zip(("state", "command", "r"), widths, strict=True)}
+    mapping = f'{STACKED}[columns.r]\nfields = ["r"]\n'
+    path = write_table(tmp_path / "log.npz", fields)
+    with pytest.raises(BadInputError, match=r"fields have 50 rows in each .* of shape \(8, 50.* 8 episodes"):
+        imported(tmp_path, path, mapping)
+    assert imported(tmp_path / "no", path, "stacked = false\n" + mapping)[0].lengths.tolist() == [7]
+    if len(widths[2]) > 1:
+        assert imported(tmp_path / "yes", path, "stacked = true\n" + mapping)[0].lengths.tolist() == [49] * 8

@@ -137,6 +137,7 @@ def test_what_cannot_be_begun_with_is_refused(tmp_path: Path) -> None:
     drives(tmp_path / "logs", 1)
     (tmp_path / "bags").mkdir()
     (tmp_path / "bags/drive.mcap").touch()
+    (tmp_path / "drive.csv.gz").touch()
     for given, expected in {
         "walks home/walks/data-1.1.0": "expected .* `astra-data merge`",
         "logs walks": "logs and walks: expected logs, or one dataset",
@@ -144,6 +145,7 @@ def test_what_cannot_be_begun_with_is_refused(tmp_path: Path) -> None:
         "walks@data-3.0.0": "walks has no version data-3.0.0 in .*home; it has data-1.0.0, data-1.1.0",
         "walsk": "walsk: no such file, folder or dataset: did you mean 'walks'",
         "bags": "bags: expected files that end in .csv or .tsv, or a dataset: make one",
+        "drive.csv.gz": r"drive.csv.gz is compressed: unpack it \(gunzip.*; expected files that end in .csv",
     }.items():
         with pytest.raises(BadInputError, match=expected):
             write_robot("cart", Path("cart"), [Path(place) for place in given.split()])
