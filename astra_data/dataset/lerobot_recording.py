@@ -33,6 +33,7 @@ from astra_data.dataset.lerobot_rows import (
     robot_of,
 )
 from astra_data.dataset.parquet import read_blocks
+from astra_data.dataset.rounding import Roundings
 
 MOST_FAULTS = 8
 """Faults that a message lists."""
@@ -68,11 +69,13 @@ def open_recording(root: Path) -> Contents:
         )
     rows = Rows({column.name: column for column in stored}, fps)
     columns = our_columns(specs, has_tasks=len(tasks) > 1)
-    episodes, content_hash, digests = _survey(root, rows, columns, tasks, info)
+    roundings = Roundings(columns, {column.name: column.dtype for column in stored})
+    episodes, content_hash, digests = _survey(root, rows, columns, tasks, info, roundings)
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
-    _announce(root, info, rows, columns, episodes, [*(spec.name for spec in specs), *names.RESERVED])
+    known = [*(spec.name for spec in specs), *names.RESERVED]
+    _announce(root, info, rows, columns, episodes, known, roundings.found())
     uids = [episode.uid for episode in kept]
     lengths = np.array([episode.steps for episode in kept])
     first, last = episodes[0], episodes[-1]
@@ -107,9 +110,14 @@ def open_recording(root: Path) -> Contents:
 
 
 def _survey(
-    root: Path, rows: Rows, columns: list[Column], tasks: Mapping[int, str], info: Mapping[str, Any]
+    root: Path,
+    rows: Rows,
+    columns: list[Column],
+    tasks: Mapping[int, str],
+    info: Mapping[str, Any],
+    roundings: Roundings,
 ) -> tuple[list[Found], str, Digests]:
-    """Read every value once; return all episodes, and hash and digests of what becomes ours."""
+    """Read every value once, for `roundings`, too; return all episodes, hash and digests of what is ours."""
     stored = list(rows.stored.values())
     specs = layout.stored_columns(columns)
     ends = [name for name in (*ENDS, names.EPISODE_INDEX) if name in rows.stored]
@@ -129,6 +137,8 @@ def _survey(
         row += len(run)
         if not episode.steps:
             continue
+        if not faults:
+            roundings.add(run.columns)
         for spec in specs:
             values = rows.values(spec, run, kept, steps, uid)
             content.update(spec.name, values)
@@ -196,9 +206,10 @@ def _announce(
     columns: Sequence[Column],
     episodes: Sequence[Found],
     known: Collection[str],
+    rounded: Sequence[str],
 ) -> None:
     """Say in one line what is left out or rounded, and which ends are not those of episodes."""
-    parts = left_out(rows, episodes)
+    parts = [*left_out(rows, episodes), *rounded]
     if early := [episode.uid for episode in episodes if episode.is_done_early]:
         parts.append(
             f"{names.DONE} is set before the last row of {len(early)} episodes "

@@ -28,6 +28,7 @@ from astra_data.dataset.lerobot_rows import (
 )
 from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
+from astra_data.dataset.rounding import Roundings
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 
@@ -96,6 +97,7 @@ def repair(
         renamed = sum("merged_uid" in episode.metadata for episode in joined)
         result.notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
     unknown = 0
+    roundings = Roundings(remains.specs, {column.name: column.dtype for column in remains.columns})
     recorded: list[Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
     with DatasetWriter(
@@ -129,6 +131,7 @@ def repair(
             try:
                 episode = Episode(known.uid, _values(remains.specs, run, rows, uid), facts)
                 writer.add(episode)
+                roundings.add(run.columns)
             except BadInputError as error:
                 result.notes.append(f"left out the episode of uid {uid}: {error}")
                 continue
@@ -137,6 +140,7 @@ def repair(
             result.frames += len(episode)
         if rows and recorded:
             result.notes.append("; ".join(left_out(rows, recorded)))
+        result.notes += roundings.found()
         result.notes += _losses(remains, result.episodes, writer.content_hash)
         if (remains.metadata or sources) and unknown:
             result.notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
