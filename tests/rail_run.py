@@ -1,9 +1,12 @@
 """A small run on the rail: seeds and rows that are trained and not tested, in seconds."""
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
 from quick_runs import fit_failures_quickly, run_here
+from shared_runs import shared
 
 ROOT = Path(__file__).parents[1]
 SMALL = """
@@ -46,3 +49,17 @@ def make_rail_run(place: Path, *, seeds: str = "[0, 1, 2]", methods: str = "", m
     with pytest.MonkeyPatch.context() as patch:
         fit_failures_quickly(patch)
         return run_here(path, until="align")
+
+
+def rail_run(factory: pytest.TempPathFactory, *, seeds: list[int], methods: list[str]) -> Path:
+    """Return a copy of one such run of rows without a latent and with one, of some of its seeds and rows."""
+    rows = '["direct_transfer", "nas", "astra"]'
+    whole = shared(factory, "rail", lambda place: make_rail_run(place, methods=rows)) / "runs/rail"
+    folder = Path(shutil.copytree(whole, factory.mktemp("rail") / "rail"))
+    settings = json.loads((folder / "recipe.json").read_text())
+    (folder / "recipe.json").write_text(json.dumps(settings | {"seeds": seeds, "methods": methods}))
+    for made in [*folder.glob("*/*/seed_*")]:
+        is_asked = made.parent.name in methods and int(made.name.removeprefix("seed_")) in seeds
+        if not is_asked:
+            shutil.rmtree(made)
+    return folder

@@ -3,14 +3,12 @@
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import version
-from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated
 
 import typer
 from typer.core import TyperArgument
-from typer.models import OptionInfo
 
 from astra_data.cli import building, datasets, recipes, sharing, starting
 from astra_data.core.durable import NO_FSYNC, disk_error
@@ -63,101 +61,48 @@ def _options(
 
 PANELS: dict[str, dict[str, Callable[..., None]]] = {
     "Recipes": {
-        "new": starting.new,
-        "run": recipes.run,
-        "check": recipes.check,
-        "ground": recipes.ground,
-        "train": recipes.train,
-        "align": recipes.align,
-        "evaluate": recipes.evaluate,
-        "report": recipes.report,
-        "select": recipes.select,
-        "deploy": recipes.deploy,
-        "view": recipes.view,
+        "new robot --from logs/*.csv": starting.new,
+        "run recipes/quickstart.toml --until ground": recipes.run,
+        "check recipes/quickstart.toml cart.py:TASK": recipes.check,
+        "ground recipes/quickstart.toml --method astra": recipes.ground,
+        "train recipes/quickstart.toml --method astra_plus --device cuda": recipes.train,
+        "align recipes/quickstart.toml": recipes.align,
+        "evaluate recipes/quickstart.toml --seed 0": recipes.evaluate,
+        "report recipes/quickstart.toml": recipes.report,
+        "select runs/cart --row astra --trials 40": recipes.select,
+        "deploy runs/quickstart --row astra": recipes.deploy,
+        "view runs/quickstart --save run.rrd": recipes.view,
     },
     "Recipes or datasets": {
-        "collect": building.collect,
-        "pair": building.pair,
-        "subset": datasets.subset,
+        "collect antmaze-umaze --episodes 50 --name walks": building.collect,
+        "pair walks --simulator antmaze-umaze": building.pair,
+        "subset walks --percent 50 --name half": datasets.subset,
     },
     "Datasets": {
-        "label": building.label,
-        "augment": building.augment,
-        "merge": datasets.merge,
-        "filter": datasets.filter_,
+        "label logs --task cart.py:TASK": building.label,
+        "augment walks --copies 3 --rotations quarter": building.augment,
+        "merge walks more --name all": datasets.merge,
+        "filter walks --success": datasets.filter_,
         "list": datasets.list_,
-        "inspect": datasets.inspect,
-        "validate": datasets.validate,
-        "repair": datasets.repair,
-        "log": datasets.log,
+        "inspect walks --plot figures": datasets.inspect,
+        "validate walks@data-1.0.0": datasets.validate,
+        "repair broken --out repaired": datasets.repair,
+        "log walks": datasets.log,
     },
     "Exchange": {
-        "import": sharing.import_,
-        "export": sharing.export,
-        "push": sharing.push,
-        "pull": sharing.pull,
+        "import logs/*.csv --mapping logs.toml": sharing.import_,
+        "export walks --format d4rl --out walks.hdf5": sharing.export,
+        "push walks me/walks": sharing.push,
+        "pull me/walks": sharing.pull,
     },
 }
-EXAMPLES = {
-    "new": "astra-data new robot --from logs/*.csv",
-    "run": "astra-data run recipes/quickstart.toml --until ground",
-    "check": "astra-data check recipes/quickstart.toml cart.py:TASK",
-    "ground": "astra-data ground recipes/quickstart.toml --method astra",
-    "train": "astra-data train recipes/quickstart.toml --method astra_plus --device cuda",
-    "align": "astra-data align recipes/quickstart.toml",
-    "evaluate": "astra-data evaluate recipes/quickstart.toml --seed 0",
-    "report": "astra-data report recipes/quickstart.toml",
-    "select": "astra-data select runs/cart --row astra --trials 40",
-    "deploy": "astra-data deploy runs/quickstart --row astra",
-    "collect": "astra-data collect antmaze-umaze --episodes 50 --name walks",
-    "pair": "astra-data pair walks --simulator antmaze-umaze",
-    "subset": "astra-data subset walks --percent 50 --name half",
-    "label": "astra-data label logs --task cart.py:TASK",
-    "augment": "astra-data augment walks --copies 3 --rotations quarter",
-    "merge": "astra-data merge walks more --name all",
-    "filter": "astra-data filter walks --success",
-    "list": "astra-data list",
-    "inspect": "astra-data inspect walks --plot figures",
-    "view": "astra-data view runs/quickstart --save run.rrd",
-    "validate": "astra-data validate walks@data-1.0.0",
-    "repair": "astra-data repair broken --out repaired",
-    "log": "astra-data log walks",
-    "import": "astra-data import logs/*.csv --mapping logs.toml",
-    "export": "astra-data export walks --format d4rl --out walks.hdf5",
-    "push": "astra-data push walks me/walks",
-    "pull": "astra-data pull me/walks",
-}
-"""What to type for each command, below its help."""
-_NAMES = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", bool: ""}
-"""How help names values of these types."""
-
-
-def _name_values(command: Callable[..., None]) -> Callable[..., None]:
-    """Let the help of a command name the values of its options by what they are, not by their types."""
-    for hint in get_type_hints(command, include_extras=True).values():
-        infos = [info for info in getattr(hint, "__metadata__", ()) if isinstance(info, OptionInfo)]
-        kinds = [kind for kind in (*_inner(hint),) if kind in _NAMES]
-        for info in infos:
-            if info.metavar is None and kinds:
-                info.metavar = _NAMES[kinds[0]]
-    return command
-
-
-def _inner(hint: Any) -> Iterator[Any]:  # noqa: ANN401 - any annotation
-    """Yield the types in an annotation, as int in `Annotated[list[int] | None, ...]`."""
-    inside = get_args(hint)[:1] if hasattr(hint, "__metadata__") else get_args(hint)
-    for one in inside:
-        yield from _inner(one)
-    if not inside:
-        yield hint
-
-
+"""Commands by what to type for each, as is said below its help; its first word is its name."""
 TyperArgument.display_type_rich = lambda self, ctx: None  # type: ignore[method-assign]
 """What an argument is, its name says."""
 for panel, commands in PANELS.items():
-    for name, command in commands.items():
-        epilog = f"Example: {EXAMPLES[name]}" if name in EXAMPLES else None
-        app.command(name, rich_help_panel=panel, epilog=epilog)(_name_values(command))
+    for example, command in commands.items():
+        epilog = f"Example: astra-data {example}"
+        app.command(example.split()[0], rich_help_panel=panel, epilog=epilog)(command)
 app.add_typer(
     starting.app,
     name="recipes",

@@ -4,7 +4,8 @@ import ast
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import wraps
+from functools import cache, wraps
+from importlib.util import find_spec
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,13 +20,8 @@ if TYPE_CHECKING:
 
 
 def recipe_at(path: Path) -> Path:
-    """Refuse a path at which there is no recipe, and say where one of this name is; and unknown names in one.
-
-    Raises:
-        RecipeError: there is no such file, it is not TOML, or it has unknown names.
-    """
+    """Refuse a path at which there is no recipe, and say where one of this name is."""
     from astra_data.core.config import load_tables
-    from astra_data.pipeline.first_look import check_names
     from astra_data.pipeline.shipped import whereabouts
 
     if path.is_dir():  # a run or a dataset, perhaps: what is read then says so
@@ -35,16 +31,11 @@ def recipe_at(path: Path) -> Path:
     except RecipeError as error:
         place = "" if path.exists() else whereabouts(path.name.removesuffix(".toml"))
         raise RecipeError(f"{path} does not exist: {place}" if place else str(error)) from None
-    check_names(path)
     return path
 
 
 def run_at(folder: Path) -> Path:
-    """Refuse what is no folder of a run.
-
-    Raises:
-        BadInputError: it has no record of a recipe.
-    """
+    """Refuse what is no folder of a run."""
     from astra_data.core.config import did_you_mean
 
     if not (folder / RECORD).is_file():
@@ -57,11 +48,7 @@ def run_at(folder: Path) -> Path:
 
 
 def task_at(name: str) -> str:
-    """Refuse a task in a file that does not exist; names, and recipes, are looked up later.
-
-    Raises:
-        BadInputError: there is no such file.
-    """
+    """Refuse a task in a file that does not exist; names, and recipes, are looked up later."""
     file = Path(name.rpartition(":")[0])
     if file.suffix == ".py" and not file.is_file():
         raise BadInputError(f"{name}: expected a file {file}, found none: write path.py:TASK")
@@ -84,11 +71,7 @@ def _device(name: str) -> str:
 
 DatasetName = Annotated[
     str,
-    typer.Argument(
-        metavar="DATASET",
-        help="A folder, name@data-1.2.0, or a name (for its highest version).",
-        show_default=False,
-    ),
+    typer.Argument(metavar="DATASET", help="A folder, name@data-1.2.0, or a name (for its highest version)."),
 ]
 Source = Annotated[
     str,
@@ -96,7 +79,6 @@ Source = Annotated[
         metavar="RECIPE|DATASET",
         help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or a name (for its highest "
         "version). The settings below apply to a dataset only; a recipe has its own.",
-        show_default=False,
     ),
 ]
 Out = Annotated[
@@ -114,19 +96,13 @@ NewName = Annotated[
         show_default="a new version",
     ),
 ]
-RecipePath = Annotated[
-    Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).", show_default=False)
-]
-RunFolder = Annotated[
-    Path, typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.", show_default=False)
-]
+RecipePath = Annotated[Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.")]
 Methods = Annotated[
-    list[str] | None,
-    typer.Option("--method", metavar="ROW", help="Run only this row; may be repeated.", show_default=False),
+    list[str] | None, typer.Option("--method", metavar="ROW", help="Run only this row; may be repeated.")
 ]
 Seeds = Annotated[
-    list[int] | None,
-    typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.", show_default=False),
+    list[int] | None, typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.")
 ]
 Device = Annotated[
     str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …", callback=_device)
@@ -167,8 +143,6 @@ def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., N
     """
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
-        from astra_data.pipeline.first_look import fields_of
-
         options = [_option(field, about) for field, about in fields_of(place)]
 
         @wraps(command)
@@ -185,6 +159,37 @@ def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., N
         return run
 
     return decorated
+
+
+@cache
+def fields_of(place: str) -> list[tuple[Any, str]]:
+    """Return the fields of a model at "package.module:Model", its bases' too, each with the text below it."""
+    module, _, name = place.partition(":")
+    spec = find_spec(module)
+    assert spec is not None and spec.origin is not None
+    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    (model,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    imported = {
+        alias.name: f"{node.module}:{alias.name}"
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    found: list[tuple[Any, str]] = []
+    for base in model.bases:
+        if isinstance(base, ast.Name) and base.id not in ("Config", "BaseModel"):
+            found += fields_of(imported.get(base.id, f"{module}:{base.id}"))
+    return [*found, *_fields(model)]
+
+
+def _fields(model: ast.ClassDef) -> Iterator[tuple[Any, str]]:
+    for node, after in zip(model.body, [*model.body[1:], None], strict=True):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            match after:
+                case ast.Expr(value=ast.Constant(value=str() as text)):
+                    yield node, " ".join(text.split())
+                case _:
+                    yield node, ""
 
 
 def _option(field: ast.AnnAssign, about: str) -> Parameter:
@@ -230,10 +235,8 @@ def run_stage(recipe: Path, stage: str, **options: Any) -> Path:  # noqa: ANN401
 
     Options that are given None are left out.
     """
-    from astra_data.pipeline.first_look import check_asked
-
     options = {name: value for name, value in options.items() if value is not None}
-    check_asked(recipe_at(recipe), options.get("methods"), options.get("seeds"))
+    recipe_at(recipe)
     from astra_data.pipeline.run import run_stage as run
 
     with resumable():
@@ -244,11 +247,7 @@ def run_stage(recipe: Path, stage: str, **options: Any) -> Path:  # noqa: ANN401
 
 
 def refuse(options: Mapping[str, object], stage: str, table: str | None = None) -> None:
-    """Refuse `options` that are given, since a recipe sets them itself.
-
-    Raises:
-        BadInputError: one is given.
-    """
+    """Refuse `options` that are given, since a recipe sets them itself."""
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
         raise BadInputError(
@@ -257,11 +256,7 @@ def refuse(options: Mapping[str, object], stage: str, table: str | None = None) 
 
 
 def refuse_of_recipes(command: str, seeds: Sequence[int] | None, jobs: int | None) -> int | None:
-    """Return the one seed that is given with a task or a dataset, if any.
-
-    Raises:
-        BadInputError: there are several, or `jobs`, which are for recipes.
-    """
+    """Return the one seed that is given with a task or a dataset, if any."""
     if len(seeds or ()) > 1 or jobs is not None:
         raise BadInputError(f"{command}: give at most one --seed and no --jobs (these are for recipes)")
     return seeds[0] if seeds else None

@@ -32,7 +32,6 @@ def collect(
             metavar="RECIPE|TASK",
             help="A recipe (.toml), or a task such as antmaze-umaze. "
             "The settings below apply to a task only; a recipe has its own.",
-            show_default=False,
         ),
     ],
     settings: dict[str, Any],
@@ -63,18 +62,10 @@ def collect(
     task_at(task)
     import torch
 
-    from astra_data.core.config import validated
-    from astra_data.pipeline.display import shown
-    from astra_data.pipeline.stages.collect import CollectConfig
-    from astra_data.pipeline.stages.collect import collect as make
-
-    planned = {"behavior": "planned"} if "plan" in settings and "behavior" not in settings else {}
-    config = validated(settings | planned, CollectConfig, "collect")
     # The networks' idle threads would slow down the physics.
     torch.set_num_threads(1)
-    with resumable("run the same command with --resume to continue"), shown("collect") as progress:
-        folder = make(task, config, seed=seed, out=out, name=name, resume=resume, progress=progress)
-    typer.echo(f"finished: {folder}")
+    with resumable("run the same command with --resume to continue"):
+        _make("collect", task, settings, seed=seed, out=out, name=name, resume=resume)
 
 
 @with_settings("astra_data.pipeline.stages.pair:PairConfig")
@@ -88,8 +79,7 @@ def pair(
         str | None,
         typer.Option(
             help="A task (to use its abstract simulator), a simulator of an installed package, or your own "
-            "class: path.py:MySimulator. Its code is run.",
-            show_default=False,
+            "class: path.py:MySimulator. Its code is run."
         ),
     ] = None,
     name: NewName = None,
@@ -107,16 +97,7 @@ def pair(
     task_at(simulator)
     from astra_data.dataset.versions import locate
 
-    source = locate(dataset)
-    from astra_data.core.config import validated
-    from astra_data.pipeline.display import shown
-    from astra_data.pipeline.stages.pair import PairConfig
-    from astra_data.pipeline.stages.pair import pair as make
-
-    config = validated(settings, PairConfig, "pair")
-    with shown("pair") as progress:
-        folder = make(simulator, config, dataset=source, name=name, out=out, progress=progress)
-    typer.echo(f"finished: {folder}")
+    _make("pair", simulator, settings, dataset=locate(dataset), name=name, out=out)
 
 
 @with_settings("astra_data.pipeline.stages.augment:AugmentConfig")
@@ -137,26 +118,13 @@ def augment(
     """Add rotated and shifted copies of episodes; the dataset must not be paired yet."""
     from astra_data.dataset.versions import locate
 
-    root = locate(dataset)
-    from astra_data.core.config import validated
-    from astra_data.pipeline.display import shown
-    from astra_data.pipeline.stages.augment import AugmentConfig
-    from astra_data.pipeline.stages.augment import augment as make
-
-    config = validated(settings, AugmentConfig, "augment")
-    with shown("augment") as progress:
-        folder = make(task, config, dataset=root, seed=seed, name=name, out=out, progress=progress)
-    typer.echo(f"finished: {folder}")
+    _make("augment", task, settings, dataset=locate(dataset), seed=seed, name=name, out=out)
 
 
 def label(
     dataset: DatasetName,
     task: Annotated[
-        str,
-        typer.Option(
-            help="A task: a name, or a place such as cart.py:TASK. Its code is run.",
-            show_default=False,
-        ),
+        str, typer.Option(help="A task: a name, or a place such as cart.py:TASK. Its code is run.")
     ],
     seed: Annotated[int, typer.Option(help="Random seed of the goals.")] = 0,
     name: NewName = None,
@@ -166,10 +134,19 @@ def label(
     task_at(task)
     from astra_data.dataset.versions import locate
 
-    data = locate(dataset)
-    from astra_data.pipeline.display import shown
-    from astra_data.pipeline.stages.label import label as make
+    _make("label", task, None, data=locate(dataset), seed=seed, name=name, out=out)
 
-    with shown("label") as progress:
-        folder = make(task, data=data, seed=seed, name=name, out=out, progress=progress)
+
+def _make(stage: str, task: str | None, settings: dict[str, Any] | None, **options: object) -> None:
+    """Run one stage on its own, and print the folder that it writes."""
+    from importlib import import_module
+
+    from astra_data.core.config import validated
+    from astra_data.pipeline.display import shown
+
+    module = import_module(f"astra_data.pipeline.stages.{stage}")
+    if settings is not None:
+        options["config"] = validated(settings, getattr(module, f"{stage.title()}Config"), stage)
+    with shown(stage) as progress:
+        folder = getattr(module, stage)(task, progress=progress, **options)
     typer.echo(f"finished: {folder}")

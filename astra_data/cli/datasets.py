@@ -26,12 +26,9 @@ from astra_data.core.naming import RUNS, first_few, printable
 
 def subset(
     dataset: Source,
-    episodes: Annotated[
-        int | None, typer.Option(min=1, help="Number of episodes to keep.", show_default=False)
-    ] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Number of episodes to keep.")] = None,
     percent: Annotated[
-        int | None,
-        typer.Option(min=1, help="The same as a percentage of --of; may exceed 100.", show_default=False),
+        int | None, typer.Option(min=1, help="The same as a percentage of --of; may exceed 100.")
     ] = None,
     of: Annotated[
         int | None,
@@ -52,8 +49,7 @@ def subset(
     stratify: Annotated[
         str | None,
         typer.Option(
-            help="Key of the episodes' metadata, such as success, whose values keep their proportions.",
-            show_default=False,
+            help="Key of the episodes' metadata, such as success, whose values keep their proportions."
         ),
     ] = None,
     name: NewName = None,
@@ -111,20 +107,15 @@ def filter_(
     dataset: DatasetName,
     without: Annotated[
         list[int] | None,
-        typer.Option(
-            metavar="UID", help="Leave out the episode with this uid; may be repeated.", show_default=False
-        ),
+        typer.Option(metavar="UID", help="Leave out the episode with this uid; may be repeated."),
     ] = None,
     success: Annotated[
-        bool | None,
-        typer.Option(
-            "--success/--no-success", help="Keep only successes, or only failures.", show_default=False
-        ),
+        bool | None, typer.Option("--success/--no-success", help="Keep only successes, or only failures.")
     ] = None,
-    min_return: Annotated[float | None, typer.Option(help="Minimum return.", show_default=False)] = None,
-    max_return: Annotated[float | None, typer.Option(help="Maximum return.", show_default=False)] = None,
-    min_length: Annotated[int | None, typer.Option(help="Minimum steps.", show_default=False)] = None,
-    max_length: Annotated[int | None, typer.Option(help="Maximum steps.", show_default=False)] = None,
+    min_return: Annotated[float | None, typer.Option(help="Minimum return.")] = None,
+    max_return: Annotated[float | None, typer.Option(help="Maximum return.")] = None,
+    min_length: Annotated[int | None, typer.Option(help="Minimum steps.")] = None,
+    max_length: Annotated[int | None, typer.Option(help="Maximum steps.")] = None,
     name: NewName = None,
     out: Out = None,
 ) -> None:
@@ -209,8 +200,7 @@ def inspect(
 
 def list_(
     folders: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="FOLDER", help="More folders for --clean, such as runs.", show_default=False),
+        list[Path] | None, typer.Argument(metavar="FOLDER", help="More folders for --clean, such as runs.")
     ] = None,
     clean: Annotated[
         bool,
@@ -345,14 +335,13 @@ def validate(
 
 def repair(
     dataset: DatasetName,
-    out: Annotated[Path, typer.Option(help="Folder of the new dataset.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder of the new dataset.")],
     like: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ORIGINAL",
             help="The dataset that LeRobot's tools made DATASET from. Its origin and its episodes' metadata "
             "are copied to episodes with the same uid and values. After a merge, give each dataset merged.",
-            show_default=False,
         ),
     ] = None,
     new_uids: Annotated[
@@ -379,8 +368,7 @@ _SHOWN = 5
 def log(
     dataset: DatasetName,
     other: Annotated[
-        str | None,
-        typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.", show_default=False),
+        str | None, typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.")
     ] = None,
 ) -> None:
     """Show what a dataset was made from, as a tree; or how two differ: columns, episodes by uid, origin."""

@@ -1,8 +1,6 @@
 """Commands on recipes and runs."""
 
-import json
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,16 +22,13 @@ from astra_data.cli.arguments import (
     task_at,
 )
 from astra_data.core.errors import AstraDataError, BadInputError
-from astra_data.core.naming import RECORD, RUNS, artifact_key
+from astra_data.core.naming import RUNS, artifact_key
 
 Publish = Annotated[
     bool,
     typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe."),
 ]
-Row = Annotated[
-    str,
-    typer.Option(metavar="ROW", help="A row of the run's recipe, such as astra_plus.", show_default=False),
-]
+Row = Annotated[str, typer.Option(metavar="ROW", help="A row of the run's recipe, such as astra_plus.")]
 
 
 def run(
@@ -41,8 +36,7 @@ def run(
     methods: Methods = None,
     seeds: Seeds = None,
     percents: Annotated[
-        list[int] | None,
-        typer.Option("--percent", help="Run only this dataset size; may be repeated.", show_default=False),
+        list[int] | None, typer.Option("--percent", help="Run only this dataset size; may be repeated.")
     ] = None,
     jobs: Jobs = None,
     device: Device = "cpu",
@@ -59,21 +53,11 @@ def run(
         ),
     ] = None,
     trackio: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PROJECT", help="Log each finished point to this trackio project.", show_default=False
-        ),
+        str | None, typer.Option(metavar="PROJECT", help="Log each finished point to this trackio project.")
     ] = None,
 ) -> None:
     """Run all stages of a recipe; after an interruption, run it again to continue."""
-    from astra_data.core.config import did_you_mean
-    from astra_data.pipeline.first_look import ENGINES, check_asked
-
-    if engine not in ENGINES:
-        raise BadInputError(f"unknown engine '{engine}'{did_you_mean(engine, ENGINES)}")
-    if address is not None and engine != "ray":
-        raise BadInputError("--address is for --engine ray: leave it out, or add that")
-    check_asked(recipe_at(recipe), methods, seeds, percents)
+    recipe_at(recipe)
     from astra_data.pipeline.run import run as run_recipe
 
     with resumable():
@@ -193,14 +177,9 @@ def evaluate(
     root: Root = RUNS,
     policy: Annotated[
         str | None,
-        typer.Option(
-            help="Test this policy of yours instead of the row's: path.py:POLICY. Its code is run.",
-            show_default=False,
-        ),
+        typer.Option(help="Test this policy of yours instead of the row's: path.py:POLICY. Its code is run."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="With --policy: the folder to write.", show_default=False)
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="With --policy: the folder to write.")] = None,
 ) -> None:
     """Run the policies in the target environment (if the task has one) and in simulators."""
     if policy is None:
@@ -298,10 +277,7 @@ def select(
     ] = None,
     percent: Annotated[
         int | None,
-        typer.Option(
-            help="With --trials, after a sweep: the dataset size whose policies are tried.",
-            show_default=False,
-        ),
+        typer.Option(help="With --trials, after a sweep: the dataset size whose policies are tried."),
     ] = None,
 ) -> None:
     """Rank the trained policies of a run without the target, or with a few trials in it."""
@@ -340,20 +316,15 @@ def deploy(
     ] = None,
     seed: Annotated[int, typer.Option(help="A seed of the run's recipe.")] = 0,
     percent: Annotated[
-        int | None,
-        typer.Option(help="The dataset size in percent, if the recipe has several.", show_default=False),
+        int | None, typer.Option(help="The dataset size in percent, if the recipe has several.")
     ] = None,
 ) -> None:
     """Export a trained policy as a folder that runs without this package."""
     from astra_data.core.durable import refuse_existing
-    from astra_data.pipeline.first_look import refuse_unmade
 
     run_at(run)
     out = out or run / artifact_key("deploy", row, seed, percent)
     refuse_existing(out)
-    if not (run / artifact_key("train", row, seed, percent)).is_dir():
-        with suppress(ValueError, TypeError, AttributeError):  # a damaged record is told of below
-            refuse_unmade(json.loads((run / RECORD).read_bytes()), row, seed)
     from astra_data.deployment.folder import deploy as write
 
     typer.echo(f"finished: {write(run, row, out, seed=seed, percent=percent)}")

@@ -15,8 +15,7 @@ NotesPath = Annotated[
     ),
 ]
 Recordings = Annotated[
-    list[Path],
-    typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.", show_default=False),
+    list[Path], typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.")
 ]
 MappingFile = Annotated[
     Path | None,
@@ -24,7 +23,6 @@ MappingFile = Annotated[
         "--mapping",
         help="TOML file that says which fields become which columns. D4RL, robomimic, d3rlpy, Minari and "
         "PACE need none.",
-        show_default=False,
     ),
 ]
 FileFormat = Annotated[
@@ -51,8 +49,7 @@ MaxBytes = Annotated[
 SkipBad = Annotated[
     bool,
     typer.Option(
-        "--skip-bad",
-        help="Skip files and episodes that cannot be imported and list them at the end.",
+        "--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end."
     ),
 ]
 
@@ -89,17 +86,13 @@ def import_(
 def export(
     dataset: DatasetName,
     format: Annotated[
-        str,
-        typer.Option(
-            help="minari, d4rl, robomimic or d3rlpy; or card: its dataset card.", show_default=False
-        ),
+        str, typer.Option(help="minari, d4rl, robomimic or d3rlpy; or card: its dataset card.")
     ],
     out: Annotated[
         Path,
         typer.Option(
             help="The new file; for minari a folder, such as maze/random-v0; for a card the Markdown file, "
-            "next to which a figure is written.",
-            show_default=False,
+            "next to which a figure is written."
         ),
     ],
     notes: NotesPath = None,
@@ -134,9 +127,7 @@ def push(
     url: Annotated[
         str,
         typer.Argument(
-            metavar="URL",
-            help="user/name on the Hugging Face Hub, s3://, gs://, or a folder: ./shared",
-            show_default=False,
+            metavar="URL", help="user/name on the Hugging Face Hub, s3://, gs://, or a folder: ./shared"
         ),
     ],
     notes: NotesPath = None,
@@ -162,7 +153,6 @@ def pull(
         typer.Argument(
             metavar="SOURCE",
             help="user/name on the Hugging Face Hub, or the URL or path of the dataset's folder.",
-            show_default=False,
         ),
     ],
     out: Out = None,

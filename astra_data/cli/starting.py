@@ -12,22 +12,14 @@ _NAMED = 5
 
 
 def new(
-    name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Name of the robot: a-z, 0-9 and _.", show_default=False)
-    ],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the robot: a-z, 0-9 and _.")],
     logs: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--from",
-            help="The robot's logs: CSV files, folders of them, or a dataset.",
-            show_default=False,
-        ),
+        typer.Option("--from", help="The robot's logs: CSV files, folders of them, or a dataset."),
     ] = None,
     more: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="[LOG]...", help="More logs, so that --from logs/*.csv works.", show_default=False
-        ),
+        typer.Argument(metavar="[LOG]...", help="More logs, so that --from logs/*.csv works."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
 ) -> None:
@@ -100,9 +92,7 @@ def list_() -> None:
 
 @app.command()
 def copy(
-    name: Annotated[
-        str, typer.Argument(metavar="NAME", help="A name shown by `recipes list`.", show_default=False)
-    ],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A name shown by `recipes list`.")],
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to copy to.")] = Path("recipes"),
 ) -> None:
     """Copy a recipe or mapping, with the recipe it is based on and the code it needs."""

@@ -21,20 +21,6 @@ STAGE_NAMES = (
 )
 """The stages in the order of the pipeline, for what need not load them."""
 
-TASK_NAMES = (
-    *("antmaze-umaze", "antmaze-long", "nao-navigation", "nao-kick"),
-    *("humanoid-walker2d", "humanoid-kinematics", "humanoid-extended"),
-)
-"""The package's tasks, likewise."""
-
-METHOD_NAMES = (
-    *("direct_transfer", "domain_randomization", "nas", "rma", "target", "full_obs", "compass"),
-    *("iql", "behavior_cloning", "direct_transfer_iql", "astra", "astra_without_latent"),
-    *("astra_without_reward", "astra_task_reward", "astra_without_failures", "astra_without_scatter"),
-    *("astra_printed", "follower"),
-)
-"""The package's methods, likewise."""
-
 
 def is_plus(row: str) -> bool:
     """Return whether a row is trained with the plus settings."""

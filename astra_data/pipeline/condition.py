@@ -4,7 +4,7 @@ An artifact is damaged if it is not what its manifest says, or a dataset that ca
 it was made from something else than what lies there now, or was made or begun with other settings.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from astra_data.core.artifact import MANIFEST, Manifest, read_manifest
+from astra_data.core.artifact import MANIFEST, read_manifest
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import stage_of_key
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION
@@ -21,7 +21,6 @@ from astra_data.dataset.description import read_description
 from astra_data.dataset.edit import share
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import open_dataset
-from astra_data.grounding.files import load_grounding, load_target_encoder
 from astra_data.grounding.paired_episodes import divided
 from astra_data.io.hub.stores import is_address
 from astra_data.methods import method_named
@@ -29,22 +28,9 @@ from astra_data.pipeline.executors import Item
 from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.label import check_fits, remarks
-from astra_data.pipeline.stages.registry import STAGES, Stage
-from astra_data.policies.running_policy import PolicyFile
-from astra_data.reports.artifacts import Evaluation, read_json
-from astra_data.reports.choice import Judged
+from astra_data.pipeline.stages.registry import STAGES
 from astra_data.robots.registry import task_named
 from astra_data.worlds.commands import Commands
-
-LOADERS: dict[str, Callable[[Path], object]] = {
-    "ground": load_grounding,
-    "train": PolicyFile.load,
-    "align": load_target_encoder,
-    "select": lambda path: read_json(Judged, path),
-    "evaluate": lambda path: read_json(Evaluation, path),
-}
-"""What reads the results of stages as other stages do."""
-
 
 BEYOND = 0.05
 """Share of the recorded range by which bounds may be wider without a warning."""
@@ -68,67 +54,42 @@ class Condition:
 
 def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Condition:
     """Return the condition of the artifact of `item`; with `verify`, every byte of it is read."""
-    key = item.key
-    if not experiment.has(key):
-        begun_otherwise = experiment.outdated(key)
-        return Condition("stale", begun_otherwise) if begun_otherwise else Condition("missing")
-    faults, manifest = examined(key, experiment, verify=verify)
-    if why := faults or (verify and _unreadable(key, experiment)):
-        return Condition("damaged", why)
-    if why := experiment.outdated(key) or _replaced(item, experiment, manifest):
-        return Condition("stale", why)
-    return Condition("finished", _remark(key, experiment, manifest))
-
-
-def spoilt(item: Item, experiment: Experiment) -> str:
-    """Return why the finished artifact of `item` cannot be read by others, every byte considered; "" if not.
-
-    Of datasets, whose values are compared whenever they are read, only the metadata are.
-    """
-    why, manifest = examined(item.key, experiment, verify=not _stage(item.key).makes_dataset)
-    if why:
-        return f"damaged ({why})"
-    why = _replaced(item, experiment, manifest)
-    return f"stale ({why})" if why else ""
-
-
-def examined(key: str, experiment: Experiment, *, verify: bool) -> tuple[str, Manifest | None]:
-    """Return what is wrong with the files of the artifact `key`, and its manifest; of datasets, None.
-
-    Their sizes are compared or, with `verify`, their bytes. Of datasets, it is what the metadata and the
-    footers of the files show or, with `verify`, all values.
-    """
-    folder, stage = experiment.place(key), _stage(key)
-    manifest = None
+    if not experiment.has(item.key):
+        begun = experiment.outdated(item.key)
+        return Condition("stale", begun) if begun else Condition("missing")
+    folder, faults, made_from = experiment.place(item.key), list[str](), dict[str, str]()
     try:
-        if stage.makes_dataset:
+        if STAGES[item.stage].makes_dataset:
             dataset = Dataset.open(folder)
             faults = dataset.verify() if verify else []
+            made_from = {parent["hash"]: parent["hash"] for parent in dataset.description["parents"]}
         elif manifest := read_manifest(folder):
-            faults = manifest.faults(folder, verify=verify)
+            faults, made_from = manifest.faults(folder, verify=verify), dict(manifest.made_from)
         else:
             faults = [f"{MANIFEST} is missing"]
     except AstraDataError as error:
-        return str(error), None
-    return "; ".join(faults), manifest
+        faults = [str(error)]
+    if faults:
+        return Condition("damaged", "; ".join(faults))
+    why = experiment.outdated(item.key) or _replaced(item, experiment, made_from)
+    return Condition("stale", why) if why else Condition("finished")
 
 
 def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, str]:
-    """Return which finished artifacts of `items` have to be made again, key to reason.
+    """Return which finished artifacts of `items`, each after those it reads, to make again: key to reason.
 
     Those are the damaged and the stale ones, and what was made from them. Of all, the sizes are compared, of
     what an item to make reads, every byte.
-
-    Args:
-        items: each after those it reads.
-        experiment: whose artifacts they are.
     """
-    absent = {item.key for item in items if item.stage in ALWAYS_NEW or not experiment.has(item.key)}
+    known = {item.key: item for item in items}
+    absent = {key for key, item in known.items() if item.stage in ALWAYS_NEW or not experiment.has(key)}
     reasons: dict[str, str] = {}
-    for item in items:
-        found = condition(item, experiment)
-        if item.key not in absent and not found.is_finished:
-            reasons[item.key] = f"{found.state} ({found.why})"
+
+    def check(keys: Collection[str], *, verify: bool) -> None:
+        found = {key: condition(known[key], experiment, verify=verify) for key in keys}
+        reasons.update({key: f"{of.state} ({of.why})" for key, of in found.items() if not of.is_finished})
+
+    check(known.keys() - absent, verify=False)
     verified: set[str] = set()
     while True:
         for item in items:
@@ -136,61 +97,25 @@ def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, 
             if source and item.key not in absent:
                 reasons.setdefault(item.key, f"made from {source}")
         made = absent | reasons.keys()
-        read = {key for item in items if item.key in made for key in item.inputs}
-        read = (read & {item.key for item in items}) - made - verified
-        if not read:
-            return reasons
+        read = {key for item in items if item.key in made for key in item.inputs if key in known}
+        if not (read := read - made - verified):
+            # In the order of the items, as they are told.
+            return {key: reasons[key] for key in known if key in reasons}
         verified |= read
-        faults = {key: examined(key, experiment, verify=True)[0] for key in sorted(read)}
-        reasons |= {key: f"damaged ({why})" for key, why in faults.items() if why}
+        check(read, verify=True)
 
 
-def can_be_made_again(key: str, experiment: Experiment) -> bool:
-    """Return whether a stage made the artifact `key`; a dataset may also have been put there."""
-    stage = _stage(key)
-    if not stage.makes_dataset:
-        return True
-    if (link := experiment.place(key)).is_symlink() and _other_data(link, experiment.recipe.data):
-        return True
-    with suppress(AstraDataError):
-        return bool(read_description(experiment.place(key))["stage"] == stage.name)
-    return False
-
-
-def _stage(key: str) -> Stage:
-    return STAGES[stage_of_key(key)]
-
-
-def _unreadable(key: str, experiment: Experiment) -> str:
-    """Return why later stages cannot read the artifact `key`, such as weights that are not finite."""
-    stage = _stage(key)
-    try:
-        if stage.result:
-            LOADERS[stage.name](experiment.place(key) / stage.result)
-    except AstraDataError as error:
-        return f"{error}, after removing this"
-    return ""
-
-
-def _replaced(item: Item, experiment: Experiment, manifest: Manifest | None) -> str:
-    """Return which of the artifacts that `item` is made from it was not made from, by its manifest."""
-    folder = experiment.place(item.key)
-    if item.stage == "label" and (data := _other_data(folder, experiment.recipe.data)):
+def _replaced(item: Item, experiment: Experiment, made_from: Mapping[str, str]) -> str:
+    """Return which of the artifacts that `item` is made from it was not made from."""
+    if item.stage == "label" and (data := _other_data(experiment.place(item.key), experiment.recipe.data)):
         return f"made from another dataset than {data}"
-    made_from: Collection[str]
-    if _stage(item.key).makes_dataset:
-        made_from = [parent["hash"] for parent in read_description(folder)["parents"]]
-    elif manifest:
-        made_from = manifest.made_from.values()
+    for key in item.inputs:
         # A choice is among the policies that the recipe has now.
-        absent = [key for key in item.inputs if item.key == "select" and key not in manifest.made_from]
-        if absent:
-            return f"made without {absent[0]}"
-    else:
-        return ""
-    digests = {key: _digest(key, experiment) for key in item.inputs if experiment.has(key)}
-    others = [key for key, digest in digests.items() if digest and digest not in made_from]
-    return f"made from another {others[0]}" if others else ""
+        if item.key == "select" and key not in made_from:
+            return f"made without {key}"
+        if experiment.has(key) and _digest(key, experiment) not in (None, *made_from.values()):
+            return f"made from another {key}"
+    return ""
 
 
 def _other_data(labeled: Path, data: str | None) -> str:
@@ -207,21 +132,13 @@ def _other_data(labeled: Path, data: str | None) -> str:
 
 def _digest(key: str, experiment: Experiment) -> str | None:
     """Return the digest by which later artifacts name the artifact `key`; None if it cannot be read."""
-    folder, stage = experiment.place(key), _stage(key)
+    folder, stage = experiment.place(key), STAGES[stage_of_key(key)]
     with suppress(AstraDataError, OSError, KeyError):
         if stage.makes_dataset:
             return str(read_description(folder)["content_hash"])
-        manifest = read_manifest(folder)
-        return manifest.files[str(stage.result)][1] if manifest else None
+        if manifest := read_manifest(folder):
+            return manifest.files[str(stage.result)][1]
     return None
-
-
-def _remark(key: str, experiment: Experiment, manifest: Manifest | None) -> str:
-    """Return what is unusual about a finished artifact with this manifest."""
-    if manifest is None:
-        return ""
-    foreign = manifest.foreign(experiment.place(key))
-    return f"not of it: {', '.join(foreign)}" if foreign else ""
 
 
 def data_condition(recipe: Recipe) -> Condition | None:

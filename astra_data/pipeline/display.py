@@ -22,13 +22,15 @@ _BAR_WIDTH = 20
 
 
 @contextmanager
-def display(keys: Collection[str], console: Console) -> Iterator[Watcher]:
-    """Show the progress of the items of these `keys` on `console`.
+def display(
+    keys: Collection[str], console: Console, then: Callable[[str], object] = lambda _: None
+) -> Iterator[Watcher]:
+    """Show the progress of the items of these `keys` on `console`; call `then` with each that has finished.
 
     Where lines are too long for the terminal, names and notes are cut off, never bar, share and time left.
     """
     if not console.is_terminal:
-        yield PlainDisplay(len(keys), console)
+        yield PlainDisplay(keys, console, then)
         return
     columns = (
         _Cropped("{task.description}", markup=False, table_column=Column()),
@@ -38,7 +40,7 @@ def display(keys: Collection[str], console: Console) -> Iterator[Watcher]:
         _Cropped("{task.fields[note]}", markup=False, table_column=Column()),
     )
     with Progress(*columns, console=console) as progress:
-        yield LiveDisplay(keys, progress)
+        yield LiveDisplay(keys, console, then, progress)
 
 
 class _Cropped(TextColumn):
@@ -63,7 +65,7 @@ class _TimeLeft(ProgressColumn):
 
 
 class TimeEstimate:
-    """The time that a run of items has left, by their work: how long an item of a stage takes.
+    """The time that a run of items has left, by how long an item of a stage takes.
 
     An item that runs takes what its share done says; one that waits, what others of its stage take.
     """
@@ -72,7 +74,7 @@ class TimeEstimate:
         """Take the `keys` of all items; `clock` returns seconds."""
         self._waiting, self._clock = list(keys), clock
         self._running: dict[str, tuple[float, float]] = {}  # when each began, and its share done
-        self._took: dict[str, list[float]] = {}
+        self._took: list[tuple[str, float]] = []
 
     def started(self, key: str) -> None:
         """Begin an item."""
@@ -86,34 +88,30 @@ class TimeEstimate:
     def finished(self, key: str, seconds: float) -> None:
         """End an item that took so long."""
         del self._running[key]
-        self._took.setdefault(stage_of_key(key), []).append(seconds)
+        self._took.append((key, seconds))
 
     def left_of(self, key: str) -> float | None:
         """Return the seconds that a running item has left; None while nothing is known of it."""
-        began, _ = self._running[key]
-        whole = self._wholes().get(key, self._means().get(stage_of_key(key)))
-        return None if whole is None else max(0.0, whole - (self._clock() - began))
+        (began, share), now = self._running[key], self._clock()
+        whole = (now - began) / share if share else self._means().get(stage_of_key(key))
+        return None if whole is None else max(0.0, whole - (now - began))
 
     def left(self) -> float | None:
         """Return the seconds left of all items, as many at a time as run now; None if not known."""
         means = self._means()
-        open_stages = {stage_of_key(key) for key in [*self._waiting, *self._running]}
-        if not means or open_stages.intersection(SLOW_STAGES) - means.keys():
+        slow = {stage_of_key(key) for key in (*self._waiting, *self._running)}.intersection(SLOW_STAGES)
+        if not means or slow - means.keys():
             return None
         of_running = [self.left_of(key) or 0.0 for key in self._running]
         waiting = sum(means.get(stage_of_key(key), 0.0) for key in self._waiting)
         return max([(sum(of_running) + waiting) / max(1, len(self._running)), *of_running])
 
-    def _wholes(self) -> dict[str, float]:
-        """Return how long each running item takes in all, as its share done says."""
-        now = self._clock()
-        return {key: (now - began) / share for key, (began, share) in self._running.items() if share > 0}
-
     def _means(self) -> dict[str, float]:
         """Return how long an item takes, by its stage."""
-        found = {stage: list(seconds) for stage, seconds in self._took.items()}
-        for key, whole in self._wholes().items():
-            found.setdefault(stage_of_key(key), []).append(whole)
+        now, found = self._clock(), dict[str, list[float]]()
+        running = [(key, (now - began) / share) for key, (began, share) in self._running.items() if share]
+        for key, seconds in (*self._took, *running):
+            found.setdefault(stage_of_key(key), []).append(seconds)
         return {stage: fmean(seconds) for stage, seconds in found.items()}
 
 
@@ -130,14 +128,12 @@ def shown(key: str) -> Iterator[Notes]:
 class PlainDisplay:
     """One line per start, tenth and finish of an item."""
 
-    def __init__(self, total: int, console: Console) -> None:
-        self._total, self._console = total, console
-        self._finished = 0
-        self._tenths: dict[str, int] = {}
+    def __init__(self, keys: Collection[str], console: Console, then: Callable[[str], object]) -> None:
+        self._total, self._console, self._then = len(keys), console, then
+        self._finished, self._tenths = 0, dict.fromkeys(keys, 0)
 
     def started(self, key: str) -> None:
         """Print that an item has started."""
-        self._tenths[key] = 0
         self._print(f"{key}  started")
 
     def progressed(self, key: str, fraction: float, note: str) -> None:
@@ -151,6 +147,7 @@ class PlainDisplay:
         """Print how long the item took."""
         self._finished += 1
         self._print(f"{key}  finished in {seconds:.1f} s  ({self._finished} of {self._total})")
+        self._then(key)
 
     def failed(self, key: str) -> None:
         """Print that the item has failed."""
@@ -160,12 +157,14 @@ class PlainDisplay:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-class LiveDisplay:
+class LiveDisplay(PlainDisplay):
     """One moving line per running item; finished ones become lines above."""
 
-    def __init__(self, keys: Collection[str], progress: Progress) -> None:
-        self._total, self._progress = len(keys), progress
-        self._finished, self._estimate = 0, TimeEstimate(keys)
+    def __init__(
+        self, keys: Collection[str], console: Console, then: Callable[[str], object], progress: Progress
+    ) -> None:
+        super().__init__(keys, console, then)
+        self._progress, self._estimate = progress, TimeEstimate(keys)
         text = f"0 of {self._total} finished"
         self._whole = progress.add_task(text, total=self._total, note="", left=self._estimate.left)
         self._tasks: dict[str, TaskID] = {}
@@ -185,10 +184,9 @@ class LiveDisplay:
         """Replace the item's line by a finished one."""
         self._progress.remove_task(self._tasks.pop(key))
         self._estimate.finished(key, seconds)
-        self._finished += 1
+        super().finished(key, seconds)
         text = f"{self._finished} of {self._total} finished"
         self._progress.update(self._whole, completed=self._finished, description=text)
-        self._progress.console.print(f"{key}  finished in {seconds:.1f} s", markup=False, highlight=False)
 
     def failed(self, key: str) -> None:
         """Leave the item's line where it stopped, if it had started."""

@@ -12,7 +12,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from graphlib import TopologicalSorter
 from multiprocessing.connection import Connection, wait
@@ -35,6 +35,8 @@ CUDA_JOBS = 2
 """Items at a time on a CUDA device, where each process has its own context."""
 Note = tuple[float, str]
 """The fraction of an item that is done, and a remark."""
+Outcome = float | AstraDataError
+"""How long an item took, in s, or how it failed."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,6 @@ def run_in_order(
         jobs: number of items at a time; None leaves the limit to `begin`.
         begin: starts an item and returns at once.
         wait: returns the keys of the items that have finished since, possibly none.
-
-    Raises:
-        ValueError: items wait for each other.
     """
     keys = [item.key for item in items]
     order = TopologicalSorter({item.key: set(item.inputs).intersection(keys) for item in items})
@@ -115,30 +114,21 @@ def run_in_order(
             running -= 1
 
 
-def with_threads(item: Item, num_threads: int) -> Item:
-    """Return `item`, to be made by `num_threads` threads if it steps the target's physics."""
-    return replace(item, call=partial(item.call, num_threads=num_threads)) if item.is_threaded else item
-
-
-def pickled(item: Item, prepare: Callable[[], object] | None) -> bytes:
-    """Return the work of `item` for `run_item`, to be unpickled only once its log file is in place.
+def pickled(item: Item, prepare: Callable[[], object] | None, num_threads: int = 1) -> bytes:
+    """Return the work of `item` for `run_item`; if it steps the target's physics, by so many threads.
 
     The call is unpickled after `prepare`: it may hold settings of a class in a file of the user's, which only
     `prepare` runs.
     """
-    return pickle.dumps((prepare, pickle.dumps(item.call)))
+    call = partial(item.call, num_threads=num_threads) if item.is_threaded else item.call
+    return pickle.dumps((prepare, pickle.dumps(call)))
 
 
-def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -> float | AstraDataError:
-    """Run an item in this process; return its wall-clock time in s, or the error with which it failed.
+def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -> Outcome:
+    """Run the `work` of an item in this process; return its wall-clock time in s, or its error.
 
-    The global generators of Python, numpy and torch are seeded by its key: by stage, row and seed.
-
-    Args:
-        key: of the item.
-        work: of `pickled`.
-        log: file for what the item prints; removed if that is nothing.
-        send: sends a note, at most ten times a second.
+    The global generators of Python, numpy and torch are seeded by its key: by stage, row and seed. What it
+    prints goes to `log`, which is removed if that is nothing. At most ten notes a second are sent.
     """
     began = time.perf_counter()
     try:
@@ -147,7 +137,11 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
             if prepare:
                 prepare()
             made = pickle.loads(call)
-            _seed_global_generators(key)
+            seed = derive(0, key)  # code of the user's may draw from the global generators
+            random.seed(seed)
+            np.random.seed(seed % 2**32)
+            if torch := sys.modules.get("torch"):  # its import takes long
+                torch.manual_seed(seed)
             made(progress=Reporter(send))
     except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
         expected = error if isinstance(error, AstraDataError) else disk_error(error)
@@ -156,15 +150,6 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
         last = traceback.format_exception_only(error)[-1].strip()
         return AstraDataError(f"{key} crashed: {last} (traceback: {log})")
     return time.perf_counter() - began
-
-
-def _seed_global_generators(key: str) -> None:
-    """Let an item draw the same whatever ran before it: code of the user's may draw from these."""
-    seed = derive(0, key)
-    random.seed(seed)
-    np.random.seed(seed % 2**32)
-    if torch := sys.modules.get("torch"):  # its import takes long, and is of no use to what did without
-        torch.manual_seed(seed)
 
 
 class Reporter:
@@ -186,14 +171,19 @@ class Reporter:
 def _printing_to(log: Path) -> Iterator[None]:
     """Redirect everything that this process prints to `log`; remove the file if that is nothing."""
     log.parent.mkdir(parents=True, exist_ok=True)
-    _flush()
+
+    def flush() -> None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+
+    flush()
     before = os.dup(1), os.dup(2)
     with log.open("w") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
     try:
         yield
-        _flush()
+        flush()
     except AstraDataError:
         raise
     except Exception:
@@ -202,17 +192,12 @@ def _printing_to(log: Path) -> Iterator[None]:
         raise
     finally:
         with suppress(OSError):
-            _flush()
+            flush()
         for stream, own in zip((1, 2), before, strict=True):
             os.dup2(own, stream)
             os.close(own)
         if not log.stat().st_size:
             log.unlink()
-
-
-def _flush() -> None:
-    sys.stdout.flush()
-    sys.stderr.flush()
 
 
 def execute(
@@ -224,40 +209,34 @@ def execute(
     prepare: Callable[[], object] | None = None,
     address: str | None = None,
 ) -> None:
-    """Run `items` in up to `jobs` spawned processes, each as soon as its inputs are finished.
+    """Run `items` in spawned processes, each as soon as its inputs are finished.
 
-    Those that step the target's physics share the cores.
-
-    Inputs that are not among `items` count as finished. What an item prints goes to `<logs>/<key>.txt`; the
-    file of an item that printed nothing is removed. When an item fails, at Ctrl-C or SIGTERM, or when this
-    process is killed, the others are stopped; their last checkpoints stay.
+    Those that step the target's physics share the cores. When an item fails, at Ctrl-C or SIGTERM, or when
+    this process is killed, the others are stopped; their last checkpoints stay.
 
     Args:
-        items: in order of preference.
-        logs: folder of the log files.
+        items: in order of preference; inputs that are not among them count as finished.
+        logs: folder of `<key>.txt`, what an item printed.
         watch: is notified of every start, progress and finish.
         jobs: number of processes; by default one per core, or `CUDA_JOBS` where an item wants a GPU.
         prepare: called in the process of an item before the item.
-        address: None, as this machine has none.
+        address: not used.
 
     Raises:
         AstraDataError: an item failed; its own error, with its key before the message, or where its
             traceback is when it crashed.
         KeyboardInterrupt: at Ctrl-C or SIGTERM.
     """
-    if address is not None:
-        raise BadInputError("--address is for --engine ray: leave it out, or add that")
     jobs = jobs or (CUDA_JOBS if any(item.wants_gpu for item in items) else cores())
     counts = Counter(item.stage for item in items)
     workers: list[_Worker] = []
 
     def begin(item: Item) -> None:
-        item = with_threads(item, max(1, cores() // min(jobs, counts[item.stage])))
-        worker = next((worker for worker in workers if worker.key is None), None)
-        if worker is None:
-            worker = _Worker()
-            workers.append(worker)
-        worker.begin(item.key, pickled(item, prepare), logs / f"{item.key}.txt")
+        if not (idle := [worker for worker in workers if worker.key is None]):
+            workers.append(_Worker())
+            idle = workers[-1:]
+        num_threads = max(1, cores() // min(jobs, counts[item.stage]))
+        idle[0].begin(item.key, pickled(item, prepare, num_threads), logs / f"{item.key}.txt")
         watch.started(item.key)
 
     def finished() -> list[str]:
@@ -266,7 +245,15 @@ def execute(
         keys = [worker.read(watch) for connection, worker in busy.items() if connection in ready]
         return [key for key in keys if key]
 
-    with _interruptible():
+    signals = (signal.SIGINT, signal.SIGTERM)
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        for number in signals:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    # Also where a shell that started the run in the background has it ignore SIGINT.
+    with _handled(signals, interrupt):
         try:
             run_in_order(items, jobs, begin, finished)
         finally:
@@ -277,30 +264,10 @@ def execute(
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
-    """Interrupt the block at SIGINT or SIGTERM, once.
-
-    Also where a shell that started the run in the background has it ignore SIGINT.
-    """
-    numbers = (signal.SIGINT, signal.SIGTERM)
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        for number in numbers:
-            signal.signal(number, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    with _handled(numbers, interrupt):
-        yield
-
-
-@contextmanager
 def _handled(
     numbers: Collection[signal.Signals], handler: Callable[[int, FrameType | None], None] | signal.Handlers
 ) -> Iterator[None]:
-    """Handle signals so within the block.
-
-    Python tells signals to the main thread alone: in another, nothing is changed.
-    """
+    """Handle signals so within the block, where this is the main thread: Python tells no other of them."""
     ours = numbers if current_thread() is main_thread() else ()
     before = [signal.signal(number, handler) for number in ours]
     try:
@@ -308,6 +275,14 @@ def _handled(
     finally:
         for number, earlier in zip(ours, before, strict=True):
             signal.signal(number, earlier)
+
+
+def _settle(key: str, outcome: Outcome, watch: Watcher) -> None:
+    """Tell `watch` how an item ended; raise its error."""
+    if isinstance(outcome, AstraDataError):
+        watch.failed(key)
+        raise outcome
+    watch.finished(key, outcome)
 
 
 class _Worker:
@@ -337,14 +312,11 @@ class _Worker:
             message = self.connection.recv()
         except (EOFError, ConnectionResetError):
             message = AstraDataError(f"{key} {self._death()}")
-        if isinstance(message, AstraDataError):
-            watch.failed(key)
-            raise message
         if isinstance(message, tuple):
             watch.progressed(key, *message)
             return None
         self.key = None
-        watch.finished(key, message)
+        _settle(key, message, watch)
         return key
 
     def _death(self) -> str:
@@ -382,8 +354,6 @@ def _exit_with_parent() -> None:
     os._exit(1)
 
 
-HERE = "local"
-"""Ray's address of a cluster of this machine alone."""
 GPU_SHARE = 0.5
 """Share of a GPU for an item that computes on one: two of them keep their CUDA contexts on one GPU."""
 SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0", "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
@@ -404,25 +374,25 @@ def execute_on_cluster(
 ) -> None:
     """Run `items` as `execute` does, each as a task with one core of the Ray cluster at `address`.
 
-    Relative paths and modules mean the same on every machine: a task runs in this process's working folder
-    and with its module search path.
-
-    Args:
-        items: in order of preference.
-        logs: folder of the log files, one per item that printed something.
-        watch: is notified of every start, progress and finish.
-        jobs: number of tasks at a time, by default as many as the cluster has cores.
-        prepare: called in each task before its item.
-        address: of a running cluster, such as ray://head:10001 or head:6379; by default one of this machine
-            starts and stops with the run.
+    That is such as ray://head:10001 or head:6379; by default one of this machine starts and stops with the
+    run. A task runs in this process's working folder and with its module search path.
 
     Raises:
         BadInputError: Ray is not installed, no cluster answers, or it lacks the GPU that an item wants.
-        AstraDataError: an item failed; its own error, with its key before the message, or where its
-            traceback is when it crashed. Or the connection to the cluster was lost.
+        AstraDataError: as `execute`, or the connection to the cluster was lost.
     """
-    items, address = [with_threads(item, 1) for item in items], address or HERE
-    ray = _connect(address, jobs)
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    ray: Any = optional("ray")
+    local = {} if address else {"num_cpus": jobs or cores(), "include_dashboard": False}
+    address = address or "local"
+    try:
+        ray.init(address, log_to_driver=False, logging_level="ERROR", **local)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise BadInputError(
+            f"found no usable Ray cluster at {address}: {_first_line(error)}; `ray status` lists clusters, "
+            "`ray start --head` starts one"
+        ) from None
     running: dict[Any, str] = {}
     here = Path.cwd(), sys.path
 
@@ -439,9 +409,13 @@ def execute_on_cluster(
                 watch.started(key)
             else:
                 watch.progressed(key, *note)
-        for task_id in done:
-            _finish(ray, task_id, running[task_id], watch)
-        return [running.pop(task_id) for task_id in done]
+        for begun in done:
+            try:
+                outcome = ray.get(begun)
+            except ray.exceptions.RayError as error:
+                outcome = AstraDataError(f"{running[begun]} was lost with its worker: {_first_line(error)}")
+            _settle(running[begun], outcome, watch)
+        return [running.pop(begun) for begun in done]
 
     try:
         if any(item.wants_gpu for item in items) and not ray.cluster_resources().get("GPU"):
@@ -452,18 +426,22 @@ def execute_on_cluster(
     except (ray.exceptions.RayError, ConnectionError) as error:
         raise AstraDataError(f"the Ray cluster at {address} was lost: {_first_line(error)}") from None
     finally:
-        _leave(ray, list(running))
+        with suppress(ray.exceptions.RayError, ConnectionError):
+            for begun in running:
+                ray.cancel(begun, force=True)
+            if running:
+                ray.wait(list(running), num_returns=len(running), timeout=PATIENCE_S)
+        ray.shutdown()
 
 
 class Mailbox:
-    """An actor that keeps the notes of tasks until they are fetched."""
+    """An actor that keeps the notes of tasks, None of one that starts, until they are fetched."""
 
     def __init__(self) -> None:
-        """Start with nothing."""
         self._notes: list[tuple[str, Note | None]] = []
 
     def put(self, key: str, note: Note | None) -> None:
-        """Keep a note on an item; None means that it has started."""
+        """Keep a note on an item."""
         self._notes.append((key, note))
 
     def take(self) -> list[tuple[str, Note | None]]:
@@ -472,55 +450,12 @@ class Mailbox:
         return notes
 
 
-def _connect(address: str, jobs: int | None) -> Any:  # noqa: ANN401 - the module
-    for name, value in SETTINGS.items():
-        os.environ.setdefault(name, value)
-    ray = optional("ray")
-    local = {"num_cpus": jobs or cores(), "include_dashboard": False} if address == HERE else {}
-    try:
-        ray.init(address, log_to_driver=False, logging_level="ERROR", **local)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise BadInputError(
-            f"found no usable Ray cluster at {address}: {_first_line(error)}; `ray status` lists clusters, "
-            "`ray start --head` starts one"
-        ) from None
-    return ray
-
-
-def _leave(ray: Any, running: list[Any]) -> None:  # noqa: ANN401 - Ray's
-    """Cancel the tasks in `running`, if the cluster is still there, and disconnect."""
-    with suppress(ray.exceptions.RayError, ConnectionError):
-        for task_id in running:
-            ray.cancel(task_id, force=True)
-        if running:
-            ray.wait(running, num_returns=len(running), timeout=PATIENCE_S)
-    ray.shutdown()
-
-
 def _first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0]
 
 
-def _finish(ray: Any, task_id: Any, key: str, watch: Watcher) -> None:  # noqa: ANN401 - Ray's
-    try:
-        outcome = ray.get(task_id)
-    except ray.exceptions.RayError as error:
-        watch.failed(key)
-        raise AstraDataError(f"{key} was lost with its worker: {_first_line(error)}") from None
-    if isinstance(outcome, AstraDataError):
-        watch.failed(key)
-        raise outcome
-    watch.finished(key, outcome)
-
-
-def _work(
-    key: str,
-    work: bytes,
-    log: Path,
-    here: tuple[Path, list[str]],
-    mailbox: Any,  # noqa: ANN401 - Ray's
-) -> float | AstraDataError:
-    """Run an item; return its wall-clock time in s, or the error with which it failed."""
+def _work(key: str, work: bytes, log: Path, here: tuple[Path, list[str]], mailbox: Any) -> Outcome:  # noqa: ANN401 - Ray's
+    """Run an item in a task of Ray's."""
     ray = sys.modules["ray"]
     folder, modules = here
     try:

@@ -11,21 +11,22 @@ the digests of the user's code. While they are others, what was made or begun wi
 """
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.config import Config, did_you_mean, in_full, read_written, validated
+from astra_data.core.config import Config, did_you_mean, read_written, validated
 from astra_data.core.durable import begun_beside, write_file
 from astra_data.core.errors import BadInputError, RecipeError
-from astra_data.core.naming import base_method, first_few, shortened, stage_of_key
+from astra_data.core.naming import first_few, shortened, stage_of_key
 from astra_data.dataset.description import changed_values
-from astra_data.methods import grounded_as
+from astra_data.io.hub.stores import is_address
+from astra_data.methods import METHODS, grounded_as, method_named
 from astra_data.pipeline.executors import Item
-from astra_data.pipeline.plan import Selection, plan
+from astra_data.pipeline.plan import plan
 from astra_data.pipeline.recipe import Recipe, read_tables
 from astra_data.pipeline.stages.registry import STAGES
 from astra_data.reports.results import Results, read_results
@@ -63,9 +64,14 @@ class Experiment:
         """The stages whose artifacts are taken from the base: those that would be the same."""
         if self.base is None:
             return set()
-        ours, theirs = settings_with_inputs(self.items), settings_with_inputs(self.base.items)
-        others = {stage_of_key(key) for key in ours if ours[key] != theirs.get(key)}
-        return {stage_of_key(key) for key in ours} - others - ALWAYS_NEW
+        others = set[str]()
+        for key, item in self.items.items():
+            like = self.base.items.get(key)
+            is_same = like and (item.settings, {*item.inputs}) == (like.settings, {*like.inputs})
+            if not is_same or others.intersection(item.inputs):
+                others.add(key)
+        stages = {item.stage for item in self.items.values()}
+        return stages - {stage_of_key(key) for key in others} - ALWAYS_NEW
 
     def maker(self, stage: str) -> "Experiment":
         """Return the experiment that makes the artifacts of `stage`."""
@@ -86,11 +92,7 @@ class Experiment:
         return link.is_symlink() and link.readlink().parent.parent == Path("..")
 
     def link_borrowed(self) -> None:
-        """Link the folders of borrowed stages to the base's.
-
-        Raises:
-            RecipeError: a link would replace artifacts.
-        """
+        """Link the folders of borrowed stages to the base's."""
         for stage in STAGES:
             link = self.folder / stage
             if self._is_link(stage):
@@ -119,8 +121,7 @@ class Experiment:
         """What changed since artifacts were made or begun, by their keys, and those that read them."""
         found: dict[str, str] = {}
         for key, item in self.items.items():
-            stage = item.stage
-            if stage in ALWAYS_NEW | self.borrowed or not (self.has(key) or begun_beside(self.folder / key)):
+            if item.stage in ALWAYS_NEW | self.borrowed or not self._made(key):
                 continue
             read = next((found[made] for made in item.inputs if made in found), "")
             if changed := self._changed(item) or read:
@@ -137,11 +138,7 @@ class Experiment:
         return changes(before, item.settings, self.recipe)
 
     def check_unchanged(self) -> None:
-        """Refuse settings and code that differ from those of existing artifacts, finished or not.
-
-        Raises:
-            RecipeError: they differ, here or in the base.
-        """
+        """Refuse settings and code that differ from those of existing artifacts, finished or not."""
         if self.base:
             self.base.check_unchanged()
         if self._outdated:
@@ -160,7 +157,7 @@ class Experiment:
         return f"{maker._outdated[key]} since: give the recipe another name, or remove {this}"
 
     def _made(self, key: str) -> list[Path]:
-        """Return the folders of a finished or begun artifact."""
+        """Return the folders of a finished or begun artifact, if there is one."""
         return [self.folder / key] if self.has(key) else begun_beside(self.folder / key)
 
     @property
@@ -172,10 +169,6 @@ class Experiment:
         """Return the files of published results that those of this recipe are added to.
 
         They are its own and, if it borrows the evaluations, the base's, as far as they are there.
-
-        Raises:
-            BadInputError: one does not hold results.
-            RecipeError: they were made with other settings.
         """
         names = dict.fromkeys((self.maker("evaluate").path.stem, self.path.stem))
         files = [file for name in names if (file := self.results / f"{name}.json").exists()]
@@ -189,24 +182,24 @@ class Experiment:
 
     def _changed_since(self, found: Results) -> str:
         """Return what of the settings of tested rows is other than in results."""
-        rows = tuple(found.tested())
-        kept = {"methods": tuple(dict.fromkeys((*self.recipe.methods, *rows))), "select": None}
-        now = self.recipe.model_copy(update=kept)
-        seeds = [seed for seed in now.seeds if seed in found.seeds]
-        before: dict[str, Any] = dict(found.settings) | kept | {"task": now.task, "seeds": now.seeds}
-        before["own_methods"] = _of_rows(before.get("own_methods", {}), rows, in_full(now)["own_methods"])
-        try:
-            old = self._plan(validated(before, type(now), "settings"), rows, seeds)
-        except RecipeError as error:
-            return f"settings changed ({str(error).removeprefix('settings: ')})"
-        new = self._plan(now, rows, seeds)
-        texts = [changes(old[key], new[key], now) if key in old else "sweep changed" for key in new]
-        return " and ".join(dict.fromkeys(filter(None, texts)))
+        makers: set[str | None] = set()
+        for row in found.tested():
+            with suppress(BadInputError):  # of a method that is no more
+                method = method_named(row)
+                makers |= {method.name, grounded_as(row), method.initial}
+        names = {method.table.name: name for name, method in METHODS.items() if method.table}
 
-    def _plan(self, recipe: Recipe, rows: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
-        """Return what the artifacts of rows of a recipe are made with."""
-        items = plan(recipe, self.path, self.folder, Selection.of(recipe, rows, seeds))
-        return {item.key: item.settings for item in items if item.stage not in ALWAYS_NEW}
+        def compared(settings: Mapping[str, Any]) -> dict[str, Any]:
+            own, data = settings.get("own_methods") or {}, settings.get("data")
+            own = {name: {**table, "method": None} for name, table in own.items() if name in makers}
+            asked = {*STAGES} - {"select", "report"} | {name for name, of in names.items() if of in makers}
+            tables = {name: table for name, table in settings.items() if name in asked}
+            return {"data": data if data and is_address(data) else None} | tables | own
+
+        before, now = (dict[str, Any](of) for of in (found.settings, self.recipe.settings))
+        old, new = ({*((of.get("sweep") or {}).get("percent") or [None])} for of in (before, now))
+        text = changes(compared(before), compared(now), self.recipe)
+        return text or ("" if new <= old else "sweep changed")
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
@@ -233,14 +226,6 @@ def load_experiment(path: Path, root: Path) -> Experiment:
     return Experiment(recipe, path, folder, base)
 
 
-def settings_with_inputs(items: Mapping[str, Item]) -> dict[str, Any]:
-    """Return, by the keys of items, what they are made with, and what all that they read is made with."""
-    found: dict[str, Any] = {}
-    for key, item in items.items():
-        found[key] = item.settings, {made: found[made] for made in item.inputs}
-    return found
-
-
 def changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) -> str:
     """Say which tables and files differ between what an artifact was made with and would be made with.
 
@@ -262,15 +247,6 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) -
         if old != new:
             texts.append(f"{name} ({_change(old, new)}) changed in the recipe")
     return " and ".join(texts)
-
-
-def _of_rows(before: dict[str, Any], rows: Collection[str], now: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings `now` of the user's methods, but those `before` of what made `rows`."""
-    makers = {base_method(row) for row in rows}
-    for row in rows:
-        with suppress(BadInputError):  # of a method that is no more
-            makers.add(grounded_as(row))
-    return now | {name: settings for name, settings in before.items() if name in makers}
 
 
 def _change(before: object, now: object) -> str:
@@ -311,18 +287,13 @@ def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, 
 
 
 def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:
-    name, faults = base.path.stem, []
-    if recipe.task != base.recipe.task and not task_named(recipe.task).shares_target(
-        task_named(base.recipe.task)
-    ):
-        faults.append(
-            f"task: expected that of {name}, '{base.recipe.task}', or one with the same target, "
-            f"got '{recipe.task}'"
-        )
+    name, faults, (ours, theirs) = base.path.stem, [], (recipe.task, base.recipe.task)
+    if ours != theirs and not task_named(ours).shares_target(task_named(theirs)):
+        faults = [f"task: expected that of {name}, '{theirs}', or one with the same target, got '{ours}'"]
     for key in ("methods", "seeds"):
-        theirs, ours = getattr(base.recipe, key), getattr(recipe, key)
-        unknown = [value for value in ours if value not in theirs]
-        advice = f"add it to those of {base.path} and run that, or leave out based_on"
-        faults += [f"{key}: {name} has no '{value}', it has {list(theirs)}: {advice}" for value in unknown]
+        known = getattr(base.recipe, key)
+        advice = f"it has {list(known)}: add it to those of {base.path} and run that, or leave out based_on"
+        unknown = [value for value in getattr(recipe, key) if value not in known]
+        faults += [f"{key}: {name} has no '{value}', {advice}" for value in unknown]
     if faults:
         raise RecipeError(f"{path} does not fit what it is based on: {'; '.join(faults)}")

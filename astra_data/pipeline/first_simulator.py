@@ -195,11 +195,7 @@ class SimulatorKind:
 
 
 def first_simulator(logs: Logs) -> SimulatorKind:
-    """Return a simulator of the first kind that no other predicts `logs` clearly better than.
-
-    Raises:
-        BadInputError: no command has the name of a state.
-    """
+    """Return a simulator of the first kind that no other predicts `logs` clearly better than."""
     shares = []
     for kind in (kinds := _planar(logs)):
         simulated, still = (errors[:4].reshape(2, 2).sum(axis=1) for errors in kind.errors())

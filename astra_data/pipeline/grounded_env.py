@@ -3,7 +3,7 @@
 Gymnasium's "astra_data/Grounded-v0" is made here.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from astra_data.core.progress import Progress, silent
 from astra_data.grounding.files import GROUNDING, grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.methods import method_named
-from astra_data.methods.method import Method
 from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.trained_policy import settings_of
@@ -63,11 +62,7 @@ def grounded_vector(
     max_episode_steps: int | None = None,
     **options: Any,  # noqa: ANN401 - checked as a recipe's are
 ) -> BatchedVectorEnv:
-    """Build `num_envs` of the environments that `grounded` builds, stepped at once.
-
-    Raises:
-        BadInputError: as `grounded`.
-    """
+    """Build `num_envs` of the environments that `grounded` builds, stepped at once."""
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=num_envs, **options)
     steps = training.simulated_steps
     return BatchedVectorEnv(SeededSimulatorEnv(env), min(steps, max_episode_steps or steps))
@@ -103,11 +98,10 @@ def evaluate_policy(
     settings = settings_of(run)
     env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)
     own = UserPolicy(policy, env.observation_size, env.action_size)
-    episodes = training.episodes
     rows = list(dict.fromkeys([*settings.get("methods", []), row]))
     tested = {"seeds": [seed]} | settings | {"methods": rows}
-    evaluate = _planned(run, tested, "evaluate", row, seed, percent)
-    _check_made(evaluate.keywords, ("target_encoder", "reference"))
+    evaluate = _planned(run, tested, "evaluate", row, seed, percent, ("target_encoder", "reference"))
+    episodes = training.episodes
     evaluate(
         policy=PolicyFile(own, simulation, episodes.reference, episodes.content_hash),
         out=Path(out),
@@ -124,7 +118,8 @@ def _world(
     **options: Any,  # noqa: ANN401 - checked as a recipe's are
 ) -> tuple[SimulatorEnv, Simulation, Training]:
     """Return the environment that `train` builds for a row, and what it builds it from."""
-    learn = _method_of(settings, row).learn
+    add_all(settings.get("own_methods", {}))
+    learn = method_named(row).learn
     if not isinstance(learn, InSimulator):
         raise BadInputError(
             f"{row} is not trained in a simulator: expected a row that is, such as nas, or "
@@ -132,28 +127,14 @@ def _world(
         )
     if unknown := sorted(options.keys() - {*OPTIONS, "num_envs"}):
         raise BadInputError(f"Grounded-v0: unknown option '{unknown[0]}'{did_you_mean(unknown[0], OPTIONS)}")
-    training = _training(run, settings, row, seed, percent, options)
-    return *learn.world(training), training
-
-
-def _training(
-    run: str | Path,
-    settings: dict[str, Any],
-    row: str,
-    seed: int,
-    percent: int | None,
-    changes: Mapping[str, Any],
-) -> Training:
-    """Return what `train` gives the method of a row, but no initial policy, with `changes` of `[train]`."""
-    changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | dict(changes)}
-    of_train = _planned(run, settings | changed, "train", row, seed, percent).keywords
-    _check_made(of_train, ("dataset", "grounding"))
-    return Training(
-        task=task_named(of_train["task"]),
-        config=of_train["config"],
-        settings=of_train["settings"],
-        episodes=PairedEpisodes.load(of_train["dataset"]),
-        grounding=grounding_at(of_train["grounding"] and of_train["grounding"] / GROUNDING),
+    changed = {"methods": [row], "seeds": [seed], "train": settings.get("train", {}) | options}
+    train = _planned(run, settings | changed, "train", row, seed, percent, ("dataset", "grounding")).keywords
+    training = Training(
+        task=task_named(train["task"]),
+        config=train["config"],
+        settings=train["settings"],
+        episodes=PairedEpisodes.load(train["dataset"]),
+        grounding=grounding_at(train["grounding"] and train["grounding"] / GROUNDING),
         initial=None,
         seed=seed,
         device="cpu",
@@ -161,28 +142,26 @@ def _training(
         progress=silent,
         is_plus=is_plus(row),
     )
-
-
-def _method_of(settings: Mapping[str, Any], row: str) -> Method:
-    """Return the method of a row of a run with these settings, whose own methods are added first."""
-    add_all(settings.get("own_methods", {}))
-    return method_named(row)
+    return *learn.world(training), training
 
 
 def _planned(
-    run: str | Path, settings: dict[str, Any], stage: str, row: str, seed: int, percent: int | None
+    run: str | Path,
+    settings: dict[str, Any],
+    stage: str,
+    row: str,
+    seed: int,
+    percent: int | None,
+    artifacts: Collection[str],
 ) -> partial[object]:
-    """Return the call by which a run with these `settings` makes the artifact of a row."""
+    """Return the call by which a run with these `settings` makes the artifact of a row of others."""
     recipe = validated(settings | {"select": None}, Recipe, f"{run}")
     only = Selection.of(recipe, (row,), (seed,), () if percent is None else (percent,))
     items = {item.key: item.call for item in plan(recipe, Path(f"{run}.toml"), Path(run), only)}
     call = items.get(artifact_key(stage, row, seed, percent))
     if not isinstance(call, partial):
         raise BadInputError(f"{run} has several sizes: expected percent, one of {[*recipe.sweep.percent]}")
-    return call
-
-
-def _check_made(given: dict[str, Any], artifacts: Iterable[str]) -> None:
-    """Refuse a call to which one of the `artifacts` is given that is not there."""
-    if missing := [str(given[name]) for name in artifacts if given[name] and not given[name].is_dir()]:
+    places = [call.keywords[name] for name in artifacts if call.keywords[name]]
+    if missing := [str(place) for place in places if not place.is_dir()]:
         raise BadInputError(f"expected {', '.join(missing)}: run the recipe first")
+    return call

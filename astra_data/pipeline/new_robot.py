@@ -82,12 +82,7 @@ def _is_installed(name: str) -> bool:
 
 
 def _dataset(logs: Sequence[Path]) -> Dataset | None:
-    """Return the dataset that `logs` name; None where they are files, or folders of them.
-
-    Raises:
-        BadInputError: one of several is a dataset, or nothing is there.
-        CorruptDatasetError: the dataset is incomplete or was altered.
-    """
+    """Return the dataset that `logs` name; None where they are files, or folders of them."""
     folders = []
     for place in logs:
         try:

@@ -25,9 +25,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key, base_method, reference_of
 from astra_data.io.hub.stores import is_address
 from astra_data.methods import grounded_as, method_named
-from astra_data.methods.method import Method
 from astra_data.pipeline.executors import Item
-from astra_data.pipeline.first_look import refuse_unknown
 from astra_data.pipeline.recipe import Recipe
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import benches, judge_of
@@ -45,7 +43,7 @@ class RunPoint:
 
     method: str
     seed: int
-    percent: int | None = None
+    percent: int | None
 
     @property
     def key(self) -> str:
@@ -69,17 +67,20 @@ class Selection:
         seeds: Sequence[int] = (),
         percents: Sequence[int] = (),
     ) -> "Selection":
-        """Return those that are named; of an axis on which nothing is named, all.
-
-        Raises:
-            BadInputError: the recipe has no such method, seed or size.
-        """
-        known = (recipe.methods, recipe.seeds, recipe.sweep.percent)
-        refuse_unknown(methods, seeds, percents, *known)
+        """Return those that are named; of an axis on which nothing is named, all."""
+        for method in methods:
+            if method not in recipe.methods:
+                hint = did_you_mean(method, recipe.methods)
+                raise BadInputError(f"the recipe has no method '{method}'{hint}")
+        sizes = recipe.sweep.percent
+        for what, asked, known in (("seed", seeds, recipe.seeds), ("size", percents, sizes)):
+            if unknown := [value for value in asked if value not in known]:
+                listed = ", ".join(map(str, known)) or "none"
+                raise BadInputError(f"the recipe has no {what} {unknown[0]}; its {what}s: {listed}")
         return cls(
             tuple(dict.fromkeys(methods)) or recipe.methods,
             tuple(dict.fromkeys(seeds)) or recipe.seeds,
-            tuple(dict.fromkeys(percents)) or recipe.sweep.percent,
+            tuple(dict.fromkeys(percents)) or sizes,
         )
 
     def points(self) -> tuple[RunPoint, ...]:
@@ -102,16 +103,10 @@ def plan(
     publish: Path | None = None,
     published: Sequence[Path] = (),
 ) -> tuple[Item, ...]:
-    """Return every artifact of `recipe`, each after those it reads, seed after seed.
+    """Return every artifact of the `recipe` at `path`, each after those it reads, seed after seed.
 
-    Args:
-        recipe: what to make.
-        path: the recipe's file.
-        folder: where it is made, such as `runs/antmaze_long`; an item's artifact is at `folder / key`.
-        selection: the points to make and to report; by default all.
-        device: torch device of the networks.
-        publish: a folder that the report copies its results to, if any.
-        published: files of results that the report adds to.
+    They are made at `folder / key`, for the points of a `selection`, by default all. The report copies its
+    results to the folder `publish`, if any, and adds to the files `published`.
     """
     selection = selection or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
@@ -124,10 +119,14 @@ def plan(
         settings=in_full(recipe),
         percents=selection.percents,
     )
-    choice = _choice(recipe, reported, folder)
-    if choice is not None:
-        items.append(choice)
-        keys += ("select",)
+    if recipe.select and len(selection.seeds) > 1:
+        of = benches(reported, judge_of(recipe.select.judge, recipe.methods))
+        if any(bench.entries for bench in of):  # there are policies to judge
+            inputs = tuple(dict.fromkeys(key for bench in of for key in bench.keys))
+            call = partial(STAGES["select"].run, reported, recipe.select, root=folder)
+            settings = {"select": recipe.select.model_dump(mode="json")}
+            items.append(Item("select", inputs, call, settings=settings))
+            keys += ("select",)
     call = partial(
         report.run,
         reported,
@@ -140,38 +139,14 @@ def plan(
     return (*items, Item("report", keys, call))
 
 
-def _choice(recipe: Recipe, reported: Reported, folder: Path) -> Item | None:
-    """Return the choice among the policies of the selection, if there are judges and policies to judge."""
-    if recipe.select is None or len(reported.seeds) < 2:
-        return None
-    of = benches(reported, judge_of(recipe.select.judge, recipe.methods))
-    if not any(bench.entries for bench in of):
-        return None
-    inputs = dict.fromkeys(key for bench in of for key in bench.keys)
-    return Item(
-        "select",
-        tuple(inputs),
-        partial(STAGES["select"].run, reported, recipe.select, root=folder),
-        settings={"select": recipe.select.model_dump(mode="json")},
-    )
-
-
 def stages_until(last: str | None) -> set[str]:
-    """Return the stages up to `last`, by default all.
-
-    Raises:
-        BadInputError: there is no such stage.
-    """
+    """Return the stages up to `last`, by default all."""
     check_stage(last or "report")
     return set(list(STAGES)[: list(STAGES).index(last or "report") + 1])
 
 
 def check_stage(stage: str) -> None:
-    """Refuse an unknown stage.
-
-    Raises:
-        BadInputError: there is no such stage.
-    """
+    """Refuse an unknown stage."""
     if stage not in STAGES:
         raise BadInputError(f"unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
 
@@ -230,6 +205,9 @@ class _Plan:
         artifacts = self._artifacts(stage, seed, percent, name)
         keys = {parameter: artifacts[parameter] for parameter in parameters if parameter in ARTIFACTS}
         settings = recipe.settings_of(name, stage.name) if name else None
+        # The dataset that the policy of a row was trained on, if it is one.
+        of_policy = method is not None and method.trains_without_target
+        recorded = self._artifacts(STAGES["train"], seed, percent, name)["dataset"] if of_policy else None
         known = {
             "task": recipe.task,
             "simulator": recipe.task,
@@ -240,7 +218,7 @@ class _Plan:
             "percent": percent,
             "of": recipe.collect and recipe.collect.episodes,
             "data": recipe.data,
-            "recorded": self._recorded(method, seed, percent, name),
+            "recorded": recorded and self.folder / recorded,
             "out": self.folder / key,
             "device": self.device,
             **{parameter: made and self.folder / made for parameter, made in keys.items()},
@@ -290,13 +268,6 @@ class _Plan:
     def _digests(self) -> dict[str, str]:
         return digests_of(self.recipe.task, self.recipe.own_methods)
 
-    def _recorded(self, method: Method | None, seed: int, percent: int | None, name: str) -> Path | None:
-        """Return the dataset that the policy of a row was trained on; None if it is none."""
-        if method is None or not method.trains_without_target:
-            return None
-        made = self._artifacts(STAGES["train"], seed, percent, name)["dataset"]
-        return self.folder / made if made else None
-
     def _artifacts(self, stage: Stage, seed: int, percent: int | None, name: str) -> dict[str, str | None]:
         """Return the keys of the artifacts that a stage may read, by its parameters."""
         datasets = [read for read in map(STAGES.get, stage.reads) if read and read.makes_dataset]
@@ -326,10 +297,10 @@ def _grounding(base: str) -> str | None:
 
 def _command(recipe: Recipe, path: Path, selection: Selection) -> str:
     """Return the command that makes `selection`."""
-    whole = Selection.of(recipe)
-    options = [f" --method {row}" for row in selection.methods if selection.methods != whole.methods]
-    options += [f" --seed {seed}" for seed in selection.seeds if selection.seeds != whole.seeds]
-    options += [
-        f" --percent {percent}" for percent in selection.percents if selection.percents != whole.percents
-    ]
+    axes = {
+        "method": (selection.methods, recipe.methods),
+        "seed": (selection.seeds, recipe.seeds),
+        "percent": (selection.percents, recipe.sweep.percent),
+    }
+    options = [f" --{name} {one}" for name, (some, whole) in axes.items() if some != whole for one in some]
     return f"astra-data run {path}{''.join(options)}"

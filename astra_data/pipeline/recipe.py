@@ -85,21 +85,13 @@ class _Record(BaseModel):
 
 
 def recorded_settings(folder: Path) -> dict[str, Any]:
-    """Return the settings that the run in `folder` was made with.
-
-    Raises:
-        BadInputError: their file is damaged.
-    """
+    """Return the settings that the run in `folder` was made with."""
     advice = "restore it from a copy, or move the folder away and run the recipe again"
     return read_written(_Record, folder / RECORD, by="a run", advice=advice).model_dump(exclude_unset=True)
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it.
-
-    Raises:
-        RecipeError: it cannot be read.
-    """
+    """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it."""
     tables = tables_of(path)
     task, data = tables.get("task"), tables.get("data")
     if isinstance(task, str):
@@ -112,11 +104,7 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def tables_of(path: Path) -> dict[str, Any]:
-    """Return the tables of the file of a recipe as they are.
-
-    Raises:
-        RecipeError: it cannot be read; of a run, a dataset or a mapping in its place, it says so.
-    """
+    """Return the tables of the file of a recipe as they are."""
     if os.path.isdir(path):  # of a name that is too long, too, `load_tables` tells
         _refuse_folder(path)
     tables = load_tables(path)
@@ -257,16 +245,12 @@ class Recipe(Config):
         return rows
 
     @model_validator(mode="after")
-    def _fits_the_learner(self) -> Self:
+    def _fits_the_learner_and_judges(self) -> Self:
         if self.train.learner != "ppo" and "rma" in map(base_method, self.methods):
             raise ValueError(f"methods: rma: expected train.learner 'ppo', got '{self.train.learner}'")
         collects_by = self.collect and self.collect.behavior
         if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
             raise ValueError(f"collect: good episodes of {self.task} are short: use 'suboptimal_ppo'")
-        return self
-
-    @model_validator(mode="after")
-    def _has_judges(self) -> Self:
         if self.select is None:
             return self
         try:
@@ -283,7 +267,7 @@ class Recipe(Config):
         return self
 
     @model_validator(mode="after")
-    def _has_the_target_that_it_needs(self) -> Self:
+    def _fits_the_task(self) -> Self:
         needing = [f"methods: {row}" for row in self.methods if method_named(row).steps_target]
         task = task_named(self.task)
         if needing and task.has_target and task.make_target is None and self.train.data_start_share:
@@ -292,11 +276,6 @@ class Recipe(Config):
         needing += ['[collect] (give `data = "…"` in its place)'] if self.data is None else []
         if needing and not task.has_target:
             raise ValueError(f"{self.task} has no target, which these need: {', '.join(needing)}")
-        return self
-
-    @model_validator(mode="after")
-    def _fits_the_task(self) -> Self:
-        task = task_named(self.task)
         if task.plane is not None:
             if "leg_scale" not in task.facts and self.evaluate.leg_scale != 1.0:
                 raise ValueError(f"evaluate.leg_scale: {self.task} has legs of one length: expected 1")
@@ -310,29 +289,22 @@ class Recipe(Config):
             "report.paper_success": bool(self.report.paper_success),
         }
         if faults := faults + [setting for setting, is_asked in asked.items() if is_asked]:
-            needing = ", ".join(faults)
-            raise ValueError(f"{self.task} has no maze, which these need: {needing}; leave them out")
+            raise ValueError(
+                f"{self.task} has no maze, which these need: {', '.join(faults)}; leave them out"
+            )
         return self
 
     @model_validator(mode="after")
-    def _counts_recorded_episodes(self) -> Self:
+    def _has_no_repeats_and_no_empty_size(self) -> Self:
         if self.augment and self.sweep.percent:
             raise ValueError(
                 "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one "
                 "of the two"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _has_no_repeats(self) -> Self:
         axes = {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}
         for name, values in axes.items():
             if len(set(values)) < len(values):
                 raise ValueError(f"expected each of {name} once, got {list(values)}")
-        return self
-
-    @model_validator(mode="after")
-    def _has_no_empty_size(self) -> Self:
         if self.collect is None:
             if self.largest > WHOLE:
                 raise ValueError(f"sweep.percent: expected at most {WHOLE} % of data, got {self.largest}")

@@ -6,7 +6,6 @@ has one line per finished point.
 
 import csv
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import partial
 from io import StringIO
 from itertools import count
@@ -16,26 +15,19 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from astra_data.core.config import did_you_mean
 from astra_data.core.durable import alone_in, clean, folder_for, make_folder, move, write_file
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import RECORD, RUNS, reference_of, row_of_key, stage_of_key
 from astra_data.core.optional import optional
 from astra_data.methods import grounded_as, method_named
-from astra_data.pipeline.condition import (
-    Condition,
-    can_be_made_again,
-    condition,
-    data_condition,
-    spoilt,
-    to_make_again,
-)
+from astra_data.pipeline.condition import Condition, condition, data_condition, to_make_again
 from astra_data.pipeline.display import display
-from astra_data.pipeline.executors import EXECUTORS, Item, Watcher
+from astra_data.pipeline.executors import EXECUTORS, Item
 from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment, load_experiment
 from astra_data.pipeline.plan import RunPoint, Selection, check_stage, plan, stages_until
 from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.stages.registry import STAGES
-from astra_data.pipeline.stages.report import is_current
 from astra_data.pipeline.user_code import OwnMethod, add_all, digests_of, record_code
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 from astra_data.reports.held_out import write_held_out
@@ -103,11 +95,11 @@ def run(
     experiment = load_experiment(recipe_path, root)
     wanted = stages - experiment.borrowed
     part = Selection.of(experiment.recipe, methods, seeds, percents)
-    log = _tracked(trackio, experiment.folder.name) if trackio else None
+    log = _tracked(trackio, experiment.folder.name) if trackio else lambda _: None
+    table = PointTable(experiment, part.points(), log)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if item.stage in wanted]
-    show = partial(_shown, PointTable(experiment, part.points()), log)
-    make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, show=show)
+    make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, table=table)
     if "ground" in wanted:
         write_errors(experiment, part)
     return experiment.folder
@@ -192,12 +184,12 @@ def _check_task(experiment: Experiment, device: str = "cpu") -> None:
         raise BadInputError("\n".join(f"{experiment.path}: task {name}: {fault}" for fault in faults))
 
 
-def check_device(device: str, engine: str = "processes") -> None:
-    """Check that the CPU or a CUDA device is available, or may be on a cluster.
-
-    Raises:
-        BadInputError: it is not.
-    """
+def check_device(device: str, engine: str = "processes", address: str | None = None) -> None:
+    """Check that the CPU or a CUDA device is available to an engine, or may be on its cluster."""
+    if engine not in EXECUTORS:
+        raise BadInputError(f"unknown engine '{engine}'{did_you_mean(engine, EXECUTORS)}")
+    if address is not None and engine != "ray":
+        raise BadInputError("--address is for --engine ray: leave it out, or add that")
     try:
         wanted = torch.device(device)
     except RuntimeError:
@@ -223,50 +215,27 @@ def make(
     device: str = "cpu",
     engine: str = "processes",
     address: str | None = None,
-    show: Callable[[Collection[str], Console], Any] = display,
+    table: "PointTable | None" = None,
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
     A task of the user's own is walked through before. What is made again is set aside, with a line that says
     why and where.
 
-    Args:
-        experiment: whose artifacts they are.
-        items: each after those it reads.
-        planned: all items of the recipe that these may read.
-        jobs: as for `run`.
-        device: as for `run`.
-        engine: as for `run`.
-        address: as for `run`.
-        show: shows the progress of items by their keys, as `display` does.
-
-    Raises:
-        MissingStageError: an artifact that an item reads is neither among them nor finished and intact.
-        RecipeError: the recipe differs from the one that made the existing artifacts.
-        BadInputError: another process runs in the recipe's folder, the device or cluster is not available, or
-            a dataset is damaged that the recipe cannot make again.
-        AstraDataError: an item failed.
+    The `items` stand after those they read, which are among `planned`; `table` is kept up to date.
     """
-    check_device(device, engine)
+    check_device(device, engine, address)
     recipe, folder = experiment.recipe, experiment.folder
     with folder_for(folder / RECORD), alone_in(folder):
         experiment.check_unchanged()
         _check_task(experiment, "cpu" if engine == "ray" else device)
         clean(folder)
         again = to_make_again(items, experiment)
-        for key, reason in again.items():
-            if not can_be_made_again(key, experiment):
-                raise BadInputError(
-                    f"{experiment.place(key)} is {reason}, and was not made by this recipe: restore it from "
-                    "a copy, recover its intact episodes with `astra-data repair`, or remove it"
-                )
         items = [
             item
             for item in items
             if item.key in again or item.stage in ALWAYS_NEW or not experiment.has(item.key)
         ]
-        if [item.stage for item in items] == ["report"] and _is_reported(items[0]):
-            items = []
         data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
@@ -281,7 +250,10 @@ def make(
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
         record_code(folder, digests_of(recipe.task, recipe.own_methods))
         experiment.write_made_with(items)
-        with show([item.key for item in items], console) as watch:
+        if table:
+            table.write()
+        then = partial(table.finished, console) if table else lambda _: None
+        with display([item.key for item in items], console, then) as watch:
             EXECUTORS[engine](
                 items,
                 jobs=jobs,
@@ -290,14 +262,6 @@ def make(
                 prepare=partial(_prepare, dict(recipe.own_methods)),
                 address=address,
             )
-
-
-def _is_reported(item: Item) -> bool:
-    """Return whether the report is there already, made of what it would be made of."""
-    call = item.call
-    if not isinstance(call, partial) or call.keywords["publish"] is not None:
-        return False
-    return is_current(*call.args, **call.keywords)
 
 
 def _prepare(own_methods: dict[str, OwnMethod]) -> None:
@@ -319,9 +283,11 @@ def _check_inputs(experiment: Experiment, items: Collection[Item], planned: Coll
     ]
     for key in dict.fromkeys(reads):
         stage, root = stage_of_key(key), experiment.folder.parent
-        fault = spoilt(known[key], experiment) if experiment.has(key) else "missing"
-        if not fault:
+        # The values of datasets are compared whenever they are read.
+        found = condition(known[key], experiment, verify=not STAGES[stage].makes_dataset)
+        if found.is_finished:
             continue
+        fault = f"{found.state} ({found.why})" if found.why else found.state
         maker = experiment.maker(stage)
         # Of the base, `run` makes what comes before the stage as well; two commands take no recipe.
         alone = stage not in ("augment", "label") and (maker is experiment or not STAGES[stage].reads)
@@ -354,9 +320,14 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
 class PointTable:
     """The finished points of a recipe, in `sweep.csv`; the line of a finished point does not change."""
 
-    def __init__(self, experiment: Experiment, shown: Collection[RunPoint]) -> None:
-        """Look at all points of the recipe; show those of this run."""
-        self.experiment, self.folder, self.shown = experiment, experiment.folder, tuple(shown)
+    def __init__(
+        self,
+        experiment: Experiment,
+        shown: Collection[RunPoint],
+        log: Callable[[dict[str, Any]], object] = lambda _: None,
+    ) -> None:
+        """Look at all points of the recipe; show and `log` those of this run."""
+        self.experiment, self.folder, self.shown, self._log = experiment, experiment.folder, shown, log
         self._points = Selection.of(experiment.recipe).points()
         self._lines: dict[RunPoint, dict[str, Any]] = {}
 
@@ -374,12 +345,15 @@ class PointTable:
             write_file(self.folder / POINTS, text.getvalue())
         return lines
 
-    def message(self, point: RunPoint) -> str:
-        """Return one line for a point that has just finished."""
-        headline = self.experiment.recipe.headline
+    def finished(self, console: Console, key: str) -> None:
+        """Show and log the point whose evaluation has finished; of other items, nothing."""
+        if not (points := [point for point in self.shown if point.key == key]):
+            return
+        line, headline = self.write()[points[0]], self.experiment.recipe.headline
         done = sum(one in self._lines for one in self.shown)
-        score = headline.text(self._lines[point][headline.measure])
-        return f"{point.key}  done {score}  ({done} of {len(self.shown)} points)"
+        text = f"{key}  done {headline.text(line[headline.measure])}  ({done} of {len(self.shown)} points)"
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._log(line)
 
     def _line(self, point: RunPoint) -> dict[str, Any]:
         evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
@@ -412,43 +386,6 @@ def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:
     for read in items[key].inputs:
         if not (key.startswith("evaluate/") and read.startswith("ground/")):
             yield from _needed(read, items)
-
-
-@contextmanager
-def _shown(
-    table: PointTable,
-    log: Callable[[dict[str, Any]], None] | None,
-    keys: Collection[str],
-    console: Console,
-) -> Iterator[Watcher]:
-    """Show the running items, and keep `sweep.csv` up to date."""
-    table.write()
-    with display(keys, console) as watch:
-        yield _PointWatcher(watch, table, log, console)
-
-
-class _PointWatcher:
-    """Passes notifications on, and writes down every point that is finished."""
-
-    def __init__(
-        self,
-        watch: Watcher,
-        table: PointTable,
-        log: Callable[[dict[str, Any]], None] | None,
-        console: Console,
-    ) -> None:
-        self.started, self.progressed, self.failed = watch.started, watch.progressed, watch.failed
-        self._watch, self._table, self._log, self._console = watch, table, log, console
-
-    def finished(self, key: str, seconds: float) -> None:
-        self._watch.finished(key, seconds)
-        point = next((point for point in self._table.shown if point.key == key), None)
-        if point is None:
-            return
-        line = self._table.write()[point]
-        self._console.print(self._table.message(point), markup=False, highlight=False, soft_wrap=True)
-        if self._log:
-            self._log(line)
 
 
 def _tracked(project: str, recipe: str) -> Callable[[dict[str, Any]], None]:

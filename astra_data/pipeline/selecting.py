@@ -140,49 +140,34 @@ def choose_by_trials(
     folder, task = Path(run), task_of(run)
     if not task_named(task).has_target:
         raise BadInputError(f"{folder}: expected a task with a target, got {task}: leave out --trials")
-    _check_enough(trials, 2 if field is None else field)
+    least = least_trials(max(2, field or 2))
+    if (field is not None and field < 2) or trials < least:
+        raise BadInputError(
+            f"expected --trials of {least} or more, for a first round of {field or 2} candidates and those "
+            f"after it, got {trials}: give more, or another --field of 2 or more"
+        )
     judged = select(run, rows=rows, judge=judge, episodes=episodes, progress=part(progress, 0.0, 0.5))
-    candidates = _candidates(judged, percent)
-    if not 2 <= (field or len(candidates)) <= len(candidates):
-        raise BadInputError(
-            f"expected two candidates or more to try, of the {len(candidates)} that were judged, got "
-            f"{field or len(candidates)}: give another --field, or more rows"
-        )
-    begun = _begun(folder, trials, field or widest_field(len(candidates), trials), percent)
-    with alone_in(folder):
-        return _halve(folder, judged, candidates, begun, part(progress, 0.5, 1.0))
-
-
-def _check_enough(trials: int, field: int) -> None:
-    least = least_trials(field)
-    if field < 2 or trials < least:
-        raise BadInputError(
-            f"expected --trials of {max(least, least_trials(2))} or more, for a first round of {field} "
-            f"candidates and those after it, got {trials}: give more, or another --field of 2 or more"
-        )
-
-
-def _candidates(judged: Judged, percent: int | None) -> list[Candidate]:
     if percent not in judged.percents:
         sizes = ", ".join(f"{size}" for size in judged.percents if size) or "none"
-        asked = percent or "none"
-        raise BadInputError(f"expected --percent to be a size of the run ({sizes}), got {asked}")
-    return judged.ranked(percent)
-
-
-def _begun(folder: Path, trials: int, field: int, percent: int | None) -> TrialsFile:
-    """Return what is there of such trials, or none of them."""
+        raise BadInputError(f"expected --percent to be a size of the run ({sizes}), got {percent or 'none'}")
+    candidates = judged.ranked(percent)
+    if not 2 <= (asked := field or len(candidates)) <= len(candidates):
+        raise BadInputError(
+            f"expected two candidates or more to try, of the {len(candidates)} that were judged, got "
+            f"{asked}: give another --field, or more rows"
+        )
+    field = field or widest_field(len(candidates), trials)
+    begun = TrialsFile(trials=trials, field=field, percent=percent, pseudo_trials=PSEUDO_TRIALS)
     path = folder / FOLDER / TRIALS
-    asked = TrialsFile(trials=trials, field=field, percent=percent, pseudo_trials=PSEUDO_TRIALS)
-    there = read_trials(path) or asked
-    for name in ("trials", "field", "percent", "pseudo_trials"):
-        was, now = getattr(there, name), getattr(asked, name)
-        if was != now:
-            raise BadInputError(
-                f"{path}: expected trials with {name} = {now}, found {there.spent} made with {was}: "
-                f"use the same settings, or move {path.parent} away"
-            )
-    return there
+    if there := read_trials(path):
+        for name, now in begun.model_dump(include={"trials", "field", "percent", "pseudo_trials"}).items():
+            if (was := getattr(there, name)) != now:
+                raise BadInputError(
+                    f"{path}: expected trials with {name} = {now}, found {there.spent} made with {was}: "
+                    f"use the same settings, or move {path.parent} away"
+                )
+    with alone_in(folder):
+        return _halve(folder, judged, candidates, there or begun, part(progress, 0.5, 1.0))
 
 
 def _halve(
@@ -196,7 +181,12 @@ def _halve(
         if number == len(rounds):
             rounds.append(TrialRound(trials=each, candidates=named))
         for row, seed in named[len(rounds[number].tried) :]:
-            success = _try(folder, row, seed, begun.percent, each, number)
+            trained = trained_policy(folder, row, seed=seed, percent=begun.percent)
+            scale = EvaluateConfig.model_validate(trained.settings.get("evaluate") or {}).leg_scale
+            policy = trained.running()
+            begin, drawn = partial(started, policy, policy.act), derive(number, "trials of a choice")
+            outcome = in_target(policy.task, begin, each, drawn, leg_scale=scale).outcome
+            success = [int(one) for one in outcome.success]
             tried = [*rounds[number].tried, Tried(row=row, seed=seed, success=success)]
             rounds[number] = rounds[number].model_copy(update={"tried": tried})
             now = begun.model_copy(update={"rounds": rounds})
@@ -210,16 +200,6 @@ def _halve(
     done = begun.model_copy(update={"rounds": rounds, "chosen": (first.row, first.seed), "mean": found.mean})
     _write(folder, judged, done)
     return done
-
-
-def _try(folder: Path, row: str, seed: int, percent: int | None, trials: int, number: int) -> list[int]:
-    """Return 1 or 0 for each episode of a policy in the target, deployed as `evaluate` does it."""
-    trained = trained_policy(folder, row, seed=seed, percent=percent)
-    config, policy = EvaluateConfig.model_validate(trained.settings.get("evaluate") or {}), trained.running()
-    drawn = derive(number, "trials of a choice")
-    begin = partial(started, policy, policy.act)
-    found = in_target(policy.task, begin, trials, drawn, leg_scale=config.leg_scale)
-    return [int(success) for success in found.outcome.success]
 
 
 def _write(folder: Path, judged: Judged, trials: TrialsFile) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.artifact import check_made_from
+from astra_data.core.config import did_you_mean
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import RECORD, artifact_key
@@ -15,7 +16,6 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import ranges
 from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_target_encoder
 from astra_data.methods import grounded_as, method_named
-from astra_data.pipeline.first_look import refuse_unmade
 from astra_data.pipeline.recipe import recorded_settings
 from astra_data.pipeline.user_code import add_all, check_unchanged
 from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
@@ -27,10 +27,8 @@ from astra_data.worlds.user_code import found_near
 class TrainedPolicy:
     """A policy that a run has trained, and what goes with it.
 
-    Attributes:
-        settings: of the run's recipe, see `settings_of`. files: those that make up the policy, by the stage
-            that wrote them. file: what that of `train` holds. dataset: that it was learned from, if it is
-            still there.
+    `settings` are those of the run's recipe, `files` those that make up the policy, by the stage that wrote
+    them, `file` is what that of `train` holds, `dataset` what it was learned from, if that is still there.
     """
 
     settings: dict[str, Any]
@@ -59,11 +57,7 @@ class TrainedPolicy:
 
 
 def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> TrainedPolicy:
-    """Return the policy of a row of a run, with its files and the settings of its recipe.
-
-    Raises:
-        BadInputError: as `load_policy`.
-    """
+    """Return the policy of a row of a run, with its files and the settings of its recipe."""
     settings = settings_of(run)
     files = _files(settings, Path(run), row, seed, percent)
     data = Path(run) / artifact_key("pair" if percent is None else "subset", "", seed, percent)
@@ -103,11 +97,7 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
 
 
 def task_of(run: str | Path) -> str:
-    """Return the task that a run's recipe names.
-
-    Raises:
-        BadInputError: as `settings_of`.
-    """
+    """Return the task that a run's recipe names."""
     return str(settings_of(run)["task"])
 
 
@@ -140,15 +130,18 @@ def _files(
     add_all(own_methods)
     files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}
     if not files["train"].is_file():
-        refuse_unmade(settings, row, seed)
-    method = method_named(row)
+        rows, seeds = settings.get("methods", [row]), settings.get("seeds", [seed])
+        if row not in rows:
+            raise BadInputError(f"the run has no row '{row}'{did_you_mean(row, rows)}")
+        if seed not in seeds:
+            raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")
+    method, base = method_named(row), grounded_as(row)
     if not method.trains:
         raise BadInputError(f"{row} has no trained policy: it is written by hand")
     sizes = settings.get("sweep", {}).get("percent", ())
-    if (percent is None) == bool(sizes) or (sizes and percent not in sizes):
+    if percent not in (sizes or (None,)):
         wanted = f"one of {', '.join(map(str, sizes))}" if sizes else "none, as the recipe has one size"
         raise BadInputError(f"{folder}: percent: expected {wanted}, got {percent or 'none'}")
-    base = grounded_as(row)
     for name in own_methods.keys() & {method.name, base}:
         check_unchanged(own_methods[name]["method"], folder, name=name)
     if method.grounds:

@@ -31,20 +31,12 @@ class OwnMethod(Config):
         return {"method": given} if isinstance(given, str) else given
 
     def add(self, name: str) -> None:
-        """Add the method by the `name` of its rows, and check its settings.
-
-        Raises:
-            BadInputError: as `add_method`, or it has no such settings.
-        """
+        """Add the method by the `name` of its rows, and check its settings."""
         add_method(name, self.method)
         self.settings(name)
 
     def settings(self, name: str) -> Config | None:
-        """Return the settings of the method, which was added by `name`; None if it has none.
-
-        Raises:
-            BadInputError: it has no such settings.
-        """
+        """Return the settings of the method, which was added by `name`; None if it has none."""
         given = self.model_extra or {}
         table = METHODS[name].table
         if table is None and given:
@@ -58,11 +50,7 @@ class OwnMethod(Config):
 
 
 def add_all(own_methods: Mapping[str, Any]) -> None:
-    """Add the methods of a recipe, each as the recipe names it.
-
-    Raises:
-        BadInputError: as `add_method`, or one has not the settings that it is given.
-    """
+    """Add the methods of a recipe, each as the recipe names it."""
     for name, given in own_methods.items():
         OwnMethod.model_validate(given).add(name)
 
@@ -100,11 +88,7 @@ def with_offered(tables: Mapping[str, Any], keys: Collection[str]) -> dict[str, 
 
 
 def check_unchanged(place: str, run: Path, *, name: str = "task") -> None:
-    """Refuse code at a `place` that is not what the folder of a run has recorded of its task, or of a method.
-
-    Raises:
-        BadInputError: it is another, or the record is damaged.
-    """
+    """Refuse code at a `place` that is not what a run's folder has recorded of its task, or of a method."""
     place = place_of(place) if name == "task" else place
     now = code_digest(place)
     if now and now != recorded_code(run).get(name, now):

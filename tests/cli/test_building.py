@@ -1,13 +1,24 @@
+import shutil
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from command_line import call
+from fake_dataset import write_fake
+from typer.testing import CliRunner
 
-from astra_data.core.errors import AstraDataError
-from astra_data.dataset.columns import Episode
+from astra_data.cli.app import app
+from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.staging import StagedWriter
 from astra_data.dataset.versions import open_dataset
+from astra_data.dataset.writer import DatasetWriter
+from astra_data.pipeline.stages.augment import AugmentConfig
+from astra_data.robots import registry
+from astra_data.worlds import user_code
 
 pytestmark = pytest.mark.usefixtures("home")
 
@@ -109,3 +120,125 @@ def test_stopping_a_recording_says_how_to_go_on(home: Path, monkeypatch: pytest.
     monkeypatch.setattr(StagedWriter, "add", add)
     assert "resume it" in str(call("collect", "antmaze-umaze", *SMALL).exception)
     assert call("collect", "antmaze-umaze", *SMALL, "--resume").exit_code == 0
+
+
+pytestmark = pytest.mark.usefixtures("home")
+
+
+def test_a_dataset_is_augmented_beside_itself(home: Path) -> None:
+    call("collect", "antmaze-umaze", "--episodes", "3", "--max-steps", "6", "--name", "walks")
+    options = ["--copies", "2", "--margin-m", "0.3", "--min-steps", "3", "--rotations", "none", "--seed", "5"]
+    result = call("augment", "walks", "--task", "antmaze-umaze", *options)
+    assert result.output.splitlines()[-1] == f"finished: {home / 'walks/data-1.1.0'}"
+    dataset = open_dataset("walks")
+    assert len(dataset) == 3 + 2 * 2
+    assert dataset.description["config"] == AugmentConfig(
+        copies=2, margin_m=0.3, min_steps=3, rotations="none"
+    ).model_dump(mode="json")
+    assert dataset.description["seeds"]["augment"] == 5
+
+
+def test_every_setting_is_an_option() -> None:
+    shown = call("augment", "--help").output
+    for name in AugmentConfig.model_fields:
+        assert f"--{name.replace('_', '-')}" in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--copies", "2", "--episodes", "9"], "augment: episodes: expected either copies or episodes"),
+        (["--rotations", "none", "--no-translations"], "augment: translations: expected rotations or transl"),
+        (["--rotations", "half"], "augment: rotations: expected 'quarter', 'any' or 'none', got 'half'"),
+        (["--held-out-share", "1"], "augment: held_out_share: expected"),
+    ],
+)
+def test_what_cannot_be_augmented_is_told(home: Path, tmp_path: Path, options: list[str], told: str) -> None:
+    assert "no dataset 'walks'" in str(call("augment", "walks", *options).exception)
+    error = call("augment", str(write_fake(tmp_path / "fake").root), *options).exception
+    assert isinstance(error, AstraDataError)
+    with pytest.raises(AstraDataError, match=told):
+        raise error
+    assert not home.exists()
+
+
+CART = Path(__file__).parents[1] / "small_cart.py"
+
+
+def test_tasks_of_the_package_and_of_installed_ones_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    offered = EntryPoint("rail-cart", "small_cart:LOGS_ALONE", registry.TASK_GROUP)
+    monkeypatch.setattr(user_code, "entry_points", lambda group: [offered])
+    result = CliRunner().invoke(app, ["list", "--tasks"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    lines = {line.split()[1]: line for line in result.output.splitlines() if line.startswith("│")}
+    assert set(registry.TASKS) <= set(lines)
+    assert "(installed)" in lines["rail-cart"] and "(installed)" not in lines["antmaze-umaze"]
+    assert "vx, vy" in lines["antmaze-long"] and " 20 " in lines["antmaze-long"]
+    assert "z, pitch, left_hip, left_knee and 11 more" in lines["humanoid-walker2d"]
+    assert "no" in lines["rail-cart"].split() and "yes" in lines["antmaze-umaze"].split()
+    narrow = CliRunner().invoke(app, ["list", "--tasks"], env={"COLUMNS": "80"}).output
+    assert all(f"│ {task} " in narrow for task in registry.TASKS)
+    assert max(map(len, narrow.splitlines()[:-1])) <= 80
+    assert registry.task_named("rail-cart").name == "rail-cart"
+    with pytest.raises(BadInputError, match=r"unknown task 'rail-crat': did you mean 'rail-cart'"):
+        registry.task_named("rail-crat")
+
+
+SETTINGS = """
+[collect]
+episodes = 1
+start = "task"
+[ground]
+updates = 1
+held_out_share = 0.5
+[train]
+total_steps = 64
+"""
+WRONG = """
+from dataclasses import replace
+from small_cart import TASK as RIGHT, Reach
+class Wrong(Reach):
+    def reward(self, before, after, goal, failed):
+        return after - before
+TASK = replace(RIGHT, objective=Wrong(horizon=40))
+"""
+
+
+def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = CliRunner().invoke(app, ["check", f"{CART}:TASK"])
+    assert result.exit_code == 0 and "small_cart.py:TASK: found no errors" in result.output
+    assert result.output.startswith("commands: v -1…4\nabstract states: x\n")
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(CART, tmp_path)  # a file of the user's imports those beside it
+    (tmp_path / "wrong.py").write_text(WRONG)
+    told = "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)"
+    result = CliRunner().invoke(app, ["check", "wrong.py:TASK"])
+    assert result.exit_code == 1
+    assert str(result.exception) == f"task wrong.py:TASK: {told}"
+    (tmp_path / "wrong.toml").write_text(
+        'task = "wrong.py:TASK"\nmethods = ["nas"]\nseeds = [0]\n' + SETTINGS
+    )
+    result = CliRunner().invoke(app, ["check", "wrong.toml"])
+    assert result.exit_code == 1
+    assert str(result.exception).startswith("wrong.toml: task ") and str(result.exception).endswith(told)
+
+
+def test_a_log_is_labeled_by_a_task_in_a_file(tmp_path: Path) -> None:
+    state = np.column_stack([0.1 * np.arange(6), np.ones(6)]).astype(np.float32)
+    columns = [Column(STATE, size=2), Column(ACTION), Column(NEXT_STATE, size=2)]
+    about: dict[str, Any] = {"fps": 10, "task": "drive", "description": {"name": "logs", "stage": "import"}}
+    with DatasetWriter(tmp_path / "logs", columns, **about) as writer:
+        writer.add(
+            Episode(0, {STATE: state[:-1], ACTION: np.ones(5, np.float32), NEXT_STATE: state[1:].copy()})
+        )
+    goals = []
+    for name, more in (("labeled", list[str]()), ("again", ["--seed", "0"]), ("other", ["--seed", "1"])):
+        out = f"{tmp_path}/{name}"
+        command = ["label", f"{tmp_path}/logs", "--task", f"{CART}:LOGS_ALONE", "--out", out, *more]
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 0, result.output
+        assert f"finished: {out}" in result.output.replace("\n", "")
+        labeled = Dataset.open(out).columns([REWARD, GOAL])
+        np.testing.assert_allclose(labeled[REWARD], 0.1, atol=1e-6)
+        goals.append(float(labeled[GOAL][0]))
+    assert goals[0] == goals[1] != goals[2]

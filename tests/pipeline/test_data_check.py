@@ -11,7 +11,6 @@ from astra_data.cli.app import app
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Column, Episode
-from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.run import check, run
 from astra_data.pipeline.stages.pair import pair
 
@@ -54,15 +53,12 @@ def recipe(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("least", "largest", "expected"),
     [
-        (-1.0, 4.0, ""),
         (-0.9, 3.9, ""),  # within 5 % of what was recorded
         (-0.75, 4.0, "v may be -1 to 4, recorded is -0.75 to 4"),  # just beyond these 5 %
-        (-1.5, 4.5, ""),
         (-0.5, 4.0, "v may be -1 to 4, recorded is -0.5 to 4: narrow the bounds of the commands, or rec"),
         (-1.0, 3.0, "v may be -1 to 4, recorded is -1 to 3"),
         (-40.0, 59.0, ""),
         (-250.0, 900.0, "v may be -1 to 4, recorded is -250 to 900: are both in the same unit?"),
-        (0.0, 900.0, "v may be -1 to 4, recorded is 0 to 900: are both in the same unit?"),
     ],
 )
 def test_bounds_beyond_what_was_recorded_are_told(
@@ -122,12 +118,6 @@ def test_data_that_were_paired_are_refused(recipe: Path) -> None:
         check(recipe, root=recipe.parent / "runs")
 
 
-def test_data_of_another_robot_are_refused(recipe: Path) -> None:
-    write_logs(recipe.parent / "logs", -1.0, 4.0, state_size=3)
-    with pytest.raises(BadInputError, match=r"state has 3 values, expected those of rail-cart: 2"):
-        check(recipe, root=recipe.parent / "runs")
-
-
 def test_data_of_which_none_is_left_to_train_on_are_refused(recipe: Path) -> None:
     write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False])
     told = r"fake@data-1.0.0: recorded episodes: 1, of which 1 would be held out, and none is left"
@@ -170,15 +160,6 @@ def test_copies_of_one_recording_are_one_in_a_size_of_a_sweep(recipe: Path) -> N
     recipe.write_text(recipe.read_text() + "[sweep]\npercent = [50, 100]\n")
     with pytest.raises(BadInputError, match=r"50 % of fake@data-1\.0\.0: recorded episodes: 1, of which 1"):
         check(recipe, root=recipe.parent / "runs")
-
-
-def test_recipes_that_collect_or_pull_have_no_such_line(recipe: Path) -> None:
-    text = recipe.read_text()
-    recipe.write_text(text.replace('"logs"', '"somebody/logs"'))
-    assert "data" not in check(recipe, root=recipe.parent / "runs")
-    recipe.write_text(text.replace('data = "logs"\n', "") + '[collect]\nstart = "task"\n')
-    assert load_experiment(recipe, recipe.parent / "runs").recipe.data is None
-    assert "data" not in check(recipe, root=recipe.parent / "runs")
 
 
 def test_a_task_of_ones_own_is_walked_through_before_a_run(recipe: Path) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_items import crash, fail, fill_the_disk, touch
+from fake_items import crash, fill_the_disk, touch
 
-from astra_data.core.errors import DiskError, MissingStageError
+from astra_data.core.errors import DiskError
 from astra_data.pipeline.executors import Item, Reporter, pickled, run_in_order, run_item
 from astra_data.worlds.user_code import user_object
 
@@ -44,22 +44,6 @@ def test_items_begin_when_their_inputs_are_finished_and_a_job_is_free(jobs: int 
     run_in_order(items, jobs, workshop.begin, workshop.wait)
     assert workshop.begun == ["a", "b", "c", "last"]
     assert workshop.most == most
-
-
-def test_nothing_finishing_yet_is_waited_for() -> None:
-    answers = iter([[], [], ["a"]])
-    begun: list[Item] = []
-    run_in_order([Item("a", (), no_call)], 1, begun.append, lambda: next(answers))
-    assert [item.key for item in begun] == ["a"]
-    assert next(answers, None) is None
-
-
-def test_items_that_wait_for_each_other_are_a_bug() -> None:
-    workshop = Workshop()
-    items = [Item("a", ("b",), no_call), Item("b", ("a",), no_call), Item("c", (), no_call)]
-    with pytest.raises(ValueError, match="nodes are in a cycle"):
-        run_in_order(items, 1, workshop.begin, workshop.wait)
-    assert workshop.begun == []
 
 
 def prepared() -> None:
@@ -123,19 +107,6 @@ def test_what_an_item_draws_depends_on_its_key_alone(tmp_path: Path) -> None:
     assert all(first == again for first, again in drawn.values())
     values = [value for first, _ in drawn.values() for value in first.strip("()").split(", ")]
     assert len(set(values)) == 9
-
-
-def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
-    error = run_item("a/b", pickled(Item("a/b", (), fail), None), tmp_path / "log", lambda note: None)
-    assert type(error) is MissingStageError
-    assert str(error) == "a/b: nothing to eat"
-
-
-def test_an_item_leaves_no_file_open(tmp_path: Path) -> None:
-    work, open_files = pickled(Item("a", (), fail), None), Path("/proc/self/fd")
-    before = len(list(open_files.iterdir()))
-    run_item("a", work, tmp_path / "log", lambda note: None)
-    assert len(list(open_files.iterdir())) == before
 
 
 def test_at_most_ten_notes_a_second_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:

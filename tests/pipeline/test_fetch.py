@@ -56,13 +56,6 @@ def test_recorded_steps_are_those_of_the_environment(folder: Path) -> None:
         np.testing.assert_allclose(observation["observation"], following, atol=1e-5)
 
 
-def test_the_simulator_does_at_once_what_it_is_told() -> None:
-    task = task_named(f"{FETCH}/reach.py:TASK")
-    simulator = task.simulator(1)
-    simulator.reset_to(torch.tensor([[1.0, 2.0, 3.0]]))
-    assert simulator.step(torch.tensor([[1.0, 0.0, -0.5]]))[0].tolist() == pytest.approx([1.05, 2.0, 2.975])
-
-
 def test_the_puck_is_pushed_at_one_height_until_it_falls() -> None:
     """In the environment; and in the simulator by what the gripper would overlap."""
     task = task_named(f"{FETCH}/push.py:TASK")

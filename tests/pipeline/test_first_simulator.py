@@ -61,7 +61,7 @@ def of_other_axes() -> Columns:
     }
 
 
-def bicycle(side: float = 1.0) -> Columns:
+def bicycle() -> Columns:
     """A tractor with a trailer, whose angle no command moves."""
     v, angle = held((-1, 2), (-0.5, 0.5))
     x, y, yaw = driven(v, 0 * v, v * np.tan(angle) / 2.5)
@@ -74,7 +74,7 @@ def bicycle(side: float = 1.0) -> Columns:
         "y": y,
         "heading": wrapped(yaw),
     }
-    return place | {"hitch_angle": hitch, "cmd_speed": v, "cmd_steering": side * angle}
+    return place | {"hitch_angle": hitch, "cmd_speed": v, "cmd_steering": angle}
 
 
 def differential() -> Columns:
@@ -140,11 +140,6 @@ KINDS: dict[str, tuple[Callable[[], Columns], str]] = {
     "bicycle": (
         bicycle,
         "a bicycle: x, y, heading, moved by speed, steering; wheelbase_m 2.5; "
-        "CHECK: trailer_heading is not in φ",
-    ),
-    "bicycle to the right": (
-        lambda: bicycle(-1.0),
-        "a bicycle: x, y, heading, moved by speed, steering; wheelbase_m -2.5; "
         "CHECK: trailer_heading is not in φ",
     ),
     "differential drive": (

@@ -17,7 +17,7 @@ from astra_data.dataset.columns import GOAL, REWARD
 from astra_data.dataset.edit import delete, subset
 from astra_data.dataset.reader import Dataset
 from astra_data.io.importing import import_dataset
-from astra_data.pipeline.condition import can_be_made_again, condition
+from astra_data.pipeline.condition import condition
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.plan import Selection, plan
 from astra_data.pipeline.run import check, set_aside, write_errors
@@ -83,14 +83,6 @@ def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
     assert action.shape == (2, 2) and bool(np.isfinite(action.numpy()).all())
 
 
-def test_rows_without_a_common_simulator_say_where_they_were_tested(logs: Path) -> None:
-    folder, _ = made(logs, "alone", 'methods = ["direct_transfer"]\n')
-    evaluation = read_json(Evaluation, folder / "evaluate/direct_transfer/seed_0" / EVALUATION)
-    assert evaluation.tested_in == "raw" and evaluation.outcomes == evaluation.raw
-    page = (folder / "report/results.md").read_text()
-    assert "Each method was tested in the simulator of its training" in page.splitlines()[2]
-
-
 def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
     until = ("label", "pair", "subset", "ground")
     text = 'methods = ["nas"]\n[sweep]\npercent = [50, 100]\n'
@@ -141,7 +133,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(logs: Path, tmp_path: Path
     ]
     item.call(progress=silent)
     assert (experiment.folder / "label/seed_0").is_symlink()
-    assert condition(item, experiment).is_finished and not can_be_made_again(item.key, experiment)
+    assert condition(item, experiment).is_finished
     # What was made of it since is no other; what was made of another is.
     link = experiment.folder / "label/seed_0"
     older = shutil.copytree(whole, tmp_path / "older")
@@ -154,4 +146,3 @@ def test_other_data_of_the_same_name_are_labeled_anew(logs: Path, tmp_path: Path
     link.unlink()
     link.symlink_to(label(experiment.recipe.task, data=tmp_path / "others", out=tmp_path / "labeled"))
     assert condition(item, experiment).why.startswith("made from another dataset than cart-logs@")
-    assert can_be_made_again(item.key, experiment)

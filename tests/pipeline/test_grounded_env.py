@@ -126,14 +126,6 @@ def test_it_is_the_environment_that_the_row_was_trained_in(
     assert torch.equal(trained.starts.state, ours.starts.state)
 
 
-def test_a_recipe_that_chooses_has_the_same_environments(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A choice needs a second seed and a judge, which a single row and seed do not have."""
-    settings = settings_of(run) | {"seeds": [0, 1], "select": {}}
-    monkeypatch.setattr(grounded_env, "settings_of", lambda _: settings)
-    for row in ("direct_transfer", "nas", "astra_plus"):
-        assert world_of(run, row, seed=0).num_envs == 1
-
-
 @pytest.mark.usefixtures("forgotten_methods")
 def test_methods_of_the_run_s_own_are_added_when_it_is_opened(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

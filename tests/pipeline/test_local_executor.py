@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -25,18 +26,14 @@ def test_an_item_starts_when_its_inputs_are_finished(tmp_path: Path) -> None:
         Item("b/second", ("a/first",), partial(touch, second, (first,))),
         Item("a/first", ("not/planned",), partial(touch, first, ())),
     ]
-    record = Record()
-    execute(items, jobs=2, logs=tmp_path / "logs", watch=record)
+    record, before = Record(), signal.getsignal(signal.SIGTERM)
+    prepare = partial(Path.write_text, tmp_path / "prepared", "")
+    execute(items, jobs=2, logs=tmp_path / "logs", watch=record, prepare=prepare)
+    assert (tmp_path / "prepared").exists() and signal.getsignal(signal.SIGTERM) is before
     assert record.events == [
         (event, key) for key in ("a/first", "b/second") for event in ("started", "0.5 half", "finished")
     ]
     assert not [path for path in (tmp_path / "logs").rglob("*") if path.is_file()]
-
-
-def test_independent_items_run_at_the_same_time(tmp_path: Path) -> None:
-    one, two = tmp_path / "one", tmp_path / "two"
-    items = [Item("one", (), partial(rendezvous, one, two)), Item("two", (), partial(rendezvous, two, one))]
-    execute(items, jobs=2, logs=tmp_path / "logs", watch=Record())
 
 
 def test_items_run_from_any_thread(tmp_path: Path) -> None:
@@ -49,12 +46,6 @@ def test_items_run_from_any_thread(tmp_path: Path) -> None:
     assert place.exists() and signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_reported_error_keeps_its_class_and_names_the_item(tmp_path: Path) -> None:
-    with pytest.raises(MissingStageError, match=r"^a/b: nothing to eat$"):
-        execute([Item("a/b", (), fail)], jobs=1, logs=tmp_path, watch=Record())
-    assert not (tmp_path / "a/b.txt").exists(), "it has no traceback"
-
-
 def test_a_crash_tells_its_last_line_and_where_its_traceback_is(tmp_path: Path) -> None:
     with pytest.raises(AstraDataError, match=r"^a/b crashed: ValueError: a bug \(traceback: .*b\.txt\)$"):
         execute([Item("a/b", (), crash)], jobs=1, logs=tmp_path, watch=Record())
@@ -63,14 +54,16 @@ def test_a_crash_tells_its_last_line_and_where_its_traceback_is(tmp_path: Path) 
     assert "Traceback" in log
 
 
-def test_a_killed_process_is_noticed(tmp_path: Path) -> None:
-    with pytest.raises(AstraDataError, match=r"^a was stopped by SIGKILL, often for want of memory$"):
-        execute([Item("a", (), kill_itself)], jobs=1, logs=tmp_path, watch=Record())
-
-
-def test_a_process_that_ends_is_noticed(tmp_path: Path) -> None:
-    with pytest.raises(AstraDataError, match=r"^a ended its process with exit code 3$"):
-        execute([Item("a", (), leave)], jobs=1, logs=tmp_path, watch=Record())
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [
+        (kill_itself, "a was stopped by SIGKILL, often for want of memory"),
+        (leave, "a ended its process with exit code 3"),
+    ],
+)
+def test_a_process_that_ends_is_noticed(end: Callable[..., None], told: str, tmp_path: Path) -> None:
+    with pytest.raises(AstraDataError, match=f"^{told}$"):
+        execute([Item("a", (), end)], jobs=1, logs=tmp_path, watch=Record())
 
 
 def test_a_failure_stops_the_others(tmp_path: Path) -> None:
@@ -152,13 +145,6 @@ def _is_gone(pid: int) -> bool:
     return False
 
 
-def test_afterwards_signals_are_handled_as_before(tmp_path: Path) -> None:
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.getsignal(number) for number in numbers]
-    execute([Item("a", (), partial(touch, tmp_path / "a", ()))], jobs=1, logs=tmp_path, watch=Record())
-    assert [signal.getsignal(number) for number in numbers] == before
-
-
 def test_a_process_runs_one_item_after_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made, worker = list[object](), local_executor._Worker
 
@@ -172,9 +158,3 @@ def test_a_process_runs_one_item_after_another(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(MissingStageError):
         execute([*items, Item("c", ("b",), fail)], jobs=1, logs=tmp_path / "logs", watch=record)
     assert len(made) == 1 and record.events[-1] == ("failed", "c")
-
-
-def test_an_item_is_prepared_in_its_process(tmp_path: Path) -> None:
-    prepare = partial(Path.write_text, tmp_path / "before", "")
-    item = Item("a", (), partial(touch, tmp_path / "a", (tmp_path / "before",)))
-    execute([item], jobs=1, logs=tmp_path / "logs", watch=Record(), prepare=prepare)

@@ -11,11 +11,7 @@ from astra_data.pipeline.stages.registry import STAGES
 from astra_data.policies.iql import IqlConfig
 from astra_data.policies.train import PpoTrainConfig, SacTrainConfig, TargetConfig
 
-BASE = {
-    "task": "humanoid-walker2d",
-    "methods": ["direct_transfer"],
-    "seeds": [0],
-}
+BASE = {"task": "humanoid-walker2d", "methods": ["direct_transfer"], "seeds": [0]}
 SAC = {"learner": "sac"}
 
 
@@ -80,26 +76,11 @@ def test_stages_get_their_tables() -> None:
         ({"train": {"burn_in": 4}}, "train.burn_in: unknown key: 'sac' has it, not 'ppo'"),
         ({"train": SAC | {"num_env": 9}}, "train.num_env: unknown key: did you mean 'num_envs'?"),
         ({"train": SAC, "methods": ["rma"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
-        ({"train": SAC, "methods": ["rma_plus"]}, "methods: rma: expected train.learner 'ppo', got 'sac'"),
-        *(
-            ({table: {}}, f"{table}: unknown key")
-            for table in ("plus", "compass", "domain_randomization", "nas_golemo", "direct_transfer_iql")
-        ),
-        ({"train": {"reward": "predicted"}}, "train.reward: unknown key"),
-        ({"train": {"command_limit": 1.0}}, "train.command_limit: unknown key"),
-        ({"ground": {"members": 3}}, "ground.members: unknown key"),
-        ({"select": {"failure_members": 3}}, "select.failure_members: unknown key"),
-        ({"methods": ["compass_uniform"]}, "unknown method 'compass_uniform'"),
+        ({"plus": {}}, "plus: unknown key"),
         ({"methods": ["iql_plus"]}, "'iql_plus' trains nothing in a simulator"),
         ({"train": 3}, "train: expected a table, got 3"),
-        ({"rma": 3}, "rma: expected a table, got 3"),
-        ({"train": {"hidden_sizes": [0]}}, "train.hidden_sizes.0: expected greater than or equal to 1"),
         ({"train": {"memory_size": -1}}, "train.memory_size: expected greater than or equal to 0"),
-        (
-            {"collect": {"hold_s": [3.0, 0.5]}},
-            "collect.hold_s: expected the lower end first, got [3.0, 0.5]",
-        ),
-        ({"collect": {"episodes": 10**18}}, "collect.episodes: expected less than or equal"),
+        ({"collect": {"hold_s": [3.0, 0.5]}}, "collect.hold_s: expected the lower end first, got [3.0, 0.5]"),
         ({"collect": {"episodes": 10**10}}, "collect: episodes: 10000000000 of up to 500"),
         (
             {"sweep": {"percent": [50], "ground.latent_weight": [0, 1]}},
@@ -110,9 +91,7 @@ def test_stages_get_their_tables() -> None:
             {"task": "antmaze-umaze", "sweep": {"percent": [50]}, "augment": {"copies": 2}},
             "sweep.percent: counts recorded episodes, but [augment] adds copies",
         ),
-        ({"train": {"num_envs": 10**9}}, "train.num_envs: expected less than or equal to 1000000"),
         ({"train": {"hidden_sizes": [10**9]}}, "train.hidden_sizes.0: expected less than or equal to"),
-        ({"evaluate": {"episodes": 10**9}}, "evaluate.episodes: expected less than or equal to 1000000"),
         ({"task": "antmaze-umaze", "collect": {"behavior": "suboptimal_sac"}}, "use 'suboptimal_ppo'"),
     ],
 )

@@ -20,7 +20,7 @@ from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.recipe import Recipe
 
 fuzzed = settings(
-    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "60")),
+    max_examples=int(os.environ.get("ASTRA_DATA_FUZZ", "40")),
     deadline=None,
     derandomize="ASTRA_DATA_FUZZ" not in os.environ,
     database=None,
@@ -50,7 +50,7 @@ def test_bytes_that_are_no_recipe(content: bytes) -> None:
     load(content)
 
 
-@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", RECIPES[::8], ids=lambda path: path.stem)
 @fuzzed
 @given(place=st.floats(0, 1), text=st.binary(max_size=8), length=st.integers(0, 20))
 def test_a_recipe_with_a_damaged_place(path: Path, place: float, text: bytes, length: int) -> None:
@@ -91,8 +91,3 @@ def test_a_hostile_value_at_any_key(path: Path, share: float, value: object) -> 
     inner[last] = value
     with suppress(RecipeError):
         assert validated(tables, Recipe, "recipe").settings
-
-
-def test_the_settings_of_the_recipes_are_valid() -> None:
-    for path in RECIPES[:4]:
-        validated(json.loads(settings_of(path)), Recipe, "recipe")

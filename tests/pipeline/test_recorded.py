@@ -59,19 +59,6 @@ def test_a_command_moves_the_walker_along_an_arc(recorded: dict[str, Any]) -> No
     torch.testing.assert_close(arc, expected.float())
 
 
-def test_jumps_and_carried_robots_are_left_out(recorded: dict[str, Any]) -> None:
-    state = np.zeros((400, 3))
-    state[:, 0] = 0.002 * np.arange(400)
-    state[100:, 0] += 0.1
-    state[200:, 2] = 0.3
-    state[300:340, 0] += 0.02 * np.arange(40)  # 1.2 m/s for 40 rows
-    state[340:, 0] += 0.8
-    found = [tuple(map(int, ends)) for ends in recorded["walker"].stretches(state, 60)]
-    assert found[:2] == [(0, 99), (100, 199)] and len(found) == 4
-    (begin, carried), (put_down, end) = found[2:]
-    assert (begin, end) == (200, 399) and 280 <= carried <= 290 and 350 <= put_down <= 360
-
-
 def test_ridge_learns_what_recorded_joints_do(
     recorded: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,11 +15,8 @@ from fake_stages import FakeStages
 
 from astra_data.core.artifact import MANIFEST
 from astra_data.core.errors import AstraDataError, BadInputError, MissingStageError, RecipeError
-from astra_data.dataset.format import DATASET_PATH
-from astra_data.pipeline.condition import LOADERS
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.run import check, check_device, make, run, run_stage
-from astra_data.pipeline.stages.registry import STAGES
 from astra_data.reports.results import results_json
 from astra_data.worlds.task import Task
 
@@ -166,14 +163,6 @@ def test_altered_values_of_a_dataset_are_made_again_once_a_step_reads_them(
     assert stages.made[:3] == ["report", "collect/seed_0", "pair/seed_0"] and states(recipe) == {}
 
 
-def test_a_damaged_dataset_that_no_stage_made_is_not_replaced(recipe: Path, folder: Path) -> None:
-    description = folder / "collect/seed_0" / DATASET_PATH
-    description.write_text("{")
-    with pytest.raises(BadInputError, match=r"collect/seed_0 is damaged .* and was not made by this recipe"):
-        run(recipe, root=recipe.parent)
-    assert description.read_text() == "{" and not (folder / "set_aside").exists()
-
-
 def test_an_artifact_of_another_input_is_stale(recipe: Path, folder: Path, stages: FakeStages) -> None:
     recipe.write_text(HEAD.replace("[0]", "[0, 1]"))
     run(recipe, root=recipe.parent)
@@ -193,22 +182,10 @@ def test_an_artifact_of_another_input_is_stale(recipe: Path, folder: Path, stage
 def test_manifests_that_are_missing_or_damaged_and_files_that_are_foreign(recipe: Path, folder: Path) -> None:
     (folder / ALIGN / MANIFEST).unlink()
     (folder / TRAIN / MANIFEST).write_text("{")
-    (folder / GROUND / "notes.txt").touch()
     found = states(recipe)
     assert found[ALIGN] == ("damaged", "manifest.json is missing")
     assert found[TRAIN][0] == "damaged" and found[TRAIN][1].startswith("manifest.json cannot be read")
-    assert found[GROUND] == ("finished", "not of it: notes.txt")
-
-
-def test_results_are_read_as_other_stages_read_them(recipe: Path, folder: Path, tmp_path: Path) -> None:
-    found = states(recipe, verify=True)
-    for key in (GROUND, TRAIN, ALIGN):  # whose fakes are no networks
-        assert found[key][0] == "damaged" and found[key][1].endswith(", after removing this")
-    assert LOADERS.keys() == {stage.name for stage in STAGES.values() if stage.result}
-    (tmp_path / "result").write_text("{}")
-    for load in LOADERS.values():
-        with pytest.raises(AstraDataError):
-            load(tmp_path / "result")
+    assert found.keys() >= {ALIGN, TRAIN} and GROUND not in found
 
 
 def test_a_stage_alone_reads_nothing_missing_and_nothing_altered(
@@ -247,9 +224,11 @@ def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     check_device("cuda:0")
     check_device("cuda", "ray")
-    for device, engine in (("cuda:1", "processes"), ("cuda:1", "ray"), ("mps", "ray")):
+    for device, engine in (("cuda:1", "processes"), ("cuda:1", "ray"), ("mps", "ray"), ("cpu", "threads")):
         with pytest.raises(BadInputError):
             check_device(device, engine)
+    with pytest.raises(BadInputError, match="--address is for --engine ray"):
+        check_device("cpu", address="head:6379")
 
 
 @pytest.mark.parametrize(("engine", "device"), [("processes", "cuda:0"), ("ray", "cpu")])

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rail_run import make_rail_run
+from rail_run import rail_run
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_failures")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_rail_run(tmp_path_factory.mktemp("selecting"))
+    return rail_run(tmp_path_factory, seeds=[0, 1, 2], methods=["direct_transfer", "nas"])
 
 
 @pytest.fixture

@@ -6,12 +6,11 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from rail_run import ROOT, make_rail_run
+from rail_run import ROOT, rail_run
 from typer.testing import CliRunner
 
 from astra_data.cli.app import app
 from astra_data.core.artifact import read_manifest
-from astra_data.core.durable import held
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.pipeline import selecting as module
@@ -27,8 +26,7 @@ pytestmark = pytest.mark.usefixtures("quick_failures")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    rows = '["direct_transfer", "nas", "astra"]'
-    folder = make_rail_run(tmp_path_factory.mktemp("trials"), seeds="[0, 1]", methods=rows)
+    folder = rail_run(tmp_path_factory, seeds=[0, 1], methods=["direct_transfer", "nas", "astra"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Judge, "success", lambda self, policy, episodes, seed: (seed % 97) / 97)
         select(folder)
@@ -111,16 +109,6 @@ def test_candidates_of_a_round_meet_the_same_starts_and_goals(
     assert not set(seeds) & {derive(seed, "evaluation") for seed in range(9)}
 
 
-def test_progress_goes_on_from_the_choice_to_the_trials(
-    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
-    shares: list[float] = []
-    choose_by_trials(folder, 20, field=4, episodes=7, progress=lambda share, note: shares.append(share))
-    assert shares == sorted(shares) and shares[-1] == 1.0 and 0.5 in shares
-    assert sum(share > 0.5 for share in shares) == len(tries.made)
-
-
 @pytest.mark.parametrize("encoder", ["target", "source"])
 def test_policies_are_deployed_as_they_are_evaluated(folder: Path, tries: Tries, encoder: str) -> None:
     recipe = folder / "recipe.json"
@@ -169,29 +157,11 @@ def test_what_trials_cannot_be_made_of_is_refused(folder: Path, tries: Tries) ->
         choose_by_trials(folder, 30, rows=["nothing"])
     assert not tries.made
     choose_by_trials(folder, 12)
-    with pytest.raises(
-        BadInputError, match=r"with trials = 13, found 12 made with 12: use the same settings"
-    ):
-        choose_by_trials(folder, 13)
+    for other, told in (({"trials": 13}, "trials = 13"), ({"trials": 12, "field": 2}, "field = 2")):
+        with pytest.raises(BadInputError, match=rf"with {told}, found 12 made with \d+: use the same set"):
+            choose_by_trials(folder, **other)
     shown = CliRunner().invoke(app, ["select", str(folder), "--field", "3"])
     assert isinstance(shown.exception, BadInputError) and "add --trials" in str(shown.exception)
-
-
-def test_trials_keep_others_out_and_go_on_only_as_they_began(folder: Path, tries: Tries) -> None:
-    held_once: list[bool] = []
-
-    def told(fraction: float, note: str) -> None:
-        with held(folder) as ours:
-            held_once.append(ours)
-        notes.append(note)
-
-    notes: list[str] = []
-    found = choose_by_trials(folder, 20, field=4, progress=told)
-    assert held_once and not any(held_once), "nobody else may work there"
-    first = found.rounds[0].tried[0]
-    assert f"{first.row}, seed {first.seed}: 2 of 2" in notes
-    with pytest.raises(BadInputError, match=r"with field = 3, found 20 made with 4: use the same settings"):
-        choose_by_trials(folder, 20, field=3)
 
 
 def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:

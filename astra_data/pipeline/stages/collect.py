@@ -153,11 +153,7 @@ def collect(
         rate = steps / (time.perf_counter() - trained)
         returns, successes = zip(*((m["return"], m["success"]) for m in writer.staged.values()), strict=True)
         metadata |= {"return_mean": float(np.mean(returns)), "success_rate": float(np.mean(successes))}
-        writer.made = {
-            "behavior": metadata,
-            **stopwatch.spent(),
-            "target_steps_per_second": rate,
-        }
+        writer.made = {"behavior": metadata, **stopwatch.spent(), "target_steps_per_second": rate}
     note = f"return {metadata['return_mean']:.2f}, success {metadata['success_rate']:.2f}"
     progress(1.0, f"{len(returns)} episodes, {note}, {rate:,.0f} target steps/s")
     return folder
@@ -191,7 +187,8 @@ def _record(
     steps = 0
     for first in range(0, config.episodes, _NUM_ENVS):
         rows = range(first, min(first + _NUM_ENVS, config.episodes))
-        if config.least_steps and _steps_before(first, writer) >= config.least_steps:
+        before = sum(length for staged, length in writer.lengths.items() if staged < first)
+        if config.least_steps and before >= config.least_steps:
             break
         if writer.staged.keys() >= set(rows):
             continue
@@ -215,10 +212,6 @@ def _record(
             progress=part(progress, rows.start / config.episodes, rows.stop / config.episodes),
         )
     return steps
-
-
-def _steps_before(position: int, writer: StagedWriter) -> int:
-    return sum(steps for staged, steps in writer.lengths.items() if staged < position)
 
 
 def _keep(least_steps: int, writer: StagedWriter) -> None:
@@ -250,10 +243,9 @@ def _behavior(
     if config.behavior.startswith("suboptimal"):
         from astra_data.policies.collecting import suboptimal_by_ppo, suboptimal_by_sac  # noqa: PLC0415 - slow to import
 
+        by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
-        else:
-            by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
         policy, metadata = by(
             task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress
         )

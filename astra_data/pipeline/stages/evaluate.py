@@ -108,7 +108,15 @@ def evaluate(
     """
     refuse_finished(out)
     world = task_named(task)
-    _check(world, method, policy, grounding)
+    base = method_named(method)
+    if base.trains and policy is None:
+        raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
+    if not base.trains and policy is not None:
+        raise BadInputError(f"method '{method}' has no policy: leave it out, or name the policy's row")
+    if not (base.trains or world.has_target):
+        raise BadInputError(f"method '{method}' acts in a target, and {world.name} has none")
+    if base.grounds and grounding is None:
+        raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
     stopwatch = Stopwatch()
     files = {
         "policy": policy / POLICY if isinstance(policy, Path) else None,
@@ -123,11 +131,16 @@ def evaluate(
     for name in made_from.keys() & {"policy", "target_encoder"}:
         check_made_from(read[name], {"grounding": made_from.get("grounding")})
     if policy is None:
-        row = _follower(world)
+        row = _Row(partial(careful, world), {"source": partial(_careful_in_target, world)}, "source")
     else:
         row = _policy(world, policy if isinstance(policy, PolicyFile) else None, read, config)
-    shared = _shared_simulators(world, read.get("reference"), config) if row.shown_abstract else {}
-    simulators = row.simulators | shared
+    simulators = dict(row.simulators)
+    if row.shown_abstract:
+        groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
+        if "reference" in read:
+            groundings["grounded"] = load_grounding(read["reference"])
+        for name, made in groundings.items():
+            simulators[name] = SimulatorEnv(world.objective, made.simulator(world, config.episodes))
     asked = None if recorded is None else RecordedRange.of(recorded, world.limits)
     tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
     results: dict[str, Any] = {
@@ -159,29 +172,11 @@ def evaluate(
     progress(1.0, f"{first.title} in the {where} {first.text(fmean(results[tested_in][first.measure]))}")
 
 
-def _check(task: Task, method: str, policy: Path | PolicyFile | None, grounding: Path | None) -> None:
-    row = method_named(method)
-    if row.trains and policy is None:
-        raise BadInputError(f"method '{method}' needs its policy: run the stage `train` first")
-    if not row.trains and policy is not None:
-        raise BadInputError(
-            f"method '{method}' has no policy: leave out the policy, or name the policy's row"
-        )
-    if not (row.trains or task.has_target):
-        raise BadInputError(f"method '{method}' acts in a target, and {task.name} has none")
-    if row.grounds and grounding is None:
-        raise BadInputError(f"method '{method}' needs its grounding: run the stage `ground` first")
-
-
 @dataclass(frozen=True)
 class _Row:
-    """What is tested.
+    """What is tested: `begin` starts it in simulators, `robots` in the target, by the encoder.
 
-    Attributes:
-        begin: starts it in simulators. robots: start it in the target, by the encoder it is deployed with.
-        headline: the encoder whose figures are the row's. simulators: the one that it was trained in, if any.
-        shown_abstract: whether it sees abstract states, and so can act in simulators.
-        is_policy: whether it was trained. facts: to be reported.
+    The figures with the encoder `headline` are the row's. `simulators` has the one that it was trained in.
     """
 
     begin: Begin
@@ -191,11 +186,6 @@ class _Row:
     shown_abstract: bool = True
     is_policy: bool = False
     facts: dict[str, Any] = field(default_factory=dict)
-
-
-def _follower(task: Task) -> _Row:
-    robot: Begin = partial(_careful_in_target, task)
-    return _Row(partial(careful, task), {"source": robot}, "source")
 
 
 def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], config: EvaluateConfig) -> _Row:
@@ -210,11 +200,7 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
         robots["target"] = partial(started, aligned, aligned.act)
         headline = config.encoder or ("target" if encoder.is_deployed else "source")
     facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, UserPolicy) else {}
-    facts |= {
-        "encoder": headline,
-        "dataset_version": trained.dataset,
-        "dataset_hash": trained.content_hash,
-    }
+    identity = {"dataset_version": trained.dataset, "dataset_hash": trained.content_hash}
     simulators = {}
     if trained.simulation is not None:
         simulators["simulated"] = own_world(task, trained.simulation, grounding, config.episodes)
@@ -225,7 +211,7 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
         simulators,
         shown_abstract=trained.observed == "abstract",
         is_policy=True,
-        facts=facts,
+        facts={**facts, "encoder": headline, **identity},
     )
 
 
@@ -255,12 +241,10 @@ def _tested_in_target(
     headline = tested[row.headline]
     figures: dict[str, Any] = {}
     if row.is_policy:
+        measures = [score.measure for score in task.objective.scores]
+        outcomes = {kind: episodes.outcome.to_json() for kind, episodes in tested.items()}
         figures["encoders"] = {
-            kind: {
-                score.measure: fmean(episodes.outcome.to_json()[score.measure])
-                for score in task.objective.scores
-            }
-            for kind, episodes in tested.items()
+            kind: {measure: fmean(of[measure]) for measure in measures} for kind, of in outcomes.items()
         }
     figures |= {"target": headline.outcome.to_json(), "target_steps_per_second": headline.rate}
     tensors = {"target.position": headline.outcome.position} | headline.start_goal
@@ -294,13 +278,3 @@ def _tested_in_simulators(
 def _careful_in_target(task: Task, goal: Tensor) -> Act:
     act = careful(task, goal)
     return lambda state, goal: act(task.abstraction(state), goal)
-
-
-def _shared_simulators(task: Task, reference: Path | None, config: EvaluateConfig) -> dict[str, SimulatorEnv]:
-    groundings: dict[str, Grounding] = {"raw": NO_GROUNDING}
-    if reference is not None:
-        groundings["grounded"] = load_grounding(reference)
-    return {
-        name: SimulatorEnv(task.objective, grounding.simulator(task, config.episodes))
-        for name, grounding in groundings.items()
-    }

@@ -6,9 +6,7 @@ A judge is the grounding of another seed, which has episodes of its own; its fai
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 from astra_data.core.artifact import check_made_from, finished_folder
 from astra_data.core.config import AtOnce, Config
@@ -50,11 +48,7 @@ class Entry:
     grounding: str | None
 
     def load(self, root: Path, task: str) -> RunningPolicy:
-        """Return the policy, with the encoder of its own grounding.
-
-        Raises:
-            BadInputError: a file was altered, or the grounding is not the one that the policy was made from.
-        """
+        """Return the policy, with the encoder of its own grounding."""
         policy, grounding = root / self.policy / POLICY, self.grounding and root / self.grounding / GROUNDING
         check_made_from(policy, {"grounding": file_digest(grounding) if grounding else None})
         return running(task_named(task), PolicyFile.load(policy), grounding_at(grounding or None))
@@ -62,12 +56,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Bench:
-    """Who is judged by whom at one size of the dataset.
-
-    Attributes:
-        percent: the size, if there are several. entries: the policies.
-        judges: the seed of each judge → the key of its grounding.
-    """
+    """Who is judged by whom at one size of the dataset: seeds of judges → the keys of their groundings."""
 
     percent: int | None
     entries: tuple[Entry, ...]
@@ -81,23 +70,19 @@ class Bench:
 
     def finished(self, root: Path) -> "Bench":
         """Return those whose artifacts are in a run's folder."""
-        entries = [
-            one
-            for one in self.entries
-            if (root / one.policy / POLICY).is_file()
-            and (one.grounding is None or (root / one.grounding / GROUNDING).is_file())
-        ]
-        judges = {seed: key for seed, key in self.judges.items() if (root / key / GROUNDING).is_file()}
-        return Bench(self.percent, tuple(entries), judges)
+
+        def has_grounding(key: str | None) -> bool:
+            return key is None or (root / key / GROUNDING).is_file()
+
+        entries = [one for one in self.entries if (root / one.policy / POLICY).is_file()]
+        judges = {seed: key for seed, key in self.judges.items() if has_grounding(key)}
+        return Bench(self.percent, tuple(one for one in entries if has_grounding(one.grounding)), judges)
 
 
 def judge_of(judge: str | None, rows: Sequence[str]) -> str:
     """Return the method whose groundings judge the policies of `rows`.
 
     By default that is the reference or, without it, the first row that grounds its simulator.
-
-    Raises:
-        BadInputError: it grounds nothing.
     """
     grounding = (row for row in rows if method_named(row).grounds)
     asked = judge or reference_of(rows) or next(grounding, None)
@@ -110,32 +95,43 @@ def judge_of(judge: str | None, rows: Sequence[str]) -> str:
 
 
 def judge_in(recipe: Reported, config: SelectConfig) -> str:
-    """Return the judge of all policies of a recipe, of which only some rows may be reported.
-
-    Raises:
-        BadInputError: as `judge_of`.
-    """
+    """Return the judge of all policies of a recipe, of which only some rows may be reported."""
     return judge_of(config.judge, recipe.settings["methods"])  # type: ignore[arg-type]
 
 
 def benches(recipe: Reported, judge: str) -> list[Bench]:
     """Return who is judged by whom, at each size; policies that do not act on abstract states are not."""
-    able = [row for row in recipe.methods if method_named(row).trains_without_target]
-    return [_bench(recipe, able, judge, percent) for percent in recipe.percents or (None,)]
+    rows = [row for row in recipe.methods if method_named(row).trains_without_target]
+    able = {row: grounded_as(row) if method_named(row).grounds else None for row in rows}
+    found = []
+    for percent in recipe.percents or (None,):
+        judges = {seed: artifact_key("ground", judge, seed, percent) for seed in recipe.seeds}
+        entries = [
+            Entry(
+                row,
+                seed,
+                percent,
+                artifact_key("train", row, seed, percent),
+                artifact_key("ground", grounded_as(row), seed, percent)
+                if method_named(row).grounds
+                else None,
+            )
+            for row, base in able.items()
+            for seed in recipe.seeds
+        ]
+        found.append(Bench(percent, tuple(entries), judges))
+    return found
 
 
 def digests(of: list[Bench], root: Path) -> dict[str, str]:
     """Return the digest of each artifact that is read, by its key."""
     keys = dict.fromkeys(key for bench in of for key in bench.keys)
-    return {key: _digest(root / key) for key in keys}
+    files = {key: root / key / (POLICY if key.startswith("train/") else GROUNDING) for key in keys}
+    return {key: file_digest(file) for key, file in files.items()}
 
 
 def select(
-    recipe: Reported,
-    config: SelectConfig = SelectConfig(),
-    *,
-    root: Path,
-    progress: Progress = silent,
+    recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Path, progress: Progress = silent
 ) -> None:
     """Try every finished policy of a recipe in groundings of other seeds; write `root`/select, ranked.
 
@@ -147,9 +143,6 @@ def select(
         config: the recipe's `[select]`.
         root: the recipe's folder of runs.
         progress: called with the fraction done and a note.
-
-    Raises:
-        BadInputError: there is no policy, no judge, or there are groundings of fewer than two seeds.
     """
     judge = judge_in(recipe, config)
     contests = [bench.finished(root) for bench in benches(recipe, judge)]
@@ -162,7 +155,11 @@ def select(
         begun = folder / _BEGUN
         known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
         for bench in contests:
-            judge_of_seed = cache(partial(_judge, bench, recipe.task, root))
+            groundings = {seed: root / key / GROUNDING for seed, key in bench.judges.items()}
+            judges = {
+                seed: Judge(task_named(recipe.task), load_grounding(file))
+                for seed, file in groundings.items()
+            }
             for entry in bench.entries:
                 policy, success = entry.load(root, recipe.task), {}
                 for other in bench.judges:
@@ -171,7 +168,7 @@ def select(
                     read = f"{made_from[entry.policy]}/{made_from[bench.judges[other]]}"
                     if read not in known:
                         drawn = derive(other, f"judged: {entry.seed}")
-                        known[read] = judge_of_seed(other).success(policy, config.episodes, drawn)
+                        known[read] = judges[other].success(policy, config.episodes, drawn)
                     success[other] = known[read]
                 write_file(begun, json.dumps(known))
                 found.append(
@@ -179,34 +176,18 @@ def select(
                 )
                 note = f"{entry.row}, seed {entry.seed}: {found[-1].predicted:.2f}"
                 progress(len(found) / total * 0.99, note)
-        record: dict[str, Any] = {
-            "judge": judge,
-            "episodes": config.episodes,
-            "shares_episodes": recipe.settings.get("data") is not None,
-            "candidates": found,
-        }
-        judged = Judged(**record | origin() | stopwatch.spent())
+        judged = Judged(
+            judge=judge,
+            episodes=config.episodes,
+            shares_episodes=recipe.settings.get("data") is not None,
+            candidates=found,
+            **origin() | stopwatch.spent(),
+        )
         begun.unlink()
         (folder / SELECTED).write_text(judged.model_dump_json(indent=1))
         (folder / "select.md").write_text(select_page(recipe.name, judged))
     first = judged.ranked(judged.percents[-1])[0]
     progress(1.0, f"{first.row}, seed {first.seed}: {first.lower:.2f} in the lower quartile of its judges")
-
-
-def _bench(recipe: Reported, rows: list[str], judge: str, percent: int | None) -> Bench:
-    entries = [
-        Entry(
-            row,
-            seed,
-            percent,
-            artifact_key("train", row, seed, percent),
-            artifact_key("ground", grounded_as(row), seed, percent) if method_named(row).grounds else None,
-        )
-        for row in rows
-        for seed in recipe.seeds
-    ]
-    judges = {seed: artifact_key("ground", judge, seed, percent) for seed in recipe.seeds}
-    return Bench(percent, tuple(entries), judges)
 
 
 def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
@@ -219,12 +200,3 @@ def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
             f"{root}: expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}: "
             "groundings of other episodes judge a policy: add seeds to the recipe and run it"
         )
-
-
-def _judge(bench: Bench, task: str, root: Path, seed: int) -> Judge:
-    return Judge(task_named(task), load_grounding(root / bench.judges[seed] / GROUNDING))
-
-
-def _digest(folder: Path) -> str:
-    policy = folder / POLICY
-    return file_digest(policy if policy.is_file() else folder / GROUNDING)

@@ -46,11 +46,10 @@ def known_task(task: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def augmented(collected: Path) -> Path:
+def augmented(collected: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("augmented") / "turned"
     with short_task():
-        return augment(
-            None, CONFIG, dataset=collected, seed=1, out=collected.with_name("turned"), progress=silent
-        )
+        return augment(None, CONFIG, dataset=collected, seed=1, out=out, progress=silent)
 
 
 def facts(dataset: Dataset, index: int) -> dict[str, Any]:
@@ -67,21 +66,6 @@ def copies(source: Dataset, dataset: Dataset) -> Iterator[tuple[Episode, Episode
             steps = slice(int(told["augmentation_first_step"]), None)
             cut = {name: values[steps][: len(copy)] for name, values in original.columns.items()}
             yield copy, Episode(original.uid, cut, original.metadata)
-
-
-def test_as_many_episodes_as_there_are_get_no_copies(collected: Path, tmp_path: Path) -> None:
-    source = Dataset.open(collected)
-    config = AugmentConfig(episodes=len(source))
-    told = list[tuple[float, str]]()
-    same = augment(
-        None, config, dataset=collected, out=tmp_path / "same", progress=lambda *note: told.append(note)
-    )
-    assert [done for done, _ in told] == pytest.approx(np.arange(1, 9) / 8)
-    assert told[-1][1] == "0 copies, no place for 0"
-    dataset = Dataset.open(same)
-    assert dataset.uids.tolist() == source.uids.tolist()
-    assert dataset.description["copies"] == 0
-    assert 0 < dataset.metadata["held_out"].count(True) < len(source)
 
 
 def test_episodes_are_as_many_as_asked_and_none_is_lost(collected: Path, augmented: Path) -> None:
@@ -275,30 +259,6 @@ def test_a_uid_that_is_taken_is_not_given_again() -> None:
     taken = {5, 6, 2**63 - 1, 0}
     assert [_free_uid(uid, taken) for uid in (9, 5, 5, 2**63 - 1)] == [9, 7, 8, 1]
     assert len(taken) == 8
-
-
-def test_originals_can_be_left_out(collected: Path, tmp_path: Path) -> None:
-    config = AugmentConfig(copies=1, keep_originals=False, min_steps=5)
-    dataset = Dataset.open(
-        augment(None, config, dataset=collected, seed=0, out=tmp_path / "out", progress=silent)
-    )
-    kept = set(Dataset.open(collected).uids.tolist()) & set(dataset.uids.tolist())
-    assert len(kept) == 1
-    assert sum(value is True for value in dataset.metadata["held_out"]) == 1
-
-
-def test_copies_may_turn_where_they_are_by_quarters(collected: Path, tmp_path: Path) -> None:
-    """Few turns fit there, so that more tries find more places."""
-    found = []
-    for tries in (1, 100):
-        config = AugmentConfig(copies=4, rotations="quarter", translations=False, min_steps=5, tries=tries)
-        out = augment(None, config, dataset=collected, out=tmp_path / f"{tries}", progress=silent)
-        made = list(copies(Dataset.open(collected), Dataset.open(out)))
-        found.append(len(made))
-        for copy, cut in made:
-            np.testing.assert_allclose(copy.columns[STATE][0, :2], cut.columns[STATE][0, :2], atol=1e-5)
-            assert float(copy.metadata["augmentation_rotation_rad"]) % (np.pi / 2) == pytest.approx(0.0)
-    assert 0 < found[0] < found[1]
 
 
 def test_copies_differ_from_what_they_are_of() -> None:

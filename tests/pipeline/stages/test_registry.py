@@ -39,12 +39,3 @@ def test_a_stage_asks_for_nothing_that_the_plan_does_not_know() -> None:
         needed = {parameter.name for parameter in parameters if parameter.default is parameter.empty}
         assert needed <= known | set(ARTIFACTS) | {"progress"}, stage.name
         assert ("config" in {parameter.name for parameter in parameters}) == (stage.config is not None)
-
-
-def test_datasets_are_made_of_seeds_and_sizes() -> None:
-    assert [name for name, stage in STAGES.items() if stage.makes_dataset] == [
-        *("collect", "label", "augment", "pair", "subset")
-    ]
-    assert {name: stage.asked_by for name, stage in STAGES.items() if stage.asked_by} == {
-        **{"collect": "collect", "label": "data", "augment": "augment", "select": "select"}
-    }

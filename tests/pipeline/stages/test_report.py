@@ -4,7 +4,6 @@ import logging
 import shutil
 from base64 import b64decode
 from collections.abc import Iterator
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +31,7 @@ from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError, MissingStageError
 from astra_data.core.naming import seed_folder
 from astra_data.pipeline.stages import report as stage
-from astra_data.pipeline.stages.report import is_current, report
+from astra_data.pipeline.stages.report import report
 from astra_data.reports.figures import catalog as figures
 from astra_data.reports.results import read_results
 from astra_data.worlds.objective import RETURN, SURVIVED_STEPS
@@ -102,25 +101,6 @@ def test_the_table_of_methods_has_the_targets_column_first(target: str) -> None:
     assert "Direct transfer (floor)" in table
 
 
-def test_a_finished_report_is_current_until_something_changes(root: Path) -> None:
-    make(root)
-    asked = {"root": root, "command": COMMAND, "config": CONFIG}
-    assert is_current(FakeRecipe(), **asked, publish=None)  # type: ignore[arg-type]
-    assert not is_current(replace(FakeRecipe(), seeds=(0, 1)), **asked)  # type: ignore[arg-type]
-    changed = CONFIG.model_copy(update={"trajectory_episodes": 3})
-    assert not is_current(FakeRecipe(), root=root, command=COMMAND, config=changed)
-    path = root / "evaluate/astra/seed_0/evaluation.json"
-    before = path.read_text()
-    edit_json(path, wall_seconds=11.0)
-    assert not is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
-    path.write_text(before)
-    assert is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
-    (root / "report/results.html").unlink()
-    assert not is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
-    shutil.rmtree(root / "report")
-    assert not is_current(FakeRecipe(), **asked)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("changed", [{"paper_success": {"astar": 0.4}}, {"compare": ("astar",)}])
 def test_a_row_that_is_no_method_is_refused(root: Path, changed: dict[str, object]) -> None:
     with pytest.raises(BadInputError, match="astar"):
@@ -133,15 +113,6 @@ def test_intervals_and_probabilities_of_improvement_need_three_seeds(root: Path,
     for name in ("results.md", "results.html"):
         page = (root / "report" / name).read_text()
         assert "Probability of improvement" not in page and "need 3 seeds, ASTRA+ has 2" in page
-
-
-def test_r2_of_rewards_stands_on_the_page(root: Path) -> None:
-    for seed in SEEDS:
-        epochs = [{"r2_reward": 0.9}, {"step": 2, "r2_state": 0.5, "r2_reward": -2.7}]
-        edit_json(root / f"ground/astra/seed_{seed}/metrics.json", epochs=epochs)
-    make(root)
-    page = read_page((root / "report/results.html").read_text())
-    assert page.table("R² of what groundings predict")[1] == ["ASTRA", "0.50", "-2.70"]
 
 
 def test_predicted_failures_are_reported(root: Path) -> None:
@@ -276,18 +247,6 @@ def test_a_robot_that_is_a_stand_in_and_code_of_the_users_are_named(
     assert "**A simulated stand-in (`mujoco`) replaces the physical robot" in page
     assert "- User code: task `0a`, astra `1b`." in page
     assert "- Code: commit `abc` with uncommitted changes (evaluate, train, ground, collect, pair);" in page
-
-
-def test_wall_time_is_that_of_the_whole_not_the_sum_of_what_ran_at_once(root: Path) -> None:
-    for row in ROWS:
-        for seed in SEEDS:
-            path = root / f"evaluate/{row}/seed_{seed}/evaluation.json"
-            edit_json(path, wall_seconds=600.0, finished_at=1000.0 + seed)
-    make(root)
-    page = (root / "report/results.md").read_text()
-    # Twelve evaluations at once take 602 s, what has no end 15 s of collect and 21 s of ground.
-    assert "Wall time of the whole recipe: 11 min" in page
-    assert "| evaluate | 2.0 h |" in page
 
 
 def test_methods_without_simulator_or_seeds_and_datasets_are_reported(root: Path) -> None:

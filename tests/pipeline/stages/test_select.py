@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rail_run import make_rail_run
+from rail_run import rail_run
 
 from astra_data.core.artifact import read_manifest
 from astra_data.core.durable import file_digest
@@ -22,7 +22,7 @@ ROWS, SEEDS = ("direct_transfer", "nas"), (0, 1, 2)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_rail_run(tmp_path_factory.mktemp("select"))
+    return rail_run(tmp_path_factory, seeds=[0, 1, 2], methods=["direct_transfer", "nas"])
 
 
 @pytest.fixture
@@ -134,36 +134,6 @@ def test_another_policy_is_judged_anew_after_an_interruption(
     shutil.copytree(second, first, dirs_exist_ok=True)
     judged(root)
     assert asked[3:5] == asked[:2]
-
-
-def test_policies_of_a_size_are_judged_by_groundings_of_that_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    more = "[sweep]\npercent = [100, 150]\n"
-    root = make_rail_run(tmp_path, seeds="[0, 1]", methods='["nas"]', more=more)
-    loaded, told = [], list[tuple[float, str]]()
-
-    def success(self: Judge, *_: object) -> float:
-        model: Any = self.grounding
-        loaded.append(float(model.model.state_mean))
-        return len(loaded) / 10
-
-    monkeypatch.setattr(Judge, "success", success)
-    recipe = reported(root, methods=("nas",), seeds=(0, 1), percents=(100, 150))
-    found = judged(root, recipe, progress=lambda done, note: told.append((done, note)))
-    assert [done for done, _ in told] == pytest.approx([0.99 / 4, 0.99 / 2, 0.99 * 3 / 4, 0.99, 1.0])
-    assert told[-1][1] == "nas, seed 1: 0.40 in the lower quartile of its judges"  # of the largest size
-    assert [(one.seed, one.percent, *one.success) for one in found.candidates] == [
-        *((0, 100, 1), (1, 100, 0)),
-        *((0, 150, 1), (1, 150, 0)),
-    ]
-    assert found.percents == [100, 150] and len(found.ranked(100)) == 2
-    manifest = read_manifest(root / "select")
-    assert manifest is not None
-    assert "ground/nas/percent_100/seed_1" in manifest.made_from
-    assert len(set(loaded)) == 4
-    page = (root / "select/select.md").read_text()
-    assert "## 100 %" in page and "## 150 %" in page and page.count("**NAS, seed") == 2
 
 
 def test_who_learned_in_the_target_or_nowhere_is_not_judged(root: Path) -> None:

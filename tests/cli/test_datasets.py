@@ -1,0 +1,288 @@
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+from command_line import call, output_of
+from fake_dataset import COLUMNS, DESCRIPTION, fake_episodes, write_fake, writer
+from rich.table import Table
+from toy_logs import Columns, toy_columns, write_logs
+
+from astra_data.cli import app as cli
+from astra_data.cli.arguments import show_table
+from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.dataset.columns import Episode
+from astra_data.dataset.edit import delete, subset
+from astra_data.dataset.versions import open_dataset, versions_at_home
+
+
+@pytest.fixture
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path))
+    write_fake(tmp_path / "fake/data-1.0.0", subset_seed=3)
+    return "fake@data-1.0.0"
+
+
+def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> None:
+    assert "(fake@data-1.1.0, 2 episodes, " in output_of(
+        "subset", fake, "--percent", "40", "--stratify", "success"
+    )
+    assert "(fake@data-1.2.0, 3 episodes, " in output_of("filter", fake, "--without", "13", "--without", "0")
+    assert "(fake@data-1.3.0, 2 episodes, " in output_of("filter", fake, "--success")
+    assert "(fake@data-1.4.0, 3 episodes, " in output_of("filter", fake, "--no-success")
+    assert "(fake@data-1.4.0, 5 episodes, 55 " in output_of(
+        "merge", "fake@data-1.3.0", "fake@data-1.4.0", "--out", str(tmp_path / "here")
+    )
+    assert open_dataset(tmp_path / "here").verify() == []
+    assert len(versions_at_home("fake")) == 5
+
+
+def test_an_edit_tells_what_the_name_means_from_now_on(fake: str, tmp_path: Path) -> None:
+    note = "note: fake now means this version, no longer data-1.0.0; --name keeps both apart\n"
+    assert output_of("subset", fake, "--percent", "40").endswith(note)
+    for apart in (("--name", "part"), ("--out", str(tmp_path / "here"))):
+        assert "note" not in output_of("subset", fake, "--percent", "40", *apart)
+    write_fake(tmp_path / "fake/data-2.0.0", description={**DESCRIPTION, "version": "2.0.0"})
+    # Of an older version, it is not the newest.
+    assert "(fake@data-1.2.0, 2 episodes, " in (output := output_of("subset", fake, "--percent", "40"))
+    assert "note" not in output
+
+
+def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str, tmp_path: Path) -> None:
+    def uids(*arguments: str) -> list[int]:
+        out = tmp_path / "-".join(arguments)
+        output_of(*arguments[:1], fake, *arguments[1:], "--out", str(out))
+        return [int(uid) for uid in open_dataset(out).uids]
+
+    # Returns are half the uids; lengths are 7, 1, 12, 30 and 5.
+    assert uids("filter", "--min-return", "2", "--max-return", "3") == [4, 6]
+    assert uids("filter", "--min-length", "5", "--max-length", "12") == [13, 2**53 + 1, 0]
+    stored = subset(open_dataset(fake), episodes=3, out=tmp_path / "stored")
+    taken = uids("subset", "--episodes", "3")
+    assert taken == open_dataset(stored).uids.tolist()
+    assert taken != uids("subset", "--episodes", "3", "--seed", "0")
+
+
+def test_a_refused_edit_writes_nothing(fake: str) -> None:
+    result = call("filter", fake, "--without", "1")
+    assert isinstance(result.exception, BadInputError)
+    assert len(versions_at_home("fake")) == 1
+
+
+def test_a_recipe_says_its_sizes_itself() -> None:
+    result = call("subset", "r.toml", "--percent", "50")
+    assert str(result.exception) == "subset: the recipe's [sweep] sets this: leave out --percent"
+    result = call("subset", "fake", "--percent", "50", "--seed", "0", "--seed", "1")
+    assert isinstance(result.exception, BadInputError)
+
+
+def test_a_dataset_is_shown_and_drawn(tmp_path: Path) -> None:
+    write_fake(tmp_path / "fake")
+    result = call("inspect", str(tmp_path / "fake"), "--plot", str(tmp_path / "plots"))
+    assert "fake@data-1.0.0: 5 episodes" in result.output
+    assert result.output.splitlines()[-1] == f"written: {tmp_path / 'plots/position_coverage.png'}"
+    # Its roles tell positions but no velocities.
+    (picture,) = (tmp_path / "plots").iterdir()
+    assert matplotlib.image.imread(picture).std() > 0.05
+
+
+def test_findings_are_shown_and_written(tmp_path: Path) -> None:
+    def copied(uid: int, columns: Columns) -> Columns | None:
+        return toy_columns(2) if uid > 20 else None
+
+    logs = tmp_path / "my logs"
+    write_logs(logs, copied)
+    result = call("inspect", str(logs), "--json", str(tmp_path / "found.json"))
+    assert result.exit_code == 0
+    lines = result.output.splitlines()
+    found = json.loads((tmp_path / "found.json").read_text())
+    (finding,) = found["findings"]
+    assert finding["episodes"] == [*range(21, 30)]
+    assert f"astra-data filter '{logs}' --without 21" in finding["advice"]
+    shown = "warning: " + finding["what"] + " (episodes 21, 22, 23, 24, 25 and 4 more): " + finding["advice"]
+    assert lines[-5:] == ["check-up", *found["summary"], shown, f"written: {tmp_path / 'found.json'}"][-5:]
+
+
+def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    write_fake(tmp_path / "fake")
+    write_fake(tmp_path / "mute", columns=[replace(column, astra=None) for column in COLUMNS])
+    for arguments, told in (
+        ([str(tmp_path / "none")], "no such folder"),
+        (
+            [str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")],
+            "expected a state with the role position or vector",
+        ),
+        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "cannot be written: a file is where"),
+    ):
+        error = call("inspect", *arguments).exception
+        assert isinstance(error, AstraDataError)
+        with pytest.raises(AstraDataError, match=told):
+            raise error
+
+
+def test_what_killed_commands_left_is_removed_on_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    dead, other = tmp_path / "home/ant/.data-1.0.0.tmp-7", tmp_path / "runs/.recipe.json.tmp-7"
+    staged = tmp_path / "home/.walks.staged"
+    for folder in (dead, other, staged):
+        folder.mkdir(parents=True)
+    assert call("list", "--clean").output.splitlines() == [
+        f"kept: {staged}: the interrupted command can continue from it; otherwise delete it",
+        f"removed: {dead}",
+    ]
+    assert not dead.exists() and other.exists()
+    assert f"removed: {other}" in call("list", "--clean", str(tmp_path / "runs")).output
+    staged.rmdir()
+    assert call("list", "--clean").output == "found no leftovers of killed commands\n"
+    assert "folders are for --clean" in str(call("list", str(tmp_path / "runs")).exception)
+
+
+def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path))
+    for name in ("broken", "whole"):
+        write_fake(tmp_path / name / "data-1.0.0")
+    (tmp_path / "broken/data-1.0.0/meta/info.json").write_text("{")
+    result = call("list")
+    assert isinstance(result.exception, AstraDataError)
+    assert "broken/data-1.0.0 is incomplete or was altered" in str(result.exception)
+    assert result.output.count("@data-1.0.0") == 2 and "damaged" in result.output
+    (tmp_path / "empty/data-1.0.0").mkdir(parents=True)
+    result = call("list")
+    assert isinstance(result.exception, AstraDataError)
+    assert "empty/data-1.0.0" in str(result.exception) and "broken/data-1.0.0" in str(result.exception)
+    assert result.output.count("@data-1.0.0") == 3
+
+
+@pytest.mark.parametrize("command", [["list"], ["list", "--clean"], ["inspect", "fake"]])
+def test_a_home_that_is_no_folder_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    (tmp_path / "home").touch()
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
+    error = call(*command).exception
+    assert isinstance(error, AstraDataError)
+    assert re.search("home is no folder: expected|expected folders, got .*home", str(error))
+
+
+def test_no_name_controls_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of columns, values, units, tasks, settings and folders; in what is shown, noted and refused."""
+    bad = "a\x1b]0;title\x07\nb\x9b31m"
+    monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / bad))
+    column = replace(COLUMNS[1], name=f"x{bad}", names=(f"x{bad}", "y"), astra={"unit": [bad, "m"]})
+    description: dict[str, object] = {**DESCRIPTION, "config": {bad: bad}, "stage": f"s{bad}"}
+    root = tmp_path / bad / "fake/data-1.0.0"
+    with writer(root, columns=[*COLUMNS, column], task=bad, description=description) as open_writer:
+        for episode in fake_episodes():
+            columns = {**episode.columns, column.name: episode.columns["action"]}
+            open_writer.add(Episode(episode.uid, columns, {bad: 1.0}))
+    (root / "meta" / bad).touch()
+    for command in ("list", "inspect", "log", "validate"):
+        monkeypatch.setattr(sys, "argv", ["astra-data", command, *(["fake"] if command != "list" else [])])
+        with pytest.raises(SystemExit):
+            cli.main()
+        shown = capsys.readouterr()
+        assert not {"\x1b", "\x07", "\x9b"} & {*shown.out, *shown.err}, command
+        assert not re.search("^b", shown.out + shown.err, re.MULTILINE)
+    monkeypatch.setattr(sys, "argv", ["astra-data", "inspect", str(tmp_path / f"none{bad}")])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert capsys.readouterr().err.count("\n  b") == 1
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["astra-data", *map(str, arguments)])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    return int(left.value.code or 0)
+
+
+def test_validate_and_repair(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    assert called(monkeypatch, "validate", root) == 0
+    told = capsys.readouterr().out
+    assert told.startswith(f"{root} is intact: 5 episodes, 55 steps\nepisodes end: ")
+    (root / "meta/tasks.parquet").unlink()
+    (root / "meta/stats.json").write_text("{}")
+    assert called(monkeypatch, "validate", root) == 1
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: {root} has ")
+    assert "meta/tasks.parquet is missing" in told
+    assert "meta/stats.json: min of observation.state is None" in told
+    assert told.endswith(f"astra-data repair {root} --out DIR\n")
+    assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 0
+    assert "finished: " in capsys.readouterr().out
+    assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
+    assert "exists already" in capsys.readouterr().err
+    assert called(monkeypatch, "validate", tmp_path / "saved") == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "fault"),
+    [
+        ("{", "meta/info.json is no JSON object"),
+        ("{}", "fps is None"),
+        ('{"fps": 10, "features": {}}', "data_path is None"),
+    ],
+)
+def test_repair_is_not_advised_where_it_cannot_help(
+    content: str,
+    fault: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    root = write_fake(tmp_path / "set").root
+    (root / "meta/info.json").write_text(content)
+    assert called(monkeypatch, "validate", root) == 1
+    told = capsys.readouterr().err
+    assert fault in told and "astra-data repair" not in told
+    assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1
+
+
+def test_lineage_and_differences_are_shown(tmp_path: Path) -> None:
+    first = write_fake(tmp_path / "first")
+    made = delete(first, [13], out=tmp_path / "made")
+    assert output_of("log", str(made)).splitlines()[1].startswith("└── fake@data-1.0.0  ")
+    told = output_of("log", str(first.root), str(made)).splitlines()
+    assert told[:3] == [
+        "fake@data-1.0.0: 5 episodes, 55 steps",
+        "fake@data-1.1.0: 4 episodes, 48 steps",
+        "1 episodes only in fake@data-1.0.0: 13",
+    ]
+    assert "stage: 'collect', then 'delete'" in told
+    back = output_of("log", str(made), str(first.root)).splitlines()
+    assert back[2] == "1 episodes only in fake@data-1.0.0: 13"
+
+
+def test_values_are_told_from_metadata(tmp_path: Path) -> None:
+    first, second = write_fake(tmp_path / "first"), tmp_path / "second"
+    with writer(second) as open_writer:
+        for episode in fake_episodes():
+            open_writer.add(replace(episode, metadata={**episode.metadata, "source": "log.csv"}))
+    told = output_of("log", str(first.root), str(second)).splitlines()
+    assert told[2:] == [
+        "0 episodes differ in values",
+        "5 episodes differ in metadata: source (0, 4, 6, 13, 9007199254740993)",
+    ]
+    other = write_fake(tmp_path / "other")
+    assert output_of("log", str(first.root), str(other.root)).splitlines()[2:] == []
+
+
+def test_cells_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table("field")
+    cells = ("x[m]", "rate[/s]", "pose:x:raw")
+    for cell in cells:
+        table.add_row(cell)
+    show_table(table)
+    shown = capsys.readouterr().out
+    assert all(cell in shown for cell in cells)

@@ -1,0 +1,80 @@
+"""The artifacts of one small run, made once by all processes of the tests."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from shared_runs import shared
+from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
+
+from astra_data.core.artifact import write_manifest
+from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.pipeline.stages.align import align
+from astra_data.pipeline.stages.collect import collect
+from astra_data.pipeline.stages.ground import ground
+from astra_data.pipeline.stages.pair import pair
+from astra_data.pipeline.stages.train import train
+
+
+@pytest.fixture
+def task() -> Iterator[str]:
+    with short_task():
+        yield TASK
+
+
+def make(folder: Path) -> None:
+    """Make ASTRA's artifacts of seed 0, and a policy of each of two rows."""
+    pairs, grounding = folder / "pair/seed_0", folder / "ground/astra/seed_0"
+    with short_task():
+        walks = collect(TASK, COLLECT, seed=0, out=folder / "collect/seed_0")
+        pair(TASK, dataset=walks, out=pairs)
+        ground(TASK, "astra", GROUND, dataset=pairs, out=grounding)
+        align(ALIGN, dataset=pairs, grounding=grounding, out=folder / "align/astra/seed_0")
+        for row in ("astra", "astra_plus"):
+            out = folder / "train" / row / "seed_0"
+            train(TASK, row, TRAIN, dataset=pairs, grounding=grounding, out=out)
+    settings = {"task": "antmaze-umaze", "evaluate": {"encoder": "target"}}  # though few updates fit it badly
+    (folder / "recipe.json").write_text(json.dumps(settings))
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the run."""
+    return shared(tmp_path_factory, "small", make)
+
+
+@pytest.fixture(scope="session")
+def collected(small: Path) -> Path:
+    return small / "collect/seed_0"
+
+
+@pytest.fixture(scope="session")
+def paired(small: Path) -> Path:
+    return small / "pair/seed_0"
+
+
+@pytest.fixture(scope="session")
+def grounded(small: Path) -> Path:
+    return small / "ground/astra/seed_0"
+
+
+@pytest.fixture(scope="session")
+def trained(small: Path) -> Path:
+    return small / "train/astra/seed_0"
+
+
+@pytest.fixture(scope="session")
+def aligned(small: Path) -> Path:
+    return small / "align/astra/seed_0"
+
+
+@pytest.fixture(scope="session")
+def grounded_anew(grounded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A grounding with the same settings and other weights."""
+    out = Path(shutil.copytree(grounded, tmp_path_factory.mktemp("anew") / "grounding"))
+    tensors, told = load_tensors(out / "grounding.safetensors")
+    save_tensors(out / "grounding.safetensors", {name: value * 0.5 for name, value in tensors.items()}, told)
+    write_manifest(out, {})
+    return out
