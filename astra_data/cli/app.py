@@ -8,7 +8,7 @@ from importlib.metadata import version
 from typing import Annotated
 
 import typer
-from typer.core import TyperArgument
+from typer.core import TyperArgument, TyperOption
 
 from astra_data.cli import building, datasets, recipes, sharing, starting
 from astra_data.core.durable import NO_FSYNC, disk_error
@@ -97,8 +97,13 @@ PANELS: dict[str, dict[str, Callable[..., None]]] = {
     },
 }
 """Commands by what to type for each, as is said below its help; its first word is its name."""
+_KINDS = {"int": "NUMBER", "float": "NUMBER", "str": "TEXT", "path": "PATH"}
 TyperArgument.display_type_rich = lambda self, ctx: None  # type: ignore[method-assign]
 """What an argument is, its name says."""
+TyperOption.display_type = (  # type: ignore[method-assign]
+    lambda self, ctx: _KINDS.get(self.bare_type().removeprefix("list[").removesuffix("]").lower(), "")
+)
+"""And what an option takes, these words rather than its type."""
 for panel, commands in PANELS.items():
     for example, command in commands.items():
         epilog = f"Example: astra-data {example}"

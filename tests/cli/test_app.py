@@ -17,8 +17,6 @@ from astra_data.cli import app as cli
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.reader import Dataset
 
-HEAVY = {"torch", "numpy", "pydantic", "lerobot", "mujoco", "matplotlib"}
-
 
 def test_help_loads_none_of_the_large_packages() -> None:
     """They take seconds, and what `--help` and completion say needs none of them."""
@@ -113,17 +111,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         '{"task": "antmaze-umaze", "methods": ["nas"], "seeds": [0]}'
     )
     return folder
-
-
-def test_a_mistake_loads_no_torch(place: Path) -> None:
-    """Also what the test's own process has loaded already: in a process of its own."""
-    code = (
-        "import sys; from astra_data.cli import app as cli; sys.argv = ['astra-data', 'run', 'nope.toml']\n"
-        "try: cli.main()\nexcept SystemExit: print(*sorted(name for name in sys.modules if '.' not in name))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=place, capture_output=True, text=True, check=True)
-    assert done.stderr == "error: nope.toml does not exist: did you mean 'broken.toml'?\n"
-    assert not (HEAVY - {"pydantic"}) & set(done.stdout.split())
 
 
 def test_every_command_has_an_example_of_options_that_it_has() -> None:

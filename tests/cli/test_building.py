@@ -44,24 +44,6 @@ def test_an_option_of_0_is_given(home: Path) -> None:
     assert open_dataset("walks").description["config"]["reset_tolerance"] == 0.0
 
 
-def test_commands_may_be_held_for_no_time(home: Path) -> None:
-    call("collect", "antmaze-umaze", *SMALL, "--hold-s", "0", "0", "--name", "restless")
-    call("collect", "antmaze-umaze", *SMALL, "--hold-s", "9", "9", "--name", "patient")
-    counts = [
-        len({tuple(row) for row in open_dataset(name).columns(["action"], [0])["action"].tolist()})
-        for name in ("restless", "patient")
-    ]
-    assert counts == [3, 1]
-
-
-def test_folder_and_name_can_be_chosen(tmp_path: Path) -> None:
-    assert (
-        call("collect", "antmaze-long", *SMALL, "--out", str(tmp_path / "a"), "--name", "walks").exit_code
-        == 0
-    )
-    assert Dataset.open(tmp_path / "a").reference == "walks@data-1.0.0"
-
-
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -96,16 +78,6 @@ def test_what_does_not_fit_is_told(home: Path, arguments: list[str], told: str) 
     assert not home.exists()
 
 
-def test_datasets_at_home_are_listed(home: Path) -> None:
-    call("collect", "antmaze-umaze", *SMALL, "--name", "walks")
-    call("pair", "walks", "--simulator", "antmaze-umaze", "--name", "pairs")
-    told = call("list").output
-    assert [line.split()[1] for line in told.splitlines() if "@" in line] == [
-        "pairs@data-1.0.0",
-        "walks@data-1.0.0",
-    ]
-
-
 def test_stopping_a_recording_says_how_to_go_on(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add = StagedWriter.add
 
@@ -136,12 +108,6 @@ def test_a_dataset_is_augmented_beside_itself(home: Path) -> None:
         copies=2, margin_m=0.3, min_steps=3, rotations="none"
     ).model_dump(mode="json")
     assert dataset.description["seeds"]["augment"] == 5
-
-
-def test_every_setting_is_an_option() -> None:
-    shown = call("augment", "--help").output
-    for name in AugmentConfig.model_fields:
-        assert f"--{name.replace('_', '-')}" in shown
 
 
 @pytest.mark.parametrize(

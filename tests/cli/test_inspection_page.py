@@ -5,33 +5,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from astra_data.cli.inspection_page import inspection_page, shaded, sparkline
+from astra_data.cli.inspection_page import inspection_page
 from astra_data.dataset.checkup.checkup import Checkup
 from astra_data.dataset.checkup.findings import Finding
 from astra_data.dataset.columns import Column
 from astra_data.dataset.inspection import BINS, Endings, Inspection, Map, Spread
-
-
-def plane(counts: list[list[int]]) -> Map:
-    """A map whose first row of `counts` is the lowest."""
-    return Map(np.array(counts), np.array([-1.0, 2.0]), 0.5)
-
-
-def test_bars_grow_with_their_counts_and_only_nothing_is_empty() -> None:
-    assert sparkline(np.array([0, 1, 50, 100])) == " ▁▄█"
-    assert sparkline(np.array([0, 1, 10**9])) == " ▁█"
-    assert sparkline(np.zeros(3, np.int64)) == "   "
-
-
-def test_the_top_of_a_map_comes_first_and_a_character_is_two_cells_high() -> None:
-    assert shaded(plane([[0, 4], [0, 0], [0, 0], [9, 0]])) == "█\n ▓"
-    assert shaded(plane([[1, 0, 0], [0, 0, 0], [0, 0, 1]])) == "  █\n█"
-
-
-def test_shades_follow_the_square_root_of_the_visits() -> None:
-    # 100 visits are the darkest of four shades; 36 give 0.6 of the root, 4 give 0.2.
-    assert shaded(plane([[0, 4, 36, 100], [0, 0, 0, 0]])) == " ░▓█"
-
 
 NOTHING = Checkup("fake@data-1.0.0", ("endings: 3 cut", "rate: 20 Hz declared"), ())
 
@@ -67,7 +45,7 @@ def inspection(success: int | None) -> Inspection:
         success=success,
         endings=Endings(terminated=2, cut_off=1, made_up=1),
         spreads=(spread,),
-        positions=plane([[1, 0], [0, 0]]),
+        positions=Map(np.array([[1, 0], [0, 0]]), np.array([-1.0, 2.0]), 0.5),
         velocities=None,
     )
 

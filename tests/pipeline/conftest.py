@@ -1,4 +1,4 @@
-"""The artifacts of one small run, made once by all processes of the tests."""
+"""Two small runs, of the ant and of a cart's logs, each made once by all processes of the tests."""
 
 import json
 import shutil
@@ -6,16 +6,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from quick_runs import fit_failures_quickly, run_here, small_tables
 from shared_runs import shared
 from small_run import ALIGN, COLLECT, GROUND, TASK, TRAIN, short_task
 
 from astra_data.core.artifact import write_manifest
 from astra_data.core.checkpoint import load_tensors, save_tensors
+from astra_data.io.importing import import_dataset
 from astra_data.pipeline.stages.align import align
 from astra_data.pipeline.stages.collect import collect
 from astra_data.pipeline.stages.ground import ground
 from astra_data.pipeline.stages.pair import pair
 from astra_data.pipeline.stages.train import train
+from astra_data.worlds.user_code import user_object
 
 
 @pytest.fixture
@@ -78,3 +81,26 @@ def grounded_anew(grounded: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     save_tensors(out / "grounding.safetensors", {name: value * 0.5 for name, value in tensors.items()}, told)
     write_manifest(out, {})
     return out
+
+
+def make_cart(folder: Path) -> None:
+    """Make the run of a recipe that the cart's logs are imported for, with a task that has no target."""
+    example = Path(__file__).parents[2] / "recipes/examples/cart"
+    user_object(f"{example}/robot.py:record")(folder / "csv", drives=8, seconds=6)
+    (folder / "cart.py").write_text((example / "cart.py").read_text())
+    import_dataset(sorted((folder / "csv").glob("*.csv")), example / "logs.toml", out=folder / "logs")
+    rows = (
+        'task = "cart.py:TASK"\ndata = "logs"\nmethods = ["direct_transfer", "nas", "astra"]\nseeds = [0]\n'
+    )
+    tables = small_tables(held_out_share=0.25, episodes=3, train="data_start_share = 0.0")
+    (folder / "cart.toml").write_text(rows + tables)
+    with pytest.MonkeyPatch.context() as patch:
+        fit_failures_quickly(patch)
+        run_here(folder / "cart.toml")
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of the module's own with the cart's code, logs, recipe and run."""
+    whole = shared(tmp_path_factory, "cart", make_cart)
+    return Path(shutil.copytree(whole, tmp_path_factory.mktemp("cart") / "cart"))

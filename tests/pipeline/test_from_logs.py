@@ -2,7 +2,6 @@
 
 import json
 import re
-import runpy
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -30,18 +29,6 @@ CART = Path(__file__).parents[2] / "recipes/examples/cart"
 SMALL = small_tables(held_out_share=0.25, episodes=3)
 
 
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the cart's task, a dataset of 8 drives, imported from CSV, and no target."""
-    folder = tmp_path_factory.mktemp("cart")
-    with pytest.MonkeyPatch.context() as as_a_script:
-        as_a_script.syspath_prepend(CART)
-        runpy.run_path(str(CART / "robot.py"))["record"](folder / "csv", drives=8, seconds=6)
-    (folder / "cart.py").write_text((CART / "cart.py").read_text())
-    import_dataset(sorted((folder / "csv").glob("*.csv")), CART / "logs.toml", out=folder / "logs")
-    return folder
-
-
 def made(
     folder: Path, name: str, text: str, wanted: Callable[[str], bool] = lambda stage: True
 ) -> tuple[Path, list[str]]:
@@ -56,9 +43,9 @@ def made(
     return experiment.folder, [item.key for item in items]
 
 
-def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
-    folder, keys = made(logs, "cart", 'methods = ["direct_transfer", "nas", "astra"]\n')
-    assert keys[:2] == ["label/seed_0", "pair/seed_0"] and not any(key.startswith("collect") for key in keys)
+def test_logs_become_policies_and_a_page_without_a_target(cart: Path) -> None:
+    folder = cart / "runs/cart"
+    assert not (folder / "collect").exists()
     labeled = Dataset.open(folder / "label/seed_0")
     assert REWARD in labeled.features and GOAL not in labeled.features and len(labeled) == 8
     for row in ("direct_transfer", "nas", "astra"):
@@ -83,13 +70,13 @@ def test_logs_become_policies_and_a_page_without_a_target(logs: Path) -> None:
     assert action.shape == (2, 2) and bool(np.isfinite(action.numpy()).all())
 
 
-def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
+def test_held_out_errors_say_how_much_data_is_enough(cart: Path) -> None:
     until = ("label", "pair", "subset", "ground")
     text = 'methods = ["nas"]\n[sweep]\npercent = [50, 100]\n'
-    folder, keys = made(logs, "sizes", text, lambda key: key.split("/")[0] in until)
+    folder, keys = made(cart, "sizes", text, lambda key: key.split("/")[0] in until)
     assert "subset/percent_050/seed_0" in keys
     assert len(Dataset.open(folder / "subset/percent_050/seed_0")) == 4
-    experiment = load_experiment(logs / "sizes.toml", logs / "runs")
+    experiment = load_experiment(cart / "sizes.toml", cart / "runs")
     page = write_errors(experiment, Selection.of(experiment.recipe))
     assert page is not None
     lines = page.read_text().splitlines()
@@ -104,9 +91,9 @@ def test_held_out_errors_say_how_much_data_is_enough(logs: Path) -> None:
     assert sum(line.startswith("- NAS, `") for line in lines) == 4
 
 
-def test_other_data_of_the_same_name_are_labeled_anew(logs: Path, tmp_path: Path) -> None:
-    shutil.copy(logs / "cart.py", tmp_path / "cart.py")
-    drives = sorted((logs / "csv").glob("*.csv"))
+def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path) -> None:
+    shutil.copy(cart / "cart.py", tmp_path / "cart.py")
+    drives = sorted((cart / "csv").glob("*.csv"))
     import_dataset(drives, CART / "logs.toml", out=tmp_path / "logs")
     made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
     path = tmp_path / "again.toml"

@@ -25,23 +25,6 @@ def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> 
     assert plan(experiment.recipe, path, experiment.folder)
 
 
-def test_only_the_legs_differ_in_the_morphology_test() -> None:
-    experiment = load_experiment(HOUSE / "recipes" / "leg_scale.toml", Path("runs"))
-    assert experiment.recipe.evaluate.leg_scale == 1.25
-    assert experiment.borrowed == {"collect", "pair", "ground", "train", "align"}
-
-
-@pytest.mark.parametrize("name", ["kinematics", "extended"])
-def test_only_the_simulator_differs_in_the_humanoids_tests(name: str) -> None:
-    ours, base = (
-        load_experiment(HOUSE / "recipes" / f"humanoid_{kind}.toml", Path("runs"))
-        for kind in (name, "walker2d")
-    )
-    assert ours.borrowed == {"collect"}
-    kept = ours.recipe.model_copy(update={"task": base.recipe.task, "based_on": None})
-    assert kept == base.recipe
-
-
 HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[collect]\n'
 
 

@@ -65,19 +65,6 @@ def test_a_choice_that_is_there_is_kept_and_another_set_aside(
     assert (folder / "select/select.md").is_file() and (folder / "set_aside/3/select").is_dir()
 
 
-def test_trials_that_are_set_aside_are_told(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
-    for episodes, trials in ((5, False), (6, True), (7, False)):
-        select(folder, rows=["nas"], episodes=episodes)
-        if trials:
-            (folder / "select/trials.json").write_text("{}")
-    (told,) = [record.getMessage() for record in caplog.records]
-    assert told.endswith(f"the old choice, with its trials in the target, is in {folder}/set_aside/2/select")
-    assert (folder / "set_aside/2/select/trials.json").is_file()
-
-
 def test_a_choice_among_other_policies_is_made_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
     assert len(select(folder, rows=["nas"]).candidates) == 3

@@ -1,6 +1,3 @@
-import os
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -62,20 +59,6 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
         copy_recipe("quickstart", tmp_path)
     assert changed.read_text() == "TASK = None\n"
     assert not (tmp_path / "quickstart.toml").exists()
-
-
-def test_in_a_checkout_all_is_there() -> None:
-    assert copy_recipe("quickstart", RECIPES) == []
-
-
-def test_the_package_may_be_reached_through_a_link(tmp_path: Path) -> None:
-    (tmp_path / "link").symlink_to(RECIPES.parent)
-    code = "from astra_data.pipeline.shipped import shipped; print(len(shipped('cart').files))"
-    settings = os.environ | {"PYTHONPATH": str(tmp_path / "link")}
-    told = subprocess.run(
-        [sys.executable, "-c", code], env=settings, cwd=tmp_path, check=True, capture_output=True, text=True
-    )
-    assert int(told.stdout) == len(shipped("cart").files)
 
 
 def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:

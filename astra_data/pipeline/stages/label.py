@@ -117,41 +117,27 @@ def label(
 
 def remarks(source: Dataset, task: Task) -> list[str]:
     """Say what is to be checked of a dataset that fits a task."""
-    named = names_apart(source, (task.state, task.action), task.name)
-    return [*_broken_steps(source), *filter(None, (named, _all_failures(source), _drawn_goals(source, task)))]
-
-
-def _broken_steps(source: Dataset) -> list[str]:
-    """Say that steps do not lead to the row after them, which a correction would be fitted to."""
     continuity = Continuity()
     for episode in source.episodes([STATE, NEXT_STATE]):
         continuity.add(episode)
-    return [f"{finding.what}: {finding.advice}" for finding in continuity.findings()]
-
-
-def _all_failures(source: Dataset) -> str:
-    """Say that every episode counts as a failure, where each terminates and no success is recorded."""
-    if TERMINATED not in source.features or SUCCESS in source.features:
-        return ""
-    if not all(is_terminated(episode.columns) for episode in source.episodes([TERMINATED])):
-        return ""
-    return (
-        f"{source.reference}: each of the {len(source)} episodes ends as {TERMINATED} and counts as a "
-        f"failure, as there is no {SUCCESS}: import that too if they succeeded, or leave {TERMINATED} out of "
-        "the mapping if it only marks where each recording ends"
-    )
-
-
-def _drawn_goals(source: Dataset, task: Task) -> str:
-    """Say that goals are drawn, where a task has some and the data have none; empty otherwise."""
-    if task.goal is None or GOAL in source.features:
-        return ""
-    alike = [name for name in source.features if "goal" in name.lower()]
-    mistaken = f" ({', '.join(alike)} is not read as one)" if alike else ""
-    return (
-        f"{source.reference} has no {GOAL}{mistaken}: goals are drawn by the objective, one an episode "
-        f"(goal_size is {task.objective.goal_size}); import those that the robot had into that column"
-    )
+    found = [f"{finding.what}: {finding.advice}" for finding in continuity.findings()]
+    if named := names_apart(source, (task.state, task.action), task.name):
+        found.append(named)
+    has_ends = TERMINATED in source.features and SUCCESS not in source.features
+    if has_ends and all(is_terminated(episode.columns) for episode in source.episodes([TERMINATED])):
+        found.append(
+            f"{source.reference}: each of the {len(source)} episodes ends as {TERMINATED} and counts as a "
+            f"failure, as there is no {SUCCESS}: import that too if they succeeded, or leave {TERMINATED} "
+            "out of the mapping if it only marks where each recording ends"
+        )
+    if task.goal is not None and GOAL not in source.features:
+        alike = [name for name in source.features if "goal" in name.lower()]
+        mistaken = f" ({', '.join(alike)} is not read as one)" if alike else ""
+        found.append(
+            f"{source.reference} has no {GOAL}{mistaken}: goals are drawn by the objective, one an episode "
+            f"(goal_size is {task.objective.goal_size}); import those that the robot had into that column"
+        )
+    return found
 
 
 def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:

@@ -161,17 +161,9 @@ def pair_steps(
 ) -> tuple[dict[str, Array], float]:
     """Reset `batch` to φ(s) of each of N target steps and step it with the recorded action.
 
-    Args:
-        pairing: the simulator and φ.
-        batch: B of these simulators; the N steps are taken B at a time.
-        state: target states, (N, S).
-        action: (N, A), or (N,).
-        next_state: (N, S).
-        tolerance: see `PairConfig`.
-        first_step: number of the first of these steps in the dataset, for messages.
-
-    Returns:
-        the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
+    Take target states (N, S), actions (N, A) and next states (N, S); `batch` has B simulators, and the N
+    steps are taken B at a time. Return the `abstract.*` columns (N, X), and the largest difference between
+    φ(s) and the reset simulator. `first_step` is the number of the first of these steps, for messages.
 
     Raises:
         BadInputError: the difference is larger than `tolerance`, the simulator's states are not finite or no

@@ -213,26 +213,6 @@ def test_only_as_many_episodes_are_kept_as_have_the_steps(
     assert len(Dataset.open(tmp_path / "exactly")) == 2 and batches == [range(2)]
 
 
-@pytest.mark.usefixtures("batches_of_two")
-def test_an_episode_that_an_interruption_cut_off_counts_before_later_ones(
-    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = TINY.model_copy(update={"episodes": 4, "least_steps": 15})
-    add = StagedWriter.add
-
-    def failing(writer: StagedWriter, episode: Episode, position: int | None = None) -> None:
-        if position == 1:
-            add(writer, episode, position)
-            raise KeyboardInterrupt  # while episode 0 still goes on
-
-    monkeypatch.setattr(StagedWriter, "add", failing)
-    with pytest.raises(KeyboardInterrupt):
-        collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
-    monkeypatch.setattr(StagedWriter, "add", add)
-    collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
-    assert Dataset.open(tmp_path / "out").uids.tolist() == [0]
-
-
 def test_too_few_episodes_for_the_steps_are_told(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"episodes": 2, "max_steps": 5, "least_steps": 11})
     with pytest.raises(
@@ -358,17 +338,3 @@ def test_commands_that_lead_to_walls_are_replaced_where_it_is_asked_for(task: st
         near = watch.clearance(torch.from_numpy(columns[STATE]), commands) < 1.0
         foreseen[clearance_m] = near.mean()
     assert foreseen[1.0] < 0.5 * foreseen[0.0]
-
-
-@pytest.mark.usefixtures("small_training", "batches_of_two")
-@pytest.mark.parametrize("behavior", ["random", "suboptimal_ppo"])
-def test_progress_goes_on_from_the_training_and_from_batch_to_batch(
-    behavior: str, task: str, tmp_path: Path
-) -> None:
-    settings = {"behavior": behavior, "ppo_steps": 1, "episodes": 4, "max_steps": 3}
-    told = list[float]()
-    config = TINY.model_copy(update=settings)
-    collect(task, config, seed=0, out=tmp_path / "out", progress=lambda share, _: told.append(share))
-    assert told == sorted(told) and told[-1] == 1.0 and len(told) >= 2 * 3
-    if behavior == "random":
-        assert told[:6] == pytest.approx([(step + 1) / 6 for step in range(6)])

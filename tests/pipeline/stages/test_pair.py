@@ -214,13 +214,6 @@ def test_names_that_are_not_the_tasks_are_told(
     assert "takes left, right of action as " in caplog.text
 
 
-def test_commands_of_another_robot_are_refused(collected: Path, tmp_path: Path) -> None:
-    other = Column(ACTION, size=1, names=("throttle",))
-    source = rewritten(Dataset.open(collected), tmp_path / "other", {ACTION: other})
-    with pytest.raises(BadInputError, match=r"action has 1 values, expected those of antmaze-umaze: 2"):
-        pair("antmaze-umaze", PairConfig(), dataset=source, out=tmp_path / "out", progress=silent)
-
-
 @pytest.mark.parametrize(
     ("state", "told"),
     [
