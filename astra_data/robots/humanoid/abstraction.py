@@ -5,8 +5,8 @@ which the dynamics do not depend on. Kinematics are in the torso's frame, in m.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -32,41 +32,26 @@ from astra_data.worlds.geometry import rotation
 _TORSO = 1
 
 
-@dataclass(frozen=True)
-class _Link:
-    """A body below the torso, as the model describes it.
-
-    Attributes:
-        parent: number of the parent body.
-        offset: from the parent's origin to its own, (3,). turn: from its axes to the parent's, (3, 3).
-        joints: their numbers among all 17. anchors: a point on each joint's axis, (3,).
-    """
+class _Link(NamedTuple):
+    """A body below the torso, as the model describes it."""
 
     parent: int
-    offset: Tensor
-    turn: Tensor
-    joints: tuple[int, ...]
-    anchors: tuple[Tensor, ...]
+    offset: Tensor  # from the parent's origin to its own, (3,)
+    turn: Tensor  # from its axes to the parent's, (3, 3)
+    joints: tuple[int, ...]  # among all 17
+    anchors: tuple[Tensor, ...]  # a point on each joint's axis, (3,)
 
 
-@dataclass(frozen=True)
-class _Skeleton:
-    """All bodies, in an order in which parents come first.
+class _Skeleton(NamedTuple):
+    """All bodies, in an order in which parents come first."""
 
-    Attributes:
-        links: by the body's number. axes: of the joints in their bodies, (17, 3). crosses: matrices K with K
-        v = axis x v, (17, 3, 3). centers: of mass of each of the 13 bodies in its own frame, (3,) by its
-        number. shares: of the bodies in the total mass, (13,). moved: the shares that each joint moves, (17,
-        13). feet: number of the body that each foot belongs to, and the foot's center, (3,).
-    """
-
-    links: dict[int, _Link]
-    axes: Tensor
-    crosses: Tensor
-    centers: dict[int, Tensor]
-    shares: Tensor
-    moved: Tensor
-    feet: tuple[tuple[int, Tensor], ...]
+    links: dict[int, _Link]  # by the body's number
+    axes: Tensor  # of the joints in their bodies, (17, 3)
+    crosses: Tensor  # matrices K with K v = axis x v, (17, 3, 3)
+    centers: dict[int, Tensor]  # of mass of each of the 13 bodies in its own frame, (3,)
+    shares: Tensor  # of the bodies in the total mass, (13,)
+    moved: Tensor  # the shares that each joint moves, (17, 13)
+    feet: tuple[tuple[int, Tensor], ...]  # body that each foot belongs to, and the foot's center, (3,)
 
 
 @cache
@@ -108,20 +93,14 @@ def _skeleton(dtype: torch.dtype, device: torch.device) -> _Skeleton:
     )
 
 
-@dataclass(frozen=True)
-class _Placed:
-    """Positions of the parts of a humanoid.
+class _Placed(NamedTuple):
+    """Positions of the parts of a humanoid."""
 
-    Attributes:
-        mass: center of mass, (..., 3). centers: those of the bodies, (..., 13, 3). feet: (..., 2, 3).
-        axes: of the joints, (..., 17, 3). anchors: points on them, (..., 17, 3).
-    """
-
-    mass: Tensor
-    centers: Tensor
-    feet: Tensor
-    axes: Tensor
-    anchors: Tensor
+    mass: Tensor  # center of mass, (..., 3)
+    centers: Tensor  # those of the bodies, (..., 13, 3)
+    feet: Tensor  # (..., 2, 3)
+    axes: Tensor  # of the joints, (..., 17, 3)
+    anchors: Tensor  # points on them, (..., 17, 3)
 
 
 def _place(joints: Tensor) -> _Placed:
@@ -185,7 +164,26 @@ _SPIN = slice(POSITIONS + 3, POSITIONS + 6)
 _RATES = slice(POSITIONS + 6, None)
 
 
-def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+class Phi:
+    """φ of tensors, which takes and returns arrays, too."""
+
+    def __init__(self, of_tensors: Callable[[Tensor], Tensor]) -> None:
+        self._of_tensors = of_tensors
+        self.__name__, self.__doc__ = of_tensors.__name__, of_tensors.__doc__
+
+    def __call__[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](self, state: Array) -> Array:
+        """Return φ of states (..., 47)."""
+        if isinstance(state, Tensor):
+            return self._of_tensors(state)
+        return self._of_tensors(torch.from_numpy(state)).numpy()
+
+    def __reduce__(self) -> str:
+        """Pickle it by its name, as functions are."""
+        return self._of_tensors.__name__
+
+
+@Phi
+def humanoid_to_walker2d(state: Tensor) -> Tensor:
     """Keep the state of a planar walker: (..., 47) to (..., 15).
 
     Height in m and pitch in rad of the torso, the angles of left hip, left knee, right hip, right knee; the
@@ -194,20 +192,33 @@ def humanoid_to_walker2d[Array: (NDArray[np.float32], NDArray[np.float64], Tenso
     horizon. Dropped: the velocity to the side, the heading, roll and turning of the torso, and the joints
     that no command moves, though the feet's heights depend on those too.
     """
-    return _mapped(_walker2d, state)
+    height, spin = state[..., _HEIGHT], state[..., _SPIN]
+    joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
+    velocity = _headed(turn, state[..., _VELOCITY])
+    # The vertical components of the torso's axes.
+    forward, left, up = turn[..., 2, :].unbind(-1)
+    level = torch.hypot(left, up).clamp_min(1e-6)
+    pitch = torch.atan2(-forward, level)
+    pitch_rate = (up * spin[..., 1] - left * spin[..., 2]) / level
+    _, feet = mass_and_feet(joints)
+    axes = torch.stack([forward, left, up], dim=-1).unsqueeze(-2)
+    clearance = height.unsqueeze(-1) + (axes * feet).sum(-1) - FOOT_RADIUS_M
+    pose = [torch.stack([height, pitch], dim=-1), joints[..., COMMANDED]]
+    rates = [velocity[..., [0, 2]], pitch_rate.unsqueeze(-1), state[..., _RATES][..., COMMANDED]]
+    return torch.cat([*pose, *rates, (clearance < CONTACT_M).to(state.dtype)], dim=-1)
 
 
-def humanoid_to_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
+@Phi
+def humanoid_to_kinematics(state: Tensor) -> Tensor:
     """Keep the angles in rad and rates in rad/s of all joints: (..., 47) to (..., 34).
 
     Dropped: position, orientation and velocity of the body.
     """
-    return _mapped(_kinematics, state)
+    return torch.cat([state[..., _JOINTS], state[..., _RATES]], dim=-1)
 
 
-def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
-    state: Array,
-) -> Array:
+@Phi
+def humanoid_to_extended_kinematics(state: Tensor) -> Tensor:
     """Keep all joints, the motion of the center of mass and the lean of the torso: (..., 47) to (..., 46).
 
     After the joints (34): x and y of the center of mass relative to the midpoint of the feet, and its height
@@ -217,7 +228,19 @@ def humanoid_to_extended_kinematics[Array: (NDArray[np.float32], NDArray[np.floa
     torso's angular velocity (3) in rad/s: what the paper calls robot-level information, citing a robot that
     observes both (Radosavovic et al. 2024). Dropped: the heading.
     """
-    return _mapped(_extended_kinematics, state)
+    joints, rates = state[..., _JOINTS], state[..., _RATES]
+    turn = rotation(state[..., _QUATERNION])
+
+    def turned(vector: Tensor) -> Tensor:
+        return (turn @ vector.unsqueeze(-1)).squeeze(-1)
+
+    mass, feet = mass_and_feet(joints)
+    aside = _headed(turn, turned(mass - feet.mean(-2)))[..., :2]
+    height = state[..., _HEIGHT, None] + turned(mass)[..., 2:]
+    spin = state[..., _SPIN]
+    swept = torch.linalg.cross(spin, mass) + mass_velocity(joints, rates)
+    velocity = _headed(turn, state[..., _VELOCITY] + turned(swept))
+    return torch.cat([joints, rates, aside, height, velocity, turn[..., 2, :], spin], dim=-1)
 
 
 def beyond_walker2d(state: Tensor) -> Tensor:
@@ -247,49 +270,6 @@ def beyond_extended_kinematics(state: Tensor) -> Tensor:
     The heading, as cosine and sine.
     """
     return _heading(rotation(state[..., _QUATERNION]))
-
-
-def _mapped[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](
-    abstraction: Callable[[Tensor], Tensor], state: Array
-) -> Array:
-    return abstraction(state) if isinstance(state, Tensor) else abstraction(torch.from_numpy(state)).numpy()
-
-
-def _walker2d(state: Tensor) -> Tensor:
-    height, spin = state[..., _HEIGHT], state[..., _SPIN]
-    joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
-    velocity = _headed(turn, state[..., _VELOCITY])
-    # The vertical components of the torso's axes.
-    forward, left, up = turn[..., 2, :].unbind(-1)
-    level = torch.hypot(left, up).clamp_min(1e-6)
-    pitch = torch.atan2(-forward, level)
-    pitch_rate = (up * spin[..., 1] - left * spin[..., 2]) / level
-    _, feet = mass_and_feet(joints)
-    axes = torch.stack([forward, left, up], dim=-1).unsqueeze(-2)
-    clearance = height.unsqueeze(-1) + (axes * feet).sum(-1) - FOOT_RADIUS_M
-    pose = [torch.stack([height, pitch], dim=-1), joints[..., COMMANDED]]
-    rates = [velocity[..., [0, 2]], pitch_rate.unsqueeze(-1), state[..., _RATES][..., COMMANDED]]
-    return torch.cat([*pose, *rates, (clearance < CONTACT_M).to(state.dtype)], dim=-1)
-
-
-def _kinematics(state: Tensor) -> Tensor:
-    return torch.cat([state[..., _JOINTS], state[..., _RATES]], dim=-1)
-
-
-def _extended_kinematics(state: Tensor) -> Tensor:
-    joints, rates = state[..., _JOINTS], state[..., _RATES]
-    turn = rotation(state[..., _QUATERNION])
-
-    def turned(vector: Tensor) -> Tensor:
-        return (turn @ vector.unsqueeze(-1)).squeeze(-1)
-
-    mass, feet = mass_and_feet(joints)
-    aside = _headed(turn, turned(mass - feet.mean(-2)))[..., :2]
-    height = state[..., _HEIGHT, None] + turned(mass)[..., 2:]
-    spin = state[..., _SPIN]
-    swept = torch.linalg.cross(spin, mass) + mass_velocity(joints, rates)
-    velocity = _headed(turn, state[..., _VELOCITY] + turned(swept))
-    return torch.cat([joints, rates, aside, height, velocity, turn[..., 2, :], spin], dim=-1)
 
 
 def _heading(turn: Tensor) -> Tensor:

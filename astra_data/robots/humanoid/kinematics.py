@@ -52,7 +52,7 @@ class HumanoidKinematics(FreeStates):
         meaning="angles and rates of all joints",
         astra={"unit": _UNITS, "frame": ["joint"] * 2 * _COUNT, "role": ["invariant"] * 2 * _COUNT},
     )
-    abstraction = staticmethod(humanoid_to_kinematics)
+    abstraction = humanoid_to_kinematics
 
     ranges = CommandRanges()
     """Joint angles of commands."""
@@ -117,7 +117,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
             "role": ["invariant"] * (2 * _COUNT + 12),
         },
     )
-    abstraction = staticmethod(humanoid_to_extended_kinematics)
+    abstraction = humanoid_to_extended_kinematics
 
     def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
         """Build B standing humanoids.

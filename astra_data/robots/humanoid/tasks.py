@@ -22,6 +22,7 @@ from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.robots.humanoid.abstraction import (
+    Phi,
     beyond_extended_kinematics,
     beyond_kinematics,
     beyond_walker2d,
@@ -74,13 +75,11 @@ class Walking(Objective):
     is_lasting = True
     spread: ClassVar[tuple[float, ...]]
     """Typical deviation of each entry of a state from standing, (X,)."""
+    phi: ClassVar[Phi]
+    """φ of target states (count, 47), (count, X)."""
 
     locomotion: Locomotion = field(default_factory=Locomotion)
     failure_reward: float = field(default=-5.0, kw_only=True)
-
-    @abstractmethod
-    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return φ of target states (count, 47), (count, X)."""
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return the deviations of states (..., X) from standing, in spreads and clipped to ±5, (..., X)."""
@@ -88,7 +87,7 @@ class Walking(Objective):
 
     @cached_property
     def _standing(self) -> NDArray[np.float64]:
-        return self.abstracted(np.array(STANDING))
+        return self.phi(np.array(STANDING))
 
     @abstractmethod
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
@@ -96,7 +95,7 @@ class Walking(Objective):
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, X) as the target does: almost upright and at rest."""
-        return self.abstracted(self.locomotion.draw_starts(rng, count))
+        return self.phi(self.locomotion.draw_starts(rng, count))
 
     def reached(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return False for all states (B, X), (B,): there is no goal to reach."""
@@ -121,10 +120,7 @@ class PlanarWalking(Walking):
         *(VELOCITY_M_S, VELOCITY_M_S, SPIN_RAD_S, *_LEG_RATES_RAD_S),
         *(1.0, 1.0),
     )
-
-    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return φ of target states (count, 47), (count, 15)."""
-        return humanoid_to_walker2d(state)
+    phi = humanoid_to_walker2d
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
@@ -147,10 +143,7 @@ class JointWalking(Walking):
     """Walking of the joints alone, states (..., 34); they show no falls, so every episode succeeds."""
 
     spread = (*JOINTS_RAD, *JOINT_RATES_RAD_S)
-
-    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return φ of target states (count, 47), (count, 34)."""
-        return humanoid_to_kinematics(state)
+    phi = humanoid_to_kinematics
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the velocity of a level torso over its lower foot, which does not slip, (B,) in m/s."""
@@ -173,12 +166,9 @@ class MassWalking(Walking):
         *JointWalking.spread,
         *([POSITION_M] * 3 + [VELOCITY_M_S] * 3 + [LEAN_RAD] * 3 + [SPIN_RAD_S] * 3),
     )
+    phi = humanoid_to_extended_kinematics
 
     lowest_mass_m: float = 0.65
-
-    def abstracted(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return φ of target states (count, 47), (count, 46)."""
-        return humanoid_to_extended_kinematics(state)
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return which centers of mass of states (B, 46) are too low, (B,) bool."""
@@ -219,14 +209,6 @@ class VariedHumanoid(VariedSimulator):
         return self.state
 
 
-_DISTANCE_M = 3.8
-_EYE_M = 0.95
-"""Height of the point that the camera looks at."""
-_SIDE_DEG = 90.0
-"""The camera looks along y, so that x goes to the right."""
-_DOWN_DEG = -8.0
-
-
 def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 200) -> NDArray[np.uint8]:
     """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3).
 
@@ -245,12 +227,13 @@ def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 2
             f"expected OpenGL that works without a window, found none ({error}): set MUJOCO_GL to egl or "
             "osmesa"
         ) from error
-    viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = _DISTANCE_M, _SIDE_DEG, _DOWN_DEG
+    # Along y, so that x goes to the right.
+    viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = 3.8, 90.0, -8.0
     pictures = []
     for state in states:
         data.qpos[:] = state[:POSITIONS]
         mujoco.mj_forward(model, data)
-        viewer.cam.lookat[:] = (*state[:2], _EYE_M)
+        viewer.cam.lookat[:] = (*state[:2], 0.95)
         pictures.append(viewer.render("rgb_array"))
     return np.stack(pictures)
 

@@ -83,7 +83,7 @@ class HumanoidWalker2d(FreeStates):
             "role": ["invariant"] * 15,
         },
     )
-    abstraction = staticmethod(humanoid_to_walker2d)
+    abstraction = humanoid_to_walker2d
 
     def __init__(self, num_envs: int, *, num_threads: int | None = None, device: str = "cpu") -> None:
         standing = humanoid_to_walker2d(torch.tensor(STANDING))

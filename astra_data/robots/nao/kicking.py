@@ -46,16 +46,9 @@ def asks_to_kick(command: Tensor) -> Tensor:
 def roll(
     position: Tensor, velocity: Tensor, period_s: Tensor | float, deceleration_m_s2: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """Roll balls for `period_s`, slowed by an even friction until they lie.
+    """Roll balls at `position` with `velocity`, both (B, 2), slowed by an even friction until they lie.
 
-    Args:
-        position: of the balls, (B, 2) in m.
-        velocity: of the balls, (B, 2) in m/s.
-        period_s: duration, (B, 1) or one for all.
-        deceleration_m_s2: of a rolling ball, (B, 1) or one for all.
-
-    Returns:
-        positions and velocities (B, 2) of the balls.
+    Return positions and velocities (B, 2). Periods and decelerations are (B, 1) or one for all.
     """
     speed = velocity.norm(dim=-1, keepdim=True)
     slower = (speed - deceleration_m_s2 * period_s).clamp_min(0.0)
@@ -75,19 +68,10 @@ def knock(
     speed_m_s: Tensor | float,
     turn_rad: Tensor | float = 0.0,
 ) -> tuple[Tensor, Tensor]:
-    """Move the balls that bodies walk into.
+    """Move the balls that bodies walk into, from `before` to `after`; return places and velocities, (B, 2).
 
-    Args:
-        before: positions of the bodies before the step, (B, 2) in m.
-        after: after it, (B, 2) in m.
-        ball: positions of the balls, (B, 2) in m.
-        velocity: of the balls, (B, 2) in m/s.
-        reach_m: distance between the centers below which a body touches a ball.
-        speed_m_s: of a touched ball, along the line between the centers, (B, 1) or one for all.
-        turn_rad: angle between that line and the ball's direction, (B,) or one for all.
-
-    Returns:
-        positions and velocities (B, 2) of the balls.
+    reach_m: distance between the centers below which a body touches a ball. speed_m_s: of a touched ball,
+    (B, 1) or one for all, along the line between the centers turned by turn_rad, (B,) or one for all.
     """
     direction, distance = _seen_from(after, ball)
     approaches = ((after - before) * direction).sum(-1, keepdim=True) > 0
@@ -109,19 +93,9 @@ def kick_away(
     speed_m_s: Tensor | float,
     turn_rad: Tensor | float = 0.0,
 ) -> Tensor:
-    """Kick balls within reach.
+    """Return the velocities (B, 2) of the balls; bodies that are `asked` (B, 1) kick those within reach.
 
-    Args:
-        body: positions of the bodies, (B, 2) in m.
-        ball: of the balls, (B, 2) in m.
-        velocity: of the balls, (B, 2) in m/s.
-        asked: which bodies are to kick, (B, 1) bool.
-        reach_m: distance between the centers below which a body can kick a ball.
-        speed_m_s: of a kicked ball, along the line between the centers, (B, 1) or one for all.
-        turn_rad: angle between that line and the ball's direction, (B,) or one for all.
-
-    Returns:
-        velocities (B, 2) of the balls.
+    reach_m, speed_m_s, turn_rad: of a kick, as of `knock`.
     """
     direction, distance = _seen_from(body, ball)
     leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))

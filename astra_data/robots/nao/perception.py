@@ -86,13 +86,8 @@ class Localisation:
         self._true = np.where(active[:, None], pose, self._true)
 
     def arrays(self) -> dict[str, Floats]:
-        """Return the arrays that later estimates depend on."""
+        """Return the arrays that later estimates depend on, themselves."""
         return {"believed": self.pose, "believed_drift": self._drift, "believed_of": self._true}
-
-    def restore(self, arrays: dict[str, Floats]) -> None:
-        """Go on from `arrays`."""
-        names = ("believed", "believed_drift", "believed_of")
-        self.pose, self._drift, self._true = (arrays[name].copy() for name in names)
 
 
 class BallSight:
@@ -120,14 +115,9 @@ class BallSight:
     def update(
         self, ball: Floats, pose: Floats, estimated: Floats, rng: np.random.Generator, active: Bools
     ) -> None:
-        """Update the estimates of the robots in `active` (B,) after a step.
+        """Update the estimates of the robots in `active` (B,) after a step to the true `ball` (B, 2).
 
-        Args:
-            ball: true positions of the balls, (B, 2).
-            pose: true poses of the robots, (B, 3).
-            estimated: estimated poses, (B, 3).
-            rng: of all errors.
-            active: robots whose estimates are updated, (B,).
+        Their true poses are `pose` (B, 3), their `estimated` ones (B, 3).
         """
         errors = self.errors
         apart = ball - pose[:, :2]
@@ -150,15 +140,10 @@ class BallSight:
         self.unseen_s = np.where(active, np.where(seen, 0.0, self.unseen_s + self.step_s), self.unseen_s)
 
     def arrays(self) -> dict[str, Floats]:
-        """Return the arrays that later estimates depend on."""
+        """Return the arrays that later estimates depend on, themselves."""
         return {
             "seen_ball": self.position,
             "seen_ball_velocity": self.velocity,
             "seen_ball_since": self.unseen_s,
             "seen_ball_error": self._error,
         }
-
-    def restore(self, arrays: dict[str, Floats]) -> None:
-        """Go on from `arrays`."""
-        names = ("seen_ball", "seen_ball_velocity", "seen_ball_since", "seen_ball_error")
-        self.position, self.velocity, self.unseen_s, self._error = (arrays[name].copy() for name in names)

@@ -1,13 +1,12 @@
 """B walking NAOs: commanded velocities in, sensor readings and true poses out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
-from astra_data.core.errors import BadInputError
 from astra_data.core.provenance import cores
 from astra_data.robots.nao.bodies import MOTORS, TICKS, BatchedBodies, nao_model
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
@@ -27,27 +26,6 @@ CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS
 _MIDDLE_M = 0.03
 """Either foot may kick a ball that is less far to the side: the torso sways as far from step to step."""
-
-
-@dataclass(frozen=True)
-class Senses:
-    """Sensor readings of B robots at the end of a control step.
-
-    Attributes:
-        angles: measured joint angles, (B, 11) in rad (`kinematics.JOINTS`). gyro: measured rates
-        about x, y, z, (B, 3) in rad/s. tilt: roll and pitch of the torso, (B, 2) in rad. pressure: on the
-        soles in N; left and right foot, front left, front right, back left, back right point, (B, 2, 4).
-        phase: fraction of the step done, (B,). left_swings: which foot is in the air, (B,) bool. planned:
-        velocity of the present step, m/s, m/s, rad/s, (B, 3).
-    """
-
-    angles: Floats
-    gyro: Floats
-    tilt: Floats
-    pressure: Floats
-    phase: Floats
-    left_swings: Bools
-    planned: Floats
 
 
 class BatchedNao:
@@ -93,21 +71,10 @@ class BatchedNao:
     def reset(
         self, rows: NDArray[np.intp], poses: Floats, rng: np.random.Generator, ball: Floats | None = None
     ) -> None:
-        """Set robots upright, with new traits.
+        """Set the robots `rows` (n,) upright at `poses` (n, 3), x, y in m and heading, with new traits.
 
-        Args:
-            rows: which robots, (n,).
-            poses: x, y in m and heading in rad, (n, 3).
-            rng: of the traits.
-            ball: positions (n, 2) of their balls in m, by default 1 m ahead of them.
-
-        Raises:
-            BadInputError: `ball` is given for robots without balls.
+        Their balls are put at `ball` (n, 2) in m, by default 1 m ahead of them.
         """
-        if ball is not None and not self.has_ball:
-            raise BadInputError(
-                "ball: expected none for robots without one, got positions: build BatchedNao with ball=True"
-            )
         put_rows(self.traits, rows, Traits.draw(self.spread, len(rows), rng))
         standing = Gait.standing(len(rows), self._limits)
         put_rows(self.gait, rows, standing)
@@ -131,16 +98,7 @@ class BatchedNao:
             command: velocities forward and to the left in m/s, turn in rad/s, (B, 3).
             active: which robots move, (B,); all others, and fallen ones, stay as they are.
             kick: which robots kick with the foot on the ball's side when it next swings, (B,).
-
-        Raises:
-            BadInputError: `command` has another shape or is not finite.
         """
-        if command.shape != (self.num_robots, 3) or not np.isfinite(command).all():
-            raise BadInputError(
-                f"command: expected finite values of shape ({self.num_robots}, 3), got {command.shape}"
-                f"{'' if np.isfinite(command).all() else ' with some that are not finite'}: "
-                "give every robot forward m/s, sideways m/s, turn rad/s"
-            )
         rows = np.flatnonzero(~self.fallen if active is None else active & ~self.fallen)
         targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))
         noise = np.random.default_rng([self._seed, self._steps]).normal(
@@ -198,20 +156,13 @@ class BatchedNao:
         return self.bodies.qvel[:, _BALL - 1 : _BALL + 1]
 
     @property
-    def senses(self) -> Senses:
-        """Present sensor readings."""
-        bodies, left_first = self.bodies, [7, *range(8, 13), *range(14, 19)]
-        return Senses(
-            angles=bodies.qpos[:, left_first] - self.traits.joint_offset_rad,
-            gyro=bodies.gyro.copy(),
-            tilt=self._tilt(),
-            pressure=bodies.pressure.reshape(-1, 2, 4).copy(),
-            phase=self.gait.phase.copy(),
-            left_swings=self.gait.left_swings.copy(),
-            planned=self.gait.velocity(),
-        )
+    def angles(self) -> Floats:
+        """Measured joint angles, (B, 11) in rad (`kinematics.JOINTS`)."""
+        return self.bodies.qpos[:, [7, *range(8, 13), *range(14, 19)]] - self.traits.joint_offset_rad
 
-    def _tilt(self) -> Floats:
+    @property
+    def tilt(self) -> Floats:
+        """Roll and pitch of the torsos, (B, 2) in rad."""
         up = rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2]
         return np.stack([np.arctan2(up[:, 1], up[:, 2]), np.arcsin(np.clip(-up[:, 0], -1.0, 1.0))], axis=1)
 

@@ -105,15 +105,16 @@ class NaoEnv(PlanarTarget):
     @property
     def state(self) -> Tensor:
         """Estimates and sensor readings of the robots, (B, S) float32."""
-        pose, senses = self.localisation.pose, self.robots.senses
-        cos, sin = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
-        forward, left, _ = np.split(senses.planned, 3, axis=1)
-        swing = np.where(senses.left_swings, 1.0, -1.0)[:, None]
-        angle = np.pi * senses.phase[:, None]
+        pose, robots, gait = self.localisation.pose, self.robots, self.robots.gait
+        cos, sin, planned = np.cos(pose[:, 2:]), np.sin(pose[:, 2:]), gait.velocity()
+        forward, left, _ = np.split(planned, 3, axis=1)
+        swing = np.where(gait.left_swings, 1.0, -1.0)[:, None]
+        angle = np.pi * gait.phase[:, None]
+        load = robots.bodies.pressure.reshape(-1, 2, 4).sum(-1) / _FOOT_LOAD_N
         parts = [
             *(pose[:, :2], cos, sin, cos * forward - sin * left, sin * forward + cos * left),
-            *(senses.angles, senses.gyro, senses.tilt, senses.pressure.sum(-1) / _FOOT_LOAD_N),
-            *(swing * np.sin(angle), swing * np.cos(angle), senses.planned),
+            *(robots.angles, robots.bodies.gyro, robots.tilt, load),
+            *(swing * np.sin(angle), swing * np.cos(angle), planned),
         ]
         if self.has_ball:
             sight = self.sight
@@ -211,9 +212,8 @@ class NaoEnv(PlanarTarget):
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
-        arrays = {name: values.numpy() for name, values in state.items()}
-        self.robots.load_state_dict(arrays)
-        self.localisation.restore(arrays)
-        self.sight.restore(arrays)
+        self.robots.load_state_dict({name: values.numpy() for name, values in state.items()})
+        for name, values in (self.localisation.arrays() | self.sight.arrays()).items():
+            values[:] = state[name].numpy()
         self.goal = state["goal"].clone()
         self._rng.bit_generator.state = json.loads(bytes(state["drawn"].tolist()))

@@ -7,7 +7,7 @@ import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.robots.humanoid.model import Locomotion
-from astra_data.robots.humanoid.target import HumanoidEnv, Humanoids
+from astra_data.robots.humanoid.target import HumanoidEnv
 
 
 def theirs(seed: int) -> Any:  # noqa: ANN401 - Gymnasium's own
@@ -16,52 +16,50 @@ def theirs(seed: int) -> Any:  # noqa: ANN401 - Gymnasium's own
     return env
 
 
+def make(num_envs: int, locomotion: Locomotion | None = None, **options: Any) -> HumanoidEnv:  # noqa: ANN401
+    return HumanoidEnv(locomotion or Locomotion(), num_envs, seed=0, **{"num_threads": 1, **options})
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.3])
 def test_equals_gymnasiums_humanoid_step_for_step(scale: float) -> None:
     env = theirs(seed=3)
     rng = np.random.default_rng(0)
-    ours = Humanoids(Locomotion(), 3, actuators="motors", num_threads=2)
+    ours = make(3, actuators="motors", num_threads=2)
     state = np.concatenate([env.data.qpos, env.data.qvel])
     ours.reset_to(np.arange(3), np.tile(state, (3, 1)))
     ended = False
     for _ in range(80):
         control = rng.uniform(-0.4 * scale, 0.4 * scale, (3, 17))
-        ours.step(control)
+        step = ours.drive(control)
         observation, reward, terminated, _, _ = env.step(control[1])
-        np.testing.assert_allclose(ours.state[1, 2:], observation[:45], rtol=0, atol=1e-9)
-        assert ours.reward[1] == pytest.approx(reward, rel=0, abs=1e-9)
-        assert ours.healthy[1] == (not terminated)
+        found = np.concatenate([ours.physics.qpos[1, 2:], ours.physics.qvel[1]])
+        np.testing.assert_allclose(found, observation[:45], rtol=0, atol=1e-9)
+        assert float(step.reward[1]) == pytest.approx(reward, rel=1e-6)
+        assert bool(step.terminated[1]) == terminated
         ended |= terminated
     assert ended  # so that both heights were seen
     env.close()
 
 
 def test_contacts_and_effort_cost() -> None:
-    plain, free = Locomotion(), Locomotion(effort_cost=0.0, contact_cost=0.0)
     rewards = []
-    for task in (plain, free, Locomotion(contact_cost=1.0)):
-        humanoids = Humanoids(task, 1, actuators="motors", num_threads=1)
-        humanoids.step(np.full((1, 17), 0.2))
-        humanoids.reset_to(np.arange(1), humanoids.state - np.eye(47)[2] * 0.15)  # feet into the floor
-        humanoids.step(np.full((1, 17), 0.2))
-        rewards.append(humanoids.reward[0])
+    for task in (Locomotion(), Locomotion(effort_cost=0.0, contact_cost=0.0), Locomotion(contact_cost=1.0)):
+        env = make(1, task, actuators="motors")
+        env.drive(np.full((1, 17), 0.2))
+        env.reset_to(np.arange(1), env.state.numpy() - np.eye(47)[[2]] * 0.15)  # feet into the floor
+        rewards.append(float(env.drive(np.full((1, 17), 0.2)).reward[0]))
     paid, unpaid, most = rewards
     assert unpaid - paid > 0.1 * 17 * 0.2**2 + 1e-4
-    assert unpaid - most == pytest.approx(0.1 * 17 * 0.2**2 + 10.0)  # clipped
+    assert unpaid - most == pytest.approx(0.1 * 17 * 0.2**2 + 10.0, rel=1e-6)  # clipped
 
 
 def test_position_control_costs_its_torques_in_units_of_the_motors() -> None:
-    humanoids = Humanoids(Locomotion(), 1, num_threads=1)
-    state = humanoids.state
+    env = make(1)
+    state = env.state.numpy()
     state[0, 2] = 1.8  # off the floor
-    humanoids.reset_to(np.arange(1), state)
-    humanoids.step(np.full((1, 17), 100.0))  # so far away that every motor gives all it has
-    paid = 5.0 - humanoids.reward[0]
-    assert paid == pytest.approx(0.1 * 17 * 0.4**2, abs=0.05)
-
-
-def make(num_envs: int, seed: int = 0) -> HumanoidEnv:
-    return HumanoidEnv(Locomotion(), num_envs, seed=seed, num_threads=1)
+    env.reset_to(np.arange(1), state)
+    step = env.drive(np.full((1, 17), 100.0))  # so far away that every motor gives all it has
+    assert 5.0 - float(step.reward[0]) == pytest.approx(0.1 * 17 * 0.4**2, abs=0.05)
 
 
 def test_starts_are_upright_and_almost_at_rest() -> None:

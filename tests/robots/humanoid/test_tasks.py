@@ -81,7 +81,7 @@ def test_pay_and_falls_are_the_targets_but_for_costs(
         states = [env.state.numpy()]
         step = env.step(action)
         states.append(env.state.numpy())
-        before, after = (torch.from_numpy(objective.abstracted(state))[alive] for state in states)
+        before, after = (torch.from_numpy(objective.phi(state))[alive] for state in states)
         failed = objective.missed(after, NOTHING)
         judged_alike = failed == step.terminated[alive]
         paid = objective.reward(before, after, NOTHING, failed)
