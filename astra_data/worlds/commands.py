@@ -99,7 +99,7 @@ class DrivenSimulator:
     """B abstract simulators of a task, given actions of ±1.
 
     States may be corrected to anywhere, and no parameter can be set, unless the simulator says otherwise (see
-    `PlacedSimulator` and `VariableSimulator`).
+    `PlacedSimulator` and `TaskSimulator`).
 
     Attributes:
         simulator: the simulator itself, whose commands have units.

@@ -1,6 +1,7 @@
 """Environments of Gymnasium as a task's robot or abstract simulator."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -12,7 +13,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.robot import State
 from astra_data.worlds.simulators import NumpySimulator
-from astra_data.worlds.user_code import explained
+from astra_data.worlds.user_code import answered, explained
 
 Env = gymnasium.Env[Any, Any]
 _SLACK = 1e-5
@@ -41,34 +42,17 @@ def as_given(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
 
 
 def made(env_id: str | Callable[..., Env], **options: Any) -> Env:  # noqa: ANN401 - handed on
-    """Return the environment `env_id`, or of that class, with its `options`, without wrappers.
+    """Return the environment `env_id`, or of that class, with its `options`.
 
     Raises:
-        BadInputError: it cannot be made, or a wrapper changes actions or observations.
+        BadInputError: it cannot be made.
     """
     if callable(env_id):
-        with explained(f"making {_name(env_id)}"):
-            return _without_wrappers(env_id(**options))
+        return answered(f"making {_name(env_id)}", partial(env_id, **options))
     with explained(f"gymnasium.make({env_id!r})"):
         # The horizon is the task's, and what is wrong with states is told by the task.
         env: Env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **options)
-    return _without_wrappers(env)
-
-
-def _without_wrappers(env: Env) -> Env:
-    inner = env
-    while isinstance(inner, gymnasium.Wrapper):
-        spaces, within = (
-            [getattr(one, f"{space}_space", None) for space in ("action", "observation")]
-            for one in (inner, inner.env)
-        )
-        if spaces != within or isinstance(inner, gymnasium.ActionWrapper | gymnasium.ObservationWrapper):
-            raise BadInputError(
-                f"{env}: wrappers are left out, and {type(inner).__name__} changes actions or observations: "
-                "make the environment without it, and do the same in command or read_state"
-            )
-        inner = inner.env
-    return env.unwrapped
+        return env
 
 
 def _name(env_id: str | Callable[..., Env]) -> str:
@@ -104,11 +88,11 @@ class GymnasiumRobot:
         """Make the environment.
 
         env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0"; or the class
-        itself, or a function that makes the environment. Wrappers are left out; one that changes actions or
-        observations is refused. read_state: makes the state (S,) of the environment, without its wrappers,
-        and an observation. command: makes an action of the environment of a command (A,) and the state that
-        it is given in. failed: whether the robot failed, from the state after a step and whether the
-        environment terminated; by default the latter, and to terminate at the task's goal is an error.
+        itself, or a function that makes the environment. read_state: makes the state (S,) of the environment,
+        without its wrappers, and an observation. command: makes an action of it of a command (A,)
+        and the state that it is given in. failed: whether the robot failed, from the state after a step and
+        whether the environment terminated; by default the latter, and to terminate at the task's goal is an
+        error.
 
         Raises:
             BadInputError: the environment cannot be made.
@@ -123,7 +107,7 @@ class GymnasiumRobot:
     def reset(self, seed: int | None = None) -> State:
         """Start an episode of the environment, at random by `seed`; return the state (S,)."""
         observation, _ = self.env.reset(seed=seed)
-        self._state = self._read_state(self.env, observation)
+        self._state = self._read_state(self.env.unwrapped, observation)
         return self._state
 
     def step(self, command: NDArray[np.float64]) -> tuple[State, bool]:
@@ -133,7 +117,7 @@ class GymnasiumRobot:
             BadInputError: it makes no action of the environment.
         """
         observation, _, terminated, _, _ = self.env.step(self._action(command))
-        self._state = self._read_state(self.env, observation)
+        self._state = self._read_state(self.env.unwrapped, observation)
         return self._state, bool(self._failed(self._state, terminated) if self._failed else terminated)
 
     def check_commands(self, limits: Commands) -> None:
@@ -209,20 +193,20 @@ class GymnasiumSimulator(NumpySimulator):
             BadInputError: the environment cannot be made.
         """
         env = made(env_id, **options)
+        inner, is_checked = env.unwrapped, False
         env.reset(seed=0)
-        is_checked = False
 
         def step_each(states: Floats, commands: Floats) -> Floats:
             nonlocal is_checked
             landed = np.empty_like(states)
             for row, (state, command) in enumerate(zip(states, commands, strict=True)):
-                write(env, state)
+                write(inner, state)
                 env.step(command)
-                landed[row] = read(env)
+                landed[row] = read(inner)
                 if not is_checked:
                     env.reset(seed=0)
-                    write(env, landed[row])
-                    _check_written(env_id, landed[row], np.asarray(read(env)))
+                    write(inner, landed[row])
+                    _check_written(env_id, landed[row], np.asarray(read(inner)))
                     is_checked = True
             return landed
 

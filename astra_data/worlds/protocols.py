@@ -92,29 +92,17 @@ class PlacedSimulator(SteppedSimulator, Protocol):
         """
 
 
-@runtime_checkable
-class WalledSimulator(Protocol):
-    """A simulator whose states are among walls."""
-
-    def keep_clear(self, distance_m: float) -> None:
-        """Let corrections end no closer to walls than `distance_m`."""
-
-
 def keep_clear(simulator: object, distance_m: float) -> None:
     """Let corrections of `simulator` end no closer to walls than `distance_m`, where there are walls."""
-    if isinstance(simulator, WalledSimulator):
-        simulator.keep_clear(distance_m)
+    if keep := getattr(simulator, "keep_clear", None):
+        keep(distance_m)
 
 
-class VariableSimulator(PlacedSimulator, Protocol):
-    """A simulator whose parameters can be set row by row."""
+class TaskSimulator(PlacedSimulator, AbstractSimulator, Protocol):
+    """The abstract simulator of a task, whose parameters can be set row by row."""
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use `parameters` by name, (B, 1) each, from the next step on; those without effect are ignored."""
-
-
-class TaskSimulator(VariableSimulator, AbstractSimulator, Protocol):
-    """The abstract simulator of a task."""
 
 
 @runtime_checkable

@@ -102,29 +102,6 @@ class RobotEnv:
         if check := getattr(self._robots[0], "check_commands", None):
             check(self._commands)
 
-    def check_seed(self) -> None:
-        """Reset robots that take a seed twice with the same one, and check that they start alike.
-
-        Raises:
-            BadInputError: they do not.
-        """
-        if not self._takes_seed:
-            return
-        found = []
-        for _ in range(2):
-            self.reseed(0)
-            self.reset()
-            found.append(self.state)
-        apart = ~torch.isclose(found[1], found[0], rtol=1e-4, atol=1e-4)
-        if apart.any():
-            row, entry = apart.nonzero()[0].tolist()
-            raise BadInputError(
-                "reset of the robot: the same seed must give the same start, and gave "
-                f"{self._column.labels[entry]} = {found[0][row, entry]:.6g} and then "
-                f"{found[1][row, entry]:.6g}: draw all that is random from the seed that reset is given (an "
-                "environment of Gymnasium from self.np_random)"
-            )
-
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Restart the robots in `mask` (B,), by default all; return observations (B, O)."""
         rows = range(self.num_envs) if mask is None else mask.nonzero().squeeze(1).tolist()

@@ -20,7 +20,7 @@ from astra_data.dataset.description import NAME
 from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.plane.mazes import Maze
-from astra_data.worlds.protocols import AbstractSimulator, TargetEnv, TaskSimulator, VariableSimulator
+from astra_data.worlds.protocols import AbstractSimulator, TargetEnv, TaskSimulator
 from astra_data.worlds.robot import Robot, RobotEnv
 from astra_data.worlds.variation import RANDOMIZED_COMMANDS, Variation, VariedSimulator
 
@@ -98,7 +98,7 @@ class Varied:
         to; its kind is that of all parameters that the simulator has.
     """
 
-    kind: Callable[[VariableSimulator, Variation], VariedSimulator]
+    kind: Callable[[TaskSimulator, Variation], VariedSimulator]
     randomized: Variation
     wide: Variation
 

@@ -8,13 +8,12 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from importlib.machinery import PathFinder
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,8 +32,6 @@ _WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) el
 """What makes `ast.dump` write the same in each version of Python, for digests."""
 _INSTALLED = ("site-packages", "dist-packages")
 """Names of folders in which what lies side by side need not belong together."""
-_TOLERANCE = 1e-4
-"""Between states, relative to their size: simulators compute in single precision."""
 
 
 def is_user_code(name: str) -> bool:
@@ -118,15 +115,14 @@ def _among_neighbors(folder: str) -> Iterator[None]:
 
     Installed packages come first. What the other files imported is theirs again afterwards.
     """
-    files = {name: getattr(module, "__file__", None) or "" for name, module in sys.modules.items()}
-    places = {
-        name: os.path.dirname(os.path.realpath(file)) for name, file in files.items() if _PREFIX in name
+    files = {
+        name: os.path.realpath(getattr(one, "__file__", None) or "") for name, one in sys.modules.items()
     }
-    others = {*places.values()} - {folder}
+    others = {os.path.dirname(file) for name, file in files.items() if _PREFIX in name} - {folder}
     theirs = {
         name: sys.modules.pop(name)
         for name, file in files.items()
-        if name not in places and others and os.path.dirname(file) in others
+        if _PREFIX not in name and os.path.dirname(file) in others
     }
     paths = [*sys.path]
     sys.path[:] = [*(path for path in paths if path not in others), folder]
@@ -134,10 +130,8 @@ def _among_neighbors(folder: str) -> Iterator[None]:
         yield
     finally:
         added = [path for path in sys.path if path not in (*paths, folder)]
-        sys.path[:] = [*added, *paths]
+        sys.path[:] = [*added, *paths, *([] if folder in paths else [folder])]
         sys.modules.update(theirs)
-    if folder not in sys.path:
-        sys.path.append(folder)  # of what is imported later
 
 
 def _public_names(module: ModuleType) -> list[str]:
@@ -147,8 +141,8 @@ def _public_names(module: ModuleType) -> list[str]:
         for name, value in vars(module).items()
         if not name.startswith("_")
         and not isinstance(value, ModuleType)
-        and type(value).__module__ not in ("__future__", "typing")
-        and not (isinstance(value, type | FunctionType) and value.__module__ != module.__name__)
+        and getattr(value, "__module__" if isinstance(value, type | FunctionType) else "", module.__name__)
+        == module.__name__
     ]
 
 
@@ -228,7 +222,10 @@ def _with_neighbors(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast
             # A package may hold what is never imported, such as a template.
             tree = ast.Module([ast.Expr(ast.Constant(path.read_bytes()))], [])
         yield path, tree
-        beside = {file for module in _imported(tree) for file in _files_of(module, folder)}
+        beside = set[Path]()
+        for module in _imported(tree) if folder.name not in _INSTALLED else ():
+            file = folder / f"{module}.py"
+            beside |= {file} if file.is_file() else {*(folder / module).rglob("*.py")}
         todo += sorted(beside - seen - set(todo))
 
 
@@ -237,18 +234,15 @@ def _installed(module: str) -> tuple[list[Path], Path]:
 
     There are none of this package, and of what is not found. None is run.
     """
-    parts, places = module.split("."), None
-    for end in range(1, len(parts) + 1) if parts[0] != _PACKAGE.name else ():
-        spec, name = None, ".".join(parts[:end])
-        with suppress(ImportError, ValueError):
-            spec = importlib.util.find_spec(name) if end == 1 else PathFinder.find_spec(name, places)
-        if spec is None:
-            break
-        places = spec.submodule_search_locations
-        if spec.origin and spec.origin.endswith(".py"):  # a folder of packages has none
-            file = Path(spec.origin)
-            return (sorted(file.parent.rglob("*.py")), file.parents[1]) if places else ([file], file.parent)
-    return [], Path()
+    top, spec = module.partition(".")[0], None
+    with suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(top) if top != _PACKAGE.name else None
+    if spec is None:
+        return [], Path()
+    if spec.submodule_search_locations:
+        folder = Path(spec.submodule_search_locations[0])
+        return sorted(folder.rglob("*.py")), folder.parent
+    return [Path(spec.origin or "")], Path(spec.origin or "").parent
 
 
 def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
@@ -257,68 +251,40 @@ def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
     Or parts of their paths are, as in `folder / "data" / "weights.npz"`.
     """
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    paths = sorted({Path(text) for text in texts if isinstance(text, str)})
-    paths = [path for path in paths if path.parts and not path.is_absolute() and ".." not in path.parts]
-    found, todo, seen = set[Path](), [place.parent], set[str]()
-    while todo:
-        folder = todo.pop()
-        if (real := os.path.realpath(folder)) in seen or not os.access(folder, os.R_OK):
-            continue
-        seen.add(real)
-        names = {*os.listdir(folder)}
-        beside = [folder / path for path in paths if path.parts[0] in names]
+    paths = [Path(text) for text in texts if isinstance(text, str) and Path(text).parts]
+    paths = [path for path in paths if not path.is_absolute() and ".." not in path.parts]
+    found, folders = set[Path](), [place.parent]
+    for folder in folders:
+        beside = [folder / path for path in paths]
         found |= {file for file in beside if file.suffix not in _NOT_READ and os.path.isfile(file)}
-        todo += [one for one in beside if os.path.isdir(one)]
+        folders += sorted({one for one in beside if os.path.isdir(one)} - {*folders})
     return sorted(found)
-
-
-def _files_of(module: str, folder: Path) -> list[Path]:
-    """Return the file of a top module in `folder`, or all of its package there that is not installed."""
-    if folder.name in _INSTALLED:
-        return []
-    file, package = folder / f"{module}.py", folder / module
-    if file.is_file() or not package.is_dir():
-        return [file] if file.is_file() else []
-    spec = None
-    with suppress(ImportError, ValueError):
-        spec = importlib.util.find_spec(module)
-    if spec is not None and spec.origin and not Path(spec.origin).is_relative_to(folder.resolve()):
-        return []
-    return sorted(package.rglob("*.py"))
 
 
 def _imported(tree: ast.Module) -> set[str]:
     """Return the names of the top modules that a file imports."""
-    names: set[str] = set()
+    names: list[str] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names |= {alias.name.partition(".")[0] for alias in node.names}
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module.partition(".")[0])
-    return names
+            names.append(node.module)
+    return {name.partition(".")[0] for name in names}
 
 
-class Saved(Protocol):
-    """What can be saved."""
-
-    def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
-        """Return tensors and metadata (JSON values)."""
-
-
-def parts_of(learned: Saved) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
-    """Return the tensors and the metadata that `to_file` of something learned returns.
+def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+    """Return the tensors and the metadata (JSON values) that `to_file` of something learned returns.
 
     Raises:
         BadInputError: it fails, or returns something else.
     """
     what = f"{type(learned).__name__}.to_file"
-    with explained(what):
-        returned: Any = learned.to_file()
+    returned = answered(what, learned.to_file)  # type: ignore[attr-defined]
     is_pair = isinstance(returned, tuple | list) and len(returned) == 2
     if not (is_pair and all(isinstance(values, Mapping) for values in returned)):
+        kind = type(returned).__name__
         raise BadInputError(
-            f"{what}: expected a pair, a dict of tensors and one of JSON values, got a "
-            f"{type(returned).__name__}"
+            f"{what}: expected a pair, a dict of tensors and one of JSON values, got a {kind}"
         )
     tensors, metadata = returned
     faults = [
@@ -346,17 +312,21 @@ def restored[Learned](
         BadInputError: it is a class of the user's, and fails.
         KeyError, TypeError, ValueError, RuntimeError: it is one of the package, and fails.
     """
-    from_file: Any = made.from_file  # type: ignore[attr-defined]
+    from_file: Callable[..., Learned] = made.from_file  # type: ignore[attr-defined]
     if made.__module__.partition(".")[0] == _PACKAGE.name:
-        return from_file(tensors, metadata, *device)  # type: ignore[no-any-return]
-    try:
-        with explained(f"{made.__name__}.from_file"):
-            return from_file(tensors, metadata, *device)  # type: ignore[no-any-return]
-    except BadInputError as error:
-        raise BadInputError(
-            f"{error}: the file has the tensors {', '.join(tensors)}, and {', '.join(metadata) or 'nothing'} "
-            "beside them: correct it or to_file, and run that stage again"
-        ) from error
+        return from_file(tensors, metadata, *device)
+    given = f"given the tensors {', '.join(tensors)} and the values {', '.join(metadata) or 'of nothing'},"
+    return answered(f"{made.__name__}.from_file, {given}", from_file, tensors, metadata, *device)
+
+
+def answered[Answer](what: str, function: Callable[..., Answer], *given: object) -> Answer:
+    """Return what a `function` of the user's returns; errors begin with `what`.
+
+    Raises:
+        BadInputError: it fails.
+    """
+    with explained(what):
+        return function(*given)
 
 
 def expect(
@@ -388,21 +358,6 @@ def expect(
     return found
 
 
-def expect_same(what: str, shown: object, expected: Tensor) -> None:
-    """Refuse states (B, X), `shown`, that are not the `expected` ones but for rounding.
-
-    Raises:
-        BadInputError: they are others; names the entry that is furthest off.
-    """
-    shown = expect(what, shown, tuple(expected.shape))
-    if not torch.allclose(shown, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
-        row, entry = ((shown - expected).abs() == (shown - expected).abs().max()).nonzero()[0].tolist()
-        raise BadInputError(
-            f"{what}: expected {float(expected[row, entry]):g} in row {row}, entry {entry}, got "
-            f"{float(shown[row, entry]):g}"
-        )
-
-
 def expect_tensor(what: str, found: object) -> Tensor:
     """Return `found`, a tensor.
 
@@ -420,9 +375,7 @@ def stepped(simulator: AbstractSimulator, command: Tensor, what: str) -> Tensor:
     Raises:
         BadInputError: the step fails, or returns no tensor.
     """
-    with explained(what):
-        landed = simulator.step(command)
-    return expect_tensor(what, landed)
+    return expect_tensor(what, answered(what, simulator.step, command))
 
 
 def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tensor:
@@ -432,8 +385,7 @@ def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tens
         BadInputError: the objective fails, or returns something else.
     """
     what = f"objective.{name}(state, goal)"
-    with explained(what):
-        found = getattr(objective, name)(state, goal)
+    found = answered(what, getattr(objective, name), state, goal)
     return expect(what, found, (len(state),), torch.bool, state.device)
 
 
@@ -444,6 +396,5 @@ def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, fail
         BadInputError: the objective fails, or returns something else.
     """
     what = "objective.reward(before, after, goal, failed)"
-    with explained(what):
-        found = objective.reward(before, after, goal, failed)
+    found = answered(what, objective.reward, before, after, goal, failed)
     return expect(what, found, (len(after),), device=after.device)

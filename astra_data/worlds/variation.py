@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 from torch import Tensor
 
 from astra_data.core.config import Config, in_order
-from astra_data.worlds.protocols import VariableSimulator, keep_clear
+from astra_data.worlds.protocols import TaskSimulator, keep_clear
 
 
 def _above_zero(ends: tuple[float, float]) -> tuple[float, float]:
@@ -170,7 +170,7 @@ class VariedSimulator(ABC):
         variation: the ranges of the parameters. parameters: (B, P), in the order of its `names`.
     """
 
-    def __init__(self, simulator: VariableSimulator, variation: Variation) -> None:
+    def __init__(self, simulator: TaskSimulator, variation: Variation) -> None:
         """Draw parameters of `simulator` from `variation`."""
         self.simulator = simulator
         self.variation = variation

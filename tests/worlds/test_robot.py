@@ -9,7 +9,6 @@ from small_cart import TASK, Cart, Reach
 
 from astra_data.core.errors import BadInputError
 from astra_data.policies.episodes import in_target
-from astra_data.worlds.robot import RobotEnv
 
 
 def test_robots_are_stepped_by_commands_in_their_units() -> None:
@@ -85,27 +84,6 @@ def test_the_same_seed_gives_the_same_goals_and_seeds() -> None:
     assert goals[0] == goals[1] == goals[3] != goals[2] and goals[0][0] != goals[0][1]
     assert Noted.seeds[:2] == Noted.seeds[2:4] == Noted.seeds[6:] != Noted.seeds[4:6]
     assert -1 not in Noted.seeds
-
-
-class Careless(Cart):
-    """One that takes a seed and draws from elsewhere."""
-
-    drawn = np.random.default_rng(0)
-
-    def reset(self, seed: int = 0) -> list[float]:
-        super().reset()
-        return [self.x, float(self.drawn.normal())]
-
-
-def test_a_robot_that_ignores_its_seed_is_told() -> None:
-    with pytest.raises(BadInputError, match=r"same seed must give the same start, and gave speed = .* then "):
-        RobotEnv(**of_robots(Careless)).check_seed()
-
-
-def of_robots(robot: type[Cart]) -> dict[str, Any]:
-    task = replace(TASK, robot=robot)
-    given = {"state": task.state, "commands": task.limits, "abstraction": task.abstraction, "seed": 3}
-    return {"objective": task.objective, "num_envs": 2, "robot": robot, **given}
 
 
 @pytest.mark.parametrize("state", [[0.0], [0.0, float("nan")], [0.0, 0.0, 0.0], None])

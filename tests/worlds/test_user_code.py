@@ -16,7 +16,6 @@ from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import (
     code_digest,
     expect,
-    expect_same,
     explained,
     file_of,
     found_near,
@@ -192,10 +191,7 @@ def test_the_digest_covers_a_package_beside_the_file(tmp_path: Path) -> None:
     assert len(set(digests)) == 3
     (tmp_path / "parts/template.py").write_text("class {{ name }}:\n")
     (tmp_path / "cart.py").write_text("import numpy\nfrom parts.joints import knee\nTASK = knee.LIMIT\n")
-    assert (with_template := code_digest(f"{tmp_path}/cart.py:TASK")) not in (*digests, None)
-    (tmp_path / "numpy").mkdir()
-    (tmp_path / "numpy/__init__.py").write_text("not the one that is installed\n")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") == with_template
+    assert (code_digest(f"{tmp_path}/cart.py:TASK")) not in (*digests, None)
 
 
 @pytest.mark.parametrize(
@@ -295,8 +291,8 @@ def made_of(body: str, folder: Path) -> Any:  # noqa: ANN401 - a class of a user
 def test_what_it_asks_for_and_the_file_has_not_is_told_with_what_it_has(tmp_path: Path) -> None:
     with pytest.raises(
         BadInputError,
-        match=r"^Own.from_file fails with KeyError: 'matrx' \(mine.py, line 7\): the file has the tensors "
-        r"matrix, factor, and sizes, kind beside them: correct it or to_file, and run that stage again$",
+        match=r"^Own.from_file, given the tensors matrix, factor and the values sizes, kind, fails with "
+        r"KeyError: 'matrx' \(mine.py, line 7\)$",
     ):
         restored(made_of('return metadata["matrx"]', tmp_path), TENSORS, METADATA)
 
@@ -316,16 +312,6 @@ def test_anything_else_is_refused_with_what_it_is(found: object, said: str) -> N
     """One line says what was expected and what came."""
     with pytest.raises(BadInputError, match=f"^{said}"):
         expect("step", found, (-1, 2), torch.float32)
-
-
-def test_states_are_the_same_but_for_rounding() -> None:
-    """The entry that is furthest apart is told."""
-    expected = torch.tensor([[1.0, 2.0], [1000.0, 0.0]])
-    expect_same("state", expected + torch.tensor([[1e-5, 0.0], [0.05, 9e-5]]), expected)
-    with pytest.raises(BadInputError, match=r"^state here: expected 1000 in row 1, entry 0, got 1003$"):
-        expect_same("state here", expected + torch.tensor([[2.0, 0.0], [3.0, 1.0]]), expected)
-    with pytest.raises(BadInputError, match=r"^state: expected shape \(2, 2\), got \(1, 2\)$"):
-        expect_same("state", expected[:1], expected)
 
 
 def _objective(**functions: object) -> Objective:

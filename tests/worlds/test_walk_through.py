@@ -1,6 +1,5 @@
 """Each wrong piece of a task is named by one line, and what is right by none."""
 
-import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -160,10 +159,6 @@ WRONG: list[tuple[Task, str]] = [
         "reset of the robot: expected a finite state of 2 numbers, got [0.0, 0.0, 0.0]",
     ),
     (
-        robot(reset=lambda self, seed: [float(torch.rand(())), 0.0]),
-        "reset of the robot: the same seed must give the same start, and gave x = ",
-    ),
-    (
         replace(abstraction(lambda state: state[..., :1] * np.nan), robot=None),
         "abstraction (φ) of states (3, 2): expected finite numbers, got nan",
     ),
@@ -195,27 +190,3 @@ def starts_apart(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_wrong_piece_is_named_in_one_line(task: Task, line: str) -> None:
     faults = check_task(task)
     assert len(faults) == 1 and faults[0].startswith(line) and "\n" not in faults[0]
-
-
-@pytest.mark.parametrize(
-    ("drawn", "started", "told"),
-    [
-        ((0.0, 0.0), [0.0], ""),
-        ((0.0, 0.0), [0.1], ""),  # within what the simulator moves in a second
-        ((4.0, 6.0), [3.5], ""),  # near the range
-        ((50.0, 50.0), [0.0, 50.0], ""),  # there in one reset
-        ((50.0, 50.0), [0.0, 1.0], "starts at x = 0 to 1, far from where objective.draw_starts puts the"),
-        ((-60.0, -50.0), [0.0], "starts at x = 0 to 0, far from where objective.draw_starts puts the"),
-    ],
-)
-def test_a_robot_that_starts_elsewhere_is_told(
-    drawn: tuple[float, float],
-    started: list[float],
-    told: str,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    places = itertools.cycle(started)
-    monkeypatch.setattr(Reach, "draw_starts", lambda self, rng, count: rng.uniform(*drawn, (count, 1)))
-    assert check_task(robot(reset=lambda self: [next(places), 0.0])) == []
-    assert (told in caplog.text and len(caplog.records) == 1) if told else not caplog.records

@@ -8,7 +8,7 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.geometry import turned
 from astra_data.worlds.plane.mazes import FreeSpace, Maze
-from astra_data.worlds.protocols import VariableSimulator
+from astra_data.worlds.protocols import TaskSimulator
 from astra_data.worlds.variation import Variation, VariedSimulator, noisy_command
 
 _CELLS_APART = 1e-6
@@ -113,7 +113,7 @@ class VariedPlanar(VariedSimulator):
     observed without noise when it was set or corrected.
     """
 
-    def __init__(self, simulator: VariableSimulator, variation: Variation) -> None:
+    def __init__(self, simulator: TaskSimulator, variation: Variation) -> None:
         super().__init__(simulator, variation)
         self._observed = simulator.state
 
