@@ -36,7 +36,7 @@ from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.policies.train import PpoTrainConfig
-from astra_data.robots.ant.body import POSITIONS, VelocityController
+from astra_data.robots.ant.tasks import POSITIONS, VelocityController
 from astra_data.robots.registry import TASKS
 
 SETTINGS = load_recipe(Path(__file__).parents[1] / "recipes" / "antmaze_long.toml", Recipe)

@@ -23,8 +23,7 @@ from timing import Candidates, Stretch, measure
 
 from astra_data.core.arrays import Floats
 from astra_data.core.provenance import cores
-from astra_data.robots.ant.body import CONTROL_SUBSTEPS, VelocityController, ant_model
-from astra_data.robots.ant.tasks import AntMazeEnv
+from astra_data.robots.ant.tasks import CONTROL_SUBSTEPS, AntMazeEnv, VelocityController, ant_model
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.navigation import PlanarObjective
 

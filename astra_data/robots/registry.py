@@ -71,32 +71,18 @@ def place_of(name: str) -> str:
 
 
 def known_tasks() -> dict[str, Task]:
-    """Return the tasks of this package and of installed ones, by name.
-
-    Raises:
-        BadInputError: a package offers something else, or it fails.
-    """
+    """Return the tasks of this package and of installed ones, by name."""
     return {name: task_named(name) for name in known_names()}
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """An abstract simulator, and the map φ to its states.
-
-    Attributes:
-        id: the simulator's name in the dataset.
-        origin: the task that it belongs to, the sha256 of its file, or its place in a package.
-        maze: that of the task; None where there is none.
-        abstract_state: the column of abstract states, with names, units, frames and roles.
-        abstraction: φ, target states (B, S) to abstract states (B, X), numpy in, numpy out.
-        simulator: builds B simulators.
-        commands: the bounds of the task's commands; None where they are ±1, and without a task.
-        fps: the task's steps per second; None for a simulator without a task.
-        columns: the states and commands of the task's robot; none for a simulator without a task.
-    """
+    """An abstract simulator, and the map φ to its states; what a task tells is None or empty without one."""
 
     id: str
+    """The simulator's name in the dataset."""
     origin: Mapping[str, str]
+    """The task that it belongs to, the sha256 of its file, or its place in a package."""
     maze: Maze | None
     abstract_state: Column
     abstraction: Callable[[Array], Array]
@@ -158,11 +144,7 @@ def _made_by(name: str) -> Any:  # noqa: ANN401 - a task or a class of the user'
 
 
 def built(pairing: Pairing, count: int) -> AbstractSimulator:
-    """Build `count` simulators.
-
-    Raises:
-        BadInputError: building them fails, or their states or parameters are of the wrong kind.
-    """
+    """Build `count` simulators; check their states and parameters."""
     with explained(f"{pairing.id}({count})"):
         batch = pairing.simulator(count)
         parameters, state = dict(batch.parameters), batch.state
@@ -178,11 +160,7 @@ def built(pairing: Pairing, count: int) -> AbstractSimulator:
 
 
 def checked_abstraction(pairing: Pairing, state: Array) -> Array:
-    """Return φ(state), (B, X) float32, for `state` (B, S).
-
-    Raises:
-        BadInputError: φ fails on such states, or returns another shape.
-    """
+    """Return φ(state), (B, X) float32, for `state` (B, S); check its shape."""
     expected = (len(state), pairing.abstract_state.size)
     with explained(f"the abstraction of {pairing.id}, given states {state.shape},"):
         abstract = np.ascontiguousarray(pairing.abstraction(state), dtype=np.float32)

@@ -14,21 +14,15 @@ from astra_data.worlds.plane.mazes import Maze
 
 @dataclass(frozen=True)
 class Score:
-    """A measure of episodes; the larger, the better.
-
-    Attributes:
-        measure: its name in evaluation.json, which has one number per episode.
-        title: of a table's column.
-        quantity: name of its mean over episodes, within a sentence.
-        digits: shown behind the decimal point.
-        limit: the largest possible value, at which axes end; None where there is none.
-    """
+    """A measure of episodes; the larger, the better."""
 
     measure: str
-    title: str
-    quantity: str
-    digits: int
+    """Its name in evaluation.json, which has one number per episode."""
+    title: str  # of a table's column
+    quantity: str  # name of its mean over episodes, within a sentence
+    digits: int  # shown behind the decimal point
     limit: float | None = None
+    """The largest possible value, at which axes end; None where there is none."""
 
     def text(self, value: float) -> str:
         """Return a value with its digits."""
@@ -114,10 +108,7 @@ class Objective(ABC):
     def succeeded(self, reached: Tensor, failed: Tensor, step: int) -> Tensor:
         """Return which episodes (B,) succeed in their `step`, counted from 1.
 
-        Args:
-            reached: whether the goal was reached in it, (B,) bool.
-            failed: whether it was a failure, (B,) bool.
-            step: its number.
+        They `reached` their goals, or `failed`, in it, (B,) bool.
         """
         return ~failed if self.is_lasting and step >= self.horizon else reached
 

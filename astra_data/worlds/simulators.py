@@ -105,13 +105,10 @@ class ColdSteps:
         *,
         substeps: int,
     ) -> Floats:
-        """Return where `substeps` physics steps under a constant control lead.
+        """Return where `substeps` physics steps from `motion`, qpos then qvel (B, nq + nv), lead.
 
-        model: the model, or one for each of the B copies, which differ in numbers alone. motion: qpos then
-        qvel, (B, nq + nv). control: of the actuators, (B, nu). substeps: their number.
-
-        Returns:
-            qpos then qvel after them, (B, nq + nv).
+        `model` is one for all, or one for each of the B copies, which differ in numbers alone; the `control`
+        of the actuators (B, nu) is constant.
         """
         one = model if isinstance(model, mujoco.MjModel) else model[0]
         after_time = slice(1, 1 + one.nq + one.nv)

@@ -90,28 +90,22 @@ def whole(state: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Varied:
-    """How the parameters of an abstract simulator vary from episode to episode.
-
-    Attributes:
-        kind: of simulator whose parameters vary; built from a plain one and the ranges. randomized: what
-        domain randomization varies, in which ranges. wide: what COMPASS varies or identifies, and RMA adapts
-        to; its kind is that of all parameters that the simulator has.
-    """
+    """How the parameters of an abstract simulator vary from episode to episode."""
 
     kind: Callable[[TaskSimulator, Variation], VariedSimulator]
+    """Builds the varied simulator from a plain one and the ranges."""
     randomized: Variation
+    """What domain randomization varies, in which ranges."""
     wide: Variation
+    """What COMPASS varies or identifies, and RMA adapts to; of the kind of all parameters that there are."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Properties that only tasks in a maze have.
-
-    Attributes:
-        wall_reach_m: a robot whose clearance in the maze is larger than this touches no wall.
-    """
+    """Properties that only tasks in a maze have."""
 
     wall_reach_m: float
+    """A robot whose clearance in the maze is larger than this touches no wall."""
 
 
 _FROM_SIMULATOR: Any = None
@@ -261,22 +255,14 @@ class Task:
 
     @property
     def planar(self) -> Plane:
-        """The properties of a task in a maze.
-
-        Raises:
-            BadInputError: the task has no maze.
-        """
+        """The properties of a task in a maze; BadInputError for others."""
         if self.plane is None:
             raise self.without_maze()
         return self.plane
 
     @property
     def maze(self) -> Maze:
-        """The maze.
-
-        Raises:
-            BadInputError: the task has no maze.
-        """
+        """The maze; BadInputError where there is none."""
         if self.objective.layout is None:
             raise self.without_maze()
         return self.objective.layout

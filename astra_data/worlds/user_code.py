@@ -148,11 +148,7 @@ def _public_names(module: ModuleType) -> list[str]:
 
 @contextmanager
 def explained(what: str) -> Iterator[None]:
-    """Turn an exception of the user's code into an error of one line that begins with `what`.
-
-    Raises:
-        BadInputError: for any exception.
-    """
+    """Turn an exception of the user's code into a BadInputError of one line that begins with `what`."""
     try:
         yield
     except AstraDataError:
@@ -273,11 +269,7 @@ def _imported(tree: ast.Module) -> set[str]:
 
 
 def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
-    """Return the tensors and the metadata (JSON values) that `to_file` of something learned returns.
-
-    Raises:
-        BadInputError: it fails, or returns something else.
-    """
+    """Return the tensors and the metadata (JSON values) that `to_file` of something learned returns."""
     what = f"{type(learned).__name__}.to_file"
     returned = answered(what, learned.to_file)  # type: ignore[attr-defined]
     is_pair = isinstance(returned, tuple | list) and len(returned) == 2
@@ -320,11 +312,7 @@ def restored[Learned](
 
 
 def answered[Answer](what: str, function: Callable[..., Answer], *given: object) -> Answer:
-    """Return what a `function` of the user's returns; errors begin with `what`.
-
-    Raises:
-        BadInputError: it fails.
-    """
+    """Return what a `function` of the user's returns; errors begin with `what`."""
     with explained(what):
         return function(*given)
 
@@ -336,11 +324,7 @@ def expect(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> Tensor:
-    """Return `found`, a finite tensor of `shape`, where -1 stands for any length.
-
-    Raises:
-        BadInputError: it is something else.
-    """
+    """Return `found`, a finite tensor of `shape`, where -1 stands for any length; refuse what is none."""
     found = expect_tensor(what, found)
     if len(shape) != found.dim() or any(
         size not in (-1, length) for size, length in zip(shape, found.shape, strict=True)
@@ -359,42 +343,26 @@ def expect(
 
 
 def expect_tensor(what: str, found: object) -> Tensor:
-    """Return `found`, a tensor.
-
-    Raises:
-        BadInputError: it is something else.
-    """
+    """Return `found`, a tensor; refuse what is none."""
     if not isinstance(found, Tensor):
         raise BadInputError(f"{what}: expected a torch tensor, got a {type(found).__name__}")
     return found
 
 
 def stepped(simulator: AbstractSimulator, command: Tensor, what: str) -> Tensor:
-    """Return the states (B, X) that a step with `command` (B, A) leads to; errors begin with `what`.
-
-    Raises:
-        BadInputError: the step fails, or returns no tensor.
-    """
+    """Return the states (B, X) that a step with `command` (B, A) leads to; errors begin with `what`."""
     return expect_tensor(what, answered(what, simulator.step, command))
 
 
 def judged(objective: Objective, name: str, state: Tensor, goal: Tensor) -> Tensor:
-    """Return which states (B, X) are "reached" or "missed", as `name` says, (B,) bool.
-
-    Raises:
-        BadInputError: the objective fails, or returns something else.
-    """
+    """Return which states (B, X) are "reached" or "missed", as `name` says, (B,) bool."""
     what = f"objective.{name}(state, goal)"
     found = answered(what, getattr(objective, name), state, goal)
     return expect(what, found, (len(state),), torch.bool, state.device)
 
 
 def paid(objective: Objective, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
-    """Return the rewards (B,) of steps between states (B, X).
-
-    Raises:
-        BadInputError: the objective fails, or returns something else.
-    """
+    """Return the rewards (B,) of steps between states (B, X)."""
     what = "objective.reward(before, after, goal, failed)"
     found = answered(what, objective.reward, before, after, goal, failed)
     return expect(what, found, (len(after),), device=after.device)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.ant.body import ant_model
+from astra_data.robots.ant.tasks import ant_model
 from astra_data.worlds.batched_mujoco import BatchedPhysics
 from astra_data.worlds.plane.mazes import U_MAZE
 

@@ -51,13 +51,13 @@ def test_equals_the_environment_stepped_by_hand() -> None:
 
 def test_an_environment_may_be_given_by_its_class() -> None:
     by_id = GymnasiumRobot("Pendulum-v1", g=9.0)
-    by_class = GymnasiumRobot(type(by_id.env), g=9.0)
+    by_class = GymnasiumRobot(type(by_id.env.unwrapped), g=9.0)
     assert by_class.name == "PendulumEnv"
     np.testing.assert_array_equal(by_class.reset(seed=4), by_id.reset(seed=4))
     moved, pushed = (robot.step(np.array([1.0]))[0] for robot in (by_class, by_id))
     np.testing.assert_array_equal(moved, pushed)
     with pytest.raises(BadInputError, match=r"^making PendulumEnv fails with TypeError.*gravity"):
-        GymnasiumRobot(type(by_id.env), gravity=9.0)
+        GymnasiumRobot(type(by_id.env.unwrapped), gravity=9.0)
 
 
 class Mirrored(gymnasium.ActionWrapper[Any, Any, Any]):

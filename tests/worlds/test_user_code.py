@@ -93,9 +93,7 @@ def test_each_file_imports_those_beside_it(tmp_path: Path, monkeypatch: pytest.M
 
 def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
-    imports = (
-        "from __future__ import annotations\nimport sys\nfrom pathlib import Path\nfrom typing import Any\n"
-    )
+    imports = "import sys\nfrom pathlib import Path\nfrom typing import Any\n"
     file.write_text(f"{imports}TASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
     with pytest.raises(BadInputError, match=r"mine.py has no 'TAKS'; it has TASK, reach$"):
         user_object(f"{file}:TAKS")

@@ -1,28 +1,28 @@
-"""AntMaze: Gymnasium's ant in a maze, and a planar point mass as its abstract simulator (Section V-A)."""
+"""The ant's body: its MuJoCo model, its heading frame, its four-fold symmetry, its low-level controller.
 
+The controller turns a planar world-frame velocity command into eight joint torques. It observes the body in a
+heading frame. The four legs are exact copies, so the frame is first turned by the multiple of 90° for which
+the command points within ±45° of the x axis, and the legs are renumbered to match.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from functools import partial
+from importlib.resources import files
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import load_file
 from torch import Tensor
+from torch.nn import functional
 
 from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
-from astra_data.robots.ant.body import (
-    CONTROL_SUBSTEPS,
-    INTEGRATOR,
-    POSITIONS,
-    STATE_SIZE,
-    TIMESTEP_S,
-    TOPPLE_COSINE,
-    WALL_REACH_M,
-    VelocityController,
-    ant_model,
-    standing_pose,
-    up_cosine,
-)
-from astra_data.worlds.batched_mujoco import BatchedPhysics, wall_geoms
+from astra_data.worlds.batched_mujoco import BatchedPhysics, add_walls, wall_geoms
+from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
@@ -38,6 +38,152 @@ from astra_data.worlds.task import (
     free_body,
 )
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
+
+STATE_SIZE = 29
+"""qpos (15): x, y, z, quaternion, 8 joint angles; qvel (14): linear, angular, 8 joint rates."""
+POSITIONS = 15
+CONTROL_SUBSTEPS = 5
+"""Physics steps per control step: 5 x 0.01 s = 20 Hz, as in Gymnasium."""
+TIMESTEP_S = 0.05
+INTEGRATOR = "RK4"
+"""Gymnasium's; "Euler" is 3.7 times faster, but has other contact dynamics."""
+TOPPLE_COSINE = 0.2
+"""The ant has toppled when the cosine between its up axis and the vertical falls below this."""
+TORSO_HEIGHT_M = 0.75
+WALL_REACH_M = 1.3
+"""With more clearance than this on the maze's grid the ant touches no wall: a stretched leg ends 1.21 m from
+the torso's center, and the grid is up to 0.1 m off."""
+WALL_HEIGHT = 0.5
+"""In units of the maze scale, as in gymnasium-robotics."""
+# Ankle axes alternate; these signs make every leg look like leg 1 (angle 30..70 degrees).
+_ANKLE_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> mujoco.MjModel:
+    """Build Gymnasium's ant, optionally in a maze and with longer legs.
+
+    Args:
+        maze: walls to add, placed as gymnasium-robotics places them; none for an open plane.
+        leg_scale: factor on the length of all leg segments (1.25 in the paper's morphology test).
+    """
+    root = ElementTree.parse(Path(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))).getroot()
+    root.findall("option")[0].set("integrator", INTEGRATOR)
+    world = root.findall("worldbody")[0]
+    torso = world.findall("body")[0]
+    for part in [*torso.iter("geom"), *torso.iterfind(".//body")] if leg_scale != 1.0 else []:
+        for length in {"fromto", "pos"} & {*part.attrib}:
+            scaled = [str(float(value) * leg_scale) for value in part.attrib[length].split()]
+            part.set(length, " ".join(scaled))
+    if maze is not None:
+        look = {"material": "", "contype": "1", "conaffinity": "1", "rgba": "0.7 0.5 0.3 1.0"}
+        add_walls(world, maze, WALL_HEIGHT * maze.scale, **look)
+    return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+
+
+def standing_pose(count: int) -> Floats:
+    """Return `count` upright poses (count, 15) at the origin, legs within their joint limits."""
+    qpos = np.zeros((count, POSITIONS))
+    qpos[:, 2] = TORSO_HEIGHT_M
+    qpos[:, 3] = 1.0
+    qpos[:, 7:] = np.array([0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
+    return qpos
+
+
+def up_cosine(quaternion: Floats) -> Floats:
+    """Return the cosine (B,) between the torso's up axis and the vertical, from `quaternion` (B, 4) wxyz."""
+    _, x, y, _ = quaternion.T
+    return np.asarray(1.0 - 2.0 * (x * x + y * y))
+
+
+def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Describe body and command in the heading frame that is turned toward the command.
+
+    Args:
+        qpos: positions, (B, 15).
+        qvel: velocities, (B, 14).
+        command: world-frame planar velocity in m/s, (B, 2).
+
+    Returns:
+        The controller's observation (B, 28): height - 0.6, up axis (3), linear velocity (3), angular
+        velocity (3), hip and ankle angles (4 + 4), their rates (4 + 4), command (2); and the number of
+        quarter turns (B,) between the body's own numbering of its legs and the observation's.
+    """
+    rotation = rotation_matrix(qpos[:, 3:7])
+    yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+    bearing = np.arctan2(command[:, 1], command[:, 0]) - yaw
+    quarters = np.round(bearing / (np.pi / 2)).astype(np.intp) % 4
+    frame = yaw + quarters * (np.pi / 2)
+    cos, sin = np.cos(frame), np.sin(frame)
+
+    def in_frame(vector: Floats) -> Floats:
+        turned = vector.copy()
+        turned[:, 0] = cos * vector[:, 0] + sin * vector[:, 1]
+        turned[:, 1] = cos * vector[:, 1] - sin * vector[:, 0]
+        return turned
+
+    legs = (np.arange(4) + quarters[:, None]) % 4
+    signs = _ANKLE_SIGNS[legs]
+    batch = np.arange(len(qpos))[:, None]
+    angles, rates = qpos[:, 7:].reshape(-1, 4, 2), qvel[:, 6:].reshape(-1, 4, 2)
+    angular = np.einsum("bij,bj->bi", rotation, qvel[:, 3:6])
+    observation = np.concatenate(
+        [
+            qpos[:, 2:3] - 0.6,
+            in_frame(rotation[:, :, 2]),
+            in_frame(qvel[:, 0:3]),
+            in_frame(angular),
+            angles[batch, legs, 0],
+            angles[batch, legs, 1] * signs,
+            rates[batch, legs, 0] * 0.2,
+            rates[batch, legs, 1] * signs * 0.2,
+            in_frame(command),
+        ],
+        axis=1,
+    )
+    return observation, quarters
+
+
+def torques_to_body(torques: Floats, quarters: NDArray[np.intp]) -> Floats:
+    """Turn canonical torques (B, 8), hips then ankles, into the model's control vector (B, 8)."""
+    legs = (np.arange(4) - quarters[:, None]) % 4
+    batch = np.arange(len(torques))[:, None]
+    hips = torques[:, :4][batch, legs]
+    ankles = torques[:, 4:][batch, legs] * _ANKLE_SIGNS
+    body = np.stack([hips, ankles], axis=-1)
+    # The model lists its actuators from leg 4, then 1, 2, 3.
+    return np.roll(body, 1, axis=1).reshape(-1, 8)
+
+
+class VelocityController:
+    """The frozen low-level controller: world-frame planar velocity command in, joint torques out.
+
+    A two-layer ReLU network with tanh output, stored as safetensors. It is evaluated in torch because numpy's
+    matrix products leave a thread per core spinning, which halves the speed of the physics.
+    """
+
+    def __init__(self, layers: Sequence[tuple[Tensor, Tensor]], torque_scale: float) -> None:
+        """Take (weight, bias) of each layer, and the largest torque as a share of the motors' limit."""
+        self._layers = list(layers)
+        self.torque_scale = torque_scale
+
+    @classmethod
+    def load(cls, path: Path | None = None) -> "VelocityController":
+        """Load weights from `path`, by default the checkpoint shipped with the package."""
+        source = path or Path(str(files("astra_data.robots.ant") / "velocity_controller.safetensors"))
+        tensors = load_file(source)
+        layers = [
+            (tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in range(len(tensors) // 2)
+        ]
+        return cls(layers, float(tensors["torque_scale"]))
+
+    def __call__(self, qpos: Floats, qvel: Floats, command: Floats) -> Floats:
+        """Return torques (B, 8) in [-1, 1] for `qpos` (B, 15), `qvel` (B, 14) and `command` (B, 2) in m/s."""
+        observation, quarters = canonical_view(qpos, qvel, command)
+        hidden = torch.from_numpy(observation).float()
+        for weight, bias in self._layers[:-1]:
+            hidden = functional.linear(hidden, weight, bias).relu()
+        squashed = functional.linear(hidden, *self._layers[-1]).tanh()
+        return torques_to_body(self.torque_scale * squashed.double().numpy(), quarters)
 
 
 class AntMazeEnv(PlanarTarget):

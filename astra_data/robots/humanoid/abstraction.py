@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.arrays import normalized
-from astra_data.robots.humanoid.model import (
+from astra_data.robots.humanoid.target import (
     COMMANDED,
     CONTACT_M,
     FEET,

@@ -32,8 +32,12 @@ from astra_data.robots.humanoid.abstraction import (
     mass_and_feet,
     mass_velocity,
 )
-from astra_data.robots.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
-from astra_data.robots.humanoid.model import (
+from astra_data.robots.humanoid.simulators import (
+    HumanoidExtendedKinematics,
+    HumanoidKinematics,
+    HumanoidWalker2d,
+)
+from astra_data.robots.humanoid.target import (
     COMMANDED,
     DAMPING,
     JOINT_RATES_RAD_S,
@@ -48,11 +52,10 @@ from astra_data.robots.humanoid.model import (
     TIMESTEP_S,
     VELOCITY_M_S,
     CommandRanges,
+    HumanoidEnv,
     Locomotion,
     humanoid_model,
 )
-from astra_data.robots.humanoid.target import HumanoidEnv
-from astra_data.robots.humanoid.walker2d import HumanoidWalker2d
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.task import Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import JointVariation, VariedSimulator, noisy_command

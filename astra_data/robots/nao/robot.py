@@ -1,26 +1,219 @@
-"""B walking NAOs: commanded velocities in, sensor readings and true poses out."""
+"""The NAO's body as a MuJoCo model, and B of them: physics, servos, ankle reflex, 16 ticks per control step.
 
+A robot's whole control step runs in one thread, so that results do not depend on the number of threads. The
+robot's own friction and stiffness are first written into the thread's copy of the model.
+"""
+
+import copy
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
+from importlib.resources import files
+from math import atan2
+from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.provenance import cores
-from astra_data.robots.nao.bodies import MOTORS, TICKS, BatchedBodies, nao_model
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
-from astra_data.robots.nao.kinematics import (
+from astra_data.robots.nao.walk import (
     HIP_OFFSET_Z_M,
     TICK_S,
     TO_MOTORS,
+    Gait,
+    StepPlanner,
+    Targets,
     Traits,
     TraitSpread,
+    WalkEngine,
+    WalkLimits,
+    WalkStyle,
     leg_angles,
+    put_rows,
 )
-from astra_data.robots.nao.walk import Gait, StepPlanner, WalkEngine, WalkLimits, WalkStyle, put_rows
+from astra_data.worlds.batched_mujoco import add_walls, share_out, views, wall_geoms
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
+
+SUBSTEPS = 3
+"""Physics steps per tick: 4 ms each."""
+WALL_HEIGHT_M = 0.5
+
+
+def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel:
+    """Build a NAO on a floor, in `maze` or without walls, with or without a ball: see nao.xml.
+
+    qpos: torso x, y, z, quaternion (7), left leg's six joints, right leg's six, the ball's pose (7).
+    Controls: twelve joint angles in rad in the same order; both hip yaw-pitch joints are coupled.
+    """
+    root = ElementTree.parse(Path(str(files("astra_data.robots.nao") / "nao.xml"))).getroot()
+    (world,) = root.findall("worldbody")
+    for body in [] if ball else world.findall("body[@name='ball']"):
+        world.remove(body)
+    if maze:
+        add_walls(world, maze, WALL_HEIGHT_M, contype="2")
+    return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+
+
+TICKS = 16
+"""Per control step."""
+FALLEN_COSINE = 0.7
+"""A robot has fallen when the cosine between its up axis and the vertical is below this (45°)."""
+MOTORS = len(TO_MOTORS)
+
+_STATE = int(
+    mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL
+)
+# Ankles among the motors: pitch, roll; left, right.
+_ANKLES = ((4, 5), (10, 11))
+
+
+class BatchedBodies:
+    """B bodies of one model.
+
+    Attributes:
+        state: MuJoCo's full states, (B, N). qpos, qvel: views of it, (B, nq), (B, nv). sent: angles sent to
+        the servos, (B, delay + 16, 12) in rad: the last ticks of the previous control step, which may not
+        have arrived, then this one's. tilting: low-passed measured rates about x and y, (B, 2) in rad/s.
+        held: angles planned for the last tick, (B, 12) in rad. waited: ticks for which the present lift of a
+        foot has been delayed, (B,) int. gyro: last measured rates, (B, 3) in rad/s. pressure: on the points
+        of the soles, left foot's then right foot's, (B, 8) in N. fallen: (B,) bool; a fallen robot stays as
+        it is until its reset. touching: whether the robot touched a wall in its last control step, (B,) bool.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        traits: Traits,
+        *,
+        longest_delay_ticks: int,
+        style: WalkStyle,
+        num_threads: int,
+    ) -> None:
+        """Allocate one body for each of `traits`' B robots; `reset` them before they are stepped."""
+        self.model = model
+        self.traits = traits
+        self.style = style
+        self._stiffness = float(model.actuator_gainprm[0, 0])
+        count = len(traits.stiffness)
+        self.state: Floats = np.zeros((count, mujoco.mj_stateSize(model, _STATE)))
+        self.qpos, self.qvel = views(model, self.state)
+        self.sent: Floats = np.zeros((count, longest_delay_ticks + TICKS, MOTORS))
+        self.tilting: Floats = np.zeros((count, 2))
+        self.held: Floats = np.zeros((count, MOTORS))
+        self.waited: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
+        self.gyro: Floats = np.zeros((count, 3))
+        self.pressure: Floats = np.zeros((count, 8))
+        self.fallen: Bools = np.zeros(count, dtype=bool)
+        self.touching: Bools = np.zeros(count, dtype=bool)
+        self._walls = wall_geoms(model)
+        self._robot_geoms = np.zeros(model.ngeom, dtype=bool)
+        self._robot_geoms[[model.geom(name).id for name in ("chest", "LFoot", "RFoot")]] = True
+        self._models = [copy.copy(model) for _ in range(min(num_threads, count))]
+        self._data = [mujoco.MjData(one) for one in self._models]
+        self._pool = ThreadPoolExecutor(len(self._models))
+
+    def reset(self, rows: NDArray[np.intp], qpos: Floats, angles: Floats) -> None:
+        """Set the bodies `rows` (n,) at rest at `qpos` (n, nq), their servos holding `angles` (n, 12)."""
+        data = self._data[0]
+        for row, position in zip(rows, qpos, strict=True):
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:] = position
+            mujoco.mj_forward(self.model, data)
+            mujoco.mj_getState(self.model, data, self.state[row], _STATE)
+        self.sent[rows], self.held[rows] = angles[:, None], angles
+        for part in (self.waited, self.tilting, self.gyro, self.pressure, self.fallen, self.touching):
+            part[rows] = 0
+
+    def step(self, rows: NDArray[np.intp], targets: Targets, noise: Floats) -> NDArray[np.intp]:
+        """Run the bodies `rows` (n,) through one control step.
+
+        Args:
+            rows: which bodies; fallen ones are left as they are.
+            targets: of the legs of all B.
+            noise: of the gyroscope, (B, 16, 3) in rad/s.
+
+        Returns:
+            The number of ticks of the targets that were followed, (B,) int; in the others a lift was delayed.
+        """
+        self.touching[rows] = False
+        rows = rows[~self.fallen[rows]]
+        before = self.sent.shape[1] - TICKS
+        self.sent[rows, :before] = self.sent[rows, TICKS:]
+        followed = np.zeros(len(self.fallen), dtype=np.intp)
+        work = partial(self._step_rows, targets, noise, followed)
+        share_out(rows.tolist(), self._pool, work, len(self._models))
+        return followed
+
+    def _step_rows(
+        self, targets: Targets, noise: Floats, followed: NDArray[np.intp], thread: int, rows: Iterator[int]
+    ) -> None:
+        model, data, traits = self._models[thread], self._data[thread], self.traits
+        floor = model.geom("floor").id
+        for row in rows:
+            model.geom_friction[floor, 0] = traits.friction[row]
+            stiffness = self._stiffness * traits.stiffness[row]
+            model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = stiffness, -stiffness
+            mujoco.mj_setState(model, data, self.state[row], _STATE)
+            followed[row] = self._walk(model, data, row, targets, noise[row])
+            mujoco.mj_getState(model, data, self.state[row], _STATE)
+            self.pressure[row] = data.sensordata
+
+    def _walk(
+        self, model: mujoco.MjModel, data: mujoco.MjData, row: int, targets: Targets, noise: Floats
+    ) -> int:
+        style, sent, rates, step = self.style, self.sent[row], data.qvel[3:6], mujoco.mj_step
+        planned = (targets.angles[row] + self.traits.joint_offset_rad[row])[:, TO_MOTORS]
+        supports, lifts_off = targets.supports[row].tolist(), targets.lifts_off[row].tolist()
+        first = sent.shape[0] - TICKS
+        arrived = first - int(self.traits.delay_ticks[row])
+        keep, (pitch_gain, roll_gain) = style.gyro_keep, style.gyro_gain
+        roll_rate, pitch_rate = self.tilting[row].tolist()
+        held, waited, followed = self.held[row], int(self.waited[row]), 0
+        for tick in range(TICKS):
+            measured = rates + noise[tick]
+            roll_rate = keep * roll_rate + (1 - keep) * float(measured[0])
+            pitch_rate = keep * pitch_rate + (1 - keep) * float(measured[1])
+            w, x, y, z = data.qpos[3:7].tolist()
+            roll = atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+            # Positive rolls are to the right; leaning over the left foot is negative.
+            lean = -(roll + style.lean_ahead_s * roll_rate) * lifts_off[followed]
+            if lean > style.lean_rad and waited < style.longest_wait_ticks:
+                waited, carries = waited + 1, (True, True)
+            else:
+                held, carries = planned[followed], supports[followed]
+                waited, followed = 0, followed + 1
+            sent[first + tick] = held
+            for carrying, (ankle_pitch, ankle_roll) in zip(carries, _ANKLES, strict=True):
+                if carrying:
+                    sent[first + tick, ankle_pitch] += pitch_gain * pitch_rate
+                    sent[first + tick, ankle_roll] += roll_gain * roll_rate
+            data.ctrl[:] = sent[arrived + tick]
+            step(model, data, SUBSTEPS)
+            if self._walls is not None and not self.touching[row]:
+                self.touching[row] = self._touches(data)
+            _, x, y, _ = data.qpos[3:7].tolist()
+            if 1 - 2 * (x * x + y * y) < FALLEN_COSINE:
+                self.fallen[row] = True
+                break
+        self.held[row], self.waited[row] = held, waited
+        self.tilting[row] = roll_rate, pitch_rate
+        self.gyro[row] = measured
+        return followed
+
+    def _touches(self, data: mujoco.MjData) -> bool:
+        """Return whether the robot, not the ball, touches a wall."""
+        first, last = self._walls or (0, -1)
+        geoms = data.contact.geom
+        walls = (geoms >= first) & (geoms <= last)
+        return bool((walls[:, ::-1] & self._robot_geoms[geoms]).any())
+
 
 CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS

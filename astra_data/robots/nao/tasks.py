@@ -5,9 +5,9 @@ from typing import Any
 
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
 from astra_data.robots.nao.kicking import BallAgent, Kicking
-from astra_data.robots.nao.kinematics import JOINTS, TICK_S
 from astra_data.robots.nao.robot import CONTROL_STEP_S
 from astra_data.robots.nao.target import SPEED_M_S, NaoEnv, nao_beyond, nao_to_ball_agent, nao_to_point_mass
+from astra_data.robots.nao.walk import JOINTS, TICK_S
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar

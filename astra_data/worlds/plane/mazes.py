@@ -48,8 +48,6 @@ class Maze:
                 for name, cell in (("start", self.start), ("goal", self.goal))
                 if cell not in self.free_cells()
             ]
-            if not faults and self.goal not in self._cells_around(self.start):
-                faults.append(f"goal: expected a cell to which a way leads from the start, got {self.goal}")
         per_cell = self.scale / self.fine_m if self.fine_m > 0 else 0.0
         if self.scale <= 0 or round(per_cell) < 2 or abs(per_cell - round(per_cell)) > 1e-6:
             faults.append(
@@ -57,18 +55,6 @@ class Maze:
             )
         if faults:
             raise BadInputError(f"maze: {'; '.join(faults)}")
-
-    def _cells_around(self, cell: tuple[int, int]) -> set[tuple[int, int]]:
-        """Return the free cells to which a way leads from a free `cell`."""
-        # Without scipy.ndimage, whose import would take everybody who names a task half a second.
-        free, found, todo = {*self.free_cells()}, {cell}, [cell]
-        while todo:
-            row, column = todo.pop()
-            beside = {(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)}
-            new = beside & free - found
-            found |= new
-            todo += new
-        return found
 
     @cached_property
     def walls(self) -> NDArray[np.bool_]:

@@ -98,12 +98,7 @@ class Relocation:
         """Move a part of `episode`, with a goal of its own, judged by the task; None where there is no room.
 
         With a ball, the step that ended the episode is left out, for where the ball was may have ended it,
-        and the copy begins with the ball neither in the goal nor out of the field.
-
-        Args:
-            episode: to be copied.
-            moving: columns that are moved.
-            rng: draws the part, its place and the goal.
+        and the copy begins with the ball neither in the goal nor out of the field. `moving` columns move.
         """
         world, movable = self.task, episode
         if world.ball_index is not None and episode.columns[TERMINATED][-1]:
@@ -149,17 +144,9 @@ class Relocation:
 def outcomes(
     objective: Objective, before: Array, after: Array, goal: Array, toppled: Array
 ) -> dict[str, Array]:
-    """Return rewards and ends of an episode as the task pays them.
+    """Return the outcome columns of an episode as the task pays them, up to the step that ends it, (T',).
 
-    Args:
-        objective: of the task.
-        before: abstract states before each step, (T, X).
-        after: after it, (T, X).
-        goal: (2,) in m.
-        toppled: whether the robot toppled in the step, (T,) bool.
-
-    Returns:
-        the outcome columns up to the step that ends the episode, (T',) with T' <= T.
+    Steps lead from abstract states `before` to `after`, (T, X); in `toppled` (T,) ones the robot toppled.
     """
     start, end = torch.from_numpy(before), torch.from_numpy(after)
     goals = torch.from_numpy(goal).expand(len(start), 2)

@@ -31,7 +31,7 @@ from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.pipeline.stages.augment import AugmentConfig, _free_uid, _moving, _shares, augment
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 from astra_data.pipeline.stages.pair import PairConfig, pair
-from astra_data.robots.ant.body import WALL_REACH_M, up_cosine
+from astra_data.robots.ant.tasks import WALL_REACH_M, up_cosine
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.navigation import Navigation

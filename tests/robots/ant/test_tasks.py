@@ -1,15 +1,177 @@
+from typing import Any
+
+import gymnasium
+import gymnasium_robotics
 import mujoco
 import numpy as np
 import pytest
 import torch
 
+from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE
-from astra_data.robots.ant.body import ant_model, standing_pose
-from astra_data.robots.ant.tasks import AntMazeEnv, ant_beyond_point_mass, ant_to_point_mass
+from astra_data.robots.ant.tasks import (
+    CONTROL_SUBSTEPS,
+    TIMESTEP_S,
+    AntMazeEnv,
+    VelocityController,
+    ant_beyond_point_mass,
+    ant_model,
+    ant_to_point_mass,
+    canonical_view,
+    standing_pose,
+    torques_to_body,
+)
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.batched_mujoco import wall_geoms
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
+
+gymnasium.register_envs(gymnasium_robotics)
+
+SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def random_state(rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return a level, moving ant of any heading above the ground, its joints inside their limits."""
+    qpos, qvel = ant_model().qpos0.copy(), rng.normal(size=14)
+    qpos[2] = 0.8
+    half_yaw = rng.uniform(-np.pi, np.pi) / 2
+    qpos[3], qpos[6] = np.cos(half_yaw), np.sin(half_yaw)
+    qpos[7::2] = rng.uniform(-0.5, 0.5, 4)
+    qpos[8::2] = SIGNS * rng.uniform(0.6, 1.2, 4)
+    return qpos, qvel
+
+
+def quarter_turned(qpos: Floats, qvel: Floats) -> tuple[Floats, Floats]:
+    """Return the same ant in the same place with its legs numbered one further: body turned by 90 degrees."""
+    turned_pos, turned_vel = qpos.copy(), qvel.copy()
+    half = np.pi / 4
+    mujoco.mju_mulQuat(turned_pos[3:7], qpos[3:7], np.array([np.cos(half), 0, 0, np.sin(half)]))
+    turned_vel[3:6] = [qvel[4], -qvel[3], qvel[5]]
+    legs = (np.arange(4) + 1) % 4
+    turned_pos[7::2], turned_vel[6::2] = qpos[7::2][legs], qvel[6::2][legs]
+    for values, turned in ((qpos[8::2], turned_pos[8::2]), (qvel[7::2], turned_vel[7::2])):
+        turned[:] = (SIGNS * values)[legs] * SIGNS
+    return turned_pos, turned_vel
+
+
+def feet(qpos: Floats) -> Floats:
+    model = ant_model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    names = ("left_ankle_geom", "right_ankle_geom", "third_ankle_geom", "fourth_ankle_geom")
+    return np.array([data.geom(name).xpos for name in names])
+
+
+def test_walls_are_gymnasium_robotics_own() -> None:
+    theirs = gymnasium.make("AntMaze_UMaze-v5").unwrapped.ant_env.model  # type: ignore[attr-defined]
+    ours = ant_model(U_MAZE)
+    walls = wall_geoms(ours)
+    assert walls is not None
+    names = {ours.geom(geom).name for geom in range(walls[0], walls[1] + 1)}
+    assert names == {theirs.geom(geom).name for geom in range(theirs.ngeom)} - {
+        ours.geom(geom).name for geom in range(ours.ngeom) if not walls[0] <= geom <= walls[1]
+    }
+    assert len(names) == len(U_MAZE.wall_cells())
+    for name in names:
+        for field in ("pos", "size", "type", "contype", "conaffinity", "friction", "solref", "margin"):
+            np.testing.assert_array_equal(getattr(ours.geom(name), field), getattr(theirs.geom(name), field))
+
+
+def test_the_ant_is_integrated_as_gymnasiums() -> None:
+    theirs: Any = gymnasium.make("Ant-v5").unwrapped
+    ours = ant_model()
+    for name in ("integrator", "timestep", "solver", "iterations", "gravity", "cone"):
+        np.testing.assert_array_equal(getattr(ours.opt, name), getattr(theirs.model.opt, name))
+    assert theirs.frame_skip == CONTROL_SUBSTEPS
+    assert theirs.dt == pytest.approx(TIMESTEP_S)
+
+
+def test_longer_legs_are_longer_and_nothing_else() -> None:
+    plain, longer = ant_model(U_MAZE), ant_model(U_MAZE, leg_scale=1.25)
+    # Legs are the capsules; a capsule's size is its radius, then half of its length.
+    legs = plain.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+    assert legs.sum() == 12
+    np.testing.assert_allclose(longer.geom_size[legs, 1], 1.25 * plain.geom_size[legs, 1])
+    np.testing.assert_array_equal(longer.geom_size[legs, 0], plain.geom_size[legs, 0])
+    np.testing.assert_array_equal(longer.geom_size[~legs], plain.geom_size[~legs])
+    np.testing.assert_array_equal(longer.geom_pos[~legs], plain.geom_pos[~legs])
+    np.testing.assert_allclose(longer.body_pos[2:], 1.25 * plain.body_pos[2:])
+    for name in ("jnt_range", "jnt_axis", "dof_damping", "dof_armature", "actuator_gear", "geom_friction"):
+        np.testing.assert_array_equal(getattr(longer, name), getattr(plain, name))
+    np.testing.assert_array_equal(longer.qpos0, plain.qpos0)
+
+
+def test_canonical_view_does_not_see_a_quarter_turn() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        (qpos, qvel), command = random_state(rng), rng.uniform(-1, 1, 2)
+        turned_pos, turned_vel = quarter_turned(qpos, qvel)
+        # The turned body is the same in space: each foot where the next one was.
+        np.testing.assert_allclose(feet(turned_pos), np.roll(feet(qpos), -1, axis=0), atol=1e-12)
+        both = np.stack([qpos, turned_pos]), np.stack([qvel, turned_vel])
+        observation, quarters = canonical_view(*both, np.stack([command, command]))
+        assert observation.shape == (2, 28)
+        np.testing.assert_allclose(observation[0], observation[1], atol=1e-12)
+        assert (quarters[0] - quarters[1]) % 4 == 1
+
+
+def test_the_view_of_an_ant_that_looks_along_its_command_is_read_off() -> None:
+    """Rolled by 0.5 rad to the left, in a world frame that is also the heading frame."""
+    qpos, qvel = np.zeros((1, 15)), np.arange(1, 15, dtype=np.float64)[None]
+    qpos[0, :3], qpos[0, 3:5] = [5.0, -3.0, 0.75], [np.cos(-0.25), np.sin(-0.25)]
+    qpos[0, 7:] = [0.1, 1.0, 0.2, -0.9, 0.3, -0.8, 0.4, 0.7]
+    observation, quarters = canonical_view(qpos, qvel, np.array([[0.8, 0.3]]))
+    spin = np.zeros(3)
+    mujoco.mju_rotVecQuat(spin, qvel[0, 3:6].copy(), qpos[0, 3:7].copy())
+    expected = [
+        *(0.15, 0.0, np.sin(0.5), np.cos(0.5)),
+        *(1.0, 2.0, 3.0, *spin),
+        *(0.1, 0.2, 0.3, 0.4, 1.0, 0.9, 0.8, 0.7),
+        # A fifth of the joints' rates, those of ankles 2 and 3 the other way round.
+        *(1.4, 1.8, 2.2, 2.6, 1.6, -2.0, -2.4, 2.8),
+        *(0.8, 0.3),
+    ]
+    np.testing.assert_allclose(observation[0], expected, atol=1e-12)
+    assert quarters.tolist() == [0]
+
+
+def test_torques_to_body_undoes_the_view() -> None:
+    # The same canonical torques move the turned body exactly as the unturned one.
+    rng = np.random.default_rng(4)
+    model = ant_model()
+    command = np.array([[1.0, 0.2], [1.0, 0.2]])
+    qpos, qvel = model.qpos0.copy(), np.zeros(14)
+    qpos[8::2] = SIGNS
+    qpos[3], qpos[6] = np.cos(0.4), np.sin(0.4)
+    bodies = [(qpos, qvel), quarter_turned(qpos, qvel)]
+    data = [mujoco.MjData(model) for _ in bodies]
+    for one, (position, velocity) in zip(data, bodies, strict=True):
+        one.qpos[:], one.qvel[:] = position, velocity
+    for _ in range(10):
+        state = np.stack([one.qpos for one in data]), np.stack([one.qvel for one in data])
+        _, quarters = canonical_view(*state, command)
+        torques = np.tile(rng.uniform(-1, 1, 8), (2, 1))
+        for one, control in zip(data, torques_to_body(torques, quarters), strict=True):
+            one.ctrl[:] = control
+            mujoco.mj_step(model, one, 5)
+    np.testing.assert_allclose(data[0].qpos[:3], data[1].qpos[:3], atol=1e-9)
+    np.testing.assert_allclose(feet(data[1].qpos), np.roll(feet(data[0].qpos), -1, axis=0), atol=1e-9)
+    assert np.abs(data[0].qpos[7:] - qpos[7:]).max() > 0.1
+
+
+@pytest.mark.parametrize("command", [[0.8, 0.0], [0.0, -0.8], [-0.5, 0.5]])
+def test_the_shipped_controller_walks_as_told(command: list[float]) -> None:
+    controller, model = VelocityController.load(), ant_model()
+    data = mujoco.MjData(model)
+    data.qpos[8::2] = SIGNS
+    mean = np.zeros(2)
+    for step in range(100):
+        data.ctrl[:] = controller(data.qpos[None], data.qvel[None], np.array([command]))[0]
+        mujoco.mj_step(model, data, 5)
+        mean += data.qvel[:2] / 60 if step >= 40 else 0.0
+    assert np.linalg.norm(mean - command) < 0.25
 
 
 def test_keeps_planar_position_and_velocity() -> None:

@@ -11,7 +11,7 @@ from astra_data.robots.humanoid.abstraction import (
     mass_and_feet,
     mass_velocity,
 )
-from astra_data.robots.humanoid.model import COMMANDED, FEET, humanoid_model
+from astra_data.robots.humanoid.target import COMMANDED, FEET, humanoid_model
 
 
 def posed(joints: Floats, rates: Floats) -> mujoco.MjData:

@@ -26,17 +26,22 @@ from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.pipeline.stages.train import train
 from astra_data.policies.train import PpoTrainConfig
-from astra_data.robots.humanoid.kinematics import HumanoidExtendedKinematics, HumanoidKinematics
-from astra_data.robots.humanoid.model import (
+from astra_data.robots.humanoid.simulators import (
+    HumanoidExtendedKinematics,
+    HumanoidKinematics,
+    HumanoidWalker2d,
+    walker_model,
+)
+from astra_data.robots.humanoid.target import (
     COMMANDED,
     FEET,
     STANDING,
     TIMESTEP_S,
     CommandRanges,
+    HumanoidEnv,
     Locomotion,
     humanoid_model,
 )
-from astra_data.robots.humanoid.target import HumanoidEnv
 from astra_data.robots.humanoid.tasks import (
     EXTENDED,
     KINEMATICS,
@@ -48,7 +53,6 @@ from astra_data.robots.humanoid.tasks import (
     Walking,
     photograph,
 )
-from astra_data.robots.humanoid.walker2d import HumanoidWalker2d, walker_model
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import JointVariation, VariedSimulator

@@ -1,11 +1,200 @@
+from dataclasses import replace
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.kinematics import IDENTICAL
-from astra_data.robots.nao.robot import BatchedNao
+from astra_data.robots.nao.kicking import BALL_RADIUS_M
+from astra_data.robots.nao.robot import (
+    MOTORS,
+    SUBSTEPS,
+    TICKS,
+    BatchedBodies,
+    BatchedNao,
+    nao_model,
+)
+from astra_data.robots.nao.walk import (
+    HIP_OFFSET_Z_M,
+    IDENTICAL,
+    TO_MOTORS,
+    Gait,
+    StepPlanner,
+    Targets,
+    Traits,
+    WalkEngine,
+    WalkLimits,
+    WalkStyle,
+    leg_angles,
+)
 from astra_data.worlds.plane.mazes import U_MAZE
+
+LEG = ("HipYawPitch", "HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
+
+
+def test_masses_and_joints_are_the_published_ones() -> None:
+    model = nao_model()
+    # B-Human's calibration of the V6: torso, neck, head; arms of 93.0 + 157.8 + 64.8 + 77.6 + 185.3 g; legs.
+    fixed = 1.0496 + 0.0784 + 0.6594 + 2 * (0.0930 + 0.1578 + 0.0648 + 0.0776 + 0.1853)
+    masses = (0.0698, 0.1405, 0.3897, 0.3014, 0.1342, 0.1718)
+    assert model.body("Torso").mass[0] == pytest.approx(fixed)
+    assert [model.joint(joint).name for joint in range(1, 13)] == [
+        side + name for side in "LR" for name in LEG
+    ]
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        np.testing.assert_allclose([model.body(side + name).mass[0] for name in LEG], masses)
+        for name in LEG[1:]:
+            axis = (1, 0, 0) if name.endswith("Roll") else (0, 1, 0)
+            np.testing.assert_array_equal(model.joint(side + name).axis, axis)
+        hip = model.joint(f"{side}HipYawPitch").axis
+        np.testing.assert_allclose(hip, (0.0, 0.5**0.5, -sign * 0.5**0.5))
+        # Roll angles and the ranges of their joints are mirrored.
+        roll = model.joint(f"{side}HipRoll").range
+        np.testing.assert_allclose(np.degrees(np.sort(sign * roll)), (-21.74, 45.29))
+    assert model.body_mass.sum() == pytest.approx(5.36, abs=0.005)
+
+
+def test_the_ball_rolls_to_a_stop_at_the_published_rate() -> None:
+    model = nao_model(ball=True)
+    assert model.body("ball").mass[0] == pytest.approx(0.045)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 5.0  # the robot is still falling
+    data.qvel[18:21], data.qvel[21:24] = [1.0, 0, 0], [0, 1.0 / BALL_RADIUS_M, 0]
+    speeds = []
+    for _ in range(round(0.9 / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        speeds.append(data.qvel[18])
+    middle = np.array(speeds[25:])
+    decelerations = -np.diff(middle) / model.opt.timestep
+    assert decelerations.mean() == pytest.approx(0.30, abs=0.003)
+
+
+@pytest.mark.parametrize("part", ["LShank", "RShank", "LFoot", "RFoot", "chest"])
+def test_shanks_and_feet_touch_the_ball_and_the_chest_does_not(part: str) -> None:
+    model = nao_model(ball=True)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 1.0
+    mujoco.mj_forward(model, data)
+    data.qpos[19:22] = data.geom(part).xpos
+    mujoco.mj_forward(model, data)
+    touched = {model.geom(int(geom)).name for pair in data.contact.geom for geom in pair}
+    assert (part in touched) == (part != "chest")
+
+
+STYLE = WalkStyle(gyro_gain=(0.0, 0.0))
+STANDING = leg_angles(WalkEngine(StepPlanner(np.ones(1)), STYLE).feet(Gait.standing(1, WalkLimits())))[0]
+FIRST = 3  # the longest delay: so many angles are under way when a control step begins
+
+
+def bodies(
+    count: int = 1, *, height_m: float = 0.0, style: WalkStyle = STYLE, **traits: NDArray[Any]
+) -> BatchedBodies:
+    drawn = replace(Traits.draw(IDENTICAL, count, np.random.default_rng(0)), **traits)
+    made = BatchedBodies(nao_model(), drawn, longest_delay_ticks=FIRST, style=style, num_threads=1)
+    qpos = np.tile(made.model.qpos0, (count, 1))
+    qpos[:, 2] = STYLE.hip_height_m + HIP_OFFSET_Z_M + height_m
+    qpos[:, 7 : 7 + MOTORS] = STANDING[TO_MOTORS]
+    made.reset(np.arange(count), qpos, np.tile(STANDING[TO_MOTORS], (count, 1)))
+    return made
+
+
+def targets(count: int = 1, *, carries: tuple[bool, bool] = (False, False), lifts_off: int = 0) -> Targets:
+    """Return the standing posture for one control step, changing by 1 mrad per tick."""
+    ramp = 1e-3 * np.arange(1, TICKS + 1)[:, None]
+    return Targets(
+        angles=np.tile(STANDING + ramp, (count, 1, 1)),
+        supports=np.tile(np.array(carries), (count, TICKS, 1)),
+        lifts_off=np.full((count, TICKS), lifts_off),
+        gaits=[],
+    )
+
+
+def noise(count: int = 1) -> Floats:
+    return np.zeros((count, TICKS, 3))
+
+
+def test_angles_arrive_after_their_delay() -> None:
+    robots = bodies(3, delay_ticks=np.array([0, 2, 3]))
+    followed = robots.step(np.arange(3), targets(3), noise(3))
+    assert followed.tolist() == [TICKS] * 3
+    expected = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+    for row in range(3):
+        np.testing.assert_allclose(robots.sent[row, FIRST:], expected)
+        np.testing.assert_array_equal(robots.sent[row, :FIRST], np.tile(STANDING[TO_MOTORS], (FIRST, 1)))
+    # What the servos held in the last tick is the end of a saved state.
+    controls = robots.state[:, -MOTORS:]
+    for row, delay in enumerate((0, 2, 3)):
+        np.testing.assert_allclose(controls[row], expected[TICKS - 1 - delay])
+    # The last ticks of this control step are the first of the next.
+    robots.step(np.arange(3), targets(3), noise(3))
+    np.testing.assert_allclose(robots.sent[:, :FIRST], np.tile(expected[-FIRST:], (3, 1, 1)))
+
+
+def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> None:
+    robots = bodies(2, friction=np.array([0.3, 0.7]), stiffness=np.array([0.8, 1.0]), height_m=0.02)
+    before = robots.qpos.copy()
+    robots.step(np.arange(2), targets(2), noise(2))
+    for row, (friction, stiffness) in enumerate(((0.3, 0.8), (0.7, 1.0))):
+        model = nao_model()
+        model.geom("floor").friction[0] = friction
+        model.actuator_gainprm[:, 0] = stiffness * 100.0
+        model.actuator_biasprm[:, 1] = -stiffness * 100.0
+        data = mujoco.MjData(model)
+        data.qpos[:] = before[row]
+        mujoco.mj_forward(model, data)
+        angles = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+        for tick in range(TICKS):
+            data.ctrl[:] = angles[tick - 2] if tick >= 2 else STANDING[TO_MOTORS]
+            mujoco.mj_step(model, data, SUBSTEPS)
+        np.testing.assert_allclose(robots.qpos[row], data.qpos, atol=1e-9)
+        np.testing.assert_allclose(robots.pressure[row], data.sensordata, atol=1e-6)
+
+
+def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
+    """In the air nothing turns the torso; what the gyroscope measures there is its noise alone."""
+    style = replace(STYLE, gyro_gain=(0.1, 0.2), gyro_keep=0.5)
+    robots = bodies(height_m=1.0, style=style, delay_ticks=np.array([0]))
+    measured = noise()
+    measured[0, 0] = [0.4, 0.8, 0.0]  # roll and pitch rate in the first tick only
+    robots.step(np.array([0]), targets(carries=(True, False)), measured)
+    planned = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+    added = robots.sent[0, FIRST:] - planned
+    assert added[0, [4, 5]] == pytest.approx([0.1 * 0.4, 0.2 * 0.2], abs=2e-3)
+    # Half of a filtered rate lasts to the next tick.
+    assert added[1, [4, 5]] == pytest.approx([0.1 * 0.2, 0.2 * 0.1], abs=4e-3)
+    assert not added[:, [10, 11]].any() and not np.delete(added, [4, 5, 10, 11], axis=1).any()
+
+
+@pytest.mark.parametrize(
+    ("lifts_off", "lean_deg", "waits"),
+    [(1, -5, True), (1, 5, False), (-1, 5, True), (-1, -5, False), (0, -5, False)],
+)
+def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(
+    lifts_off: int, lean_deg: float, waits: bool
+) -> None:
+    robots = bodies()
+    half = np.radians(lean_deg) / 2
+    robots.qpos[0, 3:5] = np.cos(half), np.sin(half)  # positive rolls are to the right
+    planned = targets()
+    planned.lifts_off[:, 0] = lifts_off
+    followed = robots.step(np.array([0]), planned, noise())
+    assert (followed[0] < TICKS) == waits
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("degrees", "fallen"), [(44.5, False), (-44.5, False), (46.5, True), (-46.5, True)])
+def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(
+    axis: int, degrees: float, fallen: bool
+) -> None:
+    """In the air, where nothing turns it."""
+    robots, half = bodies(height_m=1.0), np.radians(degrees) / 2
+    robots.qpos[0, 3] = np.cos(half)
+    robots.qpos[0, 4 + axis] = np.sin(half)
+    robots.step(np.array([0]), targets(), noise())
+    assert bool(robots.fallen[0]) == fallen
+
 
 EVERYONE = np.arange(3)
 
