@@ -161,10 +161,9 @@ def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -
 
 def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     own = "".join(
-        f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n'
-        for name in ("delta_action", "residual_ensemble", "nas_golemo", "sb3_ppo")
+        f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n' for name in ("delta_action", "nas_golemo", "sb3_ppo")
     )
-    rows = '["direct_transfer", "delta_action", "residual_ensemble", "nas_golemo", "sb3_ppo"]'
+    rows = '["direct_transfer", "delta_action", "nas_golemo", "sb3_ppo"]'
     path = recipe(tmp_path, rows, own)
     experiment = load_experiment(path, tmp_path / "runs")
     for item in plan(experiment.recipe, path, experiment.folder):
@@ -173,7 +172,7 @@ def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
     fitted = load_grounding(experiment.folder / "ground/delta_action/seed_0/grounding.safetensors")
     assert fitted.kind == "delta action"
     page = (experiment.folder / "report/results.md").read_text()
-    for row in ("Delta action", "Residual ensemble", "NAS (Golemo et al.)", "NAS, PPO of SB3"):
+    for row in ("Delta action", "NAS (Golemo et al.)", "NAS, PPO of SB3"):
         assert f"| {row} |" in page
     assert not (experiment.folder / "ground/sb3_ppo").exists()  # it is trained in NAS's simulator
     METHODS.pop("delta_action"), registry._PLACES.pop("delta_action")

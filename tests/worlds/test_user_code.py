@@ -2,8 +2,7 @@ import hashlib
 import json
 import sys
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.robots.registry import task_named
-from astra_data.worlds.objective import Objective
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import (
     code_digest,
@@ -20,8 +18,6 @@ from astra_data.worlds.user_code import (
     file_of,
     found_near,
     is_user_code,
-    judged,
-    paid,
     parts_of,
     restored,
     user_object,
@@ -34,10 +30,8 @@ CART = Path(__file__).parents[1] / "small_cart.py"
     ("name", "expected"),
     [
         ("cart.py:TASK", True),
-        ("robots/cart.py:TASK", True),
         ("package.module:TASK", True),
         ("antmaze-umaze", False),
-        ("cart.py", False),
         (":TASK", False),
         ("cart.py:", False),
         ("s3://bucket", False),
@@ -196,8 +190,6 @@ def test_the_digest_covers_a_package_beside_the_file(tmp_path: Path) -> None:
     ("code", "file"),
     [
         ("WEIGHTS = 'w.pt'", "w.pt"),
-        ("TABLE = 'table'", "table"),
-        ("DATA = 'data/w.npz'", "data/w.npz"),
         ("DATA = Path(__file__).parent / 'data' / 'w.npz'", "data/w.npz"),
         ("DATA = Path(HERE, 'data/deep').joinpath('er', 'w.npz')", "data/deep/er/w.npz"),
     ],
@@ -312,24 +304,9 @@ def test_anything_else_is_refused_with_what_it_is(found: object, said: str) -> N
         expect("step", found, (-1, 2), torch.float32)
 
 
-def _objective(**functions: object) -> Objective:
-    return cast(Objective, SimpleNamespace(**functions))
-
-
 def test_answers_come_where_the_states_are() -> None:
     """Else they meet no other tensor of a training on a GPU; "meta" stands for one."""
-    there = torch.empty(3, 2, device="meta")
-    objective = _objective(
-        reached=lambda state, goal: torch.zeros(3, dtype=torch.bool),
-        missed=lambda state, goal: state[:, 0] > torch.ones(3),
-        reward=lambda *_: torch.zeros(3),
-    )
-    expected = "expected a tensor on meta, where its inputs are, got cpu"
-    with pytest.raises(BadInputError, match=rf"^objective.reached\(state, goal\): {expected}$"):
-        judged(objective, "reached", there, there)
-    with pytest.raises(BadInputError, match=rf"^objective.reward\(.*\): {expected}$"):
-        paid(objective, there, there, there, there[:, 0] > 0)
     with pytest.raises(
-        BadInputError, match=r"^objective.missed\(state, goal\) fails with RuntimeError: .*device"
+        BadInputError, match=r"^pay: expected a tensor on meta, where its inputs are, got cpu$"
     ):
-        judged(objective, "missed", there, there)
+        expect("pay", torch.zeros(3), (3,), device=torch.device("meta"))

@@ -1,5 +1,3 @@
-from typing import Any
-
 import gymnasium
 import gymnasium_robotics
 import mujoco
@@ -10,8 +8,6 @@ import torch
 from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE
 from astra_data.robots.ant.tasks import (
-    CONTROL_SUBSTEPS,
-    TIMESTEP_S,
     AntMazeEnv,
     VelocityController,
     ant_beyond_point_mass,
@@ -77,15 +73,6 @@ def test_walls_are_gymnasium_robotics_own() -> None:
     for name in names:
         for field in ("pos", "size", "type", "contype", "conaffinity", "friction", "solref", "margin"):
             np.testing.assert_array_equal(getattr(ours.geom(name), field), getattr(theirs.geom(name), field))
-
-
-def test_the_ant_is_integrated_as_gymnasiums() -> None:
-    theirs: Any = gymnasium.make("Ant-v5").unwrapped
-    ours = ant_model()
-    for name in ("integrator", "timestep", "solver", "iterations", "gravity", "cone"):
-        np.testing.assert_array_equal(getattr(ours.opt, name), getattr(theirs.model.opt, name))
-    assert theirs.frame_skip == CONTROL_SUBSTEPS
-    assert theirs.dt == pytest.approx(TIMESTEP_S)
 
 
 def test_longer_legs_are_longer_and_nothing_else() -> None:
@@ -216,7 +203,7 @@ def rolled(env: AntMazeEnv, rows: list[int], angle: float) -> None:
 @pytest.mark.parametrize(
     ("degrees", "toppled"),
     # A cosine of 0.2 is that of 78.5 degrees.
-    [(0.0, False), (60.0, False), (76.0, False), (81.0, True), (100.0, True), (180.0, True)],
+    [(0.0, False), (76.0, False), (81.0, True), (180.0, True)],
 )
 def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> None:
     env = placed([[-4, 4], [-4, 4]])
@@ -227,16 +214,6 @@ def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> N
     assert float(step.reward[0]) == pytest.approx(-10.0 * toppled, abs=0.1)
     env.reset(step.terminated)
     assert not env.failed.any()
-
-
-def test_walls_are_felt_and_the_floor_is_not() -> None:
-    # The walls' faces are at y = 6 and x = -6, and feet stand 0.6 m to the sides.
-    env = placed([[-4.0, 5.45], [-5.45, 4.0], [-4.0, 4.0], [0.0, 4.0]])
-    felt = torch.zeros(4, dtype=torch.bool)
-    for _ in range(6):
-        env.step(torch.zeros(4, 2))
-        felt |= env.wall_contact
-    assert felt.tolist() == [True, True, False, False]
 
 
 def test_wall_contact_equals_a_search_through_all_contacts() -> None:

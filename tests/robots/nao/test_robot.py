@@ -217,18 +217,6 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads() -> None:
     assert first.tobytes() != walk(BatchedNao(5, seed=4, num_threads=1), 8).tobytes()
 
 
-def test_it_resumes_exactly() -> None:
-    nao = BatchedNao(3, seed=0, num_threads=1)
-    walk(nao, 7)
-    saved = nao.state_dict()
-    ended, angles = walk(nao, 6), nao.angles
-    other = BatchedNao(3, seed=0, num_threads=1)
-    other.reset(EVERYONE, np.ones((3, 3)), np.random.default_rng(9))
-    other.load_state_dict(saved)
-    assert walk(other, 6).tobytes() == ended.tobytes()
-    np.testing.assert_array_equal(other.angles, angles)
-
-
 @pytest.mark.parametrize(
     "command", [(0.2, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.15, 0.0), (0.0, 0.0, 0.8)]
 )
@@ -283,24 +271,6 @@ def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
     np.testing.assert_array_equal(nao.bodies.state[0], lying)
     nao.reset(np.array([0]), np.zeros((1, 3)), np.random.default_rng(0))
     assert not nao.fallen.any()
-
-
-def test_a_kick_sends_the_ball_ahead() -> None:
-    speeds = {}
-    for kick in (True, False):
-        nao = BatchedNao(2, seed=0, ball=True, spread=IDENTICAL, num_threads=1)
-        ball = np.array([[0.19, 0.05], [0.19, -0.05]])
-        nao.reset(np.arange(2), np.zeros((2, 3)), np.random.default_rng(0), ball)
-        fastest: Floats = np.zeros(2)
-        for _ in range(8):
-            near = nao.ball[:, 0] - nao.pose[:, 0] < 0.21
-            nao.step(np.tile([0.05, 0.0, 0.0], (2, 1)), kick=near & kick)
-            fastest = np.maximum(fastest, nao.ball_velocity[:, 0])
-        speeds[kick] = fastest
-        assert not nao.fallen.any()
-    assert (speeds[True] > 0.7).all()
-    assert (speeds[True] < 2.0).all()
-    assert (speeds[True] > speeds[False] + 0.3).all()
 
 
 @pytest.mark.parametrize("side", [1, -1])

@@ -27,20 +27,6 @@ def test_around_the_grid_there_is_wall() -> None:
     assert (bare == np.minimum(ring[:, None], ring)).all()
 
 
-@pytest.mark.parametrize(
-    ("start", "goal", "length"),
-    [
-        ((-8.0, 0.0), (8.0, 0.0), 16.0),  # along the corridor
-        ((-8.0, -1.0), (8.0, 1.0), np.hypot(16.0, 2.0)),  # across it
-        ((-8.0, -1.5), (-5.0, 1.5), np.hypot(3.0, 3.0)),  # diagonally
-    ],
-)
-def test_distance_along_a_straight_corridor(
-    start: tuple[float, float], goal: tuple[float, float], length: float
-) -> None:
-    assert shortest(CORRIDOR, start, goal) == pytest.approx(length, rel=0.03)
-
-
 def test_distance_around_the_u() -> None:
     # The U's inner wall ends in the corners (2, 2) and (2, -2): two slanted legs and its end between them.
     length = 2 * np.hypot(6.0, 2.0) + 4.0
@@ -130,17 +116,6 @@ def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float
     inside, outside = 2.0 - radius_m - fine_m / 2, 2.0 - radius_m + fine_m / 2
     points = torch.tensor([[inside, 0.0], [0.0, -inside], [outside, 0.0], [0.0, -outside]])
     assert free.blocked[free.cells(points)].tolist() == [False, False, True, True]
-
-
-def test_a_long_walk_never_leaves_the_free_space() -> None:
-    free = FreeSpace.of_maze(U_MAZE, radius_m=0.1)
-    generator = torch.Generator().manual_seed(0)
-    position = torch.tensor(U_MAZE.free_centers(), dtype=torch.float32).repeat(20, 1)
-    heading = torch.randn(position.shape, generator=generator)
-    for _ in range(100):
-        heading = heading + 0.1 * torch.randn(position.shape, generator=generator)
-        position, _ = free.slide(position, position + 0.08 * torch.nn.functional.normalize(heading))
-        assert not free.blocked[free.cells(position)].any()
 
 
 def test_a_start_in_a_blocked_cell_may_leave_but_not_go_deeper() -> None:

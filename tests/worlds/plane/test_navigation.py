@@ -40,21 +40,12 @@ def test_success_and_toppling_are_paid_once_each() -> None:
     assert Navigation(U_MAZE, horizon=700, success_radius_m=0.5).reached(rim, goal[:1]).all()
 
 
-def test_policies_see_shares_of_the_mazes_half_extent_and_the_velocity() -> None:
-    # LONG_MAZE is 20 m wide and 28 m high.
-    state = torch.tensor([5.0, -7.0, 0.3, -0.4]).expand(2, 3, 4)
-    goal = torch.tensor([-5.0, 7.0]).expand(2, 3, 2)
-    seen = Navigation(LONG_MAZE, horizon=9).observe(state, goal)
-    expected = torch.tensor([0.5, -0.5, 0.3, -0.4, -0.5, 0.5, -1.0, 1.0])
-    torch.testing.assert_close(seen, expected.expand(2, 3, 8))
-
-
-def test_waves_tell_the_position_finely() -> None:
+def test_policies_see_shares_of_the_half_extent_and_waves_of_the_position() -> None:
     goal = torch.tensor([[-4.0, -4.0]]).expand(2, 2)
     state = torch.tensor([[5.0, 2.5, 0.0, 0.0], [-10.0, 10.0, 0.0, 0.0]])
-    plain = TASK.observe(state, goal)
     seen = Navigation(U_MAZE, horizon=700, position_waves=2).observe(state, goal)
-    assert torch.equal(seen[:, :8], plain)
+    assert torch.equal(seen[:, :8], TASK.observe(state, goal))
+    torch.testing.assert_close(seen[0, :8], torch.tensor([0.5, 0.25, 0.0, 0.0, -0.4, -0.4, -0.9, -0.65]))
     # The maze reaches from -10 to 10 m: a quarter and an eighth of a wave, then twice as much.
     sines, cosines = seen[0, 8:12].tolist(), seen[0, 12:].tolist()
     assert sines == pytest.approx([1.0, 0.5**0.5, 0.0, 1.0], abs=1e-6)

@@ -134,24 +134,6 @@ def point_mass(num_envs: int) -> PointMass:
     return PointMass(U_MAZE, num_envs, timestep_s=0.05)
 
 
-def test_free_motion_integrates_the_command() -> None:
-    sim = point_mass(1)
-    sim.reset_to(torch.tensor([[-4.0, 4.0, 0.0, 0.0]]))
-    for _ in range(20):
-        state = sim.step(torch.tensor([[0.6, -0.8]]))
-    assert state[0].tolist() == pytest.approx([-4.0 + 0.6, 4.0 - 0.8, 0.6, -0.8], abs=1e-4)
-
-
-def test_a_wall_stops_one_axis_and_its_velocity() -> None:
-    sim = point_mass(1)
-    sim.reset_to(torch.tensor([[-4.0, 4.0, 0.0, 0.0]]))
-    for _ in range(60):
-        state = sim.step(torch.tensor([[0.5, 1.0]]))
-    # The wall's face is at y = 6, its center may come to 0.1 m of it.
-    assert state[0].tolist() == pytest.approx([-4.0 + 60 * 0.025, 5.9, 0.5, 0.0], abs=1e-3)
-    assert bool(sim.blocked)
-
-
 def one_step(variation: PlanarVariation, count: int = 1, action: torch.Tensor = ACTION) -> VariedPlanar:
     simulator = VariedPlanar(point_mass(count), variation)
     simulator.reset_to(START.expand(count, 4))
