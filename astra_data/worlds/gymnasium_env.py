@@ -42,11 +42,7 @@ def as_given(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
 
 
 def made(env_id: str | Callable[..., Env], **options: Any) -> Env:  # noqa: ANN401 - handed on
-    """Return the environment `env_id`, or of that class, with its `options`.
-
-    Raises:
-        BadInputError: it cannot be made.
-    """
+    """Return the environment `env_id`, or of that class, with its `options`."""
     if callable(env_id):
         return answered(f"making {_name(env_id)}", partial(env_id, **options))
     with explained(f"gymnasium.make({env_id!r})"):
@@ -111,21 +107,13 @@ class GymnasiumRobot:
         return self._state
 
     def step(self, command: NDArray[np.float64]) -> tuple[State, bool]:
-        """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed.
-
-        Raises:
-            BadInputError: it makes no action of the environment.
-        """
+        """Apply `command` (A,), in its units; return the state (S,) one period later, and if it failed."""
         observation, _, terminated, _, _ = self.env.step(self._action(command))
         self._state = self._read_state(self.env.unwrapped, observation)
         return self._state, bool(self._failed(self._state, terminated) if self._failed else terminated)
 
     def check_commands(self, limits: Commands) -> None:
-        """Reset, and check that the least and the largest commands make actions of the environment.
-
-        Raises:
-            BadInputError: one does not.
-        """
+        """Reset; refuse (BadInputError) least or largest commands that make no action of the environment."""
         self.reset(seed=0)
         for command in np.array([*limits.values()]).T:
             self._action(command)

@@ -18,8 +18,6 @@ from astra_data.worlds.objective import Objective
 from astra_data.worlds.protocols import Step
 from astra_data.worlds.user_code import explained
 
-_SHOWN = 4
-"""Entries of a state that a line names."""
 State = NDArray[np.floating[Any]] | Sequence[float]
 
 
@@ -68,9 +66,8 @@ class RobotEnv:
         self._objective, self._column, self._commands = objective, state, commands
         self._abstraction = abstraction
         self._robots = [robot() for _ in range(num_envs)]
-        takes = inspect.signature(self._robots[0].reset).parameters
+        self._takes_seed = "seed" in inspect.signature(self._robots[0].reset).parameters
         self._any_end_fails = getattr(self._robots[0], "any_end_fails", False)
-        self._takes_seed = "seed" in takes
         self.goal = torch.zeros(num_envs, objective.goal_size)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self._fell = self.failed.clone()
@@ -94,11 +91,7 @@ class RobotEnv:
         self._seed, self._episodes = seed, 0
 
     def check_commands(self) -> None:
-        """Let a robot that has `check_commands` check the bounds of its commands; no robot moves.
-
-        Raises:
-            BadInputError: they are not its own.
-        """
+        """Let a robot that has `check_commands` check the bounds of its commands; no robot moves."""
         if check := getattr(self._robots[0], "check_commands", None):
             check(self._commands)
 
@@ -153,11 +146,7 @@ class RobotEnv:
         )
 
     def reset_to(self, rows: NDArray[np.intp], state: NDArray[np.float64]) -> None:
-        """Refuse: a robot cannot be set to any state.
-
-        Raises:
-            BadInputError: always.
-        """
+        """Refuse with a BadInputError: a robot cannot be set to any state."""
         raise BadInputError("robots cannot be put into a recorded state: expected data_start_share = 0")
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -175,13 +164,6 @@ class RobotEnv:
         return self._objective.observe(self._abstract(), self.goal)
 
     def _checked(self, state: State, call: str, row: int) -> Tensor:
-        if isinstance(state, tuple) and len(state) == 2 and isinstance(state[1], dict):
-            name = type(self._robots[row]).__name__
-            raise BadInputError(
-                f"{call} of the robot: expected a state of {self._column.size} numbers, got an observation "
-                f"and a dictionary: {name} is an environment of Gymnasium; give "
-                f"robot=partial(GymnasiumRobot, {name})"
-            )
         with explained(f"{call} of the robot: to read its state as numbers"):
             found = torch.as_tensor(np.asarray(state, dtype=np.float32))
         expected = f"{call} of the robot: expected a finite state of {self._column.size} numbers"
@@ -189,7 +171,7 @@ class RobotEnv:
             raise BadInputError(f"{expected}, got {' '.join(repr(state).split())}")
         if lost := (~found.isfinite()).nonzero().flatten().tolist():
             raise BadInputError(
-                f"{expected}, got {first_few([self._column.labels[entry] for entry in lost], _SHOWN)} = "
+                f"{expected}, got {first_few([self._column.labels[entry] for entry in lost], 4)} = "
                 f"{float(found[lost[0]])} after step {self._steps[row]} of an episode of robot {row + 1} of "
                 f"{self.num_envs}: see what its simulation does there, or let it fail one step before"
             )

@@ -129,26 +129,6 @@ def test_a_file_without_a_simulator_is_refused(tmp_path: Path, text: str, told: 
         pairing_named(f"{tmp_path}/sim.py:Mine")
 
 
-@pytest.mark.parametrize(
-    ("kind", "told"),
-    [
-        ("Narrow", r"Narrow\(4\).state has shape \(4, 1\), expected \(4, 2\)"),
-        ("Bare", r"Bare.parameters: expected numbers or texts for maze"),
-        ("Clumsy", r"Clumsy\(4\) fails with TypeError"),
-    ],
-)
-def test_a_batch_of_another_kind_is_refused(kind: str, told: str) -> None:
-    with pytest.raises(BadInputError, match=told):
-        built(pairing_named(f"{MINE}:{kind}"), 4)
-
-
-def test_a_map_to_another_shape_is_refused() -> None:
-    with pytest.raises(BadInputError, match=r"Wide makes \(3, 3\) of states \(3, 29\), expected \(3, 2\)"):
-        checked_abstraction(pairing_named(f"{MINE}:Wide"), STATES)
-    with pytest.raises(BadInputError, match=r"Greedy, given states \(3, 29\), fails with IndexError"):
-        checked_abstraction(pairing_named(f"{MINE}:Greedy"), STATES)
-
-
 def test_installed_packages_offer_simulators_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     offered = [
         EntryPoint(name, "my_simulator:Glider", SIMULATOR_GROUP) for name in ("glider", "antmaze-umaze")

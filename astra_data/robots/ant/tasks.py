@@ -21,12 +21,12 @@ from torch.nn import functional
 
 from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import ABSTRACT_STATE, ACTION, GOAL, STATE
-from astra_data.worlds.batched_mujoco import BatchedPhysics, add_walls, wall_geoms
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.protocols import Step, rows_in
+from astra_data.worlds.simulators import BatchedPhysics, add_walls, wall_geoms
 from astra_data.worlds.task import (
     PLANAR_GOAL,
     PLANAR_STATE,
@@ -60,11 +60,9 @@ _ANKLE_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> mujoco.MjModel:
-    """Build Gymnasium's ant, optionally in a maze and with longer legs.
+    """Build Gymnasium's ant, on an open plane or in a `maze`, with walls where gymnasium-robotics has them.
 
-    Args:
-        maze: walls to add, placed as gymnasium-robotics places them; none for an open plane.
-        leg_scale: factor on the length of all leg segments (1.25 in the paper's morphology test).
+    leg_scale: factor on the length of all leg segments (1.25 in the paper's morphology test).
     """
     root = ElementTree.parse(Path(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))).getroot()
     root.findall("option")[0].set("integrator", INTEGRATOR)
@@ -98,15 +96,10 @@ def up_cosine(quaternion: Floats) -> Floats:
 def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Describe body and command in the heading frame that is turned toward the command.
 
-    Args:
-        qpos: positions, (B, 15).
-        qvel: velocities, (B, 14).
-        command: world-frame planar velocity in m/s, (B, 2).
-
-    Returns:
-        The controller's observation (B, 28): height - 0.6, up axis (3), linear velocity (3), angular
-        velocity (3), hip and ankle angles (4 + 4), their rates (4 + 4), command (2); and the number of
-        quarter turns (B,) between the body's own numbering of its legs and the observation's.
+    Of qpos (B, 15), qvel (B, 14) and the world-frame planar velocity command (B, 2) in m/s, return the
+    controller's observation (B, 28): height - 0.6, up axis (3), linear velocity (3), angular velocity (3),
+    hip and ankle angles (4 + 4), their rates (4 + 4), command (2); and how many quarter turns (B,) lie
+    between the body's own numbering of its legs and the observation's.
     """
     rotation = rotation_matrix(qpos[:, 3:7])
     yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])

@@ -113,10 +113,9 @@ class HumanoidWalker2d(FreeStates):
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use other joints and control steps from the next step on.
 
-        Args:
-            parameters: (B, 1) each: "friction", a factor on the damping of the joints; "timestep_scale", a
-                factor on the control step, which keeps its number of physics steps. At 5/3 the longer physics
-                steps put poses off by 0.3 % and rates by 1.2 % of what they change by in a step.
+        "friction" (B, 1) is a factor on the damping of the joints; "timestep_scale" one on the control step,
+        which keeps its number of physics steps. At 5/3 the longer physics steps put poses off by 0.3 % and
+        rates by 1.2 % of what they change by in a step.
         """
         plain = self._model
         if self._models[0] is plain:
@@ -202,12 +201,7 @@ class HumanoidKinematics(FreeStates):
         return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
-        """Use other joints and control steps from the next step on.
-
-        Args:
-            parameters: (B, 1) each: "friction", a factor on the joints' damping d; "timestep_scale", a factor
-                on the control step.
-        """
+        """Use factors (B, 1) on the joints' damping and on the control step from the next step on."""
         self._approach = STIFFNESS / (DAMPING + parameters["friction"] * self._damping)
         self._timestep_s = TIMESTEP_S * parameters["timestep_scale"]
 

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from astra_data.core.arrays import Bools, Floats, normalized
 from astra_data.core.errors import BadInputError
-from astra_data.worlds.batched_mujoco import BatchedPhysics
 from astra_data.worlds.protocols import Step, rows_in
+from astra_data.worlds.simulators import BatchedPhysics
 
 JOINTS = (
     *("abdomen_z", "abdomen_y", "abdomen_x"),
@@ -162,13 +162,10 @@ class Locomotion:
         return np.asarray((height > low) & (height < high))
 
     def reward(self, velocity: Floats, healthy: Bools, effort: Floats, contact: Floats) -> Floats:
-        """Return the reward (B,) of a step.
+        """Return the reward (B,) of a step that ended `healthy` (B,) or not.
 
-        Args:
-            velocity: of the center of mass along x, (B,) in m/s.
-            healthy: after the step, (B,).
-            effort: sum of the squared controls, (B,).
-            contact: sum of the squared contact forces and torques of all bodies, (B,).
+        `velocity` is that of the center of mass along x in m/s; `effort` and `contact` are the sums of the
+        squared controls, and of the squared contact forces and torques of all bodies, (B,).
         """
         cost = self.effort_cost * effort
         cost = cost + np.minimum(self.contact_cost * contact, self.contact_cost_limit)

@@ -37,9 +37,9 @@ from astra_data.robots.nao.walk import (
     leg_angles,
     put_rows,
 )
-from astra_data.worlds.batched_mujoco import add_walls, share_out, views, wall_geoms
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
+from astra_data.worlds.simulators import add_walls, share_out, views, wall_geoms
 
 SUBSTEPS = 3
 """Physics steps per tick: 4 ms each."""
@@ -132,15 +132,10 @@ class BatchedBodies:
             part[rows] = 0
 
     def step(self, rows: NDArray[np.intp], targets: Targets, noise: Floats) -> NDArray[np.intp]:
-        """Run the bodies `rows` (n,) through one control step.
+        """Run the bodies `rows` (n,) through one control step; fallen ones are left as they are.
 
-        Args:
-            rows: which bodies; fallen ones are left as they are.
-            targets: of the legs of all B.
-            noise: of the gyroscope, (B, 16, 3) in rad/s.
-
-        Returns:
-            The number of ticks of the targets that were followed, (B,) int; in the others a lift was delayed.
+        `noise` (B, 16, 3) is that of the gyroscope in rad/s. Return how many ticks of the targets were
+        followed, (B,) int; in the others a lift was delayed.
         """
         self.touching[rows] = False
         rows = rows[~self.fallen[rows]]
@@ -285,12 +280,10 @@ class BatchedNao:
         self.bodies.reset(rows, qpos, (angles + self.traits.joint_offset_rad[rows])[:, TO_MOTORS])
 
     def step(self, command: Floats, active: Bools | None = None, kick: Bools | None = None) -> None:
-        """Walk for one control step of 0.192 s.
+        """Walk for 0.192 s at `command` (B, 3), m/s forward and to the left, rad/s.
 
-        Args:
-            command: velocities forward and to the left in m/s, turn in rad/s, (B, 3).
-            active: which robots move, (B,); all others, and fallen ones, stay as they are.
-            kick: which robots kick with the foot on the ball's side when it next swings, (B,).
+        Robots that are not `active` (B,), and fallen ones, stay as they are. Those that `kick` (B,) do so
+        with the foot on the ball's side when it next swings.
         """
         rows = np.flatnonzero(~self.fallen if active is None else active & ~self.fallen)
         targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))

@@ -274,10 +274,8 @@ class StepPlanner:
     def advance(self, gait: Gait, command: Floats, seconds: float, on_the_spot: Bools | None = None) -> Bools:
         """Advance `gait` by `seconds`, in place; where a step ends, plan the next one by `command` (B, 3).
 
-        With a command of zero robots come to rest, except those that walk `on_the_spot` (B,).
-
-        Returns:
-            Which robots began a step, (B,) bool.
+        With a command of zero robots come to rest, except those that walk `on_the_spot` (B,). Return which
+        robots began a step, (B,) bool.
         """
         gait.phase = np.where(gait.walking, gait.phase + seconds / gait.duration_s, 0.0)
         called = (command != 0).any(axis=1)
@@ -389,14 +387,9 @@ class WalkEngine:
     style: WalkStyle
 
     def advance(self, gait: Gait, command: Floats, ticks: int, kick: Bools | None = None) -> Targets:
-        """Walk on for `ticks` of 12 ms, changing `gait` in place.
+        """Walk on at `command` (B, 3) for `ticks` of 12 ms, changing `gait` in place.
 
-        Args:
-            gait: the robots' phases in their steps.
-            command: velocities, m/s forward, m/s to the left, rad/s, (B, 3).
-            ticks: how many.
-            kick: feet, left and right, that kick when they swing next, (B, 2), by default none. Robots that
-                are to kick keep stepping.
+        Feet, left and right, that are to `kick` (B, 2) do so when they swing next; until then robots step on.
         """
         feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
         if kick is None:

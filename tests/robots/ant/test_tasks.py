@@ -18,9 +18,9 @@ from astra_data.robots.ant.tasks import (
     torques_to_body,
 )
 from astra_data.robots.registry import TASKS
-from astra_data.worlds.batched_mujoco import wall_geoms
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
+from astra_data.worlds.simulators import wall_geoms
 
 gymnasium.register_envs(gymnasium_robotics)
 
