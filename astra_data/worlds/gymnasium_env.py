@@ -145,18 +145,6 @@ class GymnasiumSimulator(NumpySimulator):
     """B abstract states that one environment of Gymnasium steps, one after another.
 
     A policy is trained in millions of steps, so it is for environments that step quickly, and for pairing.
-
-    Example:
-        >>> from functools import partial
-        >>> import torch
-        >>> from astra_data.worlds.gymnasium_env import GymnasiumSimulator
-        >>> def read(env):
-        ...     return env.state
-        >>> def write(env, state):
-        ...     env.state = state
-        >>> make_simulator = partial(GymnasiumSimulator, env_id="Pendulum-v1", size=2, read=read, write=write)
-        >>> make_simulator(3).step(torch.ones(3, 1)).shape
-        torch.Size([3, 2])
     """
 
     def __init__(

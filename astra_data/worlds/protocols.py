@@ -44,9 +44,6 @@ class AbstractSimulator(SteppedSimulator, Protocol):
 class Simulator(AbstractSimulator, Protocol):
     """A simulator from a file of the user's, with its map from target states; built as `Own(num_envs)`.
 
-    Attributes:
-        abstract_state: the column of abstract states, with names, units, frames and roles.
-
     Example:
         >>> import torch
         >>> from astra_data import Column
@@ -72,6 +69,7 @@ class Simulator(AbstractSimulator, Protocol):
     """
 
     abstract_state: Column
+    """The column of abstract states, with names, units, frames and roles."""
 
     @staticmethod
     def abstraction(state: Any) -> Any:  # noqa: ANN401 - numpy arrays of either precision
@@ -116,19 +114,12 @@ class RememberingSimulator(Protocol):
 
 @dataclass(frozen=True)
 class Step:
-    """The outcome of one batched step.
+    """The outcome of one batched step."""
 
-    Attributes:
-        observation: (B, O) float32, after the action.
-        reward: (B,) float32.
-        terminated: (B,) bool, the episode ended: the value of the next state is 0.
-        success: (B,) bool, the goal was reached in this step.
-    """
-
-    observation: Tensor
-    reward: Tensor
-    terminated: Tensor
-    success: Tensor
+    observation: Tensor  # (B, O) float32, after the action
+    reward: Tensor  # (B,) float32
+    terminated: Tensor  # (B,) bool, the episode ended: the value of the next state is 0
+    success: Tensor  # (B,) bool, the goal was reached in this step
 
 
 class BatchedEnv(Protocol):
@@ -146,11 +137,7 @@ class BatchedEnv(Protocol):
 
 
 class TargetEnv(BatchedEnv, Protocol):
-    """B target environments.
-
-    Attributes:
-        goal: (B, G) float32.
-    """
+    """B target environments, with goals (B, G) float32."""
 
     goal: Tensor
 

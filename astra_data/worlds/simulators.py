@@ -52,16 +52,6 @@ class NumpySimulator(FreeStates):
     Attributes:
         state: (B, X) float32.
         parameters: what a dataset paired with it records about it.
-
-    Example:
-        >>> from functools import partial
-        >>> import torch
-        >>> from astra_data.worlds.simulators import NumpySimulator
-        >>> def drive(state, command):
-        ...     return state + 0.1 * command
-        >>> make_simulator = partial(NumpySimulator, function=drive, size=2)
-        >>> make_simulator(3).step(torch.ones(3, 2)).shape
-        torch.Size([3, 2])
     """
 
     def __init__(

@@ -67,12 +67,7 @@ _LEG_RATES_RAD_S = tuple(JOINT_RATES_RAD_S[joint] for joint in COMMANDED)
 
 @dataclass(frozen=True)
 class Walking(Objective):
-    """Walk along x and do not fall; there is no goal.
-
-    Attributes:
-        locomotion: rewards and starts of the target.
-        failure_reward: minus the reward for staying up, which a step that ends in a fall does not get.
-    """
+    """Walk along x and do not fall; there is no goal."""
 
     action_size = len(COMMANDED)
     is_lasting = True
@@ -82,7 +77,9 @@ class Walking(Objective):
     """φ of target states (count, 47), (count, X)."""
 
     locomotion: Locomotion = field(default_factory=Locomotion)
+    """Rewards and starts of the target."""
     failure_reward: float = field(default=-5.0, kw_only=True)
+    """Minus the reward for staying up, which a step that ends in a fall does not get."""
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return the deviations of states (..., X) from standing, in spreads and clipped to ±5, (..., X)."""
@@ -158,12 +155,7 @@ class JointWalking(Walking):
 
 @dataclass(frozen=True)
 class MassWalking(Walking):
-    """Walking of joints, center of mass and the torso's lean, states (..., 46).
-
-    Attributes:
-        lowest_mass_m: a humanoid whose center of mass is lower than this has fallen, on average two steps
-            before the target's episode ends; standing it is 0.9 m high.
-    """
+    """Walking of joints, center of mass and the torso's lean, states (..., 46)."""
 
     spread = (
         *JointWalking.spread,
@@ -172,6 +164,8 @@ class MassWalking(Walking):
     phi = humanoid_to_extended_kinematics
 
     lowest_mass_m: float = 0.65
+    """A humanoid whose center of mass is lower has fallen, on average two steps before the target's episode
+    ends; standing it is 0.9 m high."""
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return which centers of mass of states (B, 46) are too low, (B,) bool."""
@@ -213,11 +207,7 @@ class VariedHumanoid(VariedSimulator):
 
 
 def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 200) -> NDArray[np.uint8]:
-    """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3).
-
-    Raises:
-        BadInputError: no OpenGL without a window is available.
-    """
+    """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3)."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     model = humanoid_model()
     data = mujoco.MjData(model)

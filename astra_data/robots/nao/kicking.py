@@ -30,11 +30,7 @@ _KICKS_ABOVE = 0.5
 
 
 def asks_to_kick(command: Tensor) -> Tensor:
-    """Return which commands (B, 3), a planar velocity and a kick entry, ask for a kick: (B, 1) bool.
-
-    Raises:
-        BadInputError: the commands have no kick entry, as in datasets from before there was one.
-    """
+    """Return which commands (B, 3), a planar velocity and a kick entry, ask for a kick: (B, 1) bool."""
     if command.shape[-1] != 3:
         raise BadInputError(
             f"expected commands of 3 values, a planar velocity and whether to kick, got {command.shape[-1]}: "
@@ -170,12 +166,8 @@ class BallAgent(PlanarStates):
         super().__init__(
             maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device
         )
-        self.parameters |= {
-            "reach_m": reach_m,
-            "knock_m_s": knock_m_s,
-            "kick_reach_m": kick_reach_m,
-            "kick_m_s": kick_m_s,
-        }
+        self.parameters |= {"reach_m": reach_m, "knock_m_s": knock_m_s}
+        self.parameters |= {"kick_reach_m": kick_reach_m, "kick_m_s": kick_m_s}
         self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
         self.memory = self._undecided(num_envs)
         self._deceleration_m_s2: Tensor | float = ROLLING_M_S2

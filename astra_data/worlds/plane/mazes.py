@@ -222,9 +222,7 @@ class FreeSpace:
 
         Only the cells where a move begins and ends are looked at; one that is stopped ends where its own
         cell does. A point that starts in a blocked cell may move in it and out of it, but not deeper into it.
-
-        Returns:
-            the points' new positions (B, 2), and which points were stopped (B,).
+        Return the points' new positions (B, 2), and which were stopped (B,).
         """
         here, there = self._cells(torch.stack([start, end]))
         (from_x, from_y), (to_x, to_y) = here.unbind(-1), there.unbind(-1)
@@ -263,16 +261,12 @@ class GoalDistance:
     """Length of the shortest free path to a goal near the maze's goal cell.
 
     There is one distance field per point of a lattice around the cell's middle; a goal uses the nearest.
-
-    Attributes:
-        fields: (goals, height, width) in m. lattice: the goal of each field, (goals, 2) in m. half_extent:
-        (2,) in m. cell_m: side of a field's cell.
     """
 
-    fields: Tensor
-    lattice: Tensor
-    half_extent: Tensor
-    cell_m: float
+    fields: Tensor  # (goals, height, width) in m
+    lattice: Tensor  # the goal of each field, (goals, 2) in m
+    half_extent: Tensor  # of the maze, (2,) in m
+    cell_m: float  # side of a field's cell
 
     @classmethod
     def of_maze(cls, maze: Maze, *, spacing_m: float, radius_m: float = 0.0) -> "GoalDistance":
@@ -290,10 +284,8 @@ class GoalDistance:
 
     def to(self, device: str | torch.device) -> "GoalDistance":
         """Return the same fields on `device`."""
-        fields, lattice, half_extent = (
-            values.to(device) for values in (self.fields, self.lattice, self.half_extent)
-        )
-        return GoalDistance(fields, lattice, half_extent, self.cell_m)
+        tensors = (self.fields.to(device), self.lattice.to(device), self.half_extent.to(device))
+        return GoalDistance(*tensors, self.cell_m)
 
     def __call__(self, position: Tensor, goal: Tensor) -> Tensor:
         """Return the distance in m (..., B) from `position` (..., B, 2) to `goal` (B, 2).
