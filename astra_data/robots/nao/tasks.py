@@ -67,27 +67,21 @@ _COMMAND = [*entries("command_vx command_vy", "0.25 m/s", "world", "vector")]
 _KICK = ColumnEntry("kick", "1", "body", "invariant")
 
 
-def _columns(*, ball: bool) -> dict[str, Any]:
-    state, command, abstract = _STATE, _COMMAND, [*PLANAR_STATE]
-    if ball:
-        state, command, abstract = [*state, *_BALL, _UNSEEN], [*command, _KICK], [*abstract, *_BALL]
-    meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
-    wish = ", and above 0.5 to stand and kick" if ball else ""
-    return {
-        "state": column(STATE, state, meaning),
-        "goal": column(GOAL, PLANAR_GOAL, "the middle of the goal line" if ball else "where to go"),
-        "action": column(ACTION, command, f"commanded planar velocity, ±1 per axis{wish}"),
-        "abstract_state": column(ABSTRACT_STATE, abstract, "abstract state of the target before the action"),
-    }
-
-
 def _task(*, ball: bool, **own: Any) -> Task:  # noqa: ANN401 - handed on
     """Return a task with the fields `own` and those that all of the NAO's tasks share."""
+    meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
+    wish = ", and above 0.5 to stand and kick" if ball else ""
+    rolling = _BALL if ball else []
+    state, command = [*_STATE, *rolling, *[_UNSEEN] * ball], [*_COMMAND, *[_KICK] * ball]
+    abstract = [*PLANAR_STATE, *rolling]
     return Task(
         make_target=partial(NaoEnv, ball=ball),
         beyond=nao_beyond,
-        **_columns(ball=ball),
-        commands=dict.fromkeys(("vx", "vy", *(["kick"] if ball else [])), (-1.0, 1.0)),
+        state=column(STATE, state, meaning),
+        goal=column(GOAL, PLANAR_GOAL, "the middle of the goal line" if ball else "where to go"),
+        action=column(ACTION, command, f"commanded planar velocity, ±1 per axis{wish}"),
+        abstract_state=column(ABSTRACT_STATE, abstract, "abstract state of the target before the action"),
+        commands=dict.fromkeys(("vx", "vy", *["kick"] * ball), (-1.0, 1.0)),
         quantities=_QUANTITIES | (_BALL_QUANTITIES if ball else {}),
         timestep_s=CONTROL_STEP_S,
         facts={"stand_in": "mujoco", "tick_s": TICK_S},
