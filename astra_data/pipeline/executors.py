@@ -27,6 +27,7 @@ from astra_data.core.durable import disk_error
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import stage_of_key
 from astra_data.core.optional import optional
+from astra_data.core.progress import Progress
 from astra_data.core.provenance import cores
 from astra_data.core.seeding import derive
 
@@ -92,13 +93,10 @@ def run_in_order(
     begin: Callable[[Item], object],
     wait: Callable[[], Collection[str]],
 ) -> None:
-    """Begin each item as soon as its inputs are finished, at most `jobs` at a time.
+    """Begin each item, in order of preference, as soon as its inputs are finished, at most `jobs` at a time.
 
-    Args:
-        items: in order of preference; inputs that are not among them count as finished.
-        jobs: number of items at a time; None leaves the limit to `begin`.
-        begin: starts an item and returns at once.
-        wait: returns the keys of the items that have finished since, possibly none.
+    Inputs that are not among the items count as finished. `begin` starts an item and returns at once; `wait`
+    returns the keys of the items that have finished since, possibly none.
     """
     keys = [item.key for item in items]
     order = TopologicalSorter({item.key: set(item.inputs).intersection(keys) for item in items})
@@ -142,7 +140,7 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
             np.random.seed(seed % 2**32)
             if torch := sys.modules.get("torch"):  # its import takes long
                 torch.manual_seed(seed)
-            made(progress=Reporter(send))
+            made(progress=reporter(send))
     except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
         expected = error if isinstance(error, AstraDataError) else disk_error(error)
         if expected:
@@ -152,19 +150,17 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
     return time.perf_counter() - began
 
 
-class Reporter:
-    """The `progress` of an item: sends at most ten notes a second."""
+def reporter(send: Callable[[Note], object]) -> Progress:
+    """Return the `progress` of an item, which sends at most ten notes a second."""
+    following = 0.0
 
-    def __init__(self, send: Callable[[Note], object]) -> None:
-        self._send = send
-        self._next = 0.0
+    def report(fraction: float, note: str) -> None:
+        nonlocal following
+        if (now := time.monotonic()) >= following:
+            following = now + SECONDS_BETWEEN_NOTES
+            send((fraction, note))
 
-    def __call__(self, fraction: float, note: str) -> None:
-        """Send the fraction done and the note, unless another was sent just now."""
-        now = time.monotonic()
-        if now >= self._next:
-            self._next = now + SECONDS_BETWEEN_NOTES
-            self._send((fraction, note))
+    return report
 
 
 @contextmanager
@@ -214,13 +210,9 @@ def execute(
     Those that step the target's physics share the cores. When an item fails, at Ctrl-C or SIGTERM, or when
     this process is killed, the others are stopped; their last checkpoints stay.
 
-    Args:
-        items: in order of preference; inputs that are not among them count as finished.
-        logs: folder of `<key>.txt`, what an item printed.
-        watch: is notified of every start, progress and finish.
-        jobs: number of processes; by default one per core, or `CUDA_JOBS` where an item wants a GPU.
-        prepare: called in the process of an item before the item.
-        address: not used.
+    Items are in order of preference; inputs that are not among them count as finished. What an item prints
+    goes to `<key>.txt` in `logs`. By default there is a job per core, or `CUDA_JOBS` where an item wants a
+    GPU. `prepare` is called in the process of an item before it.
 
     Raises:
         AstraDataError: an item failed; its own error, with its key before the message, or where its

@@ -41,12 +41,9 @@ _FILES = {"task.py": "{}.py", "recipe.toml": "{}.toml", "test.py": "test_{}.py",
 
 
 def write_robot(name: str, out: Path, logs: Sequence[Path]) -> SimulatorKind:
-    """Write the new folder `out` of the robot `name`; return the simulator that it begins with, and its logs.
+    """Write the new folder `out` of the robot `name`, of CSV files or folders of them, or of one dataset.
 
-    Args:
-        name: of the task: a-z, digits and _, and no module's.
-        out: the folder to write.
-        logs: CSV files, or folders of them; or one dataset.
+    Return the simulator that it begins with.
 
     Raises:
         BadInputError: `name` is no name, `out` exists, or logs are missing or useless, see `guess`.

@@ -54,13 +54,8 @@ def select(
     """Judge every trained policy of a run, as the stage `select` does; write `select` in the run's folder.
 
     A choice that is there is kept if it was made of the same with the same settings, and otherwise set aside.
-
-    Args:
-        run: the folder of a run whose recipe has two seeds or more.
-        rows: candidates; by default all rows of the recipe that have policies of abstract states.
-        judge: the row whose groundings judge; by default as the recipe says, or its reference.
-        episodes: of each policy with each judge; by default as the recipe says, or 100.
-        progress: called with the share done and a note.
+    Candidates are `rows`, by default all with policies of abstract states; judges and `episodes` are by
+    default as the recipe says.
 
     Raises:
         BadInputError: it is no run, a row is unknown or has no policy, there are no two groundings, or
@@ -122,17 +117,8 @@ def choose_by_trials(
     """Spend so many episodes in the target on the candidates of a run; write `select/trials.json`.
 
     Candidates of a round meet the same starts and goals, others than those of `evaluate`. An interrupted call
-    goes on with the next candidate.
-
-    Args:
-        run: the folder of a run, whose policies are trained and aligned.
-        trials: episodes in the target, at most.
-        field: how many of the best predicted are tried; by default as many as the trials are enough for.
-        percent: the size of the dataset, where the recipe sweeps over sizes.
-        rows: as for `select`.
-        judge: as for `select`.
-        episodes: as for `select`.
-        progress: called with the share done and a note.
+    goes on with the next candidate. The best `field` predicted are tried, by default as many as the trials
+    are enough for; those of a size in `percent`, where the recipe sweeps over sizes.
 
     Raises:
         BadInputError: as `select`; or the task has no target, the trials are too few, or others were made.

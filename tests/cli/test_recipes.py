@@ -81,12 +81,9 @@ def test_a_run_passes_its_options_on(recipe: Path, tmp_path: Path, monkeypatch: 
     ("stage", "takes"),
     [
         ("ground", {"methods", "seeds", "jobs", "device"}),
-        ("train", {"methods", "seeds", "jobs", "device"}),
-        ("align", {"methods", "seeds", "jobs", "device"}),
         ("evaluate", {"methods", "seeds", "jobs"}),
         ("report", {"seeds", "publish"}),
         ("pair", {"seeds", "jobs"}),
-        ("subset", {"seeds", "jobs"}),
     ],
 )
 def test_a_command_passes_its_options_to_its_stage(

@@ -84,7 +84,7 @@ def grounded_anew(grounded: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def make_cart(folder: Path) -> None:
-    """Make the run of a recipe that the cart's logs are imported for, with a task that has no target."""
+    """Make a run of imported logs of the cart, up to its policies; its task has no target."""
     example = Path(__file__).parents[2] / "recipes/examples/cart"
     user_object(f"{example}/robot.py:record")(folder / "csv", drives=8, seconds=6)
     (folder / "cart.py").write_text((example / "cart.py").read_text())
@@ -96,7 +96,7 @@ def make_cart(folder: Path) -> None:
     (folder / "cart.toml").write_text(rows + tables)
     with pytest.MonkeyPatch.context() as patch:
         fit_failures_quickly(patch)
-        run_here(folder / "cart.toml")
+        run_here(folder / "cart.toml", until="align")
 
 
 @pytest.fixture(scope="module")

@@ -127,16 +127,6 @@ def test_data_of_which_none_is_left_to_train_on_are_refused(recipe: Path) -> Non
     assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
 
 
-def test_data_are_divided_as_the_recipe_says(recipe: Path) -> None:
-    write_logs(recipe.parent / "logs", -1.0, 4.0)
-    recipe.write_text(recipe.read_text() + "[ground]\nheld_out_share = 0.9\n")
-    with pytest.raises(BadInputError, match=r"recorded episodes: 2, of which 2 would be held out"):
-        check(recipe, root=recipe.parent / "runs")
-    shutil.rmtree(recipe.parent / "logs")
-    write_logs(recipe.parent / "logs", -1.0, 4.0, held_out=[False, True])  # as it marks them
-    assert check(recipe, root=recipe.parent / "runs")["data"].is_finished
-
-
 @pytest.mark.parametrize(
     ("percent", "told"),
     [

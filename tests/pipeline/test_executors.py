@@ -17,7 +17,7 @@ from fake_items import Record, crash, fail, fill_the_disk, hang, kill_itself, le
 from astra_data.core.durable import held
 from astra_data.core.errors import AstraDataError, DiskError, MissingStageError
 from astra_data.pipeline import executors as local_executor
-from astra_data.pipeline.executors import Item, Reporter, execute, pickled, run_in_order, run_item
+from astra_data.pipeline.executors import Item, execute, pickled, reporter, run_in_order, run_item
 from astra_data.worlds.user_code import user_object
 
 
@@ -119,7 +119,7 @@ def test_at_most_ten_notes_a_second_are_sent(monkeypatch: pytest.MonkeyPatch) ->
     now = 5.0
     monkeypatch.setattr("astra_data.pipeline.executors.time.monotonic", lambda: now)
     sent: list[tuple[float, str]] = []
-    report = Reporter(sent.append)
+    report = reporter(sent.append)
     for step in range(12):
         now = 5.0 + step * 0.03
         report(step / 10, "")

@@ -8,8 +8,6 @@ import pytest
 import torch
 from quick_runs import run_here, small_tables
 
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
-from astra_data.dataset.reader import Dataset
 from astra_data.reports.artifacts import EVALUATION, Evaluation, read_json
 from astra_data.robots.registry import task_named
 from astra_data.worlds.user_code import user_object
@@ -40,20 +38,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_recipe_runs_until_a_policy_is_tested_in_the_arm(folder: Path) -> None:
     evaluation = read_json(Evaluation, folder / "evaluate/nas/seed_0" / EVALUATION)
     assert evaluation.tested_in == "target" and evaluation.target is not None
-
-
-def test_recorded_steps_are_those_of_the_environment(folder: Path) -> None:
-    """Repeat an episode in the environment itself, with the fingers closed."""
-    columns = Dataset.open(folder / "collect/seed_0").columns([STATE, ACTION, NEXT_STATE])
-    task = task_named(f"{folder.parents[1]}/reach.py:TASK")
-    assert task.robot is not None
-    env = task.robot().env  # type: ignore[attr-defined]
-    start = columns[STATE][0]
-    env.reset(seed=0)
-    np.testing.assert_allclose(env.unwrapped._get_obs()["observation"], start, atol=1e-5)
-    for action, following in list(zip(columns[ACTION], columns[NEXT_STATE], strict=True))[:5]:
-        observation, *_ = env.step(np.array([*action, 0.0], dtype=np.float64))
-        np.testing.assert_allclose(observation["observation"], following, atol=1e-5)
 
 
 def test_the_puck_is_pushed_at_one_height_until_it_falls() -> None:

@@ -120,16 +120,6 @@ def pushed() -> Columns:
     return {"q1": summed(speed + STEP_S * 2.5 * torque), "dq1": speed, "tau1": torque}
 
 
-def turret() -> Columns:
-    turn, lift = held((-3, 3), (-1, 1))
-    return {
-        "lift_m": summed(lift),
-        "heading": wrapped(summed(turn)),
-        "cmd_lift_m_s": lift,
-        "cmd_turn_rate": turn,
-    }
-
-
 KINDS: dict[str, tuple[Callable[[], Columns], str]] = {
     "unicycle": (unicycle, "a unicycle: x, y, yaw, moved by w, v"),
     "of other axes": (
@@ -156,7 +146,6 @@ KINDS: dict[str, tuple[Callable[[], Columns], str]] = {
     ),
     "arm": (arm, "values that commands move: elbow, grip, moved by elbow, grip; CHECK: fan has no effect"),
     "pushed": (pushed, "values that commands move: q1, dq1, moved by tau1; dq1_per_force 2.5"),
-    "turret": (turret, "values that commands move: lift, heading, moved by lift, turn_rate"),
 }
 
 
@@ -201,13 +190,10 @@ def test_the_second_command_turns_where_no_name_says_which(tmp_path: Path) -> No
         ("vx,y,cmd_vx", "vx", ""),
         ("x,y,cmd", None, ""),
         ("x,cmd", "x", ""),
-        ("load,q2,q1,cmd_q1,cmd_q2", "q1, q2", ""),
         ("x,wx,torque_roll,x_setpoint,qz_setpoint", "x", "qz has no effect"),
         ("x,y,cmd_surge,cmd_x", "x", "surge has no effect"),
         ("x_m,tilt_rad,cmd_x_m_s,cmd_tilt_m_s", "x", "tilt has no effect"),
-        ("depth,cmd_depth", "depth", ""),
         ("joint1_pos,joint1_vel,joint1_torque_nm", "joint1_pos, joint1_vel", ""),
-        ("joint1_pos,joint1_torque_nm", None, ""),
     ],
 )
 def test_a_command_moves_the_state_of_its_name_and_no_other(

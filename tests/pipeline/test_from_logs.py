@@ -44,7 +44,8 @@ def made(
 
 
 def test_logs_become_policies_and_a_page_without_a_target(cart: Path) -> None:
-    folder = cart / "runs/cart"
+    rows = 'methods = ["direct_transfer", "nas", "astra"]\n'
+    folder, _ = made(cart, "cart", rows, lambda key: key.startswith(("evaluate", "report")))
     assert not (folder / "collect").exists()
     labeled = Dataset.open(folder / "label/seed_0")
     assert REWARD in labeled.features and GOAL not in labeled.features and len(labeled) == 8

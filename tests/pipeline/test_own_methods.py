@@ -28,14 +28,6 @@ def test_a_place_alone_is_a_method_with_its_usual_settings() -> None:
     assert plain.settings("plain") is None
 
 
-def test_further_keys_are_its_settings() -> None:
-    own = OwnMethod.model_validate({"method": DELTA, "memory": 5})
-    own.add("delta")
-    settings = own.settings("delta")
-    assert settings is not None and settings.model_dump() == {"memory": 5, "learning_rate": 0.003}
-    assert OwnMethod.model_validate(own.model_dump()) == own
-
-
 def test_those_that_it_does_not_have_are_refused_before_anything_runs() -> None:
     with pytest.raises(BadInputError, match=r"^delta: memory: expected a whole number"):
         add_all({"delta": {"method": DELTA, "memory": "much"}})

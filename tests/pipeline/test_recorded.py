@@ -46,19 +46,6 @@ def test_a_walk_leads_back_to_its_poses(recorded: dict[str, Any]) -> None:
     )
 
 
-def test_a_command_moves_the_walker_along_an_arc(recorded: dict[str, Any]) -> None:
-    motion = recorded["walker"].PlanarWalker.motion
-    ahead, back, left = motion(torch.tensor([[0.0, 0.5, 0, 1], [0, -1.0, 0, 1], [0, 0.0, 1.0, 0]])).unbind()
-    torch.testing.assert_close(ahead, torch.tensor([0.6 * 0.25 / 6, 0.0, 0.0]))
-    torch.testing.assert_close(back, torch.tensor([-0.5 * 0.15 / 6, 0.0, 0.0]))
-    torch.testing.assert_close(left, torch.tensor([0.0, 0.2 / 6, 0.0]))
-    angle = 0.6 * 2.094 / 6
-    radius = (0.25 / 6) / angle
-    arc = motion(torch.tensor([[1.0, 1.0, 0.0, 0.0]]))[0]
-    expected = torch.tensor([radius * np.sin(angle), radius * (1 - np.cos(angle)), angle])
-    torch.testing.assert_close(arc, expected.float())
-
-
 def test_ridge_learns_what_recorded_joints_do(
     recorded: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,15 +67,7 @@ def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
     names = [line.split()[0] for line in listed if line.strip()]
     assert [names.count(recipe.name) for recipe in shipped_recipes()] == [1] * len(shipped_recipes())
     assert max(map(len, listed)) <= 80
+    assert "ros2_base" in "\n".join(listed).partition("Mappings")[2]
     copied = CliRunner().invoke(app, ["recipes", "copy", "quickstart", str(tmp_path)])
     assert copied.output == f"finished: 3 files; astra-data run {tmp_path}/quickstart.toml\n"
     assert (tmp_path / "quickstart.toml").is_file()
-
-
-def test_mappings_are_listed_and_copied(tmp_path: Path) -> None:
-    listed = CliRunner().invoke(app, ["recipes", "list"], env={"COLUMNS": "200"})
-    assert "ros2_base" in listed.output.partition("Mappings")[2] and "A wheeled base that" in listed.output
-    copied = CliRunner().invoke(app, ["recipes", "copy", "ros2_base", str(tmp_path)])
-    mapping = tmp_path / "imports/ros2_base.toml"
-    assert copied.output == f"finished: 2 files; astra-data import LOGS --mapping {mapping}\n"
-    assert mapping.is_file() and (tmp_path / "examples/ros2/drive.py").is_file()

@@ -65,14 +65,8 @@ def report(
 ) -> None:
     """Write results.json, .md and .html and the figures to `root`/report.
 
-    Args:
-        recipe: names the task, the methods and the seeds.
-        root: the recipe's folder of runs.
-        command: the command line to print as the results' origin.
-        publish: a folder for copies of results.json, .md and the figures, named after the recipe; or None.
-        published: files of results that those at `root` are added to.
-        progress: called with the share done and a note.
-        config: settings.
+    They name `command` as their origin, and are added to the files `published`. `publish` is a folder for
+    copies of results.json, .md and the figures, named after the recipe.
 
     Raises:
         MissingStageError: no method has an evaluation.

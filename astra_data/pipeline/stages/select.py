@@ -138,11 +138,6 @@ def select(
     Where a recipe has `data`, all seeds share their episodes, and the page says so. Policies of a size are
     judged by groundings of that size. An interrupted call goes on with the next policy.
 
-    Args:
-        recipe: names the task, the rows and the seeds.
-        config: the recipe's `[select]`.
-        root: the recipe's folder of runs.
-        progress: called with the fraction done and a note.
     """
     judge = judge_in(recipe, config)
     contests = [bench.finished(root) for bench in benches(recipe, judge)]

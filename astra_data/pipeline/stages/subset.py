@@ -12,12 +12,8 @@ def subset(
 ) -> Path:
     """Write `percent` per cent of `of` episodes of `dataset` to `out`, as a dataset of its own.
 
-    Args:
-        dataset: its stored permutation decides which episodes are taken.
-        percent: the size; may exceed 100.
-        of: number of episodes that count as 100 per cent, by default all.
-        out: the folder to write.
-        progress: called with the fraction done and a note.
+    The dataset's stored permutation decides which episodes are taken; `percent` may exceed 100, which is by
+    default all of them.
 
     Raises:
         BadInputError: `dataset` has fewer episodes, or `out` exists.

@@ -212,21 +212,6 @@ def test_commands_beyond_those_of_the_dataset_are_counted(
     assert "beyond_recorded" not in without and without["target"] == told["target"]
 
 
-def test_commands_are_counted_of_the_encoder_that_is_reported(
-    task: str, trained: Path, grounded: Path, good: Path, tmp_path: Path
-) -> None:
-    columns = [Column(name, size=2) for name in (STATE, NEXT_STATE, ACTION)]
-    with writer(tmp_path / "set", columns=columns) as made:
-        narrow = np.array([[-0.03, -0.03], [0.03, 0.03]], np.float32)
-        made.add(Episode(0, dict.fromkeys((STATE, NEXT_STATE, ACTION), narrow), {}))
-    inputs = {"policy": trained, "grounding": grounded, "recorded": tmp_path / "set"}
-    source = CONFIG.model_copy(update={"encoder": "source"})
-    alone, _ = make(task, "astra", tmp_path / "alone", inputs)
-    beside, _ = make(task, "astra", tmp_path / "beside", inputs | {"target_encoder": good}, source)
-    other, _ = make(task, "astra", tmp_path / "other", inputs | {"target_encoder": good})
-    assert beside["beyond_recorded"] == alone["beyond_recorded"] != other["beyond_recorded"]
-
-
 def test_without_a_target_starts_and_goals_are_those_of_the_simulator_that_is_reported(
     task: str, trained: Path, grounded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
