@@ -131,12 +131,12 @@ class McapFile:
         # A summary may leave out what the data say.
         if summary.chunk_indexes and used <= summary.channels.keys() and described <= summary.schemas.keys():
             indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
-            self._chunks = [index for index in indexes if self._may_hold(index.message_index_offsets)]
+            wanted = {number for number, channel in self._channels.items() if channel.topic in self._wanted}
+            # Some chunks list no channels.
+            self._chunks = [
+                index for index in indexes if not (of := index.message_index_offsets) or wanted & of.keys()
+            ]
             self.check_topics()
-
-    def _may_hold(self, channels: Collection[int]) -> bool:
-        """Return whether a chunk with messages of `channels` may have wanted ones; some list no channels."""
-        return not channels or any(self._channels[number].topic in self._wanted for number in channels)
 
     def _records(self, *, checked: bool) -> Iterator[Any]:
         """Yield the records of the data, those of chunks unpacked, and `checked` by their sums."""

@@ -308,7 +308,8 @@ def other_files(recordings: Sequence[Path], suffixes: Sequence[str]) -> tuple[st
     beside = (*suffixes, ".toml", ".md")
     inside = [source for path in recordings if path.is_dir() or is_archive(path) for source in _inside(path)]
     names = [name for name in map(str, inside) if not name.lower().endswith(beside)]
-    return tuple(sorted((name for name in names if not _is_readme(name)), key=natural))
+    names = [n for n in names if PurePosixPath(n).name.lower().partition(".")[0] != "readme"]
+    return tuple(sorted(names, key=natural))
 
 
 def refuse_dataset(place: Path) -> None:
@@ -338,10 +339,6 @@ def _inside(recording: Path) -> list[Source]:
         return [Source(path, None, recording) for path in files]
     members = [member for member in _members(recording) if _is_seen(PurePosixPath(member.name))]
     return [Source(recording, member, recording) for member in members]
-
-
-def _is_readme(name: str) -> bool:
-    return PurePosixPath(name).name.lower().partition(".")[0] == "readme"
 
 
 def _is_seen(path: PurePath) -> bool:

@@ -191,17 +191,18 @@ class Resampler:
         """Return how long after `time` the widest gap between the messages that are in step is half over."""
         if not self._states:
             return 0
-        phases = sorted(self._phase(topic, time) for topic in self._in_step)
+        phases = []
+        """How long after `time`, in ns below the spacing, messages of each topic come but for jitter."""
+        for topic in self._in_step:
+            first = np.searchsorted(self._moments[topic], self.times[topic])
+            moments = self._moments[topic][first : first + _AVERAGED]
+            step = self._spacing_ns * max(1, round(self._periods[topic] / self._spacing_ns))
+            phase = np.median(moments - time - step * np.arange(len(moments))) % self._spacing_ns
+            phases.append(float(phase))
+        phases.sort()
         gaps = pairwise([*phases, phases[0] + self._spacing_ns])
         before, after = max(gaps, key=lambda gap: gap[1] - gap[0])
         return round((before + after) / 2 % self._spacing_ns)
-
-    def _phase(self, topic: str, time: int) -> float:
-        """Return how long after `time`, in ns below the spacing, messages of `topic` come but for jitter."""
-        first = np.searchsorted(self._moments[topic], self.times[topic])
-        moments = self._moments[topic][first : first + _AVERAGED]
-        step = self._spacing_ns * max(1, round(self._periods[topic] / self._spacing_ns))
-        return float(np.median(moments - time - step * np.arange(len(moments))) % self._spacing_ns)
 
     def _end(self, time: int) -> int:
         """Return before when the last row is, of an episode whose last message is at `time`."""

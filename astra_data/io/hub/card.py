@@ -202,7 +202,10 @@ def _columns(dataset: Dataset) -> str:
             shape = f"({column.size},)"
             rows.append((in_code(column.name), column.dtype, shape, _units(column), meaning))
     plain = [f"`{column.name}`" for column in columns if column.name in RESERVED and not column.meaning]
-    order = [f"In {_joined(same)}, in order: {', '.join(names)}." for names, same in wide.items()]
+    order = [
+        f"In {' and '.join(map(in_code, same))}, in order: {', '.join(names)}."
+        for names, same in wide.items()
+    ]
     return "\n\n".join(
         [
             _table(("column", "type", "shape", "units", "meaning"), rows),
@@ -211,10 +214,6 @@ def _columns(dataset: Dataset) -> str:
             f"stand in `{layout.INFO_PATH}` under `astra`.",
         ]
     )
-
-
-def _joined(names: list[str]) -> str:
-    return " and ".join(map(in_code, names))
 
 
 def _units(column: Column) -> str:

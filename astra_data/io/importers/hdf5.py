@@ -188,21 +188,12 @@ def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]
     if pattern is None:
         return groups
     for part in pattern.strip("/").split("/"):
-        groups = [
-            _linked(h5py, group, name, origin)
-            for group in groups
-            for name in sorted(group, key=natural)
-            if fnmatchcase(name, part)
-        ]
+        inside = [(g, name) for g in groups for name in sorted(g, key=natural) if fnmatchcase(name, part)]
+        for group, name in inside:  # links may lead to another file
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                place = f"{origin}{group.name.rstrip('/')}/{name}"
+                raise BadInputError(f"{place} is a link; replace it by a copy of its target")
+        groups = [group[name] for group, name in inside]
     if not groups:
         raise BadInputError(f"{origin}: no groups '{pattern}'; it has {', '.join(list(file)[:10])}")
     return groups
-
-
-def _linked(h5py: Any, group: Any, name: str, origin: str) -> Any:  # noqa: ANN401 - of h5py
-    """Return the group `name` of `group`; links are refused, since they may lead to another file."""
-    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise BadInputError(
-            f"{origin}{group.name.rstrip('/')}/{name} is a link; replace it by a copy of its target"
-        )
-    return group[name]

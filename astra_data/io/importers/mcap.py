@@ -179,12 +179,7 @@ def _sent(file: McapFile, fields: Sequence[MessageField], message: Any) -> froze
     return frozenset(field.wanted for field in fields if field.wanted in field.names_in(content))
 
 
-def _streams(
-    file: McapFile,
-    fields: Sequence[MessageField],
-    of: Mapping[str, str],
-    message: Any,  # noqa: ANN401 - of mcap
-) -> list[str]:
+def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str], message: Any) -> list[str]:  # noqa: ANN401
     """Return as what topics a message counts."""
     return sorted({of[name] for name in _sent(file, fields, message)})
 
