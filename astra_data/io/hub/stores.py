@@ -149,7 +149,8 @@ class RemoteFolder:
 
     @property
     def _is_here(self) -> bool:
-        return "file" in str(self.filesystem.protocol)
+        protocol = self.filesystem.protocol
+        return "file" in ((protocol,) if isinstance(protocol, str) else protocol)
 
 
 @dataclass(frozen=True)

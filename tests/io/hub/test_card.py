@@ -33,6 +33,7 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "fake", description=description)
     text = render_card(dataset, NOTES)
     told = [
+        *("license: mit", "- LeRobot", "- robotics", "data_files: data/*/*.parquet"),
         *("# fake\n", "A sum.", "It walks.", "For tests.", "Nothing real.", "“run”", "20 Hz", "5 episodes"),
         *("mother@data-2.1.0", "ab" * 32, '"noise_m": 0.1', '"collect": 0', "Fake-v0", "point_mass"),
         *(dataset.content_hash, "| made by stage | collect |", dataset.description["packages"]["mujoco"]),
