@@ -30,7 +30,7 @@ def display(
     Where lines are too long for the terminal, names and notes are cut off, never bar, share and time left.
     """
     if not console.is_terminal:
-        yield PlainDisplay(keys, console, then)
+        yield _PlainDisplay(keys, console, then)
         return
     columns = (
         _Cropped("{task.description}", markup=False, table_column=Column()),
@@ -40,14 +40,13 @@ def display(
         _Cropped("{task.fields[note]}", markup=False, table_column=Column()),
     )
     with Progress(*columns, console=console) as progress:
-        yield LiveDisplay(keys, console, then, progress)
+        yield _LiveDisplay(keys, console, then, progress)
 
 
 class _Cropped(TextColumn):
     """A text of one line, of which the end gives way."""
 
     def render(self, task: Task) -> Text:
-        """Return the text."""
         text = super().render(task)
         text.no_wrap, text.overflow = True, "ellipsis"
         return text
@@ -59,7 +58,6 @@ class _TimeLeft(ProgressColumn):
     max_refresh = 0.5
 
     def render(self, task: Task) -> Text:
-        """Return hours, minutes and seconds."""
         seconds = task.fields["left"]()
         return Text("-:--:--" if seconds is None else str(timedelta(seconds=round(seconds))))
 
@@ -125,7 +123,7 @@ def shown(key: str) -> Iterator[Notes]:
         watch.finished(key, time.perf_counter() - began)
 
 
-class PlainDisplay:
+class _PlainDisplay:
     """One line per start, tenth and finish of an item."""
 
     def __init__(self, keys: Collection[str], console: Console, then: Callable[[str], object]) -> None:
@@ -133,31 +131,27 @@ class PlainDisplay:
         self._finished, self._tenths = 0, dict.fromkeys(keys, 0)
 
     def started(self, key: str) -> None:
-        """Print that an item has started."""
         self._print(f"{key}  started")
 
     def progressed(self, key: str, fraction: float, note: str) -> None:
-        """Print the note when another tenth is done."""
         tenths = int(10 * fraction)
         if tenths > self._tenths[key]:
             self._tenths[key] = tenths
             self._print(f"{key}  {10 * tenths} %  {note}")
 
     def finished(self, key: str, seconds: float) -> None:
-        """Print how long the item took."""
         self._finished += 1
         self._print(f"{key}  finished in {seconds:.1f} s  ({self._finished} of {self._total})")
         self._then(key)
 
     def failed(self, key: str) -> None:
-        """Print that the item has failed."""
         self._print(f"{key}  failed")
 
     def _print(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-class LiveDisplay(PlainDisplay):
+class _LiveDisplay(_PlainDisplay):
     """One moving line per running item; finished ones become lines above."""
 
     def __init__(
@@ -170,18 +164,15 @@ class LiveDisplay(PlainDisplay):
         self._tasks: dict[str, TaskID] = {}
 
     def started(self, key: str) -> None:
-        """Add the item's line."""
         self._estimate.started(key)
         left = partial(self._estimate.left_of, key)
         self._tasks[key] = self._progress.add_task(key, total=1.0, note="starting", left=left)
 
     def progressed(self, key: str, fraction: float, note: str) -> None:
-        """Move the item's line on."""
         self._estimate.progressed(key, fraction)
         self._progress.update(self._tasks[key], completed=fraction, note=note)
 
     def finished(self, key: str, seconds: float) -> None:
-        """Replace the item's line by a finished one."""
         self._progress.remove_task(self._tasks.pop(key))
         self._estimate.finished(key, seconds)
         super().finished(key, seconds)
@@ -189,6 +180,5 @@ class LiveDisplay(PlainDisplay):
         self._progress.update(self._whole, completed=self._finished, description=text)
 
     def failed(self, key: str) -> None:
-        """Leave the item's line where it stopped, if it had started."""
         if key in self._tasks:
             self._progress.update(self._tasks[key], note="failed")

@@ -412,7 +412,7 @@ def execute_on_cluster(
     try:
         if any(item.wants_gpu for item in items) and not ray.cluster_resources().get("GPU"):
             raise BadInputError(f"the Ray cluster at {address} has no GPU: use --device cpu")
-        mailbox = ray.remote(num_cpus=0)(Mailbox).remote()
+        mailbox = ray.remote(num_cpus=0)(_Mailbox).remote()
         task = ray.remote(num_cpus=1, max_retries=0)(_work)
         run_in_order(items, jobs, begin, finished)
     except (ray.exceptions.RayError, ConnectionError) as error:
@@ -426,18 +426,16 @@ def execute_on_cluster(
         ray.shutdown()
 
 
-class Mailbox:
+class _Mailbox:
     """An actor that keeps the notes of tasks, None of one that starts, until they are fetched."""
 
     def __init__(self) -> None:
         self._notes: list[tuple[str, Note | None]] = []
 
     def put(self, key: str, note: Note | None) -> None:
-        """Keep a note on an item."""
         self._notes.append((key, note))
 
     def take(self) -> list[tuple[str, Note | None]]:
-        """Return the notes since the last call, in their order."""
         notes, self._notes = self._notes, []
         return notes
 

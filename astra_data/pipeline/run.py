@@ -96,7 +96,7 @@ def run(
     wanted = stages - experiment.borrowed
     part = Selection.of(experiment.recipe, methods, seeds, percents)
     log = _tracked(trackio, experiment.folder.name) if trackio else lambda _: None
-    table = PointTable(experiment, part.points(), log)
+    table = _PointTable(experiment, part.points(), log)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if item.stage in wanted]
     make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, table=table)
@@ -215,7 +215,7 @@ def make(
     device: str = "cpu",
     engine: str = "processes",
     address: str | None = None,
-    table: "PointTable | None" = None,
+    table: "_PointTable | None" = None,
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
@@ -317,7 +317,7 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
     return [item for item in selected if not rows or row_of_key(item.key) in rows]
 
 
-class PointTable:
+class _PointTable:
     """The finished points of a recipe, in `sweep.csv`; the line of a finished point does not change."""
 
     def __init__(
