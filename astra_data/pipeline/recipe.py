@@ -27,7 +27,7 @@ from astra_data.methods import METHODS, method_named, tables
 from astra_data.methods.method import Table
 from astra_data.pipeline.stages.registry import STAGES, Stage
 from astra_data.pipeline.stages.select import judge_of
-from astra_data.pipeline.user_code import OwnMethod, add_all, looked_up, with_offered
+from astra_data.pipeline.user_code import UserMethod, add_all, looked_up, with_offered
 from astra_data.robots.registry import task_named
 from astra_data.worlds.objective import Score
 from astra_data.worlds.user_code import place_beside
@@ -68,7 +68,7 @@ def _agreeing(table: str, key: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
-class _OwnMethod(BaseModel):
+class _UserMethod(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     method: str
@@ -80,7 +80,7 @@ class _Record(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     task: str
-    own_methods: dict[str, _OwnMethod] = {}
+    own_methods: dict[str, _UserMethod] = {}
     sweep: dict[str, JsonValue] = {}
 
 
@@ -154,7 +154,7 @@ class Recipe(Config):
     data: str | None = Field(default=None, exclude_if=lambda data: data is None)
     """A dataset instead of `[collect]`: a folder next to the recipe, what dataset commands take (a folder, a
     name in the home folder, "walks@data-1.0.0"), or what `pull` takes ("user/name", "s3://…")."""
-    own_methods: dict[str, OwnMethod] = Field(default_factory=dict, exclude_if=lambda methods: not methods)
+    own_methods: dict[str, UserMethod] = Field(default_factory=dict, exclude_if=lambda methods: not methods)
     """Your own methods, by the names of their rows: "delta.py:METHOD", or a table of that and settings."""
     methods: tuple[str, ...] = Field(min_length=1)
     """Rows of the results: a name in `astra_data.methods.METHODS`, alone or followed by `_plus`."""
@@ -219,7 +219,7 @@ class Recipe(Config):
 
     @field_validator("own_methods")
     @classmethod
-    def _add_own_methods(cls, methods: dict[str, OwnMethod]) -> dict[str, OwnMethod]:
+    def _add_own_methods(cls, methods: dict[str, UserMethod]) -> dict[str, UserMethod]:
         try:
             add_all(methods)
         except BadInputError as error:

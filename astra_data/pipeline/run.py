@@ -28,7 +28,7 @@ from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment, load_experime
 from astra_data.pipeline.plan import RunPoint, Selection, check_stage, plan, stages_until
 from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.stages.registry import STAGES
-from astra_data.pipeline.user_code import OwnMethod, add_all, digests_of, record_code
+from astra_data.pipeline.user_code import UserMethod, add_all, digests_of, record_code
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 from astra_data.reports.held_out import write_held_out
 from astra_data.robots.registry import TASKS, task_named
@@ -264,7 +264,7 @@ def make(
             )
 
 
-def _prepare(own_methods: dict[str, OwnMethod]) -> None:
+def _prepare(own_methods: dict[str, UserMethod]) -> None:
     """Make a process ready for an item of a recipe with these methods of its own."""
     # One thread for the networks: they are small, and idle threads would slow down other items.
     torch.set_num_threads(1)

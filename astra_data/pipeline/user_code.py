@@ -17,7 +17,7 @@ from astra_data.robots.registry import place_of
 from astra_data.worlds.user_code import code_digest, place_beside
 
 
-class OwnMethod(Config):
+class UserMethod(Config):
     """A method of your own; further keys are its settings, which the model of its `table` reads."""
 
     model_config = ConfigDict(extra="allow")
@@ -52,7 +52,7 @@ class OwnMethod(Config):
 def add_all(own_methods: Mapping[str, Any]) -> None:
     """Add the methods of a recipe, each as the recipe names it."""
     for name, given in own_methods.items():
-        OwnMethod.model_validate(given).add(name)
+        UserMethod.model_validate(given).add(name)
 
 
 def looked_up(own_methods: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def record_code(folder: Path, digests: Mapping[str, str]) -> None:
         write_file(folder / CODE, json.dumps(recorded_code(folder) | dict(digests), indent=1) + "\n")
 
 
-def digests_of(task: str, own_methods: Mapping[str, OwnMethod]) -> dict[str, str]:
+def digests_of(task: str, own_methods: Mapping[str, UserMethod]) -> dict[str, str]:
     """Return the digest of the code of "task", and of methods by their names, where it is the user's."""
     places = {"task": place_of(task)} | {name: own.method for name, own in own_methods.items()}
     found = {name: code_digest(place) for name, place in places.items()}

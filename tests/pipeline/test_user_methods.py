@@ -9,7 +9,7 @@ from astra_data.core.errors import BadInputError, RecipeError
 from astra_data.methods import METHODS
 from astra_data.pipeline import run
 from astra_data.pipeline.experiment import load_experiment
-from astra_data.pipeline.user_code import OwnMethod, add_all, looked_up, with_offered
+from astra_data.pipeline.user_code import UserMethod, add_all, looked_up, with_offered
 from astra_data.reports.results import results_json
 
 EXAMPLES = Path(__file__).parents[2] / "recipes/examples/methods"
@@ -18,12 +18,12 @@ DELTA, ENSEMBLE = (f"{EXAMPLES}/{name}.py:METHOD" for name in ("delta_action", "
 
 
 def test_a_place_alone_is_a_method_with_its_usual_settings() -> None:
-    own = OwnMethod.model_validate(DELTA)
+    own = UserMethod.model_validate(DELTA)
     own.add("delta")
     settings = own.settings("delta")
     assert settings is not None and settings.model_dump() == {"memory": 32, "learning_rate": 0.003}
     assert own.model_dump() == {"method": DELTA}
-    plain = OwnMethod.model_validate(ENSEMBLE)
+    plain = UserMethod.model_validate(ENSEMBLE)
     plain.add("plain")
     assert plain.settings("plain") is None
 
@@ -43,7 +43,7 @@ def test_all_of_a_recipe_are_added_as_recipe_json_has_them() -> None:
 def test_the_process_of_an_item_knows_them_and_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[int] = []
     monkeypatch.setattr("torch.set_num_threads", told.append)
-    run._prepare({"one": OwnMethod.model_validate(DELTA)})
+    run._prepare({"one": UserMethod.model_validate(DELTA)})
     assert "one" in METHODS and told == [1]
 
 
