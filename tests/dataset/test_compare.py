@@ -1,17 +1,20 @@
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from fake_dataset import COLUMNS, DESCRIPTION, fake_columns, fake_episode, write_fake, writer
 
 from astra_data.core.errors import CorruptDatasetError
-from astra_data.dataset import Dataset, DatasetWriter
+from astra_data.dataset import Dataset, DatasetWriter, compare
 from astra_data.dataset.columns import ACTION, STATE, Column, Episode
 from astra_data.dataset.compare import (
     Differences,
     column_faults,
     differences,
+    hashes,
     lineage,
     names_apart,
     recordings_of,
@@ -115,6 +118,25 @@ def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) ->
             open_writer.add(Episode(uid, columns, {} if source is None else {"source_episode": source}))
     assert recordings_of(Dataset.open(tmp_path / "set")).tolist() == [0, 0, 0, 1, 1]
     assert recordings_of(write_fake(tmp_path / "plain")).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_of_a_thousand_merges_of_two_filters_each_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def found(_: object, key: tuple[str, str, str]) -> tuple[Path, dict[str, Any]]:
+        kind, _, number = key[0].partition("-")
+        parents = [f"{one}-{number}" for one in ("left", "right")] if kind == "merge" else []
+        parents = parents or [f"merge-{int(number) - 1}"] * (int(number) > 0)
+        return tmp_path, {"parents": [{"name": name, "version": "1.0.0", "hash": name} for name in parents]}
+
+    monkeypatch.setattr(compare._Places, "find", found)
+    newest = {"name": "merge-1000", "version": "1.0.0", "hash": "merge-1000"}
+    description = found(None, ("merge-1000", "1.0.0", "merge-1000"))[1]
+    last = SimpleNamespace(root=tmp_path, identity=newest, description=description)
+    made = lineage(last)  # type: ignore[arg-type]
+    # Of each round two filters, the merge before it once for each of them, and that of the first round.
+    assert len(list(tree_lines(made))) == 1 + 1001 * 2 + 1000 * 2
+    assert len(hashes(made)) == 3 * 1001
 
 
 def test_a_dataset_among_its_own_ancestors_is_told(tmp_path: Path) -> None:

@@ -112,9 +112,8 @@ def _of_import(dataset: Dataset) -> list[Finding]:
     """Return what the import said of rates and of rounding, where the dataset is one."""
     notes, topics = (dataset.description.get(key) for key in ("notes", "topics"))
     found = [*(notes if isinstance(notes, list) else []), *(topics if isinstance(topics, dict) else [])]
-    return [
-        Finding("warning", f"at import, {note}", "correct the mapping and import again") for note in found
-    ]
+    advice = "correct the mapping and import again, unless it is meant"
+    return [Finding("warning", f"at import, {note}", advice) for note in found]
 
 
 class GivenCommands:

@@ -8,13 +8,12 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from astra_data.core.artifact import check_intact
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import GOAL, STATE
 from astra_data.deployment.folder import DESCRIPTION, TYPE
 from astra_data.deployment.graph import ONNX, load_onnx
 from astra_data.deployment.lerobot.configuration_astra_data import AstraDataConfig
-from astra_data.deployment.run_policy import refuse_far
+from astra_data.deployment.run_policy import intact, refuse_far
 
 
 class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
@@ -35,9 +34,11 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
             raise BadInputError(
                 f"--policy.path: expected a folder that astra-data deploy wrote, got {folder or 'none'}"
             )
-        for name in (DESCRIPTION, ONNX):
-            check_intact(Path(folder) / name)
-        self._about: dict[str, Any] = json.loads((Path(folder) / DESCRIPTION).read_text())
+        try:
+            described = intact(Path(folder), DESCRIPTION, ONNX)[0]
+        except ValueError as error:
+            raise BadInputError(str(error)) from None
+        self._about: dict[str, Any] = json.loads(described)
         self._graph = load_onnx(Path(folder) / ONNX)
         self.reset()
 

@@ -81,6 +81,14 @@ def test_a_folder_without_a_policy_is_refused(made: Any, run: Path, tmp_path: Pa
         shutil.copy(run.with_name("policy") / name, tmp_path)
     with pytest.raises(BadInputError, match=f"astra-data deploy wrote, got {tmp_path}"):
         type(made).from_pretrained(tmp_path)
+    for name, told in (
+        ("policy.onnx", r"policy\.onnx was altered"),
+        ("manifest.json", "deploy wrote them, got"),
+    ):
+        robot = shutil.copytree(run.with_name("policy"), tmp_path / "robot", dirs_exist_ok=True)
+        (robot / name).write_bytes(b"other")
+        with pytest.raises(BadInputError, match=f"{told}.*: copy the folder again"):
+            type(made).from_pretrained(robot)
     for refuses in (lambda: made.forward({}), made.get_optim_params, made.config.get_optimizer_preset):
         with pytest.raises(NotImplementedError, match="astra-data train does"):
             refuses()

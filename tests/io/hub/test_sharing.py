@@ -228,6 +228,22 @@ def test_whole_files_are_not_fetched_again_and_others_are(
     assert not hidden(tmp_path / "out")
 
 
+def test_folders_in_folders_are_not_listed(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server may list one more in each, without end."""
+    listed: list[str] = []
+    ls = LocalFileSystem.ls
+
+    def watched(self: LocalFileSystem, path: str, **options: object) -> object:
+        listed.append(path)
+        return ls(self, path, **options)
+
+    monkeypatch.setattr(LocalFileSystem, "ls", watched)
+    pull(source(shared), out=tmp_path / "out")
+    assert set(listed) == {str(shared.parent)}
+
+
 def test_no_more_is_fetched_than_is_listed(
     shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
