@@ -4,7 +4,7 @@ A column of the table of methods is a line of `COLUMNS`; its measure is what a s
 line of `figures.FIGURES`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -396,12 +396,17 @@ def _every_seed(results: Results) -> Iterator[Block]:
 def _provenance(results: Results) -> Iterator[Block]:
     yield Text("Produced by")
     yield Code(results.command)
-    texts = {"Code": _commit, "Machine": _machine, "Versions": _versions}
-    items = [f"{what}: {_by_stage(results.origins, text)}." for what, text in texts.items()]
+    items = []
+    for what in ("Code", "Machine", "Versions"):
+        stages: dict[str, list[str]] = {}
+        for origin in results.origins:
+            stages.setdefault(_described(origin)[what], []).extend(origin.stages)
+        # What all stages share stands alone.
+        texts = [f"{text} ({', '.join(dict.fromkeys(of))})" for text, of in stages.items()]
+        items.append(f"{what}: {'; '.join(texts if len(stages) > 1 else stages)}.")
     if results.user_code:
-        items.append(
-            "User code: " + ", ".join(f"{name} `{hash_}`" for name, hash_ in results.user_code.items()) + "."
-        )
+        digests = [f"{name} `{digest}`" for name, digest in results.user_code.items()]
+        items.append(f"User code: {', '.join(digests)}.")
     uses: dict[tuple[str, str, str], list[str]] = {}
     for one in results.datasets:
         key = (one.stage, one.name, one.version)
@@ -417,31 +422,15 @@ def _provenance(results: Results) -> Iterator[Block]:
     )
 
 
-def _by_stage(origins: Sequence[Origin], text: Callable[[Origin], str]) -> str:
-    """Return the text that all origins share, or each text with its stages."""
-    stages: dict[str, list[str]] = {}
-    for origin in origins:
-        stages.setdefault(text(origin), []).extend(origin.stages)
-    if len(stages) == 1:
-        return next(iter(stages))
-    return "; ".join(f"{shared} ({', '.join(dict.fromkeys(of))})" for shared, of in stages.items())
-
-
-def _commit(origin: Origin) -> str:
-    if origin.commit is None:
-        return "not recorded"
-    commit = origin.commit.removesuffix("-dirty")
-    return f"commit `{commit}`{' with uncommitted changes' if commit != origin.commit else ''}"
-
-
-def _machine(origin: Origin) -> str:
-    made_on = origin.machine
-    if made_on is None:
-        return "not recorded"
-    gpu = f", {made_on.gpu}" if made_on.gpu else ""
-    return f"{made_on.cpu}, {made_on.cores} cores, {made_on.memory_gib:g} GiB of memory{gpu}"
-
-
-def _versions(origin: Origin) -> str:
-    known = (f"{name} {version}" for name, version in origin.packages.items() if version is not None)
-    return ", ".join(known) or "not recorded"
+def _described(origin: Origin) -> dict[str, str]:
+    """Return code, machine and versions in words."""
+    commit, on = (origin.commit or "").removesuffix("-dirty"), origin.machine
+    changed = " with uncommitted changes" if commit != origin.commit else ""
+    gpu = f", {on.gpu}" if on and on.gpu else ""
+    machine = on and f"{on.cpu}, {on.cores} cores, {on.memory_gib:g} GiB of memory{gpu}"
+    versions = [f"{name} {version}" for name, version in origin.packages.items() if version is not None]
+    return {
+        "Code": f"commit `{commit}`{changed}" if commit else "not recorded",
+        "Machine": machine or "not recorded",
+        "Versions": ", ".join(versions) or "not recorded",
+    }

@@ -130,14 +130,23 @@ def test_predicted_failures_are_reported(root: Path) -> None:
     assert line[:3] == ["ASTRA: failure model", "12", "0.90"] and line[-2:] == ["0.25", "0.50 of 0.40"]
 
 
+def draw_only(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "FIGURES", {name: figures.FIGURES[name]})
+
+
 def test_publishing_adds_to_what_is_there(
-    rough: None, root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    rough: None,
+    root: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    draw_only("trajectories", monkeypatch)
     folder = tmp_path / "results"
     file = folder / "antmaze_u.json"
     make(root, folder, FakeRecipe(seeds=(0, 1)))
-    pictures = {f"antmaze_u_{name}.png" for name in FIGURES}
-    assert {path.name for path in folder.iterdir()} == pictures | {"antmaze_u.json", "antmaze_u.md"}
+    made = {"antmaze_u_trajectories.png", "antmaze_u.json", "antmaze_u.md"}
+    assert {path.name for path in folder.iterdir()} == made
     drawn = (folder / "antmaze_u_trajectories.png").read_bytes()
     for row in ROWS:
         for seed in (0, 1):
@@ -179,7 +188,8 @@ def test_a_choice_without_the_target_is_reported_and_stays_published(root: Path,
     assert "**ASTRA, seed 2**, chosen from 6" in (tmp_path / "results/antmaze_u.md").read_text()
 
 
-def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path) -> None:
+def test_sizes_are_set_side_by_side(rough: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    draw_only("data_efficiency", monkeypatch)
     root = tmp_path / "runs" / "sizes"
     for percent in (50, 100):
         for seed in SEEDS:
