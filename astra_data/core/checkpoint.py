@@ -21,7 +21,6 @@ type Nested = (
 )
 """A training state, such as an optimizer's `state_dict()`."""
 CHECKPOINT_SECONDS = 60.0
-"""Time between checkpoints."""
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
@@ -45,12 +44,7 @@ def _with_sorted_metadata(data: bytes) -> bytes:
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors (on the CPU) and the metadata that `save_tensors` wrote.
-
-    Raises:
-        BadInputError: the file is missing, damaged, not the one of the manifest beside it, or not from
-            `save_tensors`.
-    """
+    """Read the tensors (on the CPU) and the metadata that `save_tensors` wrote, or raise a BadInputError."""
     if not path.is_file():
         raise BadInputError(f"{path} does not exist: expected a safetensors file")
     check_intact(path)

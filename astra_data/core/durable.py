@@ -86,9 +86,9 @@ def _is_about(error: Exception, target: Path) -> bool:
 
 @contextmanager
 def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
-    """Hold the lock of `folder`, which the system releases when the process ends; yield whether it is held.
+    """Hold the lock of `folder` until the process ends at the latest; yield whether it is held.
 
-    With `wait`, it is waited for while another process holds it.
+    With `wait`, wait while another process holds it.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would wait for a writer
     try:
@@ -129,16 +129,13 @@ def sync_tree(root: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Rename `source` to `target`, replacing a file; when this returns, the disk knows."""
+    """Rename `source` to `target`, on the disk, replacing a file."""
     os.replace(source, target)
     sync(target.parent)
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Make `folder` and those that it is in; return those that were not there, the innermost first.
-
-    When this returns, the disk knows.
-    """
+    """Make `folder` and those that it is in, on the disk; return those made, the innermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for path in missing:
@@ -198,12 +195,7 @@ def hidden_folder(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(target: Path) -> Iterator[Path]:
-    """Yield an empty hidden folder beside `target`, which is renamed to `target` when the block ends.
-
-    Raises:
-        BadInputError: `target` exists, or this process is writing it already.
-        DiskError: it cannot be written.
-    """
+    """Yield an empty hidden folder beside `target`, renamed to it at the end; refuse one that exists."""
     refuse_existing(target)
     with hidden_folder(target) as folder:
         yield folder
@@ -238,10 +230,7 @@ def refuse_existing(target: Path) -> None:
 
 
 def discard(folder: Path, target: Path) -> None:
-    """Remove `folder`, if it is there, which belongs to `target`.
-
-    It is renamed first, so that it cannot be half removed.
-    """
+    """Remove the `folder` of `target`, if it is there; it is renamed first, so it is never half removed."""
     dead = next(name for name in _hidden_names(target) if not name.exists())
     with suppress(FileNotFoundError):
         move(folder, dead)

@@ -27,12 +27,9 @@ def fresh_seed() -> int:
 
 
 def held_out_episodes(episodes: int, share: float, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Draw a `share` of so many episodes to hold out, at least one if it is not 0.
+    """Draw a `share` of so many episodes to hold out, at least one if it is not 0, the same in every stage.
 
-    Every stage that is given the same three numbers holds out the same ones.
-
-    Returns:
-        the numbers of the others and of those, both in random order.
+    Return the numbers of the others and of those, both in random order.
     """
     order = generator(seed, "held-out episodes").permutation(episodes)
     count = max(1, round(share * episodes)) if share else 0

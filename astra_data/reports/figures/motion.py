@@ -10,7 +10,6 @@ from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
-from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.errors import BadInputError
@@ -37,17 +36,16 @@ _COMMANDS = (((0.8, 0.0), 2.0), ((0.0, 0.8), 1.0), ((-0.8, 0.0), 2.0), ((0.0, -0
 
 @dataclass(frozen=True)
 class CommandReplay:
-    """T steps of the same commands in the abstract simulator and in the target.
+    """The same commands (T, 2), ±1 per axis, in the abstract simulator and in the target, at times (T,).
 
-    Attributes:
-        time_s: (T,). command: ±1 per axis, (T, 2). simulated: [x, y, vx, vy] after each step, (T, 4).
-        target: the same of N robots that start with random headings, (N, T, 4).
+    `simulated` is [x, y, vx, vy] after each step, (T, 4); `target` that of N robots, which start with random
+    headings, (N, T, 4).
     """
 
-    time_s: NDArray[np.float64]
-    command: NDArray[np.float64]
-    simulated: NDArray[np.float64]
-    target: NDArray[np.float64]
+    time_s: Floats
+    command: Floats
+    simulated: Floats
+    target: Floats
 
 
 def can_replay(task: Task) -> bool:
