@@ -48,7 +48,7 @@ def reseal(root: Path) -> None:
     path.write_text(json.dumps(sealed(root, json.loads(path.read_text()))))
 
 
-def edit(name: str, **changes: object) -> Callable[[Path], object]:
+def edit(name: str, /, **changes: object) -> Callable[[Path], object]:
     """Change keys of a JSON file."""
     return lambda root: (root / name).write_text(json.dumps(json.loads((root / name).read_text()) | changes))
 

@@ -305,8 +305,7 @@ def validate(
     """Check every file and value of a LeRobot dataset and list all errors."""
     from astra_data.core.errors import BadInputError, CorruptDatasetError
     from astra_data.dataset.columns import TERMINATED
-    from astra_data.dataset.doctor.check import check
-    from astra_data.dataset.doctor.lerobot_loader import compare_with_lerobot
+    from astra_data.dataset.doctor.check import check, compare_with_lerobot
     from astra_data.dataset.inspection import endings_of
     from astra_data.dataset.reader import Dataset, can_be_repaired
     from astra_data.dataset.versions import locate

@@ -3,19 +3,16 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
-
-from astra_data.core.config import Config, Count, validated
-from astra_data.core.errors import BadInputError, CorruptDatasetError, RecipeError
+from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.provenance import origin
-from astra_data.dataset.columns import Array, Column
-from astra_data.dataset.format import DATASET_PATH, INFO_PATH, SUBSETS_PATH
-from astra_data.dataset.integrity import is_description_sealed
-from astra_data.dataset.plain import MOST_FPS, is_data_path, read_object
+from astra_data.dataset.columns import Array
+from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.integrity import is_sealed
+from astra_data.dataset.plain import read_object
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Valid names of datasets; they name folders, with some letters added, and file systems take 255."""
@@ -31,9 +28,6 @@ _DEFAULTS: dict[str, Any] = {
     "environment": {},
     "simulator": {},
 }
-NameText = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
-VersionText = Annotated[str, Field(pattern=f"^{VERSION.pattern}$")]
-"""Names and versions of datasets in files."""
 
 
 def full_name(description: Mapping[str, Any]) -> str:
@@ -59,15 +53,7 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     """
     full = _DEFAULTS | dict(description)
     faults = [f"unknown key {key!r}, expected {', '.join(_DEFAULTS)}" for key in full.keys() - _DEFAULTS]
-    if not isinstance(full["name"], str) or not NAME.fullmatch(full["name"]):
-        faults.append(f"name {full['name']!r}, expected up to 200 letters, digits, '.', '_' and '-'")
-    if not isinstance(full["version"], str) or not VERSION.fullmatch(full["version"]):
-        faults.append(f"version {full['version']!r:.80}, expected three numbers such as 1.0.0")
-    if not isinstance(full["stage"], str) or not full["stage"]:
-        faults.append(f"stage {full['stage']!r}, expected the name of the stage that writes the dataset")
-    for parent in full["parents"]:
-        if sorted(parent) != ["hash", "name", "version"]:
-            faults.append(f"parent {dict(parent)}, expected name, version and hash")
+    faults += _faults(full)
     try:
         text = json.dumps(full, allow_nan=False, ensure_ascii=False)
         full = json.loads(text.encode())
@@ -76,6 +62,30 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
     if faults:
         raise BadInputError(f"Dataset description: {'; '.join(faults)}.")
     return full | origin()
+
+
+def _faults(description: Mapping[str, Any]) -> list[str]:
+    name, version, stage = (description[key] for key in ("name", "version", "stage"))
+    faults = []
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        faults.append(f"name {name!r:.80}, expected up to 200 letters, digits, '.', '_' and '-'")
+    if not isinstance(version, str) or not VERSION.fullmatch(version):
+        faults.append(f"version {version!r:.80}, expected three numbers such as 1.0.0")
+    if not isinstance(stage, str) or not stage:
+        faults.append(f"stage {stage!r:.80}, expected the name of the stage that writes the dataset")
+    if not isinstance(parents := description["parents"], Sequence):
+        return [*faults, f"parents {parents!r:.80}, expected a list"]
+    faults += [
+        f"parent {parent!r:.80}, expected name, version and hash"
+        for parent in parents
+        if not isinstance(parent, Mapping) or sorted(parent) != ["hash", "name", "version"]
+    ]
+    objects = ("config", "seeds", "environment", "simulator")
+    return faults + [
+        f"{key} {description[key]!r:.80}, expected an object"
+        for key in objects
+        if not isinstance(description[key], Mapping)
+    ]
 
 
 class ContentHash:
@@ -122,99 +132,12 @@ def permutation(uids: Iterable[int], seed: int) -> list[int]:
     return sorted(uids, key=lambda uid: hashlib.sha256(f"{seed} {uid}".encode()).digest())
 
 
-def _data_path(pattern: str) -> str:
-    if not is_data_path(pattern):
-        raise ValueError(f"expected a path inside the dataset's folder, got {pattern!r}")
-    return pattern
-
-
-class _Open(Config):
-    """Like `Config`, but accepts further keys, which other tools may add."""
-
-    model_config = ConfigDict(extra="allow")
-
-
-class _Meaning(Config):
-    meaning: str = ""
-    unit: tuple[str, ...] = ()
-    frame: tuple[str, ...] = ()
-    role: tuple[str, ...] = ()
-
-
-class _Feature(_Open):
-    dtype: Literal["float32", "int64", "bool"]
-    shape: tuple[Count]
-    names: tuple[str, ...] | None = None
-    astra: _Meaning | None = None
-
-
-class _Info(_Open):
-    fps: int = Field(ge=1, lt=MOST_FPS)
-    features: dict[str, _Feature]
-    total_episodes: Count
-    total_frames: Count
-    data_path: Annotated[str, AfterValidator(_data_path)]
-
-
-class _Identity(Config):
-    name: NameText
-    version: VersionText
-    hash: str
-
-
-class _Description(_Open):
-    name: NameText
-    version: VersionText
-    parents: tuple[_Identity, ...]
-    stage: str = Field(min_length=1)
-    config: dict[str, Any]
-    seeds: dict[str, Any]
-    environment: dict[str, Any]
-    simulator: dict[str, Any]
-    packages: dict[str, str]
-    git_commit: str | None
-    content_hash: str
-    sums: dict[str, str]
-
-
-class _Subsets(_Open):
-    seed: int
-    uids: tuple[int, ...]
-
-
-def read_info(root: Path) -> dict[str, Any]:
-    """Return meta/info.json of the dataset in folder `root`; its features are valid columns."""
-    info = _read(root / INFO_PATH, INFO_PATH, _Info)
-    faults = []
-    for name, feature in info["features"].items():
-        try:
-            Column.from_feature(name, feature)
-        except BadInputError as error:
-            faults.append(str(error))
-    if faults:
-        raise CorruptDatasetError(f"{INFO_PATH}: {' '.join(faults)}")
-    return info
-
-
 def read_description(root: Path) -> dict[str, Any]:
     """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more."""
-    description = _read(root / DATASET_PATH, DATASET_PATH, _Description)
-    if not is_description_sealed(description):
-        raise CorruptDatasetError(f"{DATASET_PATH} was altered")
-    return description
-
-
-def read_subsets(root: Path) -> dict[str, Any]:
-    """Return meta/astra/subsets.json: "seed" and "uids"."""
-    return _read(root / SUBSETS_PATH, SUBSETS_PATH, _Subsets)
-
-
-def _read(path: Path, name: str, model: type[BaseModel]) -> dict[str, Any]:
-    found = read_object(path)
-    if isinstance(found, str):
-        raise CorruptDatasetError(f"{name} {found}")
-    try:
-        validated(found, model, name)
-    except RecipeError as error:
-        raise CorruptDatasetError(str(error).replace(":\n  ", ": ").replace("\n  ", "; ")) from error
+    found = read_object(root / DATASET_PATH)
+    fault = found if isinstance(found, str) else "" if is_sealed(found) else "was altered"
+    if isinstance(found, str) or fault:
+        raise CorruptDatasetError(f"{DATASET_PATH} {fault}")
+    if faults := _faults({key: found.get(key) for key in _DEFAULTS}):
+        raise CorruptDatasetError(f"{DATASET_PATH}: {'; '.join(faults)}")
     return found

@@ -350,8 +350,8 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
             raise CorruptDatasetError(
                 f"{parent / name} was altered ({error}); delete it and try again."
             ) from error
-    for name in dataset.altered(columns):
-        raise CorruptDatasetError(f"{parent / name} was altered (other values); delete it and try again.")
+    for fault in dataset.alterations(columns, dataset.selected(None)):
+        raise CorruptDatasetError(f"{parent} was altered ({fault}); delete it and try again.")
     return columns
 
 

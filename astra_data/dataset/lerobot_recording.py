@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.naming import first_few
@@ -21,7 +20,7 @@ from astra_data.dataset import plain
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
 from astra_data.dataset.description import ContentHash, complete_description, permutation
-from astra_data.dataset.integrity import Digests, digests_of
+from astra_data.dataset.integrity import Digests, digest_of
 from astra_data.dataset.lerobot_rows import (
     ENDS,
     RecordedFiles,
@@ -123,7 +122,7 @@ def _survey(
     ends = [name for name in (*ENDS, names.EPISODE_INDEX) if name in rows.stored]
     found: list[Found] = []
     faults: list[str] = []
-    parts: dict[str, list[NDArray[np.uint64]]] = {spec.name: [] for spec in specs}
+    digests: dict[str, list[int]] = {spec.name: [] for spec in specs}
     content, row, kept, steps = ContentHash(), 0, 0, 0
     tables = read_blocks(plain.data_files(root), [column.name for column in stored])
     for number, run in enumerate(plain.runs(root / "data", tables, stored)):
@@ -142,7 +141,7 @@ def _survey(
         for spec in specs:
             values = rows.values(spec, run, kept, steps, uid)
             content.update(spec.name, values)
-            parts[spec.name].append(digests_of({spec.name: values}, [episode.steps])[spec.name])
+            digests[spec.name].append(digest_of(values))
             if values.dtype.kind == "f" and not faults and not np.isfinite(values).all():
                 faults.append(f"{spec.name} in episode {number} is too large for {spec.dtype}")
         kept, steps = kept + 1, steps + episode.steps
@@ -158,8 +157,7 @@ def _survey(
             "as after a merge by LeRobot's tools; new ones are given, with DATASET one of those merged, by "
             f"`astra-data repair {root} --like DATASET --new-uids --out FOLDER`"
         )
-    digests = {name: np.concatenate(values) for name, values in parts.items() if values}
-    return found, content.hexdigest(), digests
+    return found, content.hexdigest(), {name: np.array(each, np.uint64) for name, each in digests.items()}
 
 
 def found_in(run: plain.Run, rows: Rows, tasks: Mapping[int, str], *, row: int, uid: int) -> Found:

@@ -16,10 +16,10 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.core.naming import RECORD, first_few
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
-from astra_data.dataset.contents import Contents, alterations, measure, read_contents, read_values
+from astra_data.dataset.contents import Contents, read_contents, read_values
 from astra_data.dataset.description import full_name, identity_of
 from astra_data.dataset.format import CODEBASE_VERSION, INFO_PATH, OUR_FOLDER
-from astra_data.dataset.integrity import Digests, altered_columns, digests_of, read_digests
+from astra_data.dataset.integrity import Digests, alteration, altered_columns, read_digests
 from astra_data.dataset.lerobot_recording import open_recording
 from astra_data.dataset.lerobot_rows import declared_columns
 from astra_data.dataset.plain import data_files, is_format_2, read_object, read_statistics
@@ -34,9 +34,6 @@ REPAIR = "astra-data repair {} --out DIR"
 """The command that writes what is intact in a folder to another one."""
 _SHOWN = 4
 """Datasets of a run."""
-if TYPE_CHECKING:
-    import datasets
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 
 class Dataset(Contents):
@@ -160,16 +157,10 @@ class Dataset(Contents):
         """
         specs = self.schema if names is None else self.specs(names)
         for block, indices in self._verified(specs, self.selected(episodes)):
-            first = 0
-            for episode in indices.tolist():
-                last = first + int(self.lengths[episode])
+            for episode, columns in self._split(block, indices):
                 metadata = {key: values[episode] for key, values in self.metadata.items()}
-                yield Episode(
-                    int(self.uids[episode]),
-                    {name: values[first:last] for name, values in block.items()},
-                    {key: value for key, value in metadata.items() if value is not None},
-                )
-                first = last
+                known = {key: value for key, value in metadata.items() if value is not None}
+                yield Episode(int(self.uids[episode]), columns, known)
 
     def successes(self) -> list[bool | None] | None:
         """Return whether each episode succeeded, None where unknown; None if unknown of all.
@@ -204,19 +195,12 @@ class Dataset(Contents):
         return ranges(self.blocks([column.name for column in self.schema]))
 
     def verify(self) -> list[str]:
-        """Read every value again and compare content hash and digests; return what is wrong, if anything.
-
-        Both cover every column, LeRobot's own included.
-        """
+        """Read every value again, LeRobot's own columns included; return what was altered, if anything."""
         try:
-            found, digests = measure(self)
-            altered = altered_columns(digests, self._digests)
+            blocks = read_values(self, self.specs(list(self.features)), self.selected(None))
+            return [fault for block, indices in blocks for fault in self.alterations(block, indices)]
         except CorruptDatasetError as error:
             return [str(error)]
-        faults = list(alterations(self, altered, self.selected(None)))
-        if found != self.content_hash:
-            faults.append(f"the content hash is {found}, expected {self.content_hash}")
-        return faults
 
     def require_whole(self) -> None:
         """Read every value, for what states something of all of them."""
@@ -226,34 +210,49 @@ class Dataset(Contents):
     def to_huggingface(self) -> "datasets.Dataset":
         """Return the rows as a `datasets.Dataset` in memory, once all values are verified."""
         self.require_whole()
-        return to_huggingface(self.root)
+        library = optional("datasets")
+        rows: datasets.Dataset = library.Dataset(pa.concat_tables(map(pq.read_table, data_files(self.root))))
+        return rows
 
     def to_lerobot(self, **options: Any) -> "LeRobotDataset":  # noqa: ANN401 - lerobot's own
-        """Return a `LeRobotDataset` of the same files, once all values are verified; it takes `options`."""
-        self.require_whole()
-        return to_lerobot(self.root, self.description["name"], **options)
+        """Return a `LeRobotDataset` of the same files, once all values are verified.
 
-    def altered(self, columns: Mapping[str, Array]) -> list[str]:
-        """Return which of whole `columns`, (N,) or (N, size), have other values than were written."""
-        found = digests_of(columns, self.lengths)
-        return [name for name, digests in found.items() if (digests != self._digests[name]).any()]
+        It takes `options` such as `delta_timestamps`; lerobot keeps a copy of the rows in its cache.
+        """
+        self.require_whole()
+        library, name = optional("lerobot.datasets.lerobot_dataset"), self.description["name"]
+        opened: LeRobotDataset = library.LeRobotDataset(f"local/{name}", root=self.root, **options)
+        return opened
 
     @cached_property
     def _digests(self) -> Digests:
         """Those of the values as they were written, or as they were when a recording was opened."""
-        if self.recorded is not None:
-            return self.recorded.digests
-        return read_digests(self.root, self.description["sums"], self.features, len(self))
+        return self.recorded.digests if self.recorded else read_digests(self.root, self.features)
 
     def _verified(self, columns: Sequence[Column], chosen: Ints) -> Iterator[tuple[dict[str, Array], Ints]]:
         """Yield blocks of whole episodes and their indices; the first one with altered values raises."""
         with explained(self.root):
             for block, indices in read_values(self, columns, chosen):
-                stored = {name: self._digests[name][indices] for name in block}
-                altered = altered_columns(digests_of(block, self.lengths[indices]), stored)
-                for fault in alterations(self, altered, indices):
+                for fault in self.alterations(block, indices):
                     raise CorruptDatasetError(fault)
                 yield block, indices
+
+    def _split(self, block: Mapping[str, Array], indices: Ints) -> Iterator[tuple[int, dict[str, Array]]]:
+        """Yield the episodes `indices`, of which `block` has the values, and the values of each."""
+        first = 0
+        for episode in indices.tolist():
+            last = first + int(self.lengths[episode])
+            yield episode, {name: values[first:last] for name, values in block.items()}
+            first = last
+
+    def alterations(self, block: Mapping[str, Array], indices: Ints) -> Iterator[str]:
+        """Yield a sentence for each episode of a block that has other values than were written."""
+        for episode, values in self._split(block, indices):
+            if altered := altered_columns(values, episode, self._digests):
+                start = int(self.starts[episode])
+                file = int(np.searchsorted(self.file_starts, start, side="right")) - 1
+                row = start - int(self.file_starts[file])
+                yield alteration(altered, self.paths[file], row, int(self.lengths[episode]), episode)
 
     def specs(self, names: Sequence[str]) -> list[Column]:
         """Return the columns `names`."""
@@ -341,26 +340,3 @@ def can_be_repaired(root: Path) -> bool:
     except CorruptDatasetError:
         return False
     return True
-
-
-def to_huggingface(root: Path) -> "datasets.Dataset":
-    """Return the rows as a `datasets.Dataset` in memory, with the features that lerobot gives them.
-
-    It is read from the same files, and nothing is written.
-    """
-    library = optional("datasets")
-    rows: datasets.Dataset = library.Dataset(pa.concat_tables(map(pq.read_table, data_files(root))))
-    return rows
-
-
-def to_lerobot(root: Path, name: str, **options: Any) -> "LeRobotDataset":  # noqa: ANN401 - lerobot's own
-    """Return lerobot's own object over the same files; lerobot keeps a copy of the rows in its cache.
-
-    Args:
-        root: the dataset's folder.
-        name: that lerobot shows.
-        options: of `LeRobotDataset`, such as `delta_timestamps`.
-    """
-    library = optional("lerobot.datasets.lerobot_dataset")
-    opened: LeRobotDataset = library.LeRobotDataset(f"local/{name}", root=root, **options)
-    return opened

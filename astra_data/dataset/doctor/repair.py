@@ -293,7 +293,7 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         tasks=tasks,
         rows=rows,
         old=old,
-        digests={} if sources else _digests(folder, old, columns, notes),
+        digests={} if sources else _digests(folder, altered, columns, notes),
         metadata={} if sources else _metadata(folder, altered, notes),
         description=_description(folder, info, sources, old),
         subset_seed=sources[0].subset_seed if sources else _subset_seed(folder, altered, notes),
@@ -343,12 +343,13 @@ def _altered_files(folder: Path, old: Mapping[str, Any], notes: list[str]) -> It
 
 
 def _digests(
-    folder: Path, old: Mapping[str, Any], columns: Sequence[PlainColumn], notes: list[str]
+    folder: Path, altered: Collection[str], columns: Sequence[PlainColumn], notes: list[str]
 ) -> Digests:
     if not (folder / layout.OUR_FOLDER).is_dir():
         return {}
     try:
-        return read_digests(folder, old.get("sums", {}), [column.name for column in columns])
+        present = {path for path in altered if (folder / path).exists()}
+        return read_digests(folder, [column.name for column in columns], present)
     except CorruptDatasetError as error:
         notes.append(f"{error}: the values were compared with the content hash only, as a whole")
         return {}

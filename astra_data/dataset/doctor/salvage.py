@@ -15,7 +15,7 @@ from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset import plain
 from astra_data.dataset.format import INFO_PATH
-from astra_data.dataset.integrity import Digests, run_alterations
+from astra_data.dataset.integrity import Digests, alteration, altered_columns
 from astra_data.dataset.parquet import UNREADABLE
 
 _DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3
@@ -82,7 +82,9 @@ def whole_runs(
             faults.append(f"it has {len(run)} frames, expected {place.length}")
         if episode >= most and digests:
             faults.append(f"expected {most} episodes")
-        faults += [*plain.flag_faults(run, episode), *run_alterations(run, episode, digests)]
+        faults += plain.flag_faults(run, episode)
+        if altered := altered_columns(run.columns, episode, digests):
+            faults.append(alteration(altered, run.path, run.row, len(run), episode))
         uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])
         if uid < 0 or (uid in uids and not repeated):
             faults.append(f"its uid {uid} is taken or negative")
