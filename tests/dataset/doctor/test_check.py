@@ -72,7 +72,7 @@ def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
         (
             alter(EPISODES, "data/file_index", 1, 4),
             [
-                "the file of episode 1 is data/chunk-000/file-004.parquet, expected data/chunk-000/file-000.parquet"
+                "the file of episode 1 is data/chunk-000/file-004.parquet, expected data/chunk-000/file-000.par"
             ],
         ),
         (drop_last_row(DATA), ["total_frames is 55, expected 54"]),
