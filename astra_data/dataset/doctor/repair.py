@@ -1,7 +1,7 @@
 """Save the intact episodes of a damaged LeRobot dataset, ours or another tool's, into a new one."""
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -165,32 +165,25 @@ def _values(specs: Sequence[Column], run: Run, rows: Rows | None, uid: int) -> d
 
 @dataclass(frozen=True)
 class Remains:
-    """What is known of a damaged dataset before its episodes are read.
-
-    Attributes:
-        info: meta/info.json.
-        columns: the columns of numbers in its files.
-        specs: those of the new dataset.
-        fps: steps per second.
-        tasks: its tasks by task_index, empty if they are unknown.
-        rows: how its rows become ours, where LeRobot recorded it; otherwise None.
-        old: its description, empty if there is none to rely on.
-        digests: those of its values, empty if they are unknown.
-        metadata: the episodes' metadata by uid, empty if there is none to rely on.
-        description: of the new dataset.
-        subset_seed: of the new dataset.
-    """
+    """What is known of a damaged dataset before its episodes are read; empty is what cannot be relied on."""
 
     info: Mapping[str, Any]
+    """meta/info.json."""
     columns: Sequence[PlainColumn]
+    """The columns of numbers in its files."""
     specs: Sequence[Column]
+    """Those of the new dataset."""
     fps: int
     tasks: Mapping[int, str]
     rows: Rows | None
+    """How its rows become ours, where LeRobot recorded it without next states; otherwise None."""
+    description: Mapping[str, Any]
+    """Of the new dataset."""
     old: Mapping[str, Any]
+    """Its own description."""
     digests: Digests
     metadata: Mapping[int, dict[str, Scalar]]
-    description: Mapping[str, Any]
+    """The episodes' metadata by uid."""
     subset_seed: int
 
 
@@ -207,17 +200,12 @@ def _losses(remains: Remains, episodes: int, content_hash: str) -> Iterator[str]
 
 
 class Joined(NamedTuple):
-    """What is known of an episode.
-
-    Attributes:
-        uid: its uid, which differs from the stored one where that was taken.
-        metadata: its metadata, with the stored uid as "merged_uid" where it has a new one.
-        is_known: whether one of the datasets has it.
-    """
+    """What is known of an episode: its uid, a new one where the stored one was taken, and its metadata."""
 
     uid: int
     metadata: dict[str, Scalar]
     is_known: bool
+    """Whether one of the datasets has it."""
 
 
 def join(
@@ -231,21 +219,18 @@ def join(
             key = (episode.uid, _digest(episode.columns, shared))
             known.setdefault(key, (number, episode.metadata))
     found = [(uid, _digest(values, shared)) for uid, values in episodes]
-    reserved: set[int] = {uid for uid, _ in found}
+    reserved = {uid for uid, _ in found}
     taken: set[int] = set()
     renamed: dict[int | None, dict[int, int]] = {}
-    names: list[int] = []
+    renames: list[int] = []
     for uid, digest in found:
-        name = uid
-        if uid in taken:
-            name = new_uid(uid, digest, reserved)
-            reserved.add(name)
+        name = new_uid(uid, digest, reserved) if uid in taken else uid
+        reserved.add(name)
         taken.add(name)
-        names.append(name)
-        origin = known.get((uid, digest), (None, {}))[0]
-        renamed.setdefault(origin, {})[uid] = name
+        renames.append(name)
+        renamed.setdefault(known.get((uid, digest), (None, {}))[0], {})[uid] = name
     joined = []
-    for (uid, digest), name in zip(found, names, strict=True):
+    for (uid, digest), name in zip(found, renames, strict=True):
         origin, facts = known.get((uid, digest), (None, {}))
         metadata = renamed_metadata(uid, facts, renamed[origin] | {uid: name})
         joined.append(Joined(name, metadata, (uid, digest) in known))
@@ -273,18 +258,46 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
             f"{folder} has no column {names.EPISODE_UID}, by which it joins {sources[0].reference}"
         )
     tasks = read_tasks(folder)
-    rows = _recorded_rows(folder, columns, specs, fps)
-    if rows:
+    rows: Rows | None = Rows({column.name: column for column in columns}, fps)
+    has_ours = (folder / layout.OUR_FOLDER).is_dir()
+    assert rows is not None
+    if names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lacking(specs):
+        rows = None
+    else:
         specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
         notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
-    notes += _conversions(info, columns, specs)
+    kinds = {spec.name: spec.dtype for spec in specs}
+    if others := sorted(info["features"].keys() - {column.name for column in columns}):
+        notes.append(f"left out, because they are not numeric: {', '.join(others)}")
+    for column in columns:
+        kind = kinds.get(column.name, DTYPES[np.dtype(column.dtype).kind])
+        if column.dtype != kind:
+            notes.append(f"{column.name} was {column.dtype} and is now {kind}")
     if isinstance(tasks, str):
         notes.append(f"{layout.TASKS_PATH} {tasks}: the task is unknown")
         tasks = {}
+    old: Mapping[str, Any] = {}
+    digests: Digests = {}
+    metadata: Mapping[int, dict[str, Scalar]] = {}
+    seed = sources[0].subset_seed if sources else 0
     # Of what LeRobot's tools made, our metadata is no longer true, where they left it.
-    old = {} if sources else _old_description(folder, notes)
-    altered = set(_altered_files(folder, old, notes))
+    if has_ours and not sources:
+        try:
+            old = read_description(folder)
+        except CorruptDatasetError as error:
+            if (folder / layout.DATASET_PATH).exists():
+                notes.append(f"{error}: the origin is unknown")
+        # A missing file is told where it is read.
+        altered = [path for path in altered_files(folder, old) if (folder / path).exists()]
+        told = [path for path in altered if path in _IF_ALTERED]
+        notes += [f"{path} was altered after it was written: {_IF_ALTERED[path]}" for path in told]
+        try:
+            digests = read_digests(folder, [column.name for column in columns], altered)
+        except CorruptDatasetError as error:
+            notes.append(f"{error}: the values were compared with the content hash only, as a whole")
+        metadata = {} if layout.METADATA_PATH in altered else _metadata(folder, notes)
+        seed = 0 if layout.SUBSETS_PATH in altered else _subset_seed(folder, notes)
     return Remains(
         info=info,
         columns=columns,
@@ -292,78 +305,18 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
         fps=fps,
         tasks=tasks,
         rows=rows,
-        old=old,
-        digests={} if sources else _digests(folder, altered, columns, notes),
-        metadata={} if sources else _metadata(folder, altered, notes),
         description=_description(folder, info, sources, old),
-        subset_seed=sources[0].subset_seed if sources else _subset_seed(folder, altered, notes),
+        old=old,
+        digests=digests,
+        metadata=metadata,
+        subset_seed=seed,
     )
 
 
-def _recorded_rows(
-    folder: Path, columns: Sequence[PlainColumn], specs: Sequence[Column], fps: int
-) -> Rows | None:
-    """Return how rows become ours that LeRobot recorded without next states, None for other datasets."""
-    rows = Rows({column.name: column for column in columns}, fps)
-    is_ours = names.EPISODE_UID in rows.stored or (folder / layout.OUR_FOLDER).is_dir()
-    return None if is_ours or not rows.dropped or lacking(specs) else rows
-
-
-def _conversions(
-    info: Mapping[str, Any], columns: Sequence[PlainColumn], specs: Sequence[Column]
-) -> list[str]:
-    notes = []
-    ours = {spec.name: spec.dtype for spec in specs}
-    others = sorted(info["features"].keys() - {column.name for column in columns})
-    if others:
-        notes.append(f"left out, because they are not numeric: {', '.join(others)}")
-    for column in columns:
-        kind = ours.get(column.name, DTYPES[np.dtype(column.dtype).kind])
-        if column.dtype != kind:
-            notes.append(f"{column.name} was {column.dtype} and is now {kind}")
-    return notes
-
-
-def _old_description(folder: Path, notes: list[str]) -> Mapping[str, Any]:
-    """Return meta/astra/dataset.json, empty if there is none to rely on."""
-    try:
-        return read_description(folder)
-    except CorruptDatasetError as error:
-        if (folder / layout.DATASET_PATH).exists():
-            notes.append(f"{error}: the origin is unknown")
-        return {}
-
-
-def _altered_files(folder: Path, old: Mapping[str, Any], notes: list[str]) -> Iterator[str]:
-    for path in altered_files(folder, old):
-        if (folder / path).exists():  # a missing one is told where it is read
-            if path in _IF_ALTERED:
-                notes.append(f"{path} was altered after it was written: {_IF_ALTERED[path]}")
-            yield path
-
-
-def _digests(
-    folder: Path, altered: Collection[str], columns: Sequence[PlainColumn], notes: list[str]
-) -> Digests:
-    if not (folder / layout.OUR_FOLDER).is_dir():
-        return {}
-    try:
-        present = {path for path in altered if (folder / path).exists()}
-        return read_digests(folder, [column.name for column in columns], present)
-    except CorruptDatasetError as error:
-        notes.append(f"{error}: the values were compared with the content hash only, as a whole")
-        return {}
-
-
-def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[int, dict[str, Scalar]]:
-    """Return the episodes' metadata by uid, empty where there is none to rely on."""
-    if layout.METADATA_PATH in altered or not (folder / layout.OUR_FOLDER).is_dir():
-        return {}
+def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
+    """Return the episodes' metadata by uid, empty where it cannot be read."""
     table = read_small_table(folder / layout.METADATA_PATH)
-    if isinstance(table, str):
-        notes.append(f"{layout.METADATA_PATH} {table}: {_LOST}")
-        return {}
-    columns = table.to_pydict()
+    columns = {} if isinstance(table, str) else table.to_pydict()
     uids = columns.pop(names.EPISODE_UID, [])
     columns.pop("length", None)
     found = {
@@ -372,7 +325,7 @@ def _metadata(folder: Path, altered: Collection[str], notes: list[str]) -> dict[
         if isinstance(uid, int)
     }
     if not found:
-        notes.append(f"{layout.METADATA_PATH} has no uids: {_LOST}")
+        notes.append(f"{layout.METADATA_PATH} {table if isinstance(table, str) else 'has no uids'}: {_LOST}")
     return found
 
 
@@ -388,10 +341,8 @@ def _description(
     return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]
 
 
-def _subset_seed(folder: Path, altered: Collection[str], notes: list[str]) -> int:
-    """Return the seed of the subsets' order, 0 where there is none to rely on."""
-    if layout.SUBSETS_PATH in altered or not (folder / layout.OUR_FOLDER).is_dir():
-        return 0
+def _subset_seed(folder: Path, notes: list[str]) -> int:
+    """Return the seed of the subsets' order, 0 where it cannot be read."""
     subsets = read_object(folder / layout.SUBSETS_PATH)
     if isinstance(subsets, dict) and isinstance(seed := subsets.get("seed"), int):
         return seed

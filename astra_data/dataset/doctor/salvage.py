@@ -3,9 +3,9 @@
 import io
 import mmap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +29,8 @@ _HEADER = 1000
 """Upper bound of a page header in bytes, including the extremes of its values."""
 _SNAPPY, _ZSTD = 1, 6
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
+TRUE, FALSE, BYTE, I16, I32, I64 = range(1, 7)
+BINARY, LIST, STRUCT = 8, 9, 12
 Struct = dict[int, tuple[int, Any]]
 
 
@@ -123,20 +124,21 @@ def _every_run(
     """Yield each run, and whether the rows after it cannot be read."""
     for path in plain.data_files(folder):
         try:
-            if isinstance(plain.read_footer(path), str):
-                yield from ((run, False) for run in _footerless_runs(path, columns, notes))
-            else:
-                yield from _footered_runs(path, columns, notes)
+            yield from _runs_of(path, columns, notes)
         except (*UNREADABLE, CorruptDatasetError) as error:
             notes.append(f"{_name(path)} cannot be read: {in_short(error)}")
 
 
-def _footered_runs(
+def _runs_of(
     path: Path, columns: Sequence[plain.PlainColumn], notes: list[str]
 ) -> Iterator[tuple[plain.Run, bool]]:
-    """Yield the runs of a file with a footer, and whether the rows after each cannot be read."""
-    with pq.ParquetFile(path) as file:
+    """Yield the runs of a file, and whether the rows after each cannot be read."""
+    is_whole = not isinstance(plain.read_footer(path), str)
+    schema = pa.schema([(column.name, column.arrow_type) for column in columns])
+    with pq.ParquetFile(path, metadata=None if is_whole else rebuilt_metadata(path, schema)) as file:
         counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
+        if not is_whole:
+            notes.append(f"{_name(path)} has no footer: {len(counts)} whole row groups were found in it")
         group = 0
         while group < len(counts):
             rows: list[int] = []
@@ -147,37 +149,17 @@ def _footered_runs(
                 if held is not None:
                     yield held, False
                 held = replace(run, row=first + run.row)
-            if held is not None:
+            group += len(rows) + 1
+            # LeRobot writes a row group per episode. With others, the last episode may be incomplete.
+            if held is not None and not is_whole and group > len(counts) and len(held) != rows[-1]:
+                part = f"the last {len(held)} frames in {path.name} may be part of an episode"
+                notes.append(f"{part} and were left out")
+            elif held is not None:
                 yield held, bool(faults)
             if faults:
                 lost = first + sum(rows)
-                notes.append(
-                    f"{_name(path)} rows {lost} to {lost + counts[group + len(rows)] - 1} "
-                    f"cannot be read ({faults[0]})"
-                )
-            group += len(rows) + 1
-
-
-def _footerless_runs(
-    path: Path, columns: Sequence[plain.PlainColumn], notes: list[str]
-) -> Iterator[plain.Run]:
-    schema = pa.schema([(column.name, column.arrow_type) for column in columns])
-    metadata = rebuilt_metadata(path, schema)
-    rows: list[int] = []
-    held: plain.Run | None = None
-    with pq.ParquetFile(path, metadata=metadata) as file:
-        for run in plain.runs(path, _row_groups(file, columns, 0, rows, []), columns):
-            if held is not None:
-                yield held
-            held = run
-    notes.append(f"{_name(path)} has no footer: {len(rows)} whole row groups were found in it")
-    # LeRobot writes one row group per episode. With other groups, the last episode may be incomplete.
-    if held is not None and len(held) == rows[-1]:
-        yield held
-    elif held is not None:
-        notes.append(
-            f"the last {len(held)} frames in {path.name} may be part of an episode and were left out"
-        )
+                where = f"{_name(path)} rows {lost} to {lost + counts[group - 1] - 1}"
+                notes.append(f"{where} cannot be read ({faults[0]})")
 
 
 def _row_groups(
@@ -185,7 +167,7 @@ def _row_groups(
 ) -> Iterator[pa.Table]:
     """Yield row groups from `first` up to an unreadable one.
 
-    Their numbers of rows are appended to `rows`, and what is wrong with the unreadable one to `faults`.
+    Append their numbers of rows to `rows`, and what is wrong with the unreadable one to `faults`.
     """
     for group in range(first, file.num_row_groups):
         try:
@@ -199,8 +181,7 @@ def _row_groups(
         yield table
 
 
-@dataclass(frozen=True)
-class _Page:
+class _Page(NamedTuple):
     """A page from byte `start` to `end`, header included; `unpacked` is its size without compression."""
 
     start: int
@@ -219,8 +200,7 @@ class _Page:
         return least <= self.unpacked <= least + self.values // 2 + _HEADER
 
 
-@dataclass(frozen=True)
-class _Leaf:
+class _Leaf(NamedTuple):
     """A column: values per row and bits per value."""
 
     size: int
@@ -275,7 +255,7 @@ def _pages(path: Path) -> list[_Page]:
 
 def _page(data: memoryview, start: int) -> _Page | None:
     """Read the header at `start`; None if there is none, or its page is not whole."""
-    reader = Reader(data, start)
+    reader = _Reader(data, start)
     try:
         header = reader.struct()
         kind, unpacked, packed = (header[field][1] for field in (1, 2, 3))
@@ -332,7 +312,7 @@ def _chunks(
 def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_Leaf]) -> bytes:
     """Return parquet's FileMetaData: the schema of `template`, a file of one row group, and `groups`."""
     length = int.from_bytes(template[-8:-4], "little")
-    metadata = Reader(template[-8 - length : -8]).struct()
+    metadata = _Reader(template[-8 - length : -8]).struct()
     columns = [column[3][1] for column in metadata[4][1][1][0][1][1][1]]
     rows = [_values(group[0]) // leaves[0].size for group in groups]
     row_groups: list[Struct] = []
@@ -340,7 +320,7 @@ def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_
         chunks = [_column_chunk(column, pages) for column, pages in zip(columns, group, strict=True)]
         size = sum(page.unpacked for pages in group for page in pages)
         row_groups.append({1: (LIST, (STRUCT, chunks)), 2: (I64, size), 3: (I64, count)})
-    return encode(metadata | {3: (I64, sum(rows)), 4: (LIST, (STRUCT, row_groups))})
+    return _encoded(STRUCT, metadata | {3: (I64, sum(rows)), 4: (LIST, (STRUCT, row_groups))})
 
 
 def _column_chunk(column: Struct, pages: Sequence[_Page]) -> Struct:
@@ -365,52 +345,49 @@ def _values(pages: Sequence[_Page]) -> int:
     return sum(page.values for page in pages if page.kind != _DICTIONARY)
 
 
-class Reader:
-    """Reads structs of Thrift's compact protocol; `position` moves along; ValueError if they are none.
+class _Reader:
+    """Reads structs of Thrift's compact protocol; IndexError or ValueError where there is none.
 
     A struct is a dict of field number to (type, value), a list is (type, values).
     """
 
     def __init__(self, data: bytes | memoryview, position: int = 0) -> None:
-        self.data = data
-        self.position = position
+        self.data, self.position = data, position
 
     def struct(self) -> Struct:
-        """Read one struct."""
         fields: Struct = {}
         number = 0
-        while header := self._take(1)[0]:
-            step, kind = header >> 4, header & 15
-            number = number + step if step else self._signed()
+        while header := self._byte():
+            kind = header & 15
+            number = number + (header >> 4) if header >> 4 else self._signed()
             fields[number] = (kind, kind == TRUE if kind in (TRUE, FALSE) else self._value(kind))
         return fields
 
     def _value(self, kind: int) -> Any:  # noqa: ANN401 - any thrift value
         if kind in (TRUE, FALSE, BYTE):  # in a list, unlike in a struct, a truth value is a byte of its own
-            return self._take(1)[0]
+            return self._byte()
         if kind in (I16, I32, I64):
             return self._signed()
         if kind == BINARY:
-            return bytes(self._take(self._unsigned()))
+            size = self._unsigned()
+            self.position += size
+            return bytes(self.data[self.position - size : self.position])
         if kind == LIST:
-            header = self._take(1)[0]
+            header = self._byte()
             size = header >> 4 if header >> 4 < 15 else self._unsigned()
             return header & 15, [self._value(header & 15) for _ in range(size)]
         if kind == STRUCT:
             return self.struct()
         raise ValueError(f"thrift type {kind}")
 
-    def _take(self, count: int) -> bytes | memoryview:
-        taken = self.data[self.position : self.position + count]
-        if len(taken) < count:
-            raise ValueError("the bytes end early")
-        self.position += count
-        return taken
+    def _byte(self) -> int:
+        self.position += 1
+        return self.data[self.position - 1]
 
     def _unsigned(self) -> int:
         number = 0
         for shift in range(0, 70, 7):
-            byte = self._take(1)[0]
+            byte = self._byte()
             number |= (byte & 127) << shift
             if byte < 128:
                 return number
@@ -421,30 +398,25 @@ class Reader:
         return (number >> 1) ^ -(number & 1)
 
 
-def encode(fields: Struct) -> bytes:
-    """Return the bytes of a struct."""
-    out = bytearray()
-    for number, (kind, value) in sorted(fields.items()):
-        is_truth = kind in (TRUE, FALSE)
-        out += bytes([(TRUE if value else FALSE) if is_truth else kind]) + _signed(number)
-        out += b"" if is_truth else _encoded(kind, value)
-    return bytes(out) + b"\0"
-
-
 def _encoded(kind: int, value: Any) -> bytes:  # noqa: ANN401 - any thrift value
+    """Return the bytes of a value as `_Reader` returns it."""
     if kind in (TRUE, FALSE, BYTE):
         return bytes([value])
     if kind in (I16, I32, I64):
-        return _signed(value)
+        return _unsigned(value << 1 if value >= 0 else -value * 2 - 1)
     if kind == BINARY:
         return _unsigned(len(value)) + bytes(value)
     if kind == LIST:
         element, values = value
-        is_short = len(values) < 15
-        header = bytes([len(values) << 4 | element]) if is_short else bytes([15 << 4 | element])
-        length = b"" if is_short else _unsigned(len(values))
-        return header + length + b"".join(_encoded(element, each) for each in values)
-    return encode(value)
+        length = b"" if len(values) < 15 else _unsigned(len(values))
+        every = b"".join(_encoded(element, each) for each in values)
+        return bytes([min(len(values), 15) << 4 | element]) + length + every
+    out = b""
+    for number, (inner, field) in sorted(value.items()):
+        is_truth = inner in (TRUE, FALSE)
+        out += bytes([(TRUE if field else FALSE) if is_truth else inner]) + _encoded(I16, number)
+        out += b"" if is_truth else _encoded(inner, field)
+    return out + b"\0"
 
 
 def _unsigned(number: int) -> bytes:
@@ -453,7 +425,3 @@ def _unsigned(number: int) -> bytes:
         out.append(number & 127 | 128)
         number >>= 7
     return bytes([*out, number])
-
-
-def _signed(number: int) -> bytes:
-    return _unsigned(number << 1 if number >= 0 else -number * 2 - 1)

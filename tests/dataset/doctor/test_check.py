@@ -71,9 +71,7 @@ def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
         (alter(EPISODES, "dataset_from_index", 1, 9), ["dataset_from_index of episode 1 is 9, expected 7"]),
         (
             alter(EPISODES, "data/file_index", 1, 4),
-            [
-                "the file of episode 1 is data/chunk-000/file-004.parquet, expected data/chunk-000/file-000.par"
-            ],
+            ["the file of episode 1 is data/chunk-000/file-004.parquet, expected data/chunk"],
         ),
         (drop_last_row(DATA), ["total_frames is 55, expected 54"]),
         (retype(EPISODES, "tasks", 7), ["tasks of episode 0 are 7, expected {'run'}"]),
