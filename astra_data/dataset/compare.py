@@ -1,8 +1,8 @@
 """Differences between two datasets: columns, episodes, provenance."""
 
-import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from astra_data.core.naming import RECORD, printable, shortened
 from astra_data.dataset.columns import Column
 from astra_data.dataset.description import changed_values, full_name, identity_of, read_description
 from astra_data.dataset.format import DATASET_PATH
+from astra_data.dataset.integrity import digest_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import home_of
 
@@ -24,27 +25,24 @@ _Described = tuple[Path, Mapping[str, Any]]
 """Folder and description."""
 _Key = tuple[str, str, str]
 """Name, version and content hash."""
+Ancestors = dict[_Key, _Described | None]
+"""A dataset and its ancestors; None for those of which no folder was found."""
 
 
 @dataclass(frozen=True)
 class Differences:
-    """How a dataset B differs from a dataset A.
-
-    Attributes:
-        schema: one sentence per difference in columns, fps and task.
-        only_in_a: uids of episodes that B lacks, ascending.
-        only_in_b: uids of episodes that A lacks, ascending.
-        values: uids of episodes of both whose values differ, ascending.
-        metadata: the keys of metadata that differ, each with the uids of the episodes, ascending.
-        description: one sentence per difference in provenance, such as "config.noise_m: 0.1, then 0.2".
-    """
+    """How a dataset B differs from a dataset A: sentences, and uids of episodes, ascending."""
 
     schema: list[str]
+    """Columns, fps and task."""
     only_in_a: list[int]
     only_in_b: list[int]
     values: list[int]
+    """Episodes of both whose values differ."""
     metadata: dict[str, list[int]]
+    """The keys that differ, each with the episodes."""
     description: list[str]
+    """Provenance, such as "config.noise_m: 0.1, then 0.2"."""
 
 
 def differences(a: Dataset, b: Dataset) -> Differences:
@@ -119,82 +117,54 @@ def _metadata(dataset: Dataset, key: str) -> dict[int, str]:
     return {uid: repr(value) for uid, value in values if value is not None}
 
 
-def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, bytes]:
-    """Return a digest of each episode's values in the columns `names`, by uid."""
-    prints = {}
-    for episode in dataset.episodes(names or None):
-        print_ = hashlib.sha256()
-        for name in names:
-            values = episode.columns[name]
-            print_.update(f"{name} {values.dtype} {values.shape}".encode() + values.tobytes())
-        prints[episode.uid] = print_.digest()
-    return prints
+def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, list[object]]:
+    """Return what tells each episode's values in the columns `names` from others, by uid."""
+    return {
+        episode.uid: [
+            (digest_of(values), values.dtype, values.shape)
+            for name, values in episode.columns.items()
+            if name in names
+        ]
+        for episode in dataset.episodes(names or None)
+    }
 
 
-@dataclass(frozen=True, eq=False)
-class Ancestor:
-    """A dataset in the tree; one that several were made from is one object.
-
-    Attributes:
-        reference: name and version.
-        content_hash: its hash.
-        stage: the stage that wrote it, "" if its folder was not found.
-        config: the stage's settings, empty if its folder was not found.
-        parents: the datasets that it was made from.
-        folder: its folder; None if it was not found.
-    """
-
-    reference: str
-    content_hash: str
-    stage: str
-    config: Mapping[str, Any]
-    parents: tuple["Ancestor", ...]
-    folder: Path | None
-
-
-def lineage(dataset: Dataset) -> Ancestor:
-    """Return `dataset` with all its ancestors, looked up in `versions.home()`, beside it, and in its run.
+def lineage(dataset: Dataset) -> Ancestors:
+    """Return `dataset` and all its ancestors, looked up in `versions.home()`, beside it, and in its run.
 
     An ancestor is found where name, version and content hash are those that its descendant lists.
     """
-    places = _Places(dataset.root.resolve().parent)
-    described: dict[_Key, _Described | None] = {_key(dataset.identity): (dataset.root, dataset.description)}
-    known: dict[_Key, Ancestor] = {}
-    begun: set[_Key] = set()
-    steps = [(_key(dataset.identity), False)]
-    while steps:  # without recursion: there may be thousands of versions
-        key, is_complete = steps.pop()
-        reference = full_name({"name": key[0], "version": key[1]})
-        if key in known:
+    root = dataset.root.resolve()
+
+    @cache
+    def neighbors() -> Ancestors:
+        folders = [*sorted(root.parent.glob(f"*/{DATASET_PATH}"))]
+        for run in (run for run in root.parents[1:3] if (run / RECORD).exists()):
+            folders += [
+                path for depth in ("*/*", "*/*/*") for path in sorted(run.glob(f"{depth}/{DATASET_PATH}"))
+            ]
+        listed = [_described(path.parents[2]) for path in folders]
+        return {key: found for one in reversed(listed) for key, found in one.items()}
+
+    found: Ancestors = {}
+    todo = [_key(dataset.identity)]
+    while todo:
+        key = todo.pop()
+        if key in found:
             continue
-        if not is_complete and key in begun:
-            raise CorruptDatasetError(
-                f"{reference} is among its own ancestors: a {DATASET_PATH} was altered; restore it from "
-                "a copy."
-            )
-        if not is_complete and key not in described:
-            described[key] = places.find(key)
-        folder, description = described[key] or (None, {})
-        parents = [_key(parent) for parent in description.get("parents", [])]
-        if not is_complete:
-            begun.add(key)
-            steps += [(key, True), *((parent, False) for parent in parents)]
-            continue
-        begun.remove(key)
-        known[key] = Ancestor(
-            reference=reference,
-            content_hash=key[2],
-            stage=description.get("stage", ""),
-            config=description.get("config", {}),
-            parents=tuple(known[parent] for parent in parents),
-            folder=folder,
+        at_home = _described(home_of({"name": key[0], "version": key[1]})) if found else None
+        found[key] = (
+            (dataset.root, dataset.description)
+            if at_home is None
+            else at_home.get(key) or neighbors().get(key)
         )
-    return known[_key(dataset.identity)]
+        todo += _parents(found[key])
+    return found
 
 
-def hashes(ancestor: Ancestor) -> set[str]:
+def hashes(ancestors: Ancestors) -> set[str]:
     """Return the content hashes of a dataset and of all its ancestors."""
-    return {one.content_hash for one, _, _ in _walked(ancestor)}
+    return {content_hash for *_, content_hash in ancestors}
 
 
 def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
@@ -205,50 +175,31 @@ def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
     return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
 
 
-def tree_lines(ancestor: Ancestor) -> Iterator[str]:
+def tree_lines(ancestors: Ancestors) -> Iterator[str]:
     """Yield the tree, a dataset per line, parents indented below their child, those of each dataset once."""
-    for one, margin, is_repeated in _walked(ancestor):
-        yield margin + _line(one) + ("  (its parents: see above)" if is_repeated and one.parents else "")
-
-
-def _walked(ancestor: Ancestor) -> Iterator[tuple[Ancestor, str, bool]]:
-    """Yield each dataset of a tree, what stands before it in its line, and whether it came before."""
-    seen: set[Ancestor] = set()
-    steps = [(ancestor, "", "")]
-    while steps:
-        one, margin, below = steps.pop()
-        yield one, margin, one in seen
-        if one in seen:
+    seen: set[_Key] = set()
+    steps = [(next(iter(ancestors)), "", "")]
+    while steps:  # without recursion: there may be thousands of versions
+        key, margin, below = steps.pop()
+        parents = _parents(ancestors[key])
+        yield (
+            margin
+            + _line(key, ancestors[key])
+            + ("  (its parents: see above)" if key in seen and parents else "")
+        )
+        if key in seen:
             continue
-        seen.add(one)
-        for parent in reversed(one.parents):
-            is_last = parent is one.parents[-1]
-            branch, deeper = ("└── ", "    ") if is_last else ("├── ", "│   ")
-            steps.append((parent, below + branch, below + deeper))
+        seen.add(key)
+        for number in reversed(range(len(parents))):
+            branch, deeper = ("└── ", "    ") if number == len(parents) - 1 else ("├── ", "│   ")
+            steps.append((parents[number], below + branch, below + deeper))
 
 
-class _Places:
-    """Where datasets are looked for, each place once."""
-
-    def __init__(self, beside: Path) -> None:
-        """Look at home, in the folder `beside` the first dataset, and in the run that it is in."""
-        self._beside = beside
-        self._neighbors: dict[_Key, _Described] | None = None
-
-    def find(self, key: _Key) -> _Described | None:
-        """Return the dataset that has this name, version and hash."""
-        found = _described(home_of({"name": key[0], "version": key[1]})).get(key)
-        if found is None and self._neighbors is None:
-            places = [self._beside.glob(f"*/{DATASET_PATH}")]
-            for folder in self._beside.parents[:2]:
-                if (folder / RECORD).exists():
-                    places += [folder.glob(f"{depth}/{DATASET_PATH}") for depth in ("*/*", "*/*/*")]
-            listed = [_described(path.parents[2]) for place in places for path in sorted(place)]
-            self._neighbors = {key: found for one in reversed(listed) for key, found in one.items()}
-        return found or (self._neighbors or {}).get(key)
+def _parents(one: _Described | None) -> list[_Key]:
+    return [_key(parent) for parent in one[1]["parents"]] if one else []
 
 
-def _described(folder: Path) -> dict[_Key, _Described]:
+def _described(folder: Path) -> Ancestors:
     try:
         found = read_description(folder)
     except CorruptDatasetError:
@@ -261,14 +212,13 @@ def _key(identity: Mapping[str, str]) -> _Key:
     return identity["name"], identity["version"], identity["hash"]
 
 
-def _line(ancestor: Ancestor) -> str:
-    if ancestor.folder is None:
-        return f"{ancestor.reference}  {ancestor.content_hash[:8]}  (not found here)"
-    settings = ", ".join(
-        f"{key} {shortened(str(value), 40)}" for key, value in ancestor.config.items() if value is not None
-    )
-    line = f"{ancestor.reference}  {ancestor.content_hash[:8]}  {ancestor.stage}"
-    return printable(f"{line}: {settings}" if settings else line)
+def _line(key: _Key, one: _Described | None) -> str:
+    line = f"{full_name({'name': key[0], 'version': key[1]})}  {key[2][:8]}  "
+    if one is None:
+        return f"{line}(not found here)"
+    config = one[1]["config"].items()
+    settings = ", ".join(f"{name} {shortened(str(value), 40)}" for name, value in config if value is not None)
+    return printable(f"{line}{one[1]['stage']}" + (f": {settings}" if settings else ""))
 
 
 def column_faults(source: Dataset, expected: Column, task: str) -> list[str]:

@@ -74,7 +74,7 @@ def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
             ["the file of episode 1 is data/chunk-000/file-004.parquet, expected data/chunk"],
         ),
         (drop_last_row(DATA), ["total_frames is 55, expected 54"]),
-        (retype(EPISODES, "tasks", 7), ["tasks of episode 0 are 7, expected {'run'}"]),
+        (retype(EPISODES, "tasks", 7), ["tasks of episode 0 is 7, expected {'run'}"]),
         (alter(EPISODES, "stats/mode/max", 2, [5.0]), [f"{EPISODES} was altered"]),
         (write("meta/stats.json", b"{}"), ["meta/stats.json was altered"]),
         (drop("meta/tasks.parquet"), ["meta/tasks.parquet is missing"]),
