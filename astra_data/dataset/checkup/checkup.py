@@ -37,8 +37,6 @@ MOST_REPEATED = 0.05
 """Share of the steps above which states that repeat the row before, between others that move, are many."""
 MOST_ROWS = 5
 """Rows in a row that repeat a state; a robot that stands still does so for longer."""
-
-
 LAGS = range(-3, 4)
 """Rows between a step and the action that is tried as its cause."""
 CLEAR = 0.2
@@ -53,20 +51,20 @@ class _Part(Protocol):
     def add(self, episode: Episode) -> None:
         """Take the next episode."""
 
+    def findings(self, called: str) -> list[Finding]:
+        """Return what was found; commands call the dataset `called`."""
+
 
 @dataclass(frozen=True)
 class Checkup:
-    """What a check-up found.
-
-    Attributes:
-        reference: name and version of the dataset.
-        summary: a line each on how episodes end, on commands and on the rate.
-        findings: warnings first.
-    """
+    """What a check-up found."""
 
     reference: str
+    """Name and version of the dataset."""
     summary: tuple[str, ...]
+    """A line each on how episodes end, on commands and on the rate."""
     findings: tuple[Finding, ...]
+    """Warnings first."""
 
     def record(self) -> dict[str, Any]:
         """Return it for JSON."""
@@ -80,31 +78,23 @@ class Checkup:
 def check_up(dataset: Dataset, called: str | None = None) -> Checkup:
     """Look at all episodes of `dataset`, one at a time; commands call it `called`."""
     called = called or dataset.reference
-    fps, successes = int(dataset.info["fps"]), dataset.successes()
+    fps = int(dataset.info["fps"])
     columns = {column.name: column for column in dataset.schema}
     clocks = [Clock.of(column, fps) for column in columns.values() if is_clock(column)]
-    ends, duplicates, continuity = EpisodeEnds(successes), Duplicates(), Continuity()
-    dead = DeadChannels(list(columns.values()))
-    commands = GivenCommands(columns[ACTION], fps) if ACTION in columns else None
-    angles = Angles(columns[STATE]) if STATE in columns else None
+    ends = EpisodeEnds(dataset.successes())
+    commands = [GivenCommands(columns[ACTION], fps)] if ACTION in columns else []
+    angles = [Angles(columns[STATE])] if STATE in columns else []
+    parts: list[_Part] = [*clocks, Repeats(), Shift(), *angles, Continuity(), Duplicates()]
+    parts += [DeadChannels(list(columns.values())), *commands, ends]
     names = [column.name for column in columns.values() if column.name in LOOKED_AT or is_clock(column)]
-    repeats, shift = Repeats(), Shift()
-    parts: list[_Part] = [ends, duplicates, continuity, dead, repeats, shift, *clocks]
-    parts += [part for part in (commands, angles) if part is not None]
     for episode in dataset.episodes(names or list(columns)):
         for part in parts:
             part.add(episode)
-    findings = [finding for clock in clocks for finding in clock.findings(called)]
-    findings += _of_import(dataset) + repeats.findings() + shift.findings()
-    findings += angles.findings() if angles else []
-    findings += continuity.findings() + duplicates.findings(called)
-    findings += dead.findings(called)
-    findings += (commands.findings() if commands else []) + ends.findings()
-    rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no time column to compare it with"]
-    summary = [f"endings: {ends}"]
-    summary += [f"commands: {commands}"] if commands else []
-    summary += [f"rate: {rate}" for rate in rates]
+    findings = _of_import(dataset) + [finding for part in parts for finding in part.findings(called)]
     findings.sort(key=lambda finding: finding.severity != "warning")
+    rates = [str(clock) for clock in clocks] or [f"{fps} Hz declared; no time column to compare it with"]
+    summary = [f"endings: {ends}", *(f"commands: {given}" for given in commands)]
+    summary += [f"rate: {rate}" for rate in rates]
     return Checkup(dataset.reference, tuple(summary), tuple(findings))
 
 
@@ -166,21 +156,19 @@ class GivenCommands:
             f"the range: {shares}"
         )
 
-    def findings(self) -> list[Finding]:
+    def findings(self, called: str = "") -> list[Finding]:
         """Tell which commands are saturated."""
         saturated = np.flatnonzero(self.edge_shares > SATURATED)
         if not len(saturated):
             return []
         names = channels(self._column, saturated.tolist())
         worst = self.edge_shares.max()
-        return [
-            Finding(
-                "note",
-                f"commands at the edge of their range in up to {100 * worst:.0f} % of steps, {names}",
-                "values in between are rarer in the data: compare the range with what the robot follows "
-                "(`clip` in the mapping), or record gentler commands",
-            )
-        ]
+        what = f"commands at the edge of their range in up to {100 * worst:.0f} % of steps, {names}"
+        advice = (
+            "values in between are rarer in the data: compare the range with what the robot follows "
+            "(`clip` in the mapping), or record gentler commands"
+        )
+        return [Finding("note", what, advice)]
 
 
 def held_steps(actions: Array) -> NDArray[np.int64]:
@@ -230,15 +218,11 @@ class DeadChannels:
                 continue
             constant = np.flatnonzero(~self._changed[column.name]).tolist()
             if constant:
-                advice = (
-                    "a dead sensor, or nothing to learn from: check the log, or leave it out of the mapping"
-                )
+                why = "a dead sensor, or nothing to learn from: check the log"
                 if column.name == ACTION:
-                    advice = (
-                        "its effect cannot be learned: vary it in a recording, or leave it out of the mapping"
-                    )
+                    why = "its effect cannot be learned: vary it in a recording"
                 what = f"constant in all steps: {channels(column, constant)}"
-                found.append(Finding("note", what, advice))
+                found.append(Finding("note", what, f"{why}, or leave it out of the mapping"))
             if column.name == STATE and self._rests:
                 found += self._stuck(column, called)
         return found
@@ -338,31 +322,24 @@ class EpisodeEnds:
         )
         return ", ".join(f"{count} {way}" for count, way in counts if count)
 
-    def findings(self) -> list[Finding]:
+    def findings(self, called: str = "") -> list[Finding]:
         """Tell whether no episode goes on after its first step, and of few failures, where there are any."""
         failures, found = self.failures, []
         if max(self._lengths, default=0) == 1:
-            found.append(
-                Finding(
-                    "warning",
-                    "every episode ends after its first step",
-                    "check what ends them: failed of the robot or log, reached and missed of the objective, "
-                    "or how a mapping splits episodes",
-                )
+            advice = (
+                "check what ends them: failed of the robot or log, reached and missed of the objective, "
+                "or how a mapping splits episodes"
             )
-        if not 0 < len(failures) < FEW_FAILURES:
-            return found
-        count = "1 failure" if len(failures) == 1 else f"{len(failures)} failures"
-        return [
-            *found,
-            Finding(
-                "note",
-                f"{count}, which is little for a failure model to learn from",
+            found.append(Finding("warning", "every episode ends after its first step", advice))
+        if 0 < len(failures) < FEW_FAILURES:
+            count = "1 failure" if len(failures) == 1 else f"{len(failures)} failures"
+            what = f"{count}, which is little for a failure model to learn from"
+            advice = (
                 f"record {FEW_FAILURES} or more failures (astra-data collect TASK --behavior stress), or "
-                "no failure can be predicted from it",
-                tuple(failures),
-            ),
-        ]
+                "no failure can be predicted from it"
+            )
+            found.append(Finding("note", what, advice, tuple(failures)))
+        return found
 
 
 class Repeats:
@@ -381,7 +358,7 @@ class Repeats:
         self._repeated += int(runs[runs <= MOST_ROWS].sum())
         self._steps += max(len(state) - 1, 0)
 
-    def findings(self) -> list[Finding]:
+    def findings(self, called: str = "") -> list[Finding]:
         """Tell where many rows repeat the one before."""
         if self._repeated <= MOST_REPEATED * self._steps:
             return []
@@ -429,7 +406,7 @@ class Shift:
             shares.append(1 - float((rest**2).mean()))
         return np.array(shares)
 
-    def findings(self) -> list[Finding]:
+    def findings(self, called: str = "") -> list[Finding]:
         """Return by how many rows actions are off, if they are."""
         width = sum(part.shape[1] for part in self._rows[0]) if self._rows else 0
         if self._steps < 20 * (width + len(LAGS)) or not any(

@@ -25,20 +25,14 @@ LARGEST = 4 * math.pi
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding of a check-up.
-
-    Attributes:
-        severity: "warning" if a grounding would be fitted to something that the robot did not do, "note" if
-            it is worth knowing.
-        what: what was found.
-        advice: what to do.
-        episodes: uids of the episodes where it is; empty if it concerns the whole dataset.
-    """
+    """What was found, and what to do about it."""
 
     severity: Literal["warning", "note"]
+    """A warning if a grounding would be fitted to something that the robot did not do."""
     what: str
     advice: str
     episodes: tuple[int, ...] = ()
+    """Uids of the episodes where it is; empty if it concerns the whole dataset."""
 
     def __str__(self) -> str:
         """Say it in a line."""
@@ -94,7 +88,7 @@ class Angles:
         values = as_rows(episode.columns[self._column.name])[:, self._angles]
         self._farthest = np.maximum(self._farthest, np.abs(values).max(axis=0))
 
-    def findings(self) -> list[Finding]:
+    def findings(self, called: str = "") -> list[Finding]:
         """Tell which angles are larger than `LARGEST`."""
         found = np.flatnonzero(self._farthest > LARGEST).tolist()
         if not found:
@@ -107,16 +101,12 @@ class Angles:
 
 def full_turns(column: Column) -> Floats:
     """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
+    roles = (column.astra or {}).get("role", [""] * column.size)
     turns = [
         TURNS.get(unit, 2 * np.pi if role == "heading" else 0.0)
-        for unit, role in zip(column.units, _role_of_each(column), strict=True)
+        for unit, role in zip(column.units, roles, strict=True)
     ]
     return np.array(turns)
-
-
-def _role_of_each(column: Column) -> list[str]:
-    """Return the role of each value; "" where they are unknown."""
-    return (column.astra or {}).get("role", [""] * column.size)
 
 
 def shortest(steps: Floats, turns: Floats) -> Floats:
@@ -145,7 +135,7 @@ class Continuity:
         if broken:
             self._uids.append(episode.uid)
 
-    def findings(self) -> list[Finding]:
+    def findings(self, called: str = "") -> list[Finding]:
         """Tell how many steps do not lead to the row after them."""
         if not self._broken:
             return []
