@@ -61,7 +61,7 @@ class Column:
     """One column of a dataset.
 
     Attributes:
-        name: name on disk. LeRobot makes policy inputs of columns that begin with "observation" or "action".
+        name: on disk. LeRobot makes policy inputs of columns that begin with "observation" or "action".
         dtype: one of `DTYPES`.
         size: values per step.
         names: a name for each of them.
@@ -104,7 +104,13 @@ class Column:
                 faults.append(f"{len(words)} words in astra's {key} for {self.size} values")
         if unknown := sorted(set((self.astra or {}).get("role", [])) - set(ROLES)):
             faults.append(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
-        if faults := faults or self._role_faults():
+        words = (self.astra or {}).get("role", [])
+        faults = faults or [
+            f"role {role} at index {group.start}, expected {ROLES[role]} indices of it side by side"
+            for role, group in self.roles
+            if words[group] != [role] * ROLES[role]
+        ]
+        if faults:
             raise BadInputError(f"Column {self.name[:MOST_NAME_BYTES]!r}: {'; '.join(faults)}.")
 
     @property
@@ -126,14 +132,6 @@ class Column:
             groups.append((roles[index], slice(index, index + width)))
             index += width
         return groups
-
-    def _role_faults(self) -> list[str]:
-        words = (self.astra or {}).get("role", [])
-        return [
-            f"role {role} at index {group.start}, expected {ROLES[role]} indices of it side by side"
-            for role, group in self.roles
-            if words[group] != [role] * ROLES[role]
-        ]
 
     def feature(self) -> dict[str, Any]:
         """Return the column's entry in LeRobot's `features`."""

@@ -35,35 +35,29 @@ _LOCATION = ("length", "data/chunk_index", "data/file_index")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Contents:
-    """The metadata of a dataset of E episodes.
-
-    Attributes:
-        root: its folder.
-        info: meta/info.json.
-        description: meta/astra/dataset.json.
-        metadata: the episodes' metadata, key to one value per episode, None where one has none.
-        uids: uid of each episode, (E,).
-        lengths: steps of each episode, (E,).
-        order: the permutation of episode indices whose prefixes are the nested subsets.
-        subset_seed: its seed.
-        task: the task of all episodes.
-        paths: the data files in order.
-        file_starts: first row of each file.
-        recorded: where LeRobot recorded it, how its rows are converted; None for ours.
-    """
+    """The metadata of a dataset of E episodes."""
 
     root: Path
     info: dict[str, Any]
+    """meta/info.json."""
     description: dict[str, Any]
+    """meta/astra/dataset.json."""
     metadata: dict[str, list[Scalar | None]]
+    """Key to one value per episode, None where one has none."""
     uids: Ints
+    """(E,)."""
     lengths: Ints
+    """Steps of each episode, (E,)."""
     order: list[int]
+    """The permutation of episode indices whose prefixes are the nested subsets."""
     subset_seed: int
     task: str
     paths: list[Path]
+    """The data files in order."""
     file_starts: Ints
+    """First row of each file."""
     recorded: RecordedFiles | None = None
+    """Where LeRobot recorded it, how its rows are converted."""
 
     @cached_property
     def starts(self) -> Ints:

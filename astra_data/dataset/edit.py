@@ -4,7 +4,6 @@ Nothing is edited in place: every function streams the remaining episodes into a
 folder, which is `out`, or by default the new version's folder under `versions.home()`.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,6 @@ _IMPORTED = (
     "one of another origin gets the meanings of the others, and no robot_type, by an import of its files: "
     "`astra-data import FOLDER/data/*/*.parquet --mapping FILE`, with the others' mapping"
 )
-_OF_ORIGIN = re.compile(r"\.meaning: |\bmeaning: |robot_type: ")
 
 
 def subset(
@@ -44,11 +42,11 @@ def subset(
     Args:
         source: the dataset.
         episodes: number of episodes; or
-        percent: their share of `of` episodes in per cent, which may exceed 100.
-        of: number of episodes that are 100 per cent, by default all of `source`.
+        percent: their share in per cent, which may exceed 100, of
+        of: a number of episodes, by default all.
         seed: of the permutation whose first episodes are taken, by default that of `source`.
         stratify: a key of the episodes' metadata; each of its values keeps its share.
-        name: name of the new dataset; by default it is the next version of `source`.
+        name: of the new dataset; by default it is the next version of `source`.
         out: its folder, by default under `versions.home()`.
 
     Raises:
@@ -130,27 +128,22 @@ def filter_episodes(
     Raises:
         BadInputError: no condition is given, no episode has such metadata, or none meets the conditions.
     """
-    ranges: dict[str, tuple[float | None, float | None]] = {
-        "success": (success, success),
-        "return": (min_return, max_return),
-        "length": (min_length, max_length),
-    }
-    ranges = {key: bounds for key, bounds in ranges.items() if bounds != (None, None)}
-    if not ranges:
-        raise BadInputError("a filter needs a condition: on success, return or length")
-    met = [
-        {
-            uid
-            for uid, value in zip(_uids(source), _facts(source, key), strict=True)
-            if isinstance(value, int | float)
-            and (low is None or value >= low)
-            and (high is None or value <= high)
-        }
-        for key, (low, high) in ranges.items()
-    ]
     given = {"success": success, "min_return": min_return, "max_return": max_return}
     config = only_given(**given, min_length=min_length, max_length=max_length)
-    return _write(source, set.intersection(*met), stage="filter", config=config, name=name, out=out)
+    if not config:
+        raise BadInputError("a filter needs a condition: on success, return or length")
+    kept = set(_uids(source))
+    bounds = {"success": (success, success), "return": (min_return, max_return)}
+    for key, (low, high) in (bounds | {"length": (min_length, max_length)}).items():
+        if (low, high) != (None, None):
+            kept &= {
+                uid
+                for uid, value in zip(_uids(source), _facts(source, key), strict=True)
+                if isinstance(value, int | float)
+                and (low is None or value >= low)
+                and (high is None or value <= high)
+            }
+    return _write(source, kept, stage="filter", config=config, name=name, out=out)
 
 
 def merge(
@@ -158,14 +151,9 @@ def merge(
 ) -> Path:
     """Write the episodes of all `sources` one after another; name, version and seeds are those of the first.
 
-    Where tasks differ, the dataset has them all, and each episode its own as "task" in its metadata.
-
-    Args:
-        sources: two datasets or more, with equal columns, fps, environment and simulator.
-        new_uids: give an episode whose uid an earlier one has a new uid, the same in every run; the old one
-            is kept as "merged_uid", and "source_episode" follows. Otherwise repeated uids are refused.
-        name: name of the new dataset; by default it is the next version of the first.
-        out: its folder, by default under `versions.home()`.
+    They have equal columns, fps, environment and simulator. Where tasks differ, the dataset has them all, and
+    each episode its own as "task" in its metadata. With `new_uids`, an episode whose uid an earlier one has
+    gets a new one, the same in every run; the old one is kept as "merged_uid", and "source_episode" follows.
 
     Raises:
         BadInputError: the datasets do not fit together; lists every difference.
@@ -187,12 +175,9 @@ def merge(
         for fault in (*schema_differences(first, other), *world_differences(first, other))
     ]
     if faults:
-        is_of_origin = any(source.recorded for source in sources) or any(map(_OF_ORIGIN.search, faults))
-        raise BadInputError(
-            f"the datasets do not match: expected the columns, fps, environment and simulator "
-            f"of {first.reference} in all of them; merge only those that share them:\n  "
-            + "\n  ".join(faults + [_IMPORTED] * is_of_origin)
-        )
+        expected = f"the columns, fps, environment and simulator of {first.reference} in all of them"
+        faults += [_IMPORTED] if any(source.recorded for source in sources) else []
+        raise BadInputError("\n  ".join([f"the datasets do not match: expected {expected}:", *faults]))
     tasks = list(dict.fromkeys(task for source in sources for task in _tasks(source)))
     names = _merged_uids(sources, new_uids)
     config = {"datasets": [source.reference for source in sources], "new_uids": new_uids}
@@ -282,18 +267,16 @@ def _stratified(source: Dataset, key: str, strata: Mapping[str, int], seed: int)
 def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, int]]:
     """Return, for each of `sources`, its episodes' new uids by their old ones."""
     known = {uid for source in sources for uid in _uids(source)}
-    repeated: list[int] = []
     taken: set[int] = set()
-    names: list[dict[int, int]] = [{} for _ in sources]
-    for source, named in zip(sources, names, strict=True):
+    names: list[dict[int, int]] = []
+    for source in sources:
+        origin, named = f"{source.content_hash} ".encode(), dict[int, int]()
         for uid in _uids(source):
-            name = uid
-            if uid in taken:
-                repeated.append(uid)
-                name = new_uid(uid, f"{source.content_hash} ".encode(), known)
-                known.add(name)
-            taken.add(name)
-            named[uid] = name
+            named[uid] = new_uid(uid, origin, known) if uid in taken else uid
+            known.add(named[uid])
+            taken.add(named[uid])
+        names.append(named)
+    repeated = [uid for named in names for uid, name in named.items() if uid != name]
     if repeated and not new_uids:
         raise BadInputError(
             f"{len(repeated)} episodes have the uid of an earlier one "

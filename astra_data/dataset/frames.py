@@ -51,13 +51,8 @@ class Order:
         self._batches = whole + (rest > 0 and not drop_last)
         if batch_size < 1 or self._batches < 1:
             raise BadInputError(f"batches of {batch_size} out of {count} samples: expected 1 to {count}")
-        self._settings = {
-            "count": count,
-            "batch_size": batch_size,
-            "seed": seed,
-            "shuffle": shuffle,
-            "drop_last": drop_last,
-        }
+        self._settings = {"count": count, "batch_size": batch_size, "seed": seed}
+        self._settings |= {"shuffle": shuffle, "drop_last": drop_last}
         self.epoch = self.batch = 0
 
     def __len__(self) -> int:
@@ -105,7 +100,7 @@ class Samples(data.Dataset[Batch]):
     """
 
     def __init__(self, first: Tensor, gather: Callable[[Tensor], Batch], device: torch.device) -> None:
-        """Hold samples that begin at rows `first` (M,); `gather` reads those at rows (B,), for `device`."""
+        # Samples begin at rows `first` (M,), and `gather` reads those at rows (B,).
         self._first, self._gather, self._device = first, gather, device
 
     def __len__(self) -> int:
@@ -189,14 +184,14 @@ class Frames:
         memory_share: float = MEMORY_SHARE,
         cache: Path | None = None,
     ) -> "Frames":
-        """Load whole columns.
+        """Load whole columns `names`, by default all of `dataset.schema`.
 
         Columns of more than `memory_share` of the machine's memory are memory-mapped from raw files instead.
         Columns that do not fit on a CUDA device stay in main memory, and each batch is moved to the device.
 
         Args:
             dataset: the dataset.
-            names: names of the columns, by default all of `dataset.schema`.
+            names: names of the columns.
             episodes: indices of the episodes, by default all; they come in the dataset's order.
             device: torch device of the batches.
             memory_share: 0 to memory-map always.
@@ -250,22 +245,18 @@ class Frames:
             BadInputError: an argument is out of range, or no episode is long enough; lists every fault.
         """
         longest = int(self.lengths.max())
-        faults = [
-            f"{name} {value}, expected at least 1"
-            for name, value in (("length", length), ("stride", stride))
-            if value < 1
-        ]
-        if padding == "valid" and length > longest:
-            faults.append(
-                f"length {length}, expected at most {longest}, the longest episode's, or padding 'edge'"
-            )
-        if padding == "valid" and past:
-            faults.append(f"past {past}, expected 0 without padding 'edge'")
-        if padding == "edge" and not 0 <= past < max(length, 1):
-            faults.append(f"past {past}, expected 0 to {length - 1}")
-        if padding not in ("valid", "edge"):
-            faults.append(f"padding {padding!r}, expected 'valid' or 'edge'")
-        if faults:
+        is_valid, is_edge = padding == "valid", padding == "edge"
+        checks = {
+            f"length {length}, expected at least 1": length < 1,
+            f"stride {stride}, expected at least 1": stride < 1,
+            f"length {length}, expected at most {longest}, the longest episode's, or padding 'edge'": (
+                is_valid and length > longest
+            ),
+            f"past {past}, expected 0 without padding 'edge'": is_valid and past,
+            f"past {past}, expected 0 to {length - 1}": is_edge and not 0 <= past < max(length, 1),
+            f"padding {padding!r}, expected 'valid' or 'edge'": not is_valid and not is_edge,
+        }
+        if faults := [fault for fault, is_one in checks.items() if is_one]:
             raise BadInputError(f"Windows: {'; '.join(faults)}.")
         if padding == "edge":
             first = _every(stride, self.starts - past, self.lengths)
@@ -342,14 +333,10 @@ def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[
         for column in specs:
             if not (parent / column.name).exists():
                 _write_raw(dataset, column, parent / column.name)
-    columns: dict[str, Array] = {}
-    for name in names:
-        try:
-            columns[name] = np.load(parent / name / "values.npy", mmap_mode="c")
-        except (OSError, ValueError) as error:
-            raise CorruptDatasetError(
-                f"{parent / name} was altered ({error}); delete it and try again."
-            ) from error
+    try:
+        columns = {name: np.load(parent / name / "values.npy", mmap_mode="c") for name in names}
+    except (OSError, ValueError) as error:
+        raise CorruptDatasetError(f"{parent} was altered ({error}); delete it and try again.") from error
     for fault in dataset.alterations(columns, dataset.selected(None)):
         raise CorruptDatasetError(f"{parent} was altered ({fault}); delete it and try again.")
     return columns

@@ -6,30 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from astra_data.core.arrays import Floats, Ints, as_rows
-from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, Array, Column
-from astra_data.dataset.format import STATS_PATH
 from astra_data.dataset.reader import Dataset
 
 BINS = 16
 """Bins of a histogram, from the smallest to the largest value."""
 CELLS = 64
 """Cells of a map along its longer side."""
-_LARGEST = float(np.finfo(np.float32).max)
-_REMEDY = "astra-data repair rebuilds it"
 NEEDED = (STATE, NEXT_STATE, TERMINATED)
 """Columns that show how an episode ends."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Range and histogram of one column.
-
-    Attributes:
-        column: the column.
-        low, high, mean: of each index, (size,).
-        counts: values in each of `BINS` equal bins between low and high, (size, BINS).
-    """
+    """Range (size,) of a column, and how many values are in `BINS` equal bins of it, (size, BINS)."""
 
     column: Column
     low: Floats
@@ -40,13 +30,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Map:
-    """Visits of the cells of a plane.
-
-    Attributes:
-        counts: visits of each square cell, indexed [y, x] from the lower left, (height, width).
-        origin: the lower left corner, (2,).
-        cell: side of a cell, in the unit of the values.
-    """
+    """Visits of the square cells of a plane, indexed [y, x] from the lower left corner `origin` (2,)."""
 
     counts: Ints
     origin: Floats
@@ -62,16 +46,13 @@ class Map:
 
 @dataclass
 class Endings:
-    """How many episodes end in which way.
-
-    Attributes:
-        terminated: those that end in success or failure. cut_off: the others.
-        made_up: those whose last next state is the state itself, to the bit, where they are terminated.
-    """
+    """How many episodes end in which way."""
 
     terminated: int = 0
+    """In success or failure."""
     cut_off: int = 0
     made_up: int = 0
+    """Terminated ones whose last next state is the state itself, to the bit."""
 
     def add(self, columns: Mapping[str, Array]) -> None:
         """Count an episode with these columns, of which `NEEDED` are looked at."""
@@ -92,27 +73,21 @@ class Endings:
 
 @dataclass(frozen=True)
 class Inspection:
-    """Summary of a dataset of E episodes.
-
-    Attributes:
-        reference: name and version.
-        fps: steps per second.
-        lengths: steps of each episode, (E,).
-        success: number of successful episodes; None if unknown.
-        endings: how the episodes end; None if unknown.
-        spreads: one per column.
-        positions: the robot's positions, in m; None if the state has no such role.
-        velocities: its planar velocities in m/s, likewise.
-    """
+    """Summary of a dataset of E episodes; None is what is unknown."""
 
     reference: str
     fps: int
     lengths: Ints
+    """Steps of each episode, (E,)."""
     success: int | None
+    """Number of successful episodes."""
     endings: Endings | None
     spreads: tuple[Spread, ...]
+    """One per column."""
     positions: Map | None
+    """Of the robot, in m."""
     velocities: Map | None
+    """In the plane, in m/s."""
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
@@ -156,24 +131,10 @@ def visited(dataset: Dataset, role: str = "position") -> Map | None:
 
 def _empty_spreads(dataset: Dataset, columns: list[Column]) -> list[Spread]:
     ranges = dataset.statistics()
-    if isinstance(ranges, str):
-        raise CorruptDatasetError(f"{dataset.root}: {STATS_PATH} {ranges}; {_REMEDY}")
     spreads = []
     for column in columns:
-        stored = ranges.get(column.name, {})
-        try:
-            table = np.array([stored[key] for key in ("min", "max", "mean")], dtype=np.float64)
-        except (KeyError, OverflowError, TypeError, ValueError):
-            table = np.empty(0)
-        if (
-            table.shape != (3, column.size)
-            or not (np.abs(table) <= _LARGEST).all()
-            or (table[0] > table[1]).any()
-        ):
-            expected = f"expected {column.size} finite numbers as min, max and mean of {column.name}"
-            raise CorruptDatasetError(f"{dataset.root}: {STATS_PATH} is malformed, {expected}; {_REMEDY}")
-        counts = np.zeros((column.size, BINS), dtype=np.int64)
-        spreads.append(Spread(column, table[0], table[1], table[2], counts))
+        low, high, mean = (np.array(ranges[column.name][key], np.float64) for key in ("min", "max", "mean"))
+        spreads.append(Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64)))
     return spreads
 
 

@@ -6,7 +6,6 @@ following row; the last row of an episode has none and is left out, as are camer
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,7 +118,7 @@ def _survey(
     """Read every value once, for `roundings`, too; return all episodes, hash and digests of what is ours."""
     stored = list(rows.stored.values())
     specs = layout.stored_columns(columns)
-    ends = [name for name in (*ENDS, names.EPISODE_INDEX) if name in rows.stored]
+    ends = [name for name in ENDS if name in rows.stored]
     found: list[Found] = []
     faults: list[str] = []
     digests: dict[str, list[int]] = {spec.name: [] for spec in specs}
@@ -127,7 +126,7 @@ def _survey(
     tables = read_blocks(plain.data_files(root), [column.name for column in stored])
     for number, run in enumerate(plain.runs(root / "data", tables, stored)):
         faults += [fault for _, fault in plain.run_faults(run, number=number, row=row, fps=rows.fps)]
-        faults += plain.flag_faults(replace(run, columns={name: run.columns[name] for name in ends}), number)
+        faults += plain.flag_faults({name: run.columns[name] for name in ends}, f"episode {number} ")
         if len(faults) >= MOST_FAULTS:
             break
         uid = int(run.columns.get(names.EPISODE_UID, run.columns[names.EPISODE_INDEX])[0])

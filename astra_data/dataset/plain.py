@@ -3,7 +3,7 @@
 import itertools
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -118,15 +118,6 @@ def read_object(path: Path) -> dict[str, Any] | str:
     except (OSError, RecursionError, ValueError) as error:
         return f"is no JSON object ({error})"
     return found if isinstance(found, dict) else f"is no JSON object but {type(found).__name__}"
-
-
-def read_statistics(root: Path) -> dict[str, dict[str, Any]] | str:
-    """Return meta/stats.json, column to statistic to values, or what is wrong with it."""
-    found = read_object(root / layout.STATS_PATH)
-    if isinstance(found, str):
-        return found
-    strange = [name for name, statistics in found.items() if not isinstance(statistics, dict)]
-    return f"has no JSON object for {', '.join(strange)}" if strange else found
 
 
 def is_format_2(root: Path) -> bool:
@@ -313,21 +304,6 @@ def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str
     return faults
 
 
-def statistics_faults(
-    schema: pa.Schema, columns: Sequence[PlainColumn], features: Collection[str]
-) -> Iterator[str]:
-    """Yield which columns of statistics `schema`, of a file of meta/episodes, lacks or has beside the others.
-
-    Quantiles, which early files of the format lack, and statistics of what is no number are not required.
-    """
-    known = {f"stats/{feature}/{kind}" for feature in features for kind in layout.STORED_STATISTICS}
-    needed = [f"stats/{column.name}/{kind}" for column in columns for kind in PLAIN_STATISTICS]
-    yield from (f"lacks column {name}" for name in needed if name not in schema.names)
-    for name in schema.names:
-        if name.startswith("stats/") and name not in known:
-            yield f"has an unknown column {name}"
-
-
 def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, Array]:
     """Return `columns` of `table` by name, (n,) or (n, size)."""
     return {column.name: _values(table.column(column.name), column) for column in columns}
@@ -366,28 +342,28 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
             yield name, f"{name} is {values[at]} in {where}{wanted}{more}"
 
 
-def flag_faults(run: Run, number: int) -> Iterator[str]:
-    """Yield a sentence for each flag of episode `number` that ends it early or contradicts another."""
+def flag_faults(columns: Mapping[str, Array], where: str = "") -> Iterator[str]:
+    """Yield a sentence for each flag of an episode that ends it early or contradicts another."""
     flags = {
         name: values != 0
         for name in _END_FLAGS
-        if (values := run.columns.get(name)) is not None and values.ndim == 1
+        if (values := columns.get(name)) is not None and values.ndim == 1
     }
     for name, values in flags.items():
         if values[:-1].any():
-            found = f"{name} is True in episode {number} frame {values.argmax()}"
-            yield f"{found}, before the last frame {len(run) - 1}"
+            last = len(values) - 1
+            yield f"{name} is True in {where}frame {values.argmax()}, before the last frame {last}"
     if len(flags) == len(_END_FLAGS):
         expected = flags[names.TERMINATED] | flags[names.TRUNCATED]
         wrong = flags[names.DONE] != expected
         if wrong.any():
             at = wrong.argmax()
-            found = f"{names.DONE} is {flags[names.DONE][at]} in episode {number} frame {at}"
+            found = f"{names.DONE} is {flags[names.DONE][at]} in {where}frame {at}"
             yield f"{found}, expected {expected[at]}: terminated or truncated"
 
 
-def open_end_faults(run: Run, number: int) -> Iterator[str]:
-    """Yield a sentence if episode `number` has flags, and its last frame is not done."""
-    done = run.columns.get(names.DONE)
+def open_end_faults(columns: Mapping[str, Array], where: str = "") -> Iterator[str]:
+    """Yield a sentence if an episode has flags, and its last frame is not done."""
+    done = columns.get(names.DONE)
     if done is not None and done.ndim == 1 and not done[-1]:
-        yield f"{names.DONE} is False in episode {number} frame {len(run) - 1}, expected True: it ends there"
+        yield f"{names.DONE} is False in {where}frame {len(done) - 1}, expected True: it ends there"

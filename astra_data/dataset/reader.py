@@ -18,11 +18,11 @@ from astra_data.core.optional import optional
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents, read_values
 from astra_data.dataset.description import full_name, identity_of
-from astra_data.dataset.format import CODEBASE_VERSION, INFO_PATH, OUR_FOLDER
+from astra_data.dataset.format import CODEBASE_VERSION, INFO_PATH, OUR_FOLDER, STATS_PATH
 from astra_data.dataset.integrity import Digests, alteration, altered_columns, read_digests
 from astra_data.dataset.lerobot_recording import open_recording
 from astra_data.dataset.lerobot_rows import declared_columns
-from astra_data.dataset.plain import data_files, is_format_2, read_object, read_statistics
+from astra_data.dataset.plain import data_files, is_format_2, read_object
 from astra_data.dataset.statistics import ranges
 
 if TYPE_CHECKING:
@@ -185,14 +185,14 @@ class Dataset(Contents):
             raise BadInputError(f"{self.reference}: a subset of {count} episodes, expected 1 to {len(self)}.")
         return self.order[:count]
 
-    def statistics(self) -> dict[str, dict[str, Any]] | str:
-        """Return meta/stats.json, column to statistic to values, or what is wrong with it.
-
-        Of what LeRobot recorded, min, max and mean are computed from the values.
-        """
-        if self.recorded is None:
-            return read_statistics(self.root)
-        return ranges(self.blocks([column.name for column in self.schema]))
+    def statistics(self) -> dict[str, dict[str, Any]]:
+        """Return meta/stats.json, column to statistic to values; of a recording, min, max and mean."""
+        if self.recorded is not None:
+            return ranges(self.blocks([column.name for column in self.schema]))
+        found = read_object(self.root / STATS_PATH)
+        if isinstance(found, str):
+            raise CorruptDatasetError(f"{self.root}: {STATS_PATH} {found}; astra-data repair rebuilds it")
+        return found
 
     def verify(self) -> list[str]:
         """Read every value again, LeRobot's own columns included; return what was altered, if anything."""

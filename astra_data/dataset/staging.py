@@ -50,9 +50,9 @@ class StagedWriter:
     the episodes stay staged, and a writer with `resume` continues with them.
 
     Attributes:
-        staged: metadata of the staged episodes, by their position in the dataset. lengths: their steps.
+        staged, lengths: metadata and steps of the staged episodes, by their position in the dataset.
         made, policy: as in `DatasetWriter`.
-        folder: the folder of the staged episodes, and of what else the recording needs to resume.
+        folder: of the staged episodes, and of what else the recording needs to resume.
 
     Example:
         >>> from pathlib import Path
@@ -77,16 +77,7 @@ class StagedWriter:
         subset_seed: int = 0,
         resume: bool = False,
     ) -> None:
-        """Prepare to record; entering the block starts.
-
-        Args:
-            root: the dataset's folder; must not exist yet.
-            columns: as in `DatasetWriter`, like `fps`, `task`, `description` and `subset_seed`.
-            fps: steps per second.
-            task: the task of all episodes.
-            description: the dataset's provenance.
-            subset_seed: of the permutation whose prefixes are the nested subsets.
-            resume: continue an interrupted recording, if there is one.
+        """Prepare to record as `DatasetWriter` does; with `resume`, continue what was interrupted.
 
         Raises:
             BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
@@ -129,10 +120,20 @@ class StagedWriter:
                     f"{self.root} is being recorded right now; wait or choose another folder."
                 )
             if self.root.exists():
-                self._refuse_root()
+                if self._holds_work() and not self._is_written():
+                    raise BadInputError(
+                        f"{self.root} exists already and is another dataset than the interrupted recording, "
+                        f"which left {self._left()} in {self.folder}: move one of the two away."
+                    )
+                discard(self.folder, self.root)  # a kill came between the dataset and this
+                refuse_existing(self.root)
             self._agree_on_the_settings()
             for path in sorted(self.folder.glob("*.arrow")):
-                episode = self._restore(path)
+                episode = load_staged(path, self._columns)
+                try:
+                    self._admission.admit(episode)
+                except BadInputError as error:
+                    raise BadInputError(f"{path}: {error} Delete it and resume the recording.") from error
                 self.staged[int(path.stem)], self.lengths[int(path.stem)] = episode.metadata, len(episode)
             self._exit = stack.pop_all()
         self._is_open = True
@@ -147,18 +148,15 @@ class StagedWriter:
             is_written = False
             try:
                 if error is None:
-                    self._write()
+                    self._writer.made, self._writer.policy = self.made, self.policy
+                    with self._keeping(), self._writer:
+                        for position in sorted(self.staged):
+                            self._writer.add(load_staged(self._path(position), self._columns))
                     is_written = True
             finally:
                 with suppress(OSError):  # what stays is recognized by the next call
                     if is_written or not self._holds_work():
                         discard(self.folder, self.root)
-
-    def _write(self) -> None:
-        self._writer.made, self._writer.policy = self.made, self.policy
-        with self._keeping(), self._writer:
-            for position in sorted(self.staged):
-                self._writer.add(load_staged(self._path(position), self._columns))
 
     @contextmanager
     def _keeping(self) -> Iterator[None]:
@@ -166,17 +164,12 @@ class StagedWriter:
         try:
             yield
         except DiskError as error:
-            raise DiskError(
-                f"{error} {len(self.staged)} episodes are safe in {self.folder}: a recipe goes on with them "
-                "by itself, the command for a task with --resume."
-            ) from error
+            safe = f"{len(self.staged)} episodes are safe in {self.folder}"
+            how = "a recipe goes on with them by itself, the command for a task with --resume."
+            raise DiskError(f"{error} {safe}: {how}") from error
 
     def add(self, episode: Episode, position: int | None = None) -> None:
-        """Stage `episode`; a refused one changes nothing.
-
-        Args:
-            episode: the episode.
-            position: its position in the dataset, by default after the last one.
+        """Stage `episode` at `position`, by default after the last; a refused one changes nothing.
 
         Raises:
             BadInputError: it does not fit the columns, or the position is taken.
@@ -209,19 +202,8 @@ class StagedWriter:
         return any(path.name != _SETTINGS and path.suffix != ".partial" for path in kept)
 
     def _left(self) -> str:
-        """Describe what can be resumed."""
         waiting = len(list(self.folder.glob("*.arrow")))
         return f"{waiting} episodes" if waiting else "an unfinished recording"
-
-    def _refuse_root(self) -> None:
-        """Refuse an existing `root`; if nothing is staged that is not in it, remove the staged episodes."""
-        if self._holds_work() and not self._is_written():
-            raise BadInputError(
-                f"{self.root} exists already and is another dataset than the interrupted recording, which "
-                f"left {self._left()} in {self.folder}: move one of the two away."
-            )
-        discard(self.folder, self.root)
-        refuse_existing(self.root)
 
     def _is_written(self) -> bool:
         """Return whether the dataset at `root` holds every staged episode, value for value."""
@@ -235,24 +217,17 @@ class StagedWriter:
                 return all(dataset.description.get(key) == value for key, value in described.items())
             staged = {episode.uid: path for path in paths for episode in [load_staged(path, self._columns)]}
             for stored in dataset.episodes([column.name for column in self._columns]):
-                path = staged.pop(stored.uid, None)
-                if path and not _is_same(load_staged(path, self._columns), stored):
-                    return False
+                if path := staged.pop(stored.uid, None):
+                    one = load_staged(path, self._columns)
+                    same = (np.array_equal(v, stored.columns[name]) for name, v in one.columns.items())
+                    if one.metadata != stored.metadata or not all(same):
+                        return False
         except AstraDataError:
             return False
         return not staged
 
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"
-
-    def _restore(self, path: Path) -> Episode:
-        """Load an episode of the interrupted recording, as if it was added now."""
-        episode = load_staged(path, self._columns)
-        try:
-            self._admission.admit(episode)
-        except BadInputError as error:
-            raise BadInputError(f"{path}: {error} Delete it and resume the recording.") from error
-        return episode
 
     def _agree_on_the_settings(self) -> None:
         """Write the settings, or check that what was staged was made with the same."""
@@ -272,12 +247,6 @@ class StagedWriter:
             )
         else:
             write_file(self.folder / _SETTINGS, json.dumps(self._settings, indent=1, sort_keys=True))
-
-
-def _is_same(one: Episode, other: Episode) -> bool:
-    return one.metadata == other.metadata and all(
-        np.array_equal(values, other.columns[name]) for name, values in one.columns.items()
-    )
 
 
 def write_staged(path: Path, episode: Episode, schema: pa.Schema) -> None:

@@ -12,6 +12,7 @@ import logging
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -75,11 +76,7 @@ class Version:
 
 def home() -> Path:
     """Return the folder of datasets that have none of their own."""
-    return Path(os.environ.get("ASTRA_DATA_HOME", "datasets"))
-
-
-def _home_folder() -> Path:
-    folder = home()
+    folder = Path(os.environ.get("ASTRA_DATA_HOME", "datasets"))
     if folder.exists() and not folder.is_dir():
         raise BadInputError(
             f"{folder} is no folder: expected that of the datasets; set $ASTRA_DATA_HOME to one"
@@ -94,12 +91,12 @@ def home_of(description: Mapping[str, Any]) -> Path:
 
 def names_at_home() -> list[str]:
     """Return the names of the datasets at home."""
-    return sorted(folder.name for folder in _home_folder().glob("*") if versions_at_home(folder.name))
+    return sorted(folder.name for folder in home().glob("*") if versions_at_home(folder.name))
 
 
 def versions_at_home(name: str) -> list[Version]:
     """Return the versions of dataset `name` at home, the oldest first."""
-    folders = (folder for folder in (_home_folder() / name).glob("data-*") if folder.is_dir())
+    folders = (folder for folder in (home() / name).glob("data-*") if folder.is_dir())
     return sorted(version for folder in folders if (version := Version.from_tag(folder.name)))
 
 
@@ -110,8 +107,11 @@ def locate(dataset: str | Path) -> Path:
         BadInputError: there is no such folder and no such name at home.
     """
     reference, folder = _REFERENCE.fullmatch(str(dataset)), Path(dataset)
-    if _is_folder(folder) and not (reference and _is_another(folder) and versions_at_home(reference["name"])):
-        return folder
+    with suppress(OSError):  # its name may be too long for a file
+        # A folder without a dataset or versions of one, such as that of `new`, does not hide a name.
+        holds = (folder / "meta").is_dir() or any(folder.glob("data-*.*.*"))
+        if folder.is_dir() and (holds or not reference or not versions_at_home(reference["name"])):
+            return folder
     if not reference:
         raise BadInputError(
             f"{str(dataset)[:300]}: no such folder; expected a folder, name or name@data-1.2.0"
@@ -129,18 +129,6 @@ def locate(dataset: str | Path) -> Path:
         known = ", ".join(f"{name}@{known.tag}" for known in versions[:-1])
         _LOG.warning("%s is %s@%s here, a subset; the others are %s", name, name, versions[-1].tag, known)
     return folder
-
-
-def _is_another(folder: Path) -> bool:
-    """Return whether a folder holds neither a dataset nor versions of one: that of `new`, for example."""
-    return not (folder / "meta").is_dir() and not any(folder.glob("data-*.*.*"))
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # its name is too long for a file
-        return False
 
 
 def open_dataset(dataset: str | Path) -> Dataset:

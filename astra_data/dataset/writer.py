@@ -17,12 +17,12 @@ from astra_data.core.durable import atomic_folder
 from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
-from astra_data.dataset.columns import DONE, TERMINATED, TRUNCATED, Array, Column, Episode, Scalar
+from astra_data.dataset.columns import Column, Episode, Scalar
 from astra_data.dataset.description import ContentHash, complete_description, permutation
 from astra_data.dataset.format import METADATA_KEYS
 from astra_data.dataset.integrity import digest_of, sealed, write_digests
 from astra_data.dataset.parquet import RotatingWriter, to_arrow
-from astra_data.dataset.plain import data_files
+from astra_data.dataset.plain import data_files, flag_faults, open_end_faults
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import EpisodeRows, episode_statistics, global_statistics
 
@@ -72,9 +72,9 @@ class DatasetWriter:
 
         Args:
             root: the dataset's folder; must not exist yet.
-            columns: the columns of every episode, without `columns.RESERVED`.
+            columns: those of every episode, without `columns.RESERVED`.
             fps: steps per second.
-            task: the task of all episodes, a sentence or a name.
+            task: of all episodes, a sentence or a name.
             description: see `complete_description`.
             subset_seed: of the permutation whose prefixes are the nested subsets.
             compression: of the data files, one of `format.COMPRESSIONS`.
@@ -210,16 +210,13 @@ class DatasetWriter:
 
 
 class Admission:
-    """Checks each new episode against the dataset's columns and against the episodes before it.
-
-    Attributes:
-        metadata_types: type of each metadata key seen so far.
-    """
+    """Checks each new episode against the dataset's columns and against the episodes before it."""
 
     def __init__(self, columns: Sequence[Column]) -> None:
         self._columns = {column.name: column for column in columns}
         self._uids: set[int] = set()
         self.metadata_types: dict[str, type] = {}
+        """Of each metadata key seen so far."""
 
     def admit(self, episode: Episode) -> None:
         """Accept `episode`, or refuse it with a BadInputError that lists every fault."""
@@ -247,7 +244,8 @@ class Admission:
             if key in METADATA_KEYS:
                 faults.append(f"metadata {key}: is filled in by the writer, leave it out")
             faults += _metadata_faults(key, value)
-        faults += _outcome_faults(episode.columns)
+        flags = {name: values for name, values in episode.columns.items() if values.dtype == bool}
+        faults += [*flag_faults(flags), *open_end_faults(flags)]
         if episode.uid in self._uids:
             faults.append("an earlier episode has the same uid")
         return faults
@@ -269,22 +267,3 @@ def _metadata_faults(key: str, value: Scalar) -> list[str]:
     if isinstance(value, str) and not is_text(value):
         return [f"metadata {key}: {value!r:.80} has characters that are not valid Unicode"]
     return []
-
-
-def _outcome_faults(columns: Mapping[str, Array]) -> list[str]:
-    """List faults of the flags that end an episode, as far as they are flags: only its last step may."""
-    flags = {
-        name: ends
-        for name in (TERMINATED, TRUNCATED, DONE)
-        if (ends := columns.get(name)) is not None and ends.dtype == bool and ends.ndim == 1
-    }
-    faults = [
-        f"{name}: true in frame {int(ends.argmax())}, expected in the last one only"
-        for name, ends in flags.items()
-        if ends[:-1].any()
-    ]
-    if DONE in flags and not flags[DONE][-1]:
-        faults.append(f"{DONE}: false in the last frame, expected true: an episode ends there")
-    if len(flags) == 3 and flags[DONE][-1] and not (flags[TERMINATED][-1] or flags[TRUNCATED][-1]):
-        faults.append(f"{DONE}: true in the last frame, expected {TERMINATED} or {TRUNCATED} there, too")
-    return faults

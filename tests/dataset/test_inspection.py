@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from fake_dataset import LENGTHS, concatenated, write_fake
 
-from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset, DatasetWriter
 from astra_data.dataset.columns import (
     ACTION,
@@ -23,7 +22,6 @@ from astra_data.dataset.inspection import (
     endings_of,
     inspect_dataset,
     outcome_of,
-    visited,
 )
 
 
@@ -79,23 +77,6 @@ def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
     places = inspect_dataset(Dataset.open(root)).positions
     assert places is not None
     assert places.counts.tolist() == [[sum(LENGTHS)]]
-
-
-@pytest.mark.parametrize(
-    "statistics",
-    [
-        "{",
-        "{}",
-        '{"observation.state": {"min": [0], "max": 1, "mean": {}}}',
-        '{"observation.state": {"min": [0, 2, 0], "max": [1, 1, 1], "mean": [0, 1, 0]}}',
-    ],
-)
-def test_malformed_statistics_are_told(tmp_path: Path, statistics: str) -> None:
-    dataset = write_fake(tmp_path / "set")
-    (dataset.root / "meta/stats.json").write_text(statistics)
-    for read in (inspect_dataset, visited):
-        with pytest.raises(CorruptDatasetError, match=r"meta/stats\.json is .*; astra-data repair"):
-            read(dataset)
 
 
 def test_only_a_terminated_last_step_that_stands_still_was_made_up(tmp_path: Path) -> None:

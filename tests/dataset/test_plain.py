@@ -149,7 +149,7 @@ def test_flags_end_the_last_step_only_and_agree(
 ) -> None:
     flags = {"next.terminated": terminated, "next.truncated": truncated, "next.done": done}
     run = a_run(**{name: np.array([bit == "1" for bit in bits]) for name, bits in flags.items()})
-    found = list(flag_faults(run, 3))
+    found = list(flag_faults(run.columns, "episode 3 "))
     assert len(found) == len(faults)
     for sentence, (name, part) in zip(found, faults, strict=True):
         assert sentence.startswith(f"next.{name} is ")

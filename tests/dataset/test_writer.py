@@ -204,10 +204,10 @@ def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_pat
 @pytest.mark.parametrize(
     ("name", "frame", "value", "fault"),
     [
-        (DONE, 3, False, "next.done: false in the last frame"),
-        (DONE, 1, True, "next.done: true in frame 1, expected in the last one only"),
-        (TERMINATED, 0, True, "next.terminated: true in frame 0"),
-        (TRUNCATED, 2, True, "next.truncated: true in frame 2"),
+        (DONE, 3, False, "next.done is False in frame 3, expected True"),
+        (DONE, 1, True, "next.done is True in frame 1, before the last"),
+        (TERMINATED, 0, True, "next.terminated is True in frame 0"),
+        (TRUNCATED, 2, True, "next.truncated is True in frame 2"),
     ],
 )
 def test_only_the_last_step_ends_an_episode(
@@ -225,7 +225,7 @@ def test_an_episode_is_not_done_without_an_end() -> None:
     columns = fake_columns(4, seed=1)
     for name in (TERMINATED, TRUNCATED):
         columns[name][:] = False
-    with pytest.raises(BadInputError, match=r"next\.done: true in the last frame, expected next\.term"):
+    with pytest.raises(BadInputError, match=r"next\.done is True in frame \d, expected False: term"):
         Admission(COLUMNS).check(Episode(2, columns))
     columns[TRUNCATED][-1] = True
     Admission(COLUMNS).check(Episode(2, columns))

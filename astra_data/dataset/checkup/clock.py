@@ -63,7 +63,7 @@ class Clock:
 
     @property
     def period_s(self) -> float:
-        """The mean in s of the `INNER` share of steps around the median: gaps do not move it; 0 without steps."""
+        """The mean in s of the `INNER` share of steps around the median; 0 without steps."""
         steps_s = self._sorted_steps()
         first, last = (int(len(steps_s) * share) for share in ((1 - INNER) / 2, (1 + INNER) / 2))
         return float(steps_s[first : max(last, first + 1)].mean()) if len(steps_s) else 0.0

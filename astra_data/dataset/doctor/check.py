@@ -189,9 +189,6 @@ def _files_are_readable(
                 faults = plain.schema_faults(footer[1], columns)
                 for fault in [*faults, *(f"has an unknown column {column}" for column in unknown)]:
                     report.fault("columns", f"{name} {fault}")
-            else:
-                for fault in plain.statistics_faults(footer[1], columns, info["features"]):
-                    report.note("statistics", f"{name} {fault}")
     if not isinstance(total := info.get("total_frames"), int) or rows < total:
         for missing in plain.missing_files(root, plain.read_places(root, info)[0]):
             report.fault("files", f"{missing} is missing")
@@ -278,8 +275,9 @@ class EpisodeChecks:
         report = self._report
         for name, fault in plain.run_faults(run, number=number, row=report.frames, fps=self._info["fps"]):
             report.fault(name, fault)
-        for fault in (*plain.flag_faults(run, number), *plain.open_end_faults(run, number)):
-            report.note("flags", fault)
+        for faults in (plain.flag_faults, plain.open_end_faults):
+            for fault in faults(run.columns, f"episode {number} "):
+                report.note("flags", fault)
         unknown = [t for t in np.unique(run.columns[names.TASK_INDEX]).tolist() if t not in self._tasks]
         if unknown:
             report.fault("tasks", f"episode {number} has the unknown tasks {unknown}")
@@ -333,13 +331,14 @@ class EpisodeChecks:
         }
 
     def _check_global(self) -> None:
-        stored = plain.read_statistics(self._root)
+        stored = plain.read_object(self._root / layout.STATS_PATH)
         if isinstance(stored, str):
             self._report.fault("statistics", f"{layout.STATS_PATH} {stored}")
         elif self._total:
             kinds = plain.PLAIN_STATISTICS
+            every = {name: each for name, each in stored.items() if isinstance(each, dict)}
             of_each = {
-                (c.name, kind): stored.get(c.name, {}).get(kind) for c in self._columns for kind in kinds
+                (c.name, kind): every.get(c.name, {}).get(kind) for c in self._columns for kind in kinds
             }
             self._compare(of_each, self._total, "")
 

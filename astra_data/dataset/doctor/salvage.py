@@ -83,7 +83,7 @@ def whole_runs(
             faults.append(f"it has {len(run)} frames, expected {place.length}")
         if episode >= most and digests:
             faults.append(f"expected {most} episodes")
-        faults += plain.flag_faults(run, episode)
+        faults += plain.flag_faults(run.columns, f"episode {episode} ")
         if altered := altered_columns(run.columns, episode, digests):
             faults.append(alteration(altered, run.path, run.row, len(run), episode))
         uid = int(run.columns.get(names.EPISODE_UID, [episode])[0])

@@ -188,26 +188,6 @@ def test_a_missing_file_is_named_alone(tmp_path: Path, monkeypatch: pytest.Monke
         Dataset.open(root)
 
 
-@pytest.mark.parametrize(
-    ("renamed", "note"),
-    [
-        ("stats/action/count", f"{EPISODES} lacks column stats/action/count"),
-        ("stats/action/q10", f"{EPISODES} has an unknown column stats/action/q1o"),
-    ],
-)
-def test_a_renamed_column_of_statistics_is_told(tmp_path: Path, renamed: str, note: str) -> None:
-    root = write_fake(tmp_path / "set").root
-    table = pq.read_table(root / EPISODES)
-    other = renamed.replace("q10", "q1o").replace("count", "coumt")
-    listed = [other if name == renamed else name for name in table.column_names]
-    pq.write_table(table.rename_columns(listed), root / EPISODES)
-    assert f"{EPISODES} was altered after it was written, or is missing" in check(root).faults
-    with pytest.raises(CorruptDatasetError, match=f"{EPISODES} was altered"):
-        Dataset.open(root)
-    shutil.rmtree(root / "meta/astra")
-    assert note in check(root).notes
-
-
 def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None:
     root = write_fake(tmp_path / "set").root
     for path in (root / "meta/astra").iterdir():
