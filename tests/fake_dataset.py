@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -103,14 +102,13 @@ def _die(*_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-if __name__ == "__main__":
-    # Write a dataset and be killed on the way.
-    target, moment = Path(sys.argv[1]), sys.argv[2]
+def write_and_be_killed(root: Path, moment: str) -> None:
+    """Write a dataset, for a fork that is killed on the way."""
     if moment == "renaming":
         durable.os.replace = _die  # type: ignore[attr-defined]
     if moment == "validating":
         Dataset.verify = _die  # type: ignore[assignment, method-assign]
-    with writer(target) as killed_writer:
+    with writer(root) as killed_writer:
         for fake in fake_episodes():
             killed_writer.add(fake)
         if moment == "adding":

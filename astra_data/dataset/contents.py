@@ -169,8 +169,8 @@ def _converted(
     rows = recorded.rows
     lengths = contents.lengths + rows.dropped
     wanted = rows_of(episodes, recorded.first_rows, lengths, recorded.total_rows)
-    stored = rows.stored_for([column.name for column in columns])
-    tables = read_blocks(contents.paths, [column.name for column in stored], wanted)
+    stored = list(rows.stored.values())
+    tables = read_blocks(contents.paths, list(rows.stored), wanted)
     found = (run for run in runs(contents.root / "data", tables, stored) if len(run) > rows.dropped)
     for position, (episode, run) in enumerate(zip_longest(episodes.tolist(), found)):
         if run is None or episode is None or len(run) != lengths[episode]:

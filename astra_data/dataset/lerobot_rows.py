@@ -32,14 +32,10 @@ DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
 
 @dataclass(frozen=True)
 class Rows:
-    """How rows of an episode in the files become rows of ours.
-
-    Attributes:
-        stored: the columns of numbers in the files.
-        fps: steps per second.
-    """
+    """How rows of an episode in the files become rows of ours."""
 
     stored: Mapping[str, PlainColumn]
+    """The columns of numbers in the files."""
     fps: int
 
     @property
@@ -47,40 +43,24 @@ class Rows:
         """Rows at the end of each episode that are left out: 1 where next states are derived, otherwise 0."""
         return 0 if names.NEXT_STATE in self.stored else 1
 
-    def stored_for(self, wanted: Iterable[str]) -> list[PlainColumn]:
-        """Return the columns of the files from which the columns `wanted` are made, and what splits rows."""
-        sources = {names.EPISODE_INDEX, names.FRAME_INDEX}
-        for name in wanted:
-            if name == names.NEXT_STATE and self.dropped:
-                sources.add(names.STATE)
-            elif name in (*ENDS, names.DONE):
-                sources.update(ENDS)
-            elif name in (names.SUCCESS, names.REWARD):
-                sources.update((name, names.TERMINATED, names.DONE))
-            elif name == RECORDED_TASK:
-                sources.add(names.TASK_INDEX)
-            elif name not in names.RESERVED:
-                sources.add(name)
-        return [column for name, column in self.stored.items() if name in sources]
-
     def values(self, spec: Column, run: Run, episode: int, start: int, uid: int) -> Array:
         """Return the column `spec` of one episode, (T,) or (T, size)."""
-        steps = len(run) - self.dropped
-        reserved = reserved_values(steps, uid=uid, episode=episode, start=start, fps=self.fps)
-        if spec.name in reserved:
-            return reserved[spec.name].astype(spec.dtype)
-        if spec.name in (names.TRUNCATED, names.DONE):
+        steps, name = len(run) - self.dropped, spec.name
+        if name in (names.TERMINATED, names.TRUNCATED, names.DONE):
             terminated, truncated = self._ends(run, steps)
-            return truncated if spec.name == names.TRUNCATED else terminated | truncated
-        if spec.name == names.TERMINATED:
-            return self._ends(run, steps)[0]
-        if spec.name == names.SUCCESS and self.dropped:
-            return self._successes(run, steps).astype(spec.dtype)
-        if spec.name == names.NEXT_STATE and self.dropped:
+            return {names.TERMINATED: terminated, names.TRUNCATED: truncated}.get(
+                name, terminated | truncated
+            )
+        if name in names.RESERVED:
+            start_of = {"uid": uid, "episode": episode, "start": start}
+            values = reserved_values(steps, **start_of, fps=self.fps)[name]
+        elif name == names.SUCCESS and self.dropped:
+            values = self._successes(run, steps)
+        elif name == names.NEXT_STATE and self.dropped:
             values = run.columns[names.STATE][1:]
         else:
-            values = run.columns[names.TASK_INDEX if spec.name == RECORDED_TASK else spec.name][:steps]
-        if spec.name == names.REWARD and self._hands_on(run):
+            values = run.columns[names.TASK_INDEX if name == RECORDED_TASK else name][:steps]
+        if name == names.REWARD and self._hands_on(run):
             values = values.astype(np.float64)
             values[-1] += run.columns[names.REWARD][-1]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -139,19 +119,14 @@ class Rows:
 
 @dataclass(frozen=True)
 class RecordedFiles:
-    """What is known of the files of a recording, and of the E episodes in them that have steps.
-
-    Attributes:
-        rows: how their rows become ours.
-        first_rows: the row of the files in which each episode begins, (E,).
-        total_rows: rows of all files.
-        digests: those of the values when the recording was opened.
-    """
+    """What is known of the files of a recording, and of the E episodes in them that have steps."""
 
     rows: Rows
     first_rows: Ints
+    """The row of the files in which each episode begins, (E,)."""
     total_rows: int
     digests: Digests
+    """Those of the values when the recording was opened."""
 
 
 def lacking(recorded: Iterable[Column]) -> list[str]:
@@ -165,7 +140,8 @@ def lacking(recorded: Iterable[Column]) -> list[str]:
 
 def our_columns(recorded: Iterable[Column], *, has_tasks: bool) -> list[Column]:
     """Return the columns of the dataset, from those of the recording that are not LeRobot's own."""
-    columns = {column.name: _typed(column) for column in recorded}
+    kinds = dict.fromkeys(FLOATS, "float32") | dict.fromkeys(_OUTCOME_FLAGS, "bool")
+    columns = {c.name: replace(c, dtype=kinds.get(c.name, c.dtype)) for c in recorded}
     derived = [next_state_of(columns[names.STATE]), *DERIVED_FLAGS]
     derived += [Column(RECORDED_TASK, "int64", meaning="the recording's task_index")] if has_tasks else []
     return [*columns.values(), *(column for column in derived if column.name not in columns)]
@@ -174,12 +150,6 @@ def our_columns(recorded: Iterable[Column], *, has_tasks: bool) -> list[Column]:
 def next_state_of(state: Column) -> Column:
     """Return the column of next states, which are those of the following rows."""
     return replace(state, name=names.NEXT_STATE, meaning=f"{state.meaning or 'the state'}, one step later")
-
-
-def _typed(column: Column) -> Column:
-    if column.name in (*FLOATS, *_OUTCOME_FLAGS):
-        return replace(column, dtype="float32" if column.name in FLOATS else "bool")
-    return column
 
 
 def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:

@@ -63,7 +63,7 @@ def test_a_subset_of_a_subset_is_the_subset(forty: Dataset, tmp_path: Path) -> N
     assert uids(tmp_path / "a") != uids(subset(forty, episodes=7, out=tmp_path / "c"))
 
 
-@pytest.mark.parametrize("count", [1, 5, 14, 30])
+@pytest.mark.parametrize("count", [1, 30])
 def test_a_stratified_subset_keeps_shares_and_nesting(tmp_path: Path, count: int) -> None:
     with writer(tmp_path / "set") as open_writer:
         for uid in (*range(0, 52, 2), *range(1, 19, 2)):

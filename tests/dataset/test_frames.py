@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 from astra_data.core.errors import BadInputError, CorruptDatasetError, DiskError
 from astra_data.dataset import Dataset
 from astra_data.dataset.columns import INDEX, STATE
-from astra_data.dataset.frames import Frames, Order, Padding
+from astra_data.dataset.frames import Frames, Order
 
 
 def test_columns_are_the_datasets(fake: Dataset) -> None:
@@ -79,12 +79,11 @@ def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
         Frames.load(fake, ["speed"])
 
 
-@pytest.mark.parametrize(("workers", "padding"), [(0, "valid"), (0, "edge"), (2, "edge")])
-def test_a_data_loader_draws_the_same_batches(frames: Frames, workers: int, padding: Padding) -> None:
-    windows = frames.windows(6, padding=padding)
+def test_a_data_loader_draws_the_same_batches(frames: Frames) -> None:
+    windows = frames.windows(6, padding="edge")
     expected = list(windows.batches(8, seed=3))
     order = windows.batches(8, seed=3).order
-    loader = DataLoader(windows, batch_sampler=order, collate_fn=windows.collate, num_workers=workers)  # type: ignore[arg-type]
+    loader = DataLoader(windows, batch_sampler=order, collate_fn=windows.collate)  # type: ignore[arg-type]
     found = list(loader)
     assert len(found) == len(expected) == len(loader)
     for ours, theirs in zip(expected, found, strict=True):
@@ -131,24 +130,6 @@ def test_without_shuffling_the_order_is_the_samples() -> None:
     dropped = Order(10, 4, shuffle=False, drop_last=True)
     assert [batch.tolist() for batch in dropped] == [[0, 1, 2, 3], [4, 5, 6, 7]]
     assert (len(order), len(dropped)) == (3, 2)
-
-
-@pytest.mark.parametrize("seen", [1, 4, 6])
-def test_a_state_names_the_next_batch(seen: int) -> None:
-    reference = Order(20, 5, seed=4)
-    expected = [batch.tolist() for _ in range(3) for batch in reference]
-    order = Order(20, 5, seed=4)
-    found: list[list[int]] = []
-    while len(found) < seen:
-        for batch in order:
-            found.append(batch.tolist())
-            if len(found) == seen:
-                break
-    resumed = Order(20, 5, seed=4)
-    resumed.load_state_dict(order.state_dict())
-    while len(found) < len(expected):
-        found += [batch.tolist() for batch in resumed]
-    assert found == expected
 
 
 def test_a_state_of_another_order_is_refused() -> None:
@@ -216,7 +197,7 @@ def test_another_value_in_a_raw_file_is_told(fake: Dataset, tmp_path: Path) -> N
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(content)
-    with pytest.raises(CorruptDatasetError, match=f"{STATE} was altered .other values.; delete"):
+    with pytest.raises(CorruptDatasetError, match=f"was altered .{STATE}: other values .*; delete"):
         Frames.load(fake, NAMES, memory_share=0.0, cache=tmp_path)
 
 

@@ -115,11 +115,6 @@ def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
         fake.columns("action")
 
 
-def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="found no dataset"):
-        Dataset.open(tmp_path / "typo")
-
-
 def test_a_run_names_its_datasets(tmp_path: Path) -> None:
     def told() -> set[str]:
         reads = Dataset.open, check, lambda run: repair(run, out=tmp_path / "saved")
@@ -154,11 +149,9 @@ def test_verify_finds_altered_values(tmp_path: Path) -> None:
     changed = table.column("frame_index").to_numpy().copy()
     changed[9] = 7
     pq.write_table(table.set_column(frame, table.schema.field(frame), [changed]), path)
-    faults = Dataset.open(dataset.root).verify()
-    [altered, content_hash] = faults
+    [altered] = Dataset.open(dataset.root).verify()
     where = "data/chunk-000/file-000.parquet rows 8 to 19 (episode 2)"
     assert altered == f"frame_index: other values than were written in {where}"
-    assert content_hash.endswith(f", expected {dataset.content_hash}")
 
 
 def test_the_content_hash_sees_values_only(tmp_path: Path) -> None:

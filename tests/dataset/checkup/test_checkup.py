@@ -10,7 +10,6 @@ from toy_logs import Columns, toy_columns, write_logs
 from astra_data.core.arrays import Floats
 from astra_data.dataset.checkup.checkup import (
     Checkup,
-    DeadChannels,
     Duplicates,
     EpisodeEnds,
     GivenCommands,
@@ -21,7 +20,6 @@ from astra_data.dataset.checkup.checkup import (
     longest_rests,
 )
 from astra_data.dataset.checkup.findings import (
-    Angles,
     Continuity,
     Finding,
     channels,
@@ -151,28 +149,6 @@ def test_five_episodes_are_named_and_the_others_counted() -> None:
     pose = Column("pose", size=2, names=("x", "y"))
     assert (labels(pose), channels(pose, [1])) == (["x", "y"], "y of pose")
     assert (labels(Column("charge")), channels(Column("charge"), [0])) == (["charge"], "charge")
-
-
-ANGLES = Column(
-    STATE, size=4, names=("x", "heading", "rate", "arm"), astra={"unit": ["m", "rad", "rad/s", "rad"]}
-)
-
-
-@pytest.mark.parametrize(
-    ("largest", "what"),
-    [
-        ((500.0, 179.9, 500.0, 3.0), "heading of observation.state: up to 179.9 rad"),
-        ((0.0, 179.9, 0.0, 90.0), "heading, arm of observation.state: up to 179.9 rad"),
-        ((500.0, 12.5, 500.0, 3.0), None),
-    ],
-)
-def test_an_angle_of_many_turns_is_taken_for_degrees(largest: tuple[float, ...], what: str | None) -> None:
-    angles = Angles(ANGLES)
-    for uid, share in enumerate((0.5, -1.0, 0.25)):
-        angles.add(Episode(uid, {STATE: np.outer([0.0, share], largest).astype(np.float32)}))
-    assert [finding.what.rpartition(", which")[0] for finding in angles.findings()] == (
-        [what] if what else []
-    )
 
 
 def test_angles_are_known_by_their_names() -> None:
@@ -348,71 +324,12 @@ def test_steps_at_either_edge_of_the_range_of_all_episodes_are_counted() -> None
         np.testing.assert_allclose(given(*order).edge_shares, [9 / 30])
 
 
-@pytest.mark.parametrize(("at_edge", "found"), [(20, False), (21, True)])
-def test_a_command_is_saturated_above_a_fifth_of_steps(at_edge: int, found: bool) -> None:
-    inside = np.linspace(-0.9, 0.9, 100 - at_edge)
-    edge = np.where(np.arange(at_edge) % 2, 1.0, -1.0)
-    (action,) = [np.concatenate([inside, edge])]
-    both = np.column_stack([action, np.linspace(-1, 1, 100)])
-    findings = given(both, size=2).findings()
-    assert len(findings) == found
-    if found:
-        assert "up to 21 % of steps, v of action" in findings[0].what
-
-
 @pytest.mark.parametrize(("values", "found"), [(8, False), (9, True)])
 def test_a_choice_of_a_few_commands_has_no_edge(values: int, found: bool) -> None:
     action = np.tile(np.arange(values), 10)
     assert bool(given(action[:40], action[40:]).findings()) == found
 
 
-DEAD_COLUMNS = [Column(STATE, size=3, names=("x", "y", "z")), Column(ACTION), Column("next.reward")]
-
-
-def moving(seed: int, steps: int = 41) -> Array:
-    return np.random.default_rng(seed).normal(size=(steps, 3)).astype(np.float32)
-
-
-def findings(states: list[Array], actions: list[Array] | None = None) -> list[Finding]:
-    dead = DeadChannels(DEAD_COLUMNS)
-    for uid, state in enumerate(states):
-        action = moving(uid, len(state))[:, 0] if actions is None else actions[uid]
-        dead.add(
-            Episode(uid, {STATE: state, ACTION: action, "next.reward": np.zeros(len(state), np.float32)})
-        )
-    return dead.findings("walks")
-
-
-def held(state: Array, first: int, last: int, index: int = 1) -> Array:
-    """Let steps first to last change nothing."""
-    out = state.copy()
-    out[first : last + 1, index] = out[first, index]
-    return out
-
-
 def test_the_longest_rest_is_counted_in_each_column() -> None:
     changes = np.array([[1, 0, 0], [0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 0, 1]], bool)
     assert longest_rests(changes).tolist() == [2, 5, 2]
-
-
-def test_a_value_is_constant_only_if_it_is_in_all_episodes() -> None:
-    states = [held(moving(uid), 0, 40) for uid in range(3)]
-    for state in states:
-        state[:, 1] = 2.0
-    (found,) = findings(states)
-    assert found.what == "constant in all steps: y of observation.state"
-    states[2][:, 1] = 2.5  # constant in each episode, but another value
-    assert not findings(states)
-
-
-def test_a_command_that_was_never_given_is_told() -> None:
-    states = [moving(uid) for uid in range(3)]
-    (found,) = findings(states, [np.full(41, 0.5, np.float32)] * 3)
-    assert (found.severity, found.what) == ("note", "constant in all steps: action")
-
-
-@pytest.mark.parametrize(("last", "found"), [(20, False), (21, True)])
-def test_a_value_is_stuck_above_half_of_an_episode(last: int, found: bool) -> None:
-    states = [moving(uid) for uid in range(5)]
-    states[3] = held(states[3], 0, last)
-    assert [finding.episodes for finding in findings(states)] == [(3,)] * found

@@ -60,12 +60,6 @@ def test_a_rate_that_is_off_by_over_a_twentieth_is_wrong(period_s: float, found:
     assert ["is declared" in finding.what for finding in timed.findings("walks")] == [True] * found
 
 
-def test_gaps_do_not_move_the_rate() -> None:
-    timed = clock([*REGULAR, 5.0])
-    assert timed.period_s == pytest.approx(0.1)
-    assert timed.jitter == pytest.approx(0.0, abs=1e-9)
-
-
 @pytest.mark.parametrize(("step_s", "found"), [(0.149, False), (0.152, True)])
 def test_a_step_of_over_one_and_a_half_periods_is_a_gap(step_s: float, found: bool) -> None:
     timed = clock(REGULAR, [*REGULAR, step_s], REGULAR)
@@ -81,15 +75,6 @@ def test_gaps_are_counted_where_the_declared_rate_is_wrong_too() -> None:
     assert "at 10 Hz, but 100 Hz is declared" in wrong.what
     assert "the longest 0.4 s" in gaps.what
     assert "gap_s = 0.15" in gaps.advice
-
-
-@pytest.mark.parametrize(("off_s", "found"), [(0.019, False), (0.022, True)])
-def test_steps_that_are_off_by_a_fifth_of_a_period_are_jitter(off_s: float, found: bool) -> None:
-    # Every tenth step is late and the next early: a fifth of all steps.
-    steps = np.tile([0.1 + off_s, 0.1 - off_s, *[0.1] * 8], 20)
-    timed = clock(steps)
-    assert timed.jitter == pytest.approx(10 * off_s, abs=0.01)
-    assert ["resample" in finding.advice for finding in timed.findings("walks")] == [True] * found
 
 
 @pytest.mark.parametrize(("step_s", "found"), [(0.01, False), (0.0, True), (-0.3, True)])
@@ -109,12 +94,6 @@ def test_a_step_of_next_to_no_time_is_another_unit() -> None:
     fast = Clock.of(Column("time", astra={"unit": ["ms"]}), 20)
     fast.add(Episode(0, {"time": np.arange(50, dtype=np.float32) * np.float32(0.1)}))
     assert "at 1e+04 Hz" in fast.findings("walks")[0].what
-
-
-def test_the_keys_that_split_at_gaps_are_those_of_files_and_of_topics() -> None:
-    (finding,) = clock([*REGULAR * 3, 0.3]).findings("walks")
-    assert "`gap_s = 0.15` in [split]" in finding.advice
-    assert '`gap_s = 0.075` in [columns."time"]' in finding.advice
 
 
 def test_time_that_never_goes_on_has_no_rate() -> None:

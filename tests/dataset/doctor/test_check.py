@@ -218,11 +218,6 @@ def test_what_is_no_number_is_no_column_of_a_plain_dataset(tmp_path: Path) -> No
     assert "not checked, because they are not numeric: action, next.reward" in report.notes
 
 
-def test_no_dataset_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="found no dataset"):
-        check(tmp_path)
-
-
 def test_only_the_first_findings_of_a_kind_are_shown_and_all_are_counted() -> None:
     report = Report()
     for number in range(MOST + 3):
