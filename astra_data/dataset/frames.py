@@ -31,12 +31,8 @@ class Order:
     """Indices of `count` samples, batch by batch, reshuffled each epoch.
 
     An epoch's order depends on (seed, epoch) alone. Iterating yields the batches (B,) that are left of the
-    current epoch; the next iteration continues from there. An `Order` also serves a `DataLoader` as
-    batch_sampler; its workers draw a few batches ahead.
-
-    Attributes:
-        epoch: the epoch of the next batch.
-        batch: its number in that epoch.
+    current epoch; the next iteration continues from there, with `batch` of `epoch`. An `Order` also serves a
+    `DataLoader` as batch_sampler; its workers draw a few batches ahead.
     """
 
     def __init__(
@@ -76,11 +72,7 @@ class Order:
         return {**self._settings, "epoch": self.epoch, "batch": self.batch}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state`.
-
-        Raises:
-            BadInputError: it belongs to another order, or names a batch that does not exist.
-        """
+        """Continue from `state`, unless it belongs to another order or names a batch that does not exist."""
         epoch, batch = state.get("epoch"), state.get("batch")
         settings = {key: state.get(key) for key in self._settings}
         is_batch = type(epoch) is int and epoch >= 0 and type(batch) is int and 0 <= batch < len(self)
@@ -234,15 +226,9 @@ class Frames:
     def windows(self, length: int, *, stride: int = 1, padding: Padding = "valid", past: int = 0) -> Samples:
         """Return windows of L consecutive steps of one episode, with "is_pad" (L,), true outside of it.
 
-        Args:
-            length: L.
-            stride: steps from one window to the next.
-            padding: "valid" for windows inside their episode; "edge" for a window at every step t (of a
-                stride), padded with the first or the last step, as in lerobot's `delta_timestamps`.
-            past: with "edge", how many steps before t the window begins.
-
-        Raises:
-            BadInputError: an argument is out of range, or no episode is long enough; lists every fault.
+        Padding "valid" gives windows inside their episode; "edge" one at every step t (of a `stride`), which
+        begins `past` steps before t and is padded with the first or the last step, as in lerobot's
+        `delta_timestamps`. A BadInputError lists every argument that is out of range.
         """
         longest = int(self.lengths.max())
         is_valid, is_edge = padding == "valid", padding == "edge"

@@ -68,13 +68,10 @@ def read_blocks(
     wanted: NDArray[np.bool_] | None = None,
     most_rows: int | None = None,
 ) -> Iterator[pa.Table]:
-    """Yield columns of all files in order, in blocks of whole row groups; memory stays bounded.
+    """Yield the columns `names`, by default all, of all files in order; memory stays bounded.
 
-    Args:
-        paths: the files.
-        names: the columns, by default all.
-        wanted: mask over all rows of all files, by default all; row groups without a wanted row are skipped.
-        most_rows: rows of a block, rounded up to whole row groups; by default `BLOCK_ROWS`.
+    A block has `most_rows`, by default `BLOCK_ROWS`, rounded up to whole row groups. `wanted` is a mask over
+    all rows of all files; row groups without a wanted row are skipped.
     """
     end, enough = 0, most_rows or BLOCK_ROWS
     for path in paths:
@@ -121,12 +118,7 @@ def read_arrays(
 
 
 class RotatingWriter:
-    """Writes tables as row groups, and starts the next file once one has reached `FILE_SIZE_LIMIT`.
-
-    Attributes:
-        chunk_index: chunk of the current file.
-        file_index: its number within the chunk.
-    """
+    """Writes tables as row groups, and starts the next file once one has reached `FILE_SIZE_LIMIT`."""
 
     def __init__(
         self,

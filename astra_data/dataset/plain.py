@@ -73,13 +73,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """Consecutive rows of one file: one episode, unless the dataset is damaged.
-
-    Attributes:
-        path: the file.
-        row: the first of them there.
-        columns: name to (T,) or (T, size).
-    """
+    """Consecutive rows of a file, from its `row` on: one episode, unless the dataset is damaged."""
 
     path: Path
     row: int

@@ -99,14 +99,12 @@ class Dataset(Contents):
     def columns(self, names: Sequence[str], episodes: Collection[int] | None = None) -> dict[str, Array]:
         """Return whole columns by name, contiguous (n, size), or (n,) where there is one value per step.
 
-        Args:
-            names: names of the columns.
-            episodes: indices of the episodes whose n steps are read, by default all; they come in the
-                dataset's order.
+        The n steps are those of `episodes`, by default of all, given as indices; they come in the dataset's
+        order.
 
         Raises:
             BadInputError: a column or an episode does not exist, or an episode is listed twice.
-            CorruptDatasetError: a file cannot be read.
+            CorruptDatasetError: a file cannot be read, or values differ from their digests.
         """
         chosen = self.selected(episodes)
         rows = int(self.lengths[chosen].sum())
@@ -147,13 +145,7 @@ class Dataset(Contents):
     ) -> Iterator[Episode]:
         """Yield episodes in order with the columns `names`, by default `schema`; memory stays bounded.
 
-        Args:
-            names: names of the columns.
-            episodes: indices of the episodes, by default all.
-
-        Raises:
-            BadInputError: a column or an episode does not exist, or an episode is listed twice.
-            CorruptDatasetError: a file cannot be read, or values differ from their digests.
+        `episodes` and errors are those of `columns`.
         """
         specs = self.schema if names is None else self.specs(names)
         for block, indices in self._verified(specs, self.selected(episodes)):
@@ -176,11 +168,7 @@ class Dataset(Contents):
         return None if set(known) == {None} else known
 
     def subset(self, count: int) -> list[int]:
-        """Return `count` episode indices; smaller subsets are prefixes of larger ones.
-
-        Raises:
-            BadInputError: there are not that many episodes.
-        """
+        """Return `count` episode indices; smaller subsets are prefixes of larger ones."""
         if not 1 <= count <= len(self):
             raise BadInputError(f"{self.reference}: a subset of {count} episodes, expected 1 to {len(self)}.")
         return self.order[:count]
@@ -273,14 +261,12 @@ def refuse_others(root: Path) -> None:
     if not (root / "meta").is_dir():
         refuse_run(root)
         if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
-            raise BadInputError(
-                f"{root} contains logs ({logs[0]} and so on): make them a dataset with `astra-data import` "
-                "and a mapping, which `astra-data new` writes"
+            advice = (
+                "make them a dataset with `astra-data import` and a mapping, which `astra-data new` writes"
             )
-        raise BadInputError(
-            f"{root}: found no dataset; check the path (`astra-data list` shows where names are) "
-            "or run the stage that writes it."
-        )
+            raise BadInputError(f"{root} contains logs ({logs[0]} and so on): {advice}")
+        advice = "check the path (`astra-data list` shows where names are) or run the stage that writes it."
+        raise BadInputError(f"{root}: found no dataset; {advice}")
 
 
 def format_fault(root: Path) -> str | None:

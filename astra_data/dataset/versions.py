@@ -101,11 +101,7 @@ def versions_at_home(name: str) -> list[Version]:
 
 
 def locate(dataset: str | Path) -> Path:
-    """Return the folder of `dataset`: a folder, `name@data-1.2.0`, or `name` for its highest version at home.
-
-    Raises:
-        BadInputError: there is no such folder and no such name at home.
-    """
+    """Return the folder of `dataset`: one, `name@data-1.2.0`, or `name` for its highest version at home."""
     reference, folder = _REFERENCE.fullmatch(str(dataset)), Path(dataset)
     with suppress(OSError):  # its name may be too long for a file
         # A folder without a dataset or versions of one, such as that of `new`, does not hide a name.
@@ -132,12 +128,7 @@ def locate(dataset: str | Path) -> Path:
 
 
 def open_dataset(dataset: str | Path) -> Dataset:
-    """Open `dataset`, named as `locate` takes it.
-
-    Raises:
-        BadInputError: there is none.
-        CorruptDatasetError: it is incomplete or was altered.
-    """
+    """Open `dataset`, named as `locate` takes it; it raises as `Dataset.open` does."""
     return Dataset.open(locate(dataset))
 
 
@@ -152,7 +143,7 @@ def successor(
     parents: Iterable[Mapping[str, str]] = (),
     **more: Any,  # noqa: ANN401 - JSON
 ) -> tuple[dict[str, Any], Path]:
-    """Describe the version that follows `source`, and return its folder: `out`, or by default one at home.
+    """Return the description of the version that follows `source`, for `DatasetWriter`, and its folder.
 
     Args:
         source: the description of its first parent; name, seeds, environment and simulator are carried over.
@@ -160,12 +151,9 @@ def successor(
         stage: the stage that writes it.
         config: the stage's settings.
         name: of a new dataset, which begins with version 1.0.0; by default that of `source`.
-        out: its folder; the version then does not depend on those at home.
+        out: its folder, by default one at home; the version then does not depend on those at home.
         parents: the identities of further parents.
         more: keys of the description that differ from those of `source`.
-
-    Returns:
-        the description that `DatasetWriter` takes, and the folder.
     """
     kept = {key: source[key] for key in ("name", "seeds", "environment", "simulator")}
     taken = versions_at_home(name or source["name"]) if out is None else []
@@ -193,14 +181,8 @@ def next_version(
 ) -> DatasetWriter:
     """Prepare to write the version that follows `source`; its folder is the writer's `root`.
 
-    Args:
-        source: its first parent; columns, fps, task and description are carried over.
-        change: see `successor`.
-        more: columns besides those of `source`.
-        subset_seed: of the permutation of the subsets, by default that of `source`.
-        others: further parents.
-        task: of its episodes, by default that of `source`.
-        described: `stage`, `config`, `name`, `out` and keys of the description, as `successor` takes them.
+    Columns, of which there may be `more`, fps, task, the seed of the subsets and the description are carried
+    over. `others` are further parents; `described` is what `successor` takes: `stage`, `config`, `name`, ...
     """
     parents = [other.identity for other in others]
     description, folder = successor(source.description, change, parents=parents, **described)

@@ -49,12 +49,7 @@ OFFSETS = np.array([-2, -1, 0, 1])
 
 @dataclass
 class Report:
-    """The findings in a dataset.
-
-    Attributes:
-        episodes: number of episodes in the data.
-        frames: number of steps.
-    """
+    """The findings in a dataset, and its numbers of episodes and steps."""
 
     episodes: int = 0
     frames: int = 0

@@ -44,13 +44,7 @@ _IF_ALTERED = {
 
 @dataclass
 class Repaired:
-    """The result of `repair`.
-
-    Attributes:
-        episodes: number of episodes saved.
-        frames: number of steps saved.
-        notes: losses and changes, a sentence each.
-    """
+    """What `repair` saved, and losses and changes, a sentence each."""
 
     episodes: int = 0
     frames: int = 0
