@@ -7,8 +7,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from astra_data.dataset.description import sealed
 from astra_data.dataset.format import DATASET_PATH
-from astra_data.dataset.integrity import sealed
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"

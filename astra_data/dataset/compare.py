@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.core.naming import RECORD, printable, shortened
 from astra_data.dataset.columns import Column
-from astra_data.dataset.description import changed_values, full_name, identity_of, read_description
+from astra_data.dataset.description import changed_values, digest_of, full_name, identity_of, read_description
 from astra_data.dataset.format import DATASET_PATH
-from astra_data.dataset.integrity import digest_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import home_of
 

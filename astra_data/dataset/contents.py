@@ -15,8 +15,7 @@ from astra_data.core.arrays import Ints
 from astra_data.core.errors import BadInputError, CorruptDatasetError, in_short
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array, Column, Scalar
-from astra_data.dataset.description import read_description
-from astra_data.dataset.integrity import altered_files
+from astra_data.dataset.description import altered_files, read_description
 from astra_data.dataset.lerobot_rows import RecordedFiles
 from astra_data.dataset.parquet import read_arrays, read_blocks, rows_of, to_numpy
 from astra_data.dataset.plain import (

@@ -18,8 +18,7 @@ from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.columns import Column, Scalar
 from astra_data.dataset.contents import Contents
-from astra_data.dataset.description import ContentHash, complete_description, permutation
-from astra_data.dataset.integrity import Digests, digest_of
+from astra_data.dataset.description import ContentHash, Digests, complete_description, digest_of, permutation
 from astra_data.dataset.lerobot_rows import (
     ENDS,
     RecordedFiles,

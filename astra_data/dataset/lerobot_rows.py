@@ -12,8 +12,8 @@ from astra_data.core.arrays import Ints
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import Array, Column
+from astra_data.dataset.description import Digests
 from astra_data.dataset.format import DEFAULT_COLUMNS, INFO_PATH, reserved_values
-from astra_data.dataset.integrity import Digests
 from astra_data.dataset.plain import MOST_FPS, PlainColumn, Run, plain_columns
 
 RECORDED_TASK = "recorded.task_index"

@@ -17,9 +17,15 @@ from astra_data.core.naming import RECORD, first_few
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents, read_values
-from astra_data.dataset.description import full_name, identity_of
+from astra_data.dataset.description import (
+    Digests,
+    alteration,
+    altered_columns,
+    full_name,
+    identity_of,
+    read_digests,
+)
 from astra_data.dataset.format import CODEBASE_VERSION, INFO_PATH, OUR_FOLDER, STATS_PATH
-from astra_data.dataset.integrity import Digests, alteration, altered_columns, read_digests
 from astra_data.dataset.lerobot_recording import open_recording
 from astra_data.dataset.lerobot_rows import declared_columns
 from astra_data.dataset.plain import data_files, is_format_2, read_object

@@ -30,8 +30,7 @@ from astra_data.core.durable import (
 from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, DiskError, in_short
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Episode, Scalar
-from astra_data.dataset.description import changed_values
-from astra_data.dataset.integrity import digest_of
+from astra_data.dataset.description import changed_values, digest_of
 from astra_data.dataset.parquet import to_arrow, to_numpy
 from astra_data.dataset.plain import read_object
 from astra_data.dataset.reader import Dataset

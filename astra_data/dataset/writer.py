@@ -18,9 +18,15 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Column, Episode, Scalar
-from astra_data.dataset.description import ContentHash, complete_description, permutation
+from astra_data.dataset.description import (
+    ContentHash,
+    complete_description,
+    digest_of,
+    permutation,
+    sealed,
+    write_digests,
+)
 from astra_data.dataset.format import METADATA_KEYS
-from astra_data.dataset.integrity import digest_of, sealed, write_digests
 from astra_data.dataset.parquet import RotatingWriter, to_arrow
 from astra_data.dataset.plain import data_files, flag_faults, open_end_faults
 from astra_data.dataset.reader import Dataset

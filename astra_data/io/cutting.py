@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
-from astra_data.dataset.checkup.clock import Clock
-from astra_data.dataset.checkup.findings import full_turns, shortest
+from astra_data.dataset.checkup.findings import Clock, full_turns, shortest
 from astra_data.dataset.columns import (
     DONE,
     NEXT_STATE,

@@ -3,19 +3,27 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-from damaged import edit, reseal
-from fake_dataset import write_fake
+import xxhash
+from damaged import DATA, EPISODES, alter, edit, reseal
+from fake_dataset import concatenated, fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.dataset import Dataset, parquet
+from astra_data.dataset.columns import ACTION, REWARD, STATE
 from astra_data.dataset.description import (
+    SEALED,
     ContentHash,
+    altered_files,
     changed_values,
     complete_description,
     permutation,
     read_description,
+    read_digests,
 )
-from astra_data.dataset.format import DATA_PATH, DATASET_PATH
+from astra_data.dataset.format import DATA_PATH, DATASET_PATH, DIGESTS_PATH
 from astra_data.dataset.plain import is_data_path
 
 PARENT = {"name": "raw", "version": "1.0.0", "hash": "0"}
@@ -110,3 +118,95 @@ def test_every_fault_of_a_forged_description_is_told_at_once(tmp_path: Path) -> 
         read_description(root)
     for fault in ("name 'a/b', expected", "parent {'name': 'x'}, expected", "config 3, expected an object"):
         assert fault in str(caught.value)
+
+
+def test_the_file_holds_a_digest_of_each_episode_and_column(fake: Dataset) -> None:
+    table = pq.read_table(fake.root / DIGESTS_PATH)
+    assert set(table.column_names) == set(fake.features)
+    for name in (STATE, ACTION, REWARD, "next.done", "mode"):
+        expected = [
+            xxhash.xxh3_64(episode.columns[name].tobytes()).intdigest() for episode in fake_episodes()
+        ]
+        assert table.column(name).to_pylist() == expected
+
+
+@pytest.mark.parametrize("block_rows", [1, 2**16])
+@pytest.mark.parametrize("rows", [3, 10, 1000])
+def test_an_altered_value_is_refused_before_it_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_rows: int, rows: int
+) -> None:
+    monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
+    root = write_fake(tmp_path / "set").root
+    alter(DATA, REWARD, 25, 9.0)(root)
+    pq.write_table(pq.read_table(root / DATA), root / DATA, row_group_size=rows)
+    dataset = Dataset.open(root)
+    seen = []
+    with pytest.raises(CorruptDatasetError) as caught:
+        seen += list(dataset.episodes([ACTION, REWARD]))
+    assert len(seen) <= 3
+    assert str(caught.value) == (
+        f"{root} is incomplete or was altered: next.reward: other values than were written in {DATA} rows "
+        "20 to 49 (episode 3). Restore it from a copy, run the stage that wrote it again, or recover its "
+        f"intact episodes: `astra-data repair {root} --out FOLDER`."
+    )
+    with pytest.raises(CorruptDatasetError, match=r"next\.reward"):
+        dataset.columns([REWARD])
+    # What was not altered is read as ever.
+    np.testing.assert_array_equal(dataset.columns([ACTION])[ACTION], concatenated(ACTION))
+    others = [episode.columns[REWARD] for episode in dataset.episodes([REWARD], [0, 1, 2, 4])]
+    for found, expected in zip(others, [*fake_episodes()[:3], fake_episodes()[4]], strict=True):
+        np.testing.assert_array_equal(found, expected.columns[REWARD])
+
+
+def test_a_file_that_shrinks_while_it_is_open_is_refused(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    table = pq.read_table(dataset.root / DATA)
+    for rows in (table.slice(0, 50), pa.concat_tables([table, table.slice(0, 1)])):
+        pq.write_table(rows, dataset.root / DATA)
+        with pytest.raises(CorruptDatasetError, match="other rows than when the dataset was opened"):
+            dataset.columns([REWARD])
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        pa.table({REWARD: pa.array([1] * 5, pa.uint64())}),
+        pa.table({REWARD: pa.array([1.0] * 5), ACTION: pa.array([1] * 5, pa.uint64())}),
+        pa.table({name: pa.array([1, 2, 3, 4, None], pa.uint64()) for name in (REWARD, ACTION)}),
+    ],
+)
+def test_digests_that_do_not_fit_are_refused(tmp_path: Path, table: pa.Table) -> None:
+    (tmp_path / DIGESTS_PATH).parent.mkdir(parents=True)
+    pq.write_table(table, tmp_path / DIGESTS_PATH)
+    with pytest.raises(CorruptDatasetError, match="has other columns than the data"):
+        read_digests(tmp_path, [REWARD, ACTION])
+
+
+def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    sums = dict(dataset.description["sums"])
+    sums.pop(DATASET_PATH)
+    assert sums == {
+        path: hashlib.sha256((dataset.root / path).read_bytes()).hexdigest() for path in (*SEALED, EPISODES)
+    }
+    assert altered_files(dataset.root, dataset.description) == []
+
+
+@pytest.mark.parametrize("path", [*SEALED, EPISODES])
+def test_every_sealed_file_is_known_when_altered_or_missing(path: str, tmp_path: Path) -> None:
+    dataset = write_fake(tmp_path / "set")
+    with (dataset.root / path).open("ab") as file:
+        file.write(b" ")
+    assert altered_files(dataset.root, dataset.description) == [path]
+    (dataset.root / path).unlink()
+    assert altered_files(dataset.root, dataset.description) == [path]
+
+
+@pytest.mark.parametrize("change", [{"seeds": {}}, {"content_hash": "0" * 64}, {"more": 1}])
+def test_the_description_seals_itself(change: dict[str, object], tmp_path: Path) -> None:
+    root = write_fake(tmp_path / "set").root
+    edit(DATASET_PATH, **change)(root)
+    with pytest.raises(CorruptDatasetError, match=r"^meta/astra/dataset\.json was altered$"):
+        read_description(root)
+    with pytest.raises(CorruptDatasetError, match=r"dataset\.json was altered.*Restore it from a copy"):
+        Dataset.open(root)

@@ -9,11 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats, as_rows
-from astra_data.dataset.checkup.clock import Clock, is_clock
-from astra_data.dataset.checkup.findings import SHOWN, Angles, Continuity, Finding, channels, deletion, labels
+from astra_data.dataset.checkup.findings import (
+    SHOWN,
+    Angles,
+    Clock,
+    Continuity,
+    Finding,
+    channels,
+    deletion,
+    is_clock,
+    labels,
+)
 from astra_data.dataset.columns import ACTION, NEXT_STATE, REWARD, STATE, TERMINATED, Array, Column, Episode
+from astra_data.dataset.description import digest_of
 from astra_data.dataset.inspection import is_terminated
-from astra_data.dataset.integrity import digest_of
 from astra_data.dataset.reader import Dataset
 
 LOOKED_AT = (STATE, ACTION, NEXT_STATE, REWARD, TERMINATED)

@@ -21,13 +21,13 @@ from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain
 from astra_data.dataset.columns import Array
-from astra_data.dataset.description import read_description
-from astra_data.dataset.integrity import (
+from astra_data.dataset.description import (
     SEALED,
     Digests,
     alteration,
     altered_columns,
     altered_files,
+    read_description,
     read_digests,
 )
 from astra_data.dataset.parquet import read_blocks

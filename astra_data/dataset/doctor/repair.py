@@ -13,9 +13,8 @@ from astra_data.core.errors import BadInputError, CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array, Column, Episode, Scalar, new_uid, renamed_metadata
-from astra_data.dataset.description import read_description
+from astra_data.dataset.description import Digests, altered_files, read_description, read_digests
 from astra_data.dataset.doctor.salvage import whole_runs
-from astra_data.dataset.integrity import Digests, altered_files, read_digests
 from astra_data.dataset.lerobot_recording import Found, found_in, left_out
 from astra_data.dataset.lerobot_rows import (
     DTYPES,

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
 from astra_data.dataset import plain
+from astra_data.dataset.description import Digests, alteration, altered_columns
 from astra_data.dataset.format import INFO_PATH
-from astra_data.dataset.integrity import Digests, alteration, altered_columns
 from astra_data.dataset.parquet import UNREADABLE
 
 _DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3

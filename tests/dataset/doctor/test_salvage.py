@@ -10,8 +10,8 @@ from fake_dataset import fake_episodes, write_fake
 
 from astra_data.dataset import parquet
 from astra_data.dataset.columns import STATE
+from astra_data.dataset.description import Digests, read_digests
 from astra_data.dataset.doctor.salvage import rebuilt_metadata, whole_runs
-from astra_data.dataset.integrity import Digests, read_digests
 from astra_data.dataset.plain import plain_columns, read_object
 
 UIDS = [episode.uid for episode in fake_episodes()]

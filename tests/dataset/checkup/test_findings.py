@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from astra_data.dataset.checkup.clock import Clock, is_clock
+from astra_data.dataset.checkup.findings import Clock, is_clock
 from astra_data.dataset.columns import Column, Episode
 
 SECONDS = Column("time", astra={"unit": ["s"]})
