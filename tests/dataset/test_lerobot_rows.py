@@ -96,7 +96,6 @@ def test_a_terminated_row_that_is_left_out_hands_its_reward_to_the_step_before()
     assert values(names.REWARD, more=sparse).tolist() == [0, 0, 5]
     rows, run = rows_and_run(dict(sparse))
     assert rows.lost_reward(run) == 0.0
-    assert names.TERMINATED in [column.name for column in rows.stored_for([names.REWARD])]
     cut_off = sparse | {names.TERMINATED: ~last & last}
     assert values(names.REWARD, more=cut_off).tolist() == [0, 0, 0]
     rows, run = rows_and_run(cut_off)
