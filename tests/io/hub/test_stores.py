@@ -87,7 +87,7 @@ def test_a_version_there_never_changes(any_place: str, fake: Dataset, tmp_path: 
         push(fake.root, any_place)
     assert filesystem.cat_file(path) == b"altered"
     filesystem.rm_file(path)
-    filesystem.rm_file(path.reany_place("SHA256SUMS", "meta/info.json"))
+    filesystem.rm_file(path.replace("SHA256SUMS", "meta/info.json"))
     with pytest.raises(SharingError, match=r"data-1\.0\.0 has no SHA256SUMS"):
         push(changed(tmp_path / "changed").root, any_place)
 
