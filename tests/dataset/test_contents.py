@@ -1,18 +1,16 @@
-import itertools
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from damaged import DATA, edit, reseal, truncate
-from fake_dataset import LENGTHS, concatenated, fake_episodes, write_fake
+from damaged import edit, reseal, truncate
+from fake_dataset import LENGTHS, concatenated, write_fake
 
 from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import Dataset, parquet
 from astra_data.dataset.columns import STATE
-from astra_data.dataset.contents import read_contents, read_values
+from astra_data.dataset.contents import read_values
 from astra_data.dataset.format import DATASET_PATH
 from astra_data.dataset.reader import can_be_repaired
 
@@ -59,21 +57,6 @@ def test_damage_is_told_in_one_line(
     assert "\n" not in message
     for part in parts:
         assert part in message
-
-
-def test_contents_are_what_was_written(fake: Dataset) -> None:
-    contents = read_contents(fake.root)
-    episodes = fake_episodes()
-    assert contents.uids.tolist() == [episode.uid for episode in episodes]
-    assert contents.lengths.tolist() == list(LENGTHS)
-    assert contents.starts.tolist() == [0, *itertools.accumulate(LENGTHS[:-1])]
-    assert contents.metadata["return"] == [episode.metadata["return"] for episode in episodes]
-    assert contents.metadata["source_episode"] == [e.metadata.get("source_episode") for e in episodes]
-    assert not {"episode_uid", "length"} & contents.metadata.keys()
-    assert contents.paths == [fake.root / DATA]
-    assert contents.task == "run"
-    listed = json.loads((fake.root / "meta/astra/subsets.json").read_text())["uids"]
-    assert [episodes[index].uid for index in contents.order] == listed
 
 
 @pytest.mark.parametrize("block_rows", [1, 20, 2**16])

@@ -62,15 +62,6 @@ def test_info_has_lerobots_fields(lerobot: SimpleNamespace, fake: Dataset) -> No
     assert set(asdict(info)) - set(fake.info) == {"tools"}
 
 
-def test_encodings_are_keyed_by_the_paths_in_the_file(fake: Dataset) -> None:
-    row_group = pq.read_metadata(fake.paths[0]).row_group(0)
-    chunks = [row_group.column(index) for index in range(row_group.num_columns)]
-    stored = {chunk.path_in_schema: chunk.encodings for chunk in chunks}
-    encodings = layout.data_encodings(layout.stored_columns(COLUMNS))
-    assert all(encoding in stored[path] for path, encoding in encodings.items())
-    assert stored.keys() - encodings.keys() == {column.name for column in COLUMNS if column.dtype == "bool"}
-
-
 def test_the_tasks_table_is_a_pandas_frame_with_the_task_as_index() -> None:
     frame = layout.tasks_table("walk").to_pandas()
     assert (frame.index.name, frame.index.tolist()) == ("task", ["walk"])

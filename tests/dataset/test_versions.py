@@ -34,13 +34,6 @@ def test_versions_order_as_numbers() -> None:
     assert Version.from_tag("data-" + "9" * 5000 + ".0.0") is None
 
 
-def test_each_kind_of_change_moves_its_number() -> None:
-    version = Version.parse("1.2.3")
-    assert str(version.next("columns")) == "2.0.0"
-    assert str(version.next("episodes")) == "1.3.0"
-    assert str(version.next("description")) == "1.2.4"
-
-
 def test_the_next_version_is_free() -> None:
     taken = versions("1.2.3", "1.4.0", "1.2.7", "3.1.0")
     version = Version.parse("1.2.3")

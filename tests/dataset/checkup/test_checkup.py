@@ -22,11 +22,7 @@ from astra_data.dataset.checkup.checkup import (
 from astra_data.dataset.checkup.findings import (
     Continuity,
     Finding,
-    channels,
-    deletion,
     is_angle,
-    labels,
-    listed,
 )
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED, Array, Column, Episode
 
@@ -139,16 +135,6 @@ def test_warnings_come_first_and_findings_are_recorded(tmp_path: Path) -> None:
     assert record["dataset"] == "logs@data-1.0.0"
     assert record["findings"][0]["episodes"] == [3, 4]
     assert set(record["findings"][1]) == set(Finding.__dataclass_fields__)
-
-
-def test_five_episodes_are_named_and_the_others_counted() -> None:
-    assert listed([7]) == "episode 7"
-    assert listed(range(7)) == "episodes 0, 1, 2, 3, 4 and 2 more"
-    assert deletion("walks", [3, 9]) == "astra-data filter walks --without 3 --without 9"
-    assert deletion("walks", range(6)).endswith("--without 3 --without 4 ...")
-    pose = Column("pose", size=2, names=("x", "y"))
-    assert (labels(pose), channels(pose, [1])) == (["x", "y"], "y of pose")
-    assert (labels(Column("charge")), channels(Column("charge"), [0])) == (["charge"], "charge")
 
 
 def test_angles_are_known_by_their_names() -> None:
