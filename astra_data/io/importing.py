@@ -119,7 +119,7 @@ class ImportReport:
                 else ""
             ): True,
         }
-        return "\n".join(line for line, is_told in lines.items() if is_told)
+        return "\n".join(line for line, is_shown in lines.items() if is_shown)
 
 
 def import_dataset(

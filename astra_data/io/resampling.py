@@ -27,11 +27,11 @@ from astra_data.io.mapping import ImportMapping
 MOST_HELD_ROWS = 10**6
 """Most rows in which the same values may be held: five hours at 50 Hz."""
 MOST_UNEVEN = 0.05
-"""Largest share of a topic's rows, steps or messages that are odd and not told."""
+"""Largest share of a topic's rows, steps or messages that are odd without a warning."""
 _WHOLE = 0.005
 """Relative error of a measured rate that is taken for a whole number."""
 _SMOOTH = 10
-"""With so many messages a row, or more, one more or less changes a step too little to be told."""
+"""With so many messages a row, or more, one more or less changes a step too little for a warning."""
 _NEAR = 4
 """Rates of rows that are proposed are up to so many times as high or low as `fps`."""
 _AVERAGED = 20
@@ -136,23 +136,23 @@ class Resampler:
         """Yield what ended episodes: each topic that was silent alone, and what to do if it should not."""
         for topic, times in self.silences.items():
             key = "gap_s of its column" if topic in self._has_own_gap else "split.gap_s"
-            told = (
+            note = (
                 f"{self._origin}: {topic} is silent for over {self._gap_ns[topic] / 1e9:g} s ({key}) {times} "
                 "times while others are not; episodes end there"
             )
             if command := self._commands.get(topic):
                 yield (
-                    f"{told}. That is right if the robot stops by itself without commands; if it continues "
+                    f"{note}. That is right if the robot stops by itself without commands; if it continues "
                     f'with the last one, set latched = true in [columns."{command}"], or a longer gap_s'
                 )
             else:
-                yield f"{told}: set latched = true if it is sent on change, or a longer gap_s"
+                yield f"{note}: set latched = true if it is sent on change, or a longer gap_s"
 
     def unevenness(self) -> tuple[str, ...]:
         """Return a line for each topic that many rows repeat, or of which many messages are in no row.
 
         Of a topic without commands, flags and outcomes, messages may be in no row, as where fps is lower than
-        its rate; if it is observed, uneven steps are told.
+        its rate; if it is observed, uneven steps are named.
         """
         notes = []
         for topic in sorted(self._expiring & self._periods.keys()):

@@ -398,11 +398,11 @@ def _of_the_hub(place: str, error: Exception) -> AstraDataError | None:
         )
     if isinstance(cause, HfHubHTTPError):
         status = cause.response.status_code
-        told = dict.fromkeys(
+        causes = dict.fromkeys(
             (401, 403), "no rights to do this; log in with `hf auth login` and a token that may write."
         ) | dict.fromkeys(
             (409, 412), "it was changed by somebody else at the same time; run the same command again."
         )
         answered = f"it answered {status}: {cause.server_message or cause}"
-        return SharingError(f"{place}: {told.get(status, answered)}")
+        return SharingError(f"{place}: {causes.get(status, answered)}")
     return None
