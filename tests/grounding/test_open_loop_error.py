@@ -76,6 +76,20 @@ def test_the_last_real_step_counts_and_the_one_after_does_not() -> None:
     assert raw["low"][1] < raw["mean"][1] < raw["high"][1]
 
 
+@pytest.mark.parametrize("horizon", [1, 10, 50])
+def test_replays_start_at_every_step_alike(horizon: int) -> None:
+    """Not at a standstill, where episodes begin, more often than on the way."""
+    lengths, rng = np.array([60, 9, 100]), np.random.default_rng(0)
+    counts = np.zeros((3, 100))
+    for _ in range(2000):
+        np.add.at(counts, _starts(lengths, horizon, rng), 1)
+    for one, possible in zip(counts, lengths - horizon + 1, strict=True):
+        assert not one[max(possible, 0) :].any()
+        if possible > 0:
+            share = -(-possible // 25) / possible
+            np.testing.assert_allclose(one[:possible] / 2000, share, atol=5 * np.sqrt(share / 2000))
+
+
 def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
     torch.manual_seed(0)
     errors, episode = torch.rand(400, dtype=torch.float64), torch.arange(400)
