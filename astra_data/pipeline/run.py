@@ -28,6 +28,7 @@ from astra_data.pipeline.experiment import ALWAYS_NEW, Experiment, load_experime
 from astra_data.pipeline.plan import RunPoint, Selection, check_stage, plan, stages_until
 from astra_data.pipeline.recipe import WHOLE
 from astra_data.pipeline.stages.registry import STAGES
+from astra_data.pipeline.stages.report import is_current
 from astra_data.pipeline.user_code import UserMethod, add_all, digests_of, record_code
 from astra_data.reports.artifacts import CURVE, EVALUATION, METRICS, Artifact, Evaluation, read_json
 from astra_data.reports.held_out import write_held_out
@@ -236,6 +237,8 @@ def make(
             for item in items
             if item.key in again or item.stage in ALWAYS_NEW or not experiment.has(item.key)
         ]
+        if [item.stage for item in items] == ["report"] and _is_reported(items[0]):
+            items = []
         data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
@@ -262,6 +265,14 @@ def make(
                 prepare=partial(_prepare, dict(recipe.own_methods)),
                 address=address,
             )
+
+
+def _is_reported(item: Item) -> bool:
+    """Return whether the report is there already, made of what it would be made of."""
+    call = item.call
+    if not isinstance(call, partial) or call.keywords["publish"] is not None:
+        return False
+    return is_current(*call.args, **call.keywords)
 
 
 def _prepare(own_methods: dict[str, UserMethod]) -> None:

@@ -1,18 +1,21 @@
 """Report: the results of all methods and seeds of a recipe, as results.json, .md, .html and figures."""
 
+import json
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from hashlib import sha256
 from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from astra_data.core.artifact import finished_folder
+from astra_data.core.artifact import finished_folder, read_manifest
 from astra_data.core.config import Config, Share
 from astra_data.core.durable import file_digest, write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key
 from astra_data.core.progress import Progress, silent
+from astra_data.core.provenance import origin
 from astra_data.methods import method_named
 from astra_data.reports.artifacts import EVALUATION
 from astra_data.reports.blocks import html, markdown
@@ -79,14 +82,7 @@ def report(
     for row in (*config.trajectory_methods, *config.paper_success, *config.compare):
         method_named(row)
     task = task_named(recipe.task)
-    keys = [
-        artifact_key("evaluate", row, seed, percent)
-        for row in recipe.methods
-        for percent in recipe.percents or (None,)
-        for seed in recipe.seeds
-    ]
-    read = {key: root / key / EVALUATION for key in keys} | {FOLDER: root / FOLDER / SELECTED}
-    made_from = {key: file_digest(file) for key, file in read.items() if file.exists()}
+    made_from = _digests(recipe, root, command, config)
     found = _added_to(published, _read(recipe, root, command, task, config))
     progress(0.5, f"{len(found.tested())} methods, {len(found.seeds)} seeds")
     scene = Scene(root, task, config.trajectory_methods, config.trajectory_episodes)
@@ -130,6 +126,33 @@ def _added_to(published: Sequence[Path], found: Results) -> Results:
         if changed := replaced(one, found):
             _log.warning("%s: new results replace those of %s", path, "; ".join(changed))
     return merge([*earlier, found]) if earlier else found
+
+
+def is_current(recipe: Reported, *, root: Path, command: str, config: ReportConfig, **_: object) -> bool:
+    """Return whether the report at `root` was made of what is there now, and as it would be now."""
+    try:
+        manifest = read_manifest(root / "report")
+    except BadInputError:
+        return False
+    if manifest is None or manifest.faults(root / "report", verify=False):
+        return False
+    return manifest.made_from == _digests(recipe, root, command, config)
+
+
+def _digests(recipe: Reported, root: Path, command: str, config: ReportConfig) -> dict[str, str]:
+    """Return the digest of each evaluation that is finished, of a choice, and of settings and version."""
+    keys = [
+        artifact_key("evaluate", row, seed, percent)
+        for row in recipe.methods
+        for percent in recipe.percents or (None,)
+        for seed in recipe.seeds
+    ]
+    read = {key: root / key / EVALUATION for key in keys} | {FOLDER: root / FOLDER / SELECTED}
+    settings = json.dumps(
+        [asdict(recipe), command, config.model_dump(), origin()], sort_keys=True, default=str
+    )
+    digests = {key: file_digest(file) for key, file in read.items() if file.exists()}
+    return digests | {"settings": sha256(settings.encode()).hexdigest()}
 
 
 def _shown(root: Path) -> str:
