@@ -346,7 +346,7 @@ class EpisodeChecks:
             for kind in plain.PLAIN_STATISTICS:
                 one, expected = stored[column.name, kind], found[kind][part]
                 if kind == "count":
-                    expected = expected[:1]
+                    expected = expected[:1].astype(np.int64)
                 if not is_estimate(kind, one, expected, largest):
                     what = f"{kind} of {column.name}{where} is {one}, expected {expected.tolist()}"
                     self._report.note("statistics", f"statistics: {what}")
