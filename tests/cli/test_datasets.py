@@ -116,7 +116,7 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
             [str(tmp_path / "mute"), "--plot", str(tmp_path / "plots")],
             "expected a state with the role position or vector",
         ),
-        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "cannot be written: a file is where"),
+        ([str(tmp_path / "fake"), "--plot", str(tmp_path / "file")], "cannot be written: "),
     ):
         error = call("inspect", *arguments).exception
         assert isinstance(error, AstraDataError)
