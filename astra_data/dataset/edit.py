@@ -97,11 +97,7 @@ def check_uids(dataset: Dataset, uids: Sequence[int]) -> None:
 
 
 def delete(source: Dataset, uids: Sequence[int], *, name: str | None = None, out: Path | None = None) -> Path:
-    """Write `source` without the episodes `uids`.
-
-    Raises:
-        BadInputError: one of them is not in `source`, or none would be left.
-    """
+    """Write `source` without the episodes `uids`."""
     check_uids(source, uids)
     if not uids:
         raise BadInputError("expected the uids of episodes to leave out, got none")
@@ -124,9 +120,6 @@ def filter_episodes(
 
     Success is that of `Dataset.successes`, the return that of the episodes' metadata; episodes without one
     do not meet conditions on it.
-
-    Raises:
-        BadInputError: no condition is given, no episode has such metadata, or none meets the conditions.
     """
     given = {"success": success, "min_return": min_return, "max_return": max_return}
     config = only_given(**given, min_length=min_length, max_length=max_length)

@@ -38,11 +38,7 @@ class Order:
     def __init__(
         self, count: int, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False
     ) -> None:
-        """Start with the first batch of epoch 0; with `drop_last`, a smaller last batch is left out.
-
-        Raises:
-            BadInputError: there would be no batches.
-        """
+        """Start with the first batch of epoch 0; with `drop_last`, a smaller last batch is left out."""
         whole, rest = divmod(count, max(batch_size, 1))
         self._batches = whole + (rest > 0 and not drop_last)
         if batch_size < 1 or self._batches < 1:

@@ -120,10 +120,6 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
         out: the folder to write.
         seed: one of the recipe's seeds.
         percent: the size of the dataset, where the recipe sweeps over sizes.
-
-    Raises:
-        BadInputError: the row trains no policy, an artifact of it is not there, was altered or made from
-            another than lies there now, code of the task cannot be written as a graph, or `out` exists.
     """
     refuse_existing(out)
     trained = trained_policy(run, row, seed=seed, percent=percent)

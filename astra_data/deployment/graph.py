@@ -64,9 +64,6 @@ def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], 
 
     Returns:
         the sizes of the parts of the hidden state, and the largest difference of commands, in half ranges.
-
-    Raises:
-        BadInputError: code of the task cannot be traced, or the graph gives other commands than the policy.
     """
     optional("onnxscript")
     if isinstance(deployed.policy, UserPolicy):
@@ -164,9 +161,6 @@ def _apart(graph: PolicyGraph, written: Graph, name: str) -> float:
 
     Only states for which the policy has a command count: φ may have none for others, as of an angle by its
     sine.
-
-    Raises:
-        BadInputError: they differ, or the policy hardly ever has a command.
     """
     rng = np.random.default_rng(0)
     deployed = graph._deployed

@@ -32,11 +32,7 @@ def seeded(seed: int, device: torch.device) -> Iterator[None]:
 
 
 def refuse_divergence(where: str, figures: Mapping[str, float | None]) -> None:
-    """Check that the `figures` of a training, so far measured `where`, are numbers.
-
-    Raises:
-        BadInputError: one is infinite or not a number.
-    """
+    """Check that the `figures` of a training, so far measured `where`, are numbers."""
     if wrong := [name for name, value in figures.items() if value is not None and not math.isfinite(value)]:
         figure = f"a {' and a '.join(wrong)} that is not finite"
         raise BadInputError(f"training diverged {where}, with {figure}: make learning_rate smaller")
@@ -103,9 +99,6 @@ class Descent:
             config: settings.
             checkpoint: the file that `keep` writes; None for none.
             weight_decay: of AdamW.
-
-        Raises:
-            BadInputError: the checkpoint is of another model, or from an older version.
         """
         self.done = 0
         self.best: int | None = None
@@ -138,11 +131,7 @@ class Descent:
         return self.done / self._config.updates
 
     def update(self, loss: Tensor) -> None:
-        """Take one step down the gradient of `loss`.
-
-        Raises:
-            BadInputError: the fit diverged.
-        """
+        """Take one step down the gradient of `loss`."""
         self._optimizer.zero_grad()
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, _GRADIENT_NORM)
@@ -155,9 +144,6 @@ class Descent:
         """Add the figures `measured` now to the points, and write the checkpoint.
 
         The weights are remembered if their `held_out_error` is the least so far; `finish` returns to them.
-
-        Raises:
-            BadInputError: the fit diverged.
         """
         error = {} if held_out_error is None else {"held_out_error": held_out_error}
         refuse_divergence(f"by update {self.done}", error | measured)

@@ -25,40 +25,24 @@ _TARGET_ENCODER = "target encoder"
 
 
 def save_grounding(path: Path, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
-    """Write `grounding`, which was fitted to `episodes`, to `path`.
-
-    Raises:
-        BadInputError: its `to_file` fails, or returns something else than tensors and JSON values.
-    """
+    """Write `grounding`, which was fitted to `episodes`, to `path`."""
     tensors, metadata = parts_of(grounding)
     save_tensors(path, tensors, episodes.named | {"kind": grounding.kind} | metadata)
 
 
 def load_grounding(path: Path | str, device: str = "cpu") -> FittedGrounding:
-    """Read a grounding; the parameters of its networks are frozen.
-
-    Raises:
-        BadInputError: the file is missing, holds something else, or is from an older version.
-    """
+    """Read a grounding; the parameters of its networks are frozen."""
     with understood(Path(path), "a grounding", KINDS, device) as (tensors, metadata):
         return restored(KINDS[metadata["kind"]], tensors, metadata, device)
 
 
 def grounding_at(path: Path | None, device: str = "cpu") -> Grounding:
-    """Read a grounding; without a `path`, that is none.
-
-    Raises:
-        BadInputError: as `load_grounding`.
-    """
+    """Read a grounding; without a `path`, that is none."""
     return load_grounding(path, device) if path else NO_GROUNDING
 
 
 def load_history_model(path: Path | str, device: str = "cpu") -> GroundingModel:
-    """Read a grounding that has to be a history model.
-
-    Raises:
-        BadInputError: as `load_grounding`, and if it is another grounding.
-    """
+    """Read a grounding that has to be a history model."""
     grounding = load_grounding(path, device)
     if grounding.kind != HistoryGrounding.kind:
         raise BadInputError(f"{path}: expected a history model, got a grounding without latents")
@@ -71,11 +55,7 @@ def save_target_encoder(path: Path, encoder: TargetEncoder) -> None:
 
 
 def load_target_encoder(path: Path | str) -> TargetEncoder:
-    """Read a target encoder; its parameters are frozen.
-
-    Raises:
-        BadInputError: the file is missing, holds something else, or is from an older version.
-    """
+    """Read a target encoder; its parameters are frozen."""
     with understood(Path(path), "a target encoder", (_TARGET_ENCODER,), "cpu") as (tensors, metadata):
         return loaded(TargetEncoder(**metadata["sizes"]), tensors)
 
@@ -96,11 +76,7 @@ def missing_parts(grounding: type) -> list[str]:
 
 
 def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
-    """Return the grounding and the figures that a fit `returned`.
-
-    Raises:
-        BadInputError: they are no such pair, no class of groundings that is known, or no JSON values by name.
-    """
+    """Return the grounding and the figures that a fit `returned`."""
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise BadInputError(
             f"fit returned a {type(returned).__name__}: expected a pair, the grounding and a dict of figures"
@@ -125,11 +101,7 @@ def fitted(returned: object) -> tuple[FittedGrounding, dict[str, Any]]:
 
 @torch.no_grad()
 def check_step(task: Task, grounding: FittedGrounding, episodes: PairedEpisodes) -> None:
-    """Step the corrected simulator of `task` once, from where the first of `episodes` begin.
-
-    Raises:
-        BadInputError: it fails, it returns something else than states (B, X), or its simulator is not there.
-    """
+    """Step the corrected simulator of `task` once, from where the first of `episodes` begin."""
     windows = episodes.windows
     state, goal, action = (values[:2, 0] for values in (windows.state, windows.goal, windows.action))
     with explained(f"a step of {task.name} as corrected by {type(grounding).__name__}"):

@@ -111,11 +111,7 @@ class HistoryFit:
         )
 
     def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:
-        """Return the grounding and its figures.
-
-        Raises:
-            BadInputError: the reward is to be predicted, and none was recorded.
-        """
+        """Return the grounding and its figures."""
         task = fitting.task
         if self.reward and not fitting.training.has_rewards:
             raise BadInputError(

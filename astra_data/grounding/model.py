@@ -275,9 +275,6 @@ def telemetry(
     removes), None where there is no variance to explain, as in a perfect simulator; the mean standard
     deviation of the latent's entries; and the latent's effective rank (exponential of the entropy of the
     normalized eigenvalues of its covariance); both None for a single step.
-
-    Raises:
-        BadInputError: latents are not finite: the fit diverged.
     """
     windows = episodes.windows
     latent, _ = model.encode(windows)

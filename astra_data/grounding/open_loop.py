@@ -34,9 +34,6 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
     grounding's memory of the true history up to there. Errors are distances in the task's quantities after 1,
     10, 50 and 200 steps: means and 95 % bootstrap intervals over episodes; None where a single episode is
     that long.
-
-    Raises:
-        BadInputError: a simulator's states are not finite, though the recorded ones are.
     """
     torch.manual_seed(derive(seed, "gap noise"))
     windows, lengths = episodes.windows, episodes.lengths.cpu().numpy()

@@ -248,11 +248,7 @@ class PairedEpisodes:
         )
 
     def check(self, task: Task) -> None:
-        """Check that states, actions and, where there are any, goals are those of `task`.
-
-        Raises:
-            BadInputError: it was paired with another simulator or other bounds; lists every mismatch.
-        """
+        """Check that states, actions and, where there are any, goals are those of `task`."""
         faults = [
             f"has {found} values in {what}, {task.name} {expected}"
             for what, found, expected in (
@@ -297,9 +293,6 @@ class PairedEpisodes:
         """Split into training and held-out episodes, as the dataset marks them, else at random.
 
         At random, `held_out_share` of the recordings are held out, each with its copies.
-
-        Raises:
-            BadInputError: there are too few episodes, or all are held out.
         """
         if self.held_out is not None:
             if self.held_out.all():
@@ -337,11 +330,7 @@ class PairedEpisodes:
 def divided(
     reference: str, recordings: int, held_out_share: float, seed: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the numbers of the recordings of the dataset `reference` to train on, and of those held out.
-
-    Raises:
-        BadInputError: none is left to train on.
-    """
+    """Return the numbers of the recordings of the dataset `reference` to train on, and of those held out."""
     training, held_out = held_out_episodes(recordings, held_out_share, seed)
     if not len(training):
         raise BadInputError(

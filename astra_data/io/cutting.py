@@ -136,9 +136,6 @@ class Cutter:
         Args:
             block: at least one row.
             is_apart: whether it begins a new file instead of continuing the block before.
-
-        Raises:
-            BadInputError: values do not fit their columns, or change in size; lists every fault.
         """
         if is_apart or block.starts:
             yield from self.cut()
@@ -343,10 +340,6 @@ class Cutter:
 
         The rates are the mean rate, and the usual one without pauses, of all files and of each, or of each
         episode of formats that have their own.
-
-        Raises:
-            BadInputError: most steps of large numbers are lost; or both rates differ by more than
-                `RATE_TOLERANCE` over all files; names those that differ.
         """
         self.tally.notes += self.rounded()
         timed = [
@@ -376,11 +369,7 @@ class Cutter:
         self.tally.clock = str(self._clock)
 
     def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Mask]]:
-        """Return the columns of `block` with n rows, (n,) or (n, size), and rows where fields are not finite.
-
-        Raises:
-            BadInputError: values do not fit their columns, or change in size; lists every fault.
-        """
+        """Return the columns of `block` with n rows, (n,) or (n, size), and rows where fields are not finite."""
         faults: list[str] = []
         fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
         if faults:

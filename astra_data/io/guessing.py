@@ -184,12 +184,7 @@ class Logs:
 
 
 def guess(paths: Sequence[Path]) -> Logs:
-    """Read CSV logs, files with the same fields or folders of them, and guess what their fields are.
-
-    Raises:
-        BadInputError: there is no such file, it is no CSV, files differ, there are no commands, no states or
-            no episodes of two rows, or the rate is too far from a whole number for an import.
-    """
+    """Read CSV logs, files with the same fields or folders of them, and guess what their fields are."""
     files = [file for path in paths for file in csv_files(path)]
     sources = [Source(file, None, file) for file in files]
     tables = [read_numbers(source) for source in sources]

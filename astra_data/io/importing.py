@@ -282,10 +282,6 @@ def episodes(
     """Yield the episodes of `sources`, as the format's `module` reads them and the `cutter` cuts their rows.
 
     What is wrong with files and episodes is added to `left_out`, and they are; without it, they are refused.
-
-    Raises:
-        BadInputError: a file cannot be read, or an episode does not fit into memory. The files after it that
-            cannot either, as far as their beginnings tell, are listed with it.
     """
     recording, size = None, 0
     try:

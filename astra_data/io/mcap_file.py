@@ -44,11 +44,7 @@ class McapFile:
     """
 
     def __init__(self, source: Source, topics: Collection[str]) -> None:
-        """Look at both ends of the file, and read its index if it has one.
-
-        Raises:
-            BadInputError: the file is empty, or lacks topics by its index.
-        """
+        """Look at both ends of the file, and read its index if it has one."""
         self.is_cut = False
         self.streams: dict[str, Callable[[Any], list[str]]] = {}
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
@@ -281,9 +277,6 @@ class Timeline:
             file: has all topics that are wanted.
             gap_s: by how much a topic may go back while the clock does not.
             pause_s: what is longer between messages ends an episode in any case.
-
-        Raises:
-            BadInputError: the file lacks topics; lists all of them.
         """
         self._file = file
         self._stretches = self._survey(round(gap_s * 1e9))

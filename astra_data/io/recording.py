@@ -247,9 +247,6 @@ def find_sources(
         mapping: says which files are joined.
         max_bytes: the most bytes of values that may be taken from them, by default in proportion to their
             sizes.
-
-    Raises:
-        BadInputError: one does not exist, cannot be read, is unsafe or holds no such file.
     """
     sources: list[Source] = []
     for recording in recordings:
@@ -373,11 +370,7 @@ def row_name(origin: str, row: int) -> str:
 
 
 def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int, ...]]) -> int:
-    """Return how many rows `fields` have, of the `shapes` of every field in the file `origin`.
-
-    Raises:
-        BadInputError: lists the fields that are missing or have no rows, and differing numbers of rows.
-    """
+    """Return how many rows `fields` have, of the `shapes` of every field in the file `origin`."""
     unused, known = [name for name in shapes if name not in fields], f"; known: {', '.join(shapes)}"
     hints = {field: did_you_mean(field, unused) or known for field in fields if field not in shapes}
     if len(hints) > 1 and len(set(hints.values())) == 1:  # all are listed, once

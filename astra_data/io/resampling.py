@@ -57,9 +57,6 @@ class Resampler:
         """Sample the fields of `mapping` from the file `origin`, with the times of messages by topic, in ns.
 
         `topic_of` gives the topic of each field where names do not.
-
-        Raises:
-            BadInputError: a topic begins when another has ended, as where their clocks differ.
         """
         self._origin, self._fps = origin, mapping.fps
         of = topic_of or {field: field.partition(":")[0] for field in mapping.all_fields}
@@ -116,11 +113,7 @@ class Resampler:
             self._start, self._row = time + self._delay_ns, 0
 
     def rows_before(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
-        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode.
-
-        Raises:
-            BadInputError: these are more than `MOST_HELD_ROWS`.
-        """
+        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode."""
         # A pause: all topics that are not latched are silent for too long.
         if self._start is not None and len(self._silent(time)) == len(self._expiring):
             yield from self._sampled(self._end(max(self.times[topic] for topic in self._expiring)))

@@ -70,10 +70,6 @@ def add_method(name: str, place: str) -> None:
     Args:
         name: of its rows.
         place: "file.py:METHOD" or "package.module:METHOD", whose code is run.
-
-    Raises:
-        BadInputError: the name is taken or cannot be that of a folder; or what is there is no method, or
-            lacks a part.
     """
     file, is_file, attribute = place.partition(".py:")
     found = f"{Path(f'{file}.py').resolve()}:{attribute}" if is_file else place
@@ -161,11 +157,7 @@ def method_title(row: str) -> str:
 
 
 def method_named(row: str) -> Method:
-    """Return the method of a row: `astra` for "astra" and for "astra_plus".
-
-    Raises:
-        BadInputError: there is no such method.
-    """
+    """Return the method of a row: `astra` for "astra" and for "astra_plus"."""
     name = base_method(row)
     if name not in METHODS and (place := offered_methods().get(name)):
         add_method(name, place)
@@ -175,9 +167,5 @@ def method_named(row: str) -> Method:
 
 
 def grounded_as(row: str) -> str:
-    """Return the method whose grounding and alignment a row uses.
-
-    Raises:
-        BadInputError: as `method_named`.
-    """
+    """Return the method whose grounding and alignment a row uses."""
     return method_named(row).grounded_as or base_method(row)

@@ -41,9 +41,6 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
 
     Returns:
         the policy, which starts from `training.initial` if there is one, and the losses every few updates.
-
-    Raises:
-        BadInputError: no rewards were recorded; cloning needs none.
     """
     config, episodes = _config(training), training.episodes
     if config.temperature and not episodes.has_rewards:

@@ -44,10 +44,6 @@ def grounded(
         seed: one of the recipe's seeds: that of the data and the grounding.
         percent: the size of the dataset, where the recipe sweeps over sizes.
         options: those of `OPTIONS` that are not to be as in the recipe, see `TrainConfig`.
-
-    Raises:
-        BadInputError: the row is not trained in a simulator, an artifact is not there, or an option does not
-            fit the row or the task.
     """
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=1, **options)
     return SingleEnv(SeededSimulatorEnv(env), training.simulated_steps)
@@ -91,9 +87,6 @@ def evaluate_policy(
         seed: one of the recipe's seeds.
         percent: the size of the dataset, where the recipe sweeps over sizes.
         progress: called with the fraction done.
-
-    Raises:
-        BadInputError: as `grounded`, or the policy returns something else than actions.
     """
     settings = settings_of(run)
     env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)

@@ -44,9 +44,6 @@ def write_robot(name: str, out: Path, logs: Sequence[Path]) -> SimulatorKind:
     """Write the new folder `out` of the robot `name`, of CSV files or folders of them, or of one dataset.
 
     Return the simulator that it begins with.
-
-    Raises:
-        BadInputError: `name` is no name, `out` exists, or logs are missing or useless, see `guess`.
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise BadInputError(

@@ -35,11 +35,6 @@ def view_run(
 
     By default these are the first 5 `uids` that groundings held out, of the first `seed` of the recipe.
     `save` is a file that ends in `.rrd` and is replaced, in place of the viewer.
-
-    Raises:
-        BadInputError: Rerun is not installed or its viewer does not open, `save` is no `.rrd` file, or `run`
-            is not the folder of a run, or has no pairs yet, no such seed or no such episode, or a grounding
-            of other data than lie there now.
     """
     rerun = optional("rerun")
     if save is not None and save.suffix != ".rrd":

@@ -56,10 +56,6 @@ def select(
     A choice that is there is kept if it was made of the same with the same settings, and otherwise set aside.
     Candidates are `rows`, by default all with policies of abstract states; judges and `episodes` are by
     default as the recipe says.
-
-    Raises:
-        BadInputError: it is no run, a row is unknown or has no policy, there are no two groundings, or
-            another process runs there.
     """
     folder, settings = Path(run), settings_of(run)
     add_all(settings.get("own_methods", {}))
@@ -119,9 +115,6 @@ def choose_by_trials(
     Candidates of a round meet the same starts and goals, others than those of `evaluate`. An interrupted call
     goes on with the next candidate. The best `field` predicted are tried, by default as many as the trials
     are enough for; those of a size in `percent`, where the recipe sweeps over sizes.
-
-    Raises:
-        BadInputError: as `select`; or the task has no target, the trials are too few, or others were made.
     """
     folder, task = Path(run), task_of(run)
     if not task_named(task).has_target:

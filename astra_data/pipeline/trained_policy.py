@@ -105,10 +105,6 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     """Return the settings of a run's recipe, as it recorded them.
 
     Files of the user's that it names are looked up in the run's folder and those above it, and else here.
-
-    Raises:
-        BadInputError: it is not the folder of a run, its record is damaged, or the code of its task changed
-            since.
     """
     folder = Path(run)
     if not (folder / RECORD).is_file():

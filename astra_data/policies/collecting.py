@@ -313,9 +313,6 @@ def suboptimal_by_sac(
 
     Returns:
         the policy, and how it was trained.
-
-    Raises:
-        BadInputError: the task's episodes end in success, so that lasting long is not good.
     """
     if not task.objective.is_lasting:
         raise BadInputError(f"in {task.name} good episodes are short: use 'suboptimal_ppo'")

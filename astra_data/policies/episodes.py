@@ -311,9 +311,6 @@ def in_target(
         num_threads: of the physics, by default one per core; the outcome is the same with any number.
         progress: called with the fraction done and the speed.
         asked: counts commands beyond what was recorded.
-
-    Raises:
-        BadInputError: the robot has no legs of another length.
     """
     if leg_scale != 1.0 and "leg_scale" not in task.facts:
         raise BadInputError(
@@ -384,11 +381,7 @@ class Reached:
 
 
 def reached_in_own_world(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
-    """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions.
-
-    Raises:
-        BadInputError: it does not know that simulator.
-    """
+    """Test a policy in the simulator of its training, from the task's starts, by the mean of its actions."""
     if trained.simulation is None:
         raise BadInputError(
             "tries: expected a policy that knows its simulator, got one without: give PolicyFile its "

@@ -166,11 +166,7 @@ class Iql:
         return self.updates >= self.total_updates
 
     def iterate(self) -> dict[str, float]:
-        """Make one update and return its losses: "value" and "action_value", or the "policy"'s.
-
-        Raises:
-            BadInputError: the training diverged.
-        """
+        """Make one update and return its losses: "value" and "action_value", or the "policy"'s."""
         seed_generators(derive(self.seed, f"update {self.updates}"), self._transitions.reward.device)
         losses = (
             self._learn_values()
@@ -262,9 +258,6 @@ def transitions(experience: Experience, config: IqlConfig) -> Transitions:
 
     n is `config.return_steps`. Steps with fewer recorded steps after them are left out, unless the task ended
     there.
-
-    Raises:
-        BadInputError: there are none.
     """
     count, lengths = config.return_steps, experience.lengths[:, None]
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)

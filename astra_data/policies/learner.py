@@ -186,9 +186,6 @@ class Learner(ABC):
 
         Returns:
             the metrics of `Acting`, and the learner's own.
-
-        Raises:
-            BadInputError: the training diverged.
         """
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
         figures = self._iterate()

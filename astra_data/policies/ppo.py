@@ -69,9 +69,6 @@ class Ppo(Learner):
             config: settings.
             horizon: steps after which episodes are truncated.
             seed: of all randomness.
-
-        Raises:
-            BadInputError: a rollout is a single step, which has no advantage over others.
         """
         if env.num_envs * config.rollout_steps == 1:
             raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")

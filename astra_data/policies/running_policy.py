@@ -68,11 +68,7 @@ class UserPolicy(Policy):
     """A policy of another learner, in the place of one that was trained here; it has no memory."""
 
     def __init__(self, acting: ActingPolicy, observation_size: int, action_size: int) -> None:
-        """Let `acting` act on observations (B, O).
-
-        Raises:
-            BadInputError: it has no `act`.
-        """
+        """Let `acting` act on observations (B, O)."""
         super().__init__(PolicyShape(observation_size, action_size))
         if not callable(getattr(acting, "act", None)):
             raise BadInputError(f"{type(acting).__name__} is no policy: expected act(observation) -> action")
@@ -93,11 +89,7 @@ class UserPolicy(Policy):
         return action, torch.zeros_like(action)
 
     def act(self, features: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the actions (B, A), clipped to ±1, for observations (B, O); `generator` has no effect.
-
-        Raises:
-            BadInputError: the policy fails, or returns something of another shape, or that is not finite.
-        """
+        """Return the actions (B, A), clipped to ±1, for observations (B, O); `generator` has no effect."""
         with explained(f"{self.name}.act"):
             action = np.asarray(self.acting.act(features.numpy()), dtype=np.float32)
         expected = (len(features), self.shape.action_size)
@@ -182,11 +174,7 @@ class RunningPolicy:
         self._generator = None
 
     def command(self, state: Given, goal: Given) -> Tensor:
-        """Return commands (B, A), in their own units, for target states (B, S) and goals (B, G).
-
-        Raises:
-            BadInputError: `start` was not called, or the state or the goal is of another shape or not finite.
-        """
+        """Return commands (B, A), in their own units, for target states (B, S) and goals (B, G)."""
         if not hasattr(self, "memory"):
             raise BadInputError("expected start(count) before the first command")
         state = self._checked("state", state, self.task.state.size)
@@ -250,11 +238,7 @@ _PART = "policy"
 
 
 def add_policy_kind(made: type[SavedPolicy]) -> None:
-    """Let files hold policies of another learner.
-
-    Raises:
-        BadInputError: the package, or another learner, has policies of this kind.
-    """
+    """Let files hold policies of another learner."""
     if made.kind in _KINDS or KINDS.setdefault(made.kind, made) is not made:
         raise BadInputError(
             f"policies of kind '{made.kind}' are the package's or another learner's: rename that of "
@@ -281,12 +265,7 @@ class PolicyFile:
     observed: Observed = "abstract"
 
     def save(self, path: Path) -> None:
-        """Write the policy to `path`.
-
-        Raises:
-            BadInputError: it is of a class that `load` does not know, or its `to_file` returns something else
-                than tensors and JSON values.
-        """
+        """Write the policy to `path`."""
         kind, networks, own = _taken_apart(self.policy)
         tensors = as_part(networks, _PART)
         metadata: dict[str, Any] = own | {
@@ -306,11 +285,7 @@ class PolicyFile:
 
     @classmethod
     def load(cls, path: Path | str, device: str = "cpu") -> "PolicyFile":
-        """Read a policy; its parameters are frozen.
-
-        Raises:
-            BadInputError: the file is missing, holds something else, or is from an older version.
-        """
+        """Read a policy; its parameters are frozen."""
         with understood(Path(path), "a policy", {**_KINDS, **KINDS}, device) as (tensors, metadata):
             policy = _put_together(part_of(tensors, _PART), metadata)
             simulation = None
@@ -358,11 +333,7 @@ def running(
     grounding: Grounding = NO_GROUNDING,
     target_encoder: TargetEncoder | None = None,
 ) -> RunningPolicy:
-    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s.
-
-    Raises:
-        BadInputError: it is of another task, or of another grounding.
-    """
+    """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s."""
     world = trained.simulation.world if trained.simulation else WorldConfig()
     made = RunningPolicy(
         task,

@@ -87,9 +87,6 @@ class Sac(Learner):
             config: settings.
             horizon: steps after which episodes are truncated.
             seed: of all randomness.
-
-        Raises:
-            BadInputError: the buffer is smaller than a window.
         """
         self.policy, self.config = policy, config
         torch.manual_seed(derive(seed, "critics"))

@@ -397,11 +397,7 @@ class UserLearner(InSimulator):
     policy: type[SavedPolicy]
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
-        """Return the policy and its learning curve.
-
-        Raises:
-            BadInputError: what it returns is no such policy, or the device is no CPU.
-        """
+        """Return the policy and its learning curve."""
         if training.device != "cpu":
             raise BadInputError(
                 f"--device {training.device}: a learner of your own gets an environment of numpy arrays, "

@@ -49,9 +49,6 @@ def write_held_out(
         seeds: of the recipe.
         percents: sizes of the dataset; empty for the whole alone.
         timestep_s: of the task.
-
-    Raises:
-        BadInputError: a file of errors is malformed.
     """
     run = RunReader(root)
     for row in groundings:

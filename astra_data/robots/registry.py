@@ -51,9 +51,6 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
     """Return a task of this or an installed package, or that of "cart.py:TASK" or "package.module:TASK".
 
     `besides` are other names that an unknown one may have meant.
-
-    Raises:
-        BadInputError: there is no such task, file or module, or it is no task.
     """
     if name in TASKS:
         return TASKS[name]
@@ -97,9 +94,6 @@ def pairing_named(name: str) -> Pairing:
 
     A simulator is a class as `Simulator` of `astra_data.worlds.protocols`; its file or package is run. A task
     comes before a simulator of the same name.
-
-    Raises:
-        BadInputError: there is no such task, file or class, or the class lacks an attribute.
     """
     if name not in TASKS and name.endswith(".py"):
         raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")

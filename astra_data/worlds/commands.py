@@ -29,11 +29,7 @@ class Commands(Mapping[str, tuple[float, float]]):
     """
 
     def __init__(self, bounds: Mapping[str, tuple[float, float]]) -> None:
-        """Take the bounds (least, largest) of each axis, in the units of the robot's commands.
-
-        Raises:
-            BadInputError: there is none, or an axis has no two finite ends in order; lists every fault.
-        """
+        """Take the bounds (least, largest) of each axis, in the units of the robot's commands."""
         faults = [] if bounds else ["no axis is named"]
         for name, ends in bounds.items():
             if np.shape(ends) != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:

@@ -52,11 +52,7 @@ class PlanarMap:
         return np.stack(turned, axis=-1)
 
     def of_column(self, column: Column, values: Array) -> Array:
-        """Move the values (T,) or (T, size) of `column` by the roles of its entries; computed in float64.
-
-        Raises:
-            BadInputError: the column has no roles.
-        """
+        """Move the values (T,) or (T, size) of `column` by the roles of its entries; computed in float64."""
         if not column.roles:
             raise BadInputError(f"column {column.name} has no roles: expected one for each of its values")
         before: Floats = values.reshape(len(values), column.size).astype(np.float64)

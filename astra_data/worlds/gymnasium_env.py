@@ -22,11 +22,7 @@ _ADVICE = "give GymnasiumRobot a command, a function of a command and a state th
 
 
 def observed(env: Env, observation: Any) -> State:  # noqa: ANN401 - whatever the environment shows
-    """Return the observation as the robot's state; of a `GoalEnv` its entry "observation".
-
-    Raises:
-        BadInputError: it has several entries, and none is called so.
-    """
+    """Return the observation as the robot's state; of a `GoalEnv` its entry "observation"."""
     if isinstance(observation, dict) and "observation" not in observation:
         raise BadInputError(
             f"the environment shows {', '.join(observation)}: give GymnasiumRobot a read_state, a function "
@@ -89,9 +85,6 @@ class GymnasiumRobot:
         and the state that it is given in. failed: whether the robot failed, from the state after a step and
         whether the environment terminated; by default the latter, and to terminate at the task's goal is an
         error.
-
-        Raises:
-            BadInputError: the environment cannot be made.
         """
         self.name, self.env = _name(env_id), made(env_id, **options)
         self._read_state, self._command, self._failed = read_state, command, failed
@@ -164,9 +157,6 @@ class GymnasiumSimulator(NumpySimulator):
         state, X. read: returns the abstract state (X,) of the environment, without its wrappers. write: sets
         it, so that `read` returns it again; this is tried after the first step. All that a step depends on
         has to be in it. parameters: numbers or texts about it, by default none.
-
-        Raises:
-            BadInputError: the environment cannot be made.
         """
         env = made(env_id, **options)
         inner, is_checked = env.unwrapped, False

@@ -112,12 +112,7 @@ class RobotEnv:
         return self._observe()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
-        """Apply `action` (B, A) of ±1; robots outside `active` (B,) stay as they are.
-
-        Raises:
-            BadInputError: a robot breaks, or an environment of Gymnasium ends at its goal, and nobody said
-                whether that is a failure.
-        """
+        """Apply `action` (B, A) of ±1; robots outside `active` (B,) stay as they are."""
         before = self._abstract()
         commands = self._commands.in_units(action).double().numpy()
         rows = range(self.num_envs) if active is None else active.nonzero().squeeze(1).tolist()

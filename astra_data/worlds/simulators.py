@@ -125,11 +125,7 @@ class MujocoModel(FreeStates):
     def __init__(
         self, model: mujoco.MjModel, num_envs: int, *, substeps: int, num_threads: int | None = None
     ) -> None:
-        """Allocate B copies in the model's initial state.
-
-        Raises:
-            BadInputError: the model's actuators have states of their own, which (qpos, qvel) leaves out.
-        """
+        """Allocate B copies in the model's initial state."""
         if model.na:
             raise BadInputError(
                 f"the model has {model.na} actuator states: expected actuators without states"

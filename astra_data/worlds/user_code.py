@@ -66,11 +66,7 @@ def file_of(name: str) -> dict[str, str]:
 
 
 def user_object(name: str) -> Any:  # noqa: ANN401 - any object
-    """Run the file or module that `name` begins with, and return the object that it ends with.
-
-    Raises:
-        BadInputError: there is no such file, module or object, or running it fails.
-    """
+    """Run the file or module that `name` begins with, and return the object that it ends with."""
     place, _, attribute = name.rpartition(":")
     module = _of_file(Path(place)) if place.endswith(".py") else _of_package(place)
     if not hasattr(module, attribute):
@@ -184,9 +180,6 @@ def code_digest(name: str) -> str | None:
     Of a file, the files and packages beside it that it imports count too; of an installed module, all of its
     package. So do models and data beside these that they name, such as a robot.xml; what they find without
     its name, comments and layout do not.
-
-    Raises:
-        BadInputError: one of these files is no Python.
     """
     place = name.rpartition(":")[0]
     file = Path(place)

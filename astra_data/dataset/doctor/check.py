@@ -88,11 +88,7 @@ def _first_of_each(found: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
 
 def check(root: Path) -> Report:
-    """Check the dataset in folder `root`: its files, every value and, if it is ours, what it was written as.
-
-    Raises:
-        BadInputError: there is no folder `root`, or it holds no dataset, or versions of one.
-    """
+    """Check the dataset in folder `root`: its files, every value and, if it is ours, what it was written as."""
     if not (root / "meta").is_dir() and not (root / "data").is_dir():
         refuse_versions(root)
         refuse_run(root)

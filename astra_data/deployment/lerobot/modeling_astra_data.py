@@ -23,11 +23,7 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
     name = TYPE
 
     def __init__(self, config: AstraDataConfig, **_: object) -> None:
-        """Read the folder `config.pretrained_path`.
-
-        Raises:
-            BadInputError: there is none, it is not the folder of a policy, or a file of it was altered.
-        """
+        """Read the folder `config.pretrained_path`."""
         super().__init__(config)
         folder = config.pretrained_path
         if folder is None or not (Path(folder) / DESCRIPTION).is_file():
@@ -58,12 +54,7 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """Return commands (B, A), in their units, for the states (B, S) and goals (B, G) of `batch`.
-
-        Raises:
-            BadInputError: values are missing, too many, not finite or far outside what was recorded, or the
-                number of robots has changed since the last `reset`.
-        """
+        """Return commands (B, A), in their units, for the states (B, S) and goals (B, G) of `batch`."""
         state = self._checked(batch, STATE, "state")
         goal = self._checked(batch, GOAL, "goal") if self._about["goal"]["names"] else state[:, :0]
         if self._hidden is None:

@@ -190,9 +190,6 @@ class HubStore:
 
         `upload_folder` may make several commits, of which the first would leave a mixture behind. The folder
         `card` has SHA256SUMS, README.md and perhaps its figure.
-
-        Raises:
-            BadInputError: the Hub refuses the card, or the repository holds another dataset or a newer one.
         """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
 
@@ -254,11 +251,7 @@ class UrlStore:
     """The versions of one dataset below a URL; a version counts once its `layout.DATASET_PATH` exists."""
 
     def __init__(self, url: str) -> None:
-        """Take the folder `url`, whose last part is the dataset's name.
-
-        Raises:
-            BadInputError: no installed package handles such a URL.
-        """
+        """Take the folder `url`, whose last part is the dataset's name."""
         import fsspec  # noqa: PLC0415 - slow to import
 
         self.url = url

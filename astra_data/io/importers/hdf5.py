@@ -86,9 +86,6 @@ def layout(source: Source) -> dict[str, Any]:
     the order of their names; `dones` is taken as terminated, as robomimic's own learners do. It may stay set
     while success lasts: rows after its first are episodes of one step, left out unless truncation is recorded
     too. The demonstrations' attribute `success` is that of their last steps.
-
-    Raises:
-        BadInputError: it is none of them, or has no observations.
     """
     with _opened(source) as (h5py, file):
         fields = stored_datasets(h5py, file)

@@ -51,11 +51,7 @@ class MessageField:
         return _names_in(content) or []
 
     def value(self, content: Any) -> Array:  # noqa: ANN401 - any message
-        """Return the numbers, or the text, in a message; a time in s and ns as whole ns.
-
-        Raises:
-            BadInputError: the message lacks them, or its list is in another order than in messages before.
-        """
+        """Return the numbers, or the text, in a message; a time in s and ns as whole ns."""
         before = owner = None
         part = content
         for depth, key in enumerate(self._keys):

@@ -201,12 +201,7 @@ def _goals(task: Task, episode: Episode, seed: int) -> Tensor:
 
 
 def check_fits(source: Dataset, task: Task) -> None:
-    """Check that a dataset has the states and actions of a task.
-
-    Raises:
-        BadInputError: it lacks some, or theirs are of another size, in another order, in other units or at
-            another rate.
-    """
+    """Check that a dataset has the states and actions of a task."""
     faults = []
     if (fps := source.info["fps"]) != task.fps:
         faults.append(

@@ -164,10 +164,6 @@ def pair_steps(
     Take target states (N, S), actions (N, A) and next states (N, S); `batch` has B simulators, and the N
     steps are taken B at a time. Return the `abstract.*` columns (N, X), and the largest difference between
     φ(s) and the reset simulator. `first_step` is the number of the first of these steps, for messages.
-
-    Raises:
-        BadInputError: the difference is larger than `tolerance`, the simulator's states are not finite or no
-            tensors, or its step changes those handed out before.
     """
     abstract = checked_abstraction(pairing, state)
     landed = np.empty_like(abstract)

@@ -201,9 +201,6 @@ class HumanoidEnv:
         """Build B humanoids.
 
         locomotion: reward, ends and starts. actuators: meaning of the controls, see `humanoid_model`.
-
-        Raises:
-            BadInputError: `start_anywhere` is true.
         """
         if start_anywhere:
             raise BadInputError("collect.start: expected 'task' for a humanoid, got 'anywhere'")

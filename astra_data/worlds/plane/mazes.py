@@ -115,9 +115,6 @@ class Maze:
         Cells within `radius` m of a wall are not free. Paths keep `margin` m from walls where they can:
         within it, cells cost more the closer they are to a wall. Cells that are not free, or closed off,
         take the value of the nearest one with a path plus the distance to it.
-
-        Raises:
-            BadInputError: the goal's cell is not free.
         """
         free = self.clearance_field > radius
         goal_cell = self.fine_index(goal)

@@ -111,11 +111,7 @@ class Navigation(PlanarObjective):
         return self._around(self.maze.goal, rng, count)
 
     def draw_anywhere(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls.
-
-        Raises:
-            BadInputError: no place is as far from walls as `start_clearance_m` says.
-        """
+        """Draw states [x, y, vx, vy] (count, 4) at rest, uniformly from the free space away from walls."""
         rows, columns = np.nonzero(self.maze.clearance_field > self.start_clearance_m)
         if not len(rows):
             raise BadInputError(

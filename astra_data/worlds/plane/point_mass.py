@@ -40,9 +40,6 @@ class PlanarStates:
 
         radius_m: distance that the disc's center keeps from walls, a multiple of the maze's `fine_m`.
         speed_m_s: top speed along each axis.
-
-        Raises:
-            BadInputError: the radius is no such multiple.
         """
         cells = radius_m / maze.fine_m
         if abs(cells - round(cells)) > _CELLS_APART:

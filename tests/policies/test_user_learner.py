@@ -74,7 +74,7 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
 @pytest.mark.parametrize(
     ("is_plus", "task", "command", "expected"),
     [
-        (True, TASK, 1.0, [0.0] * 10 + [0.25]),
+        (True, TASK, 1.0, [0.0] * 10 + [0.4]),
         (True, TASK, -1.0, [0.0] * 11),
         (False, TASK, 1.0, [1.0] * 11),
         (True, replace(TASK, objective=Last(horizon=40)), 1.0, [1.0] * 11),
@@ -88,7 +88,7 @@ def test_prices_grow_as_in_other_trainings(
     def learn(env: WatchedEnv, training: Training) -> Constant:
         env.reset()
         for _ in range(11):
-            # After a tenth of the training, of which prices grow over four.
+            # After a tenth of the training, over a quarter of which prices grow.
             env.points[:] = [] if len(scales) < 10 else [{"share": 0.1, "success": max(0.0, command)}]
             env.step(np.full((4, 1), command))
             scales.append(env.env.env.penalty_scale)  # type: ignore[attr-defined]
