@@ -369,7 +369,7 @@ class Cutter:
         self.tally.clock = str(self._clock)
 
     def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Mask]]:
-        """Return the columns of `block` with n rows, (n,) or (n, size), and rows where fields are not finite."""
+        """Return the columns of `block`, (n,) or (n, size), and the rows where fields are not finite."""
         faults: list[str] = []
         fields = {name: _as_rows(name, block.values[name], faults) for name in self._mapping.fields}
         if faults:

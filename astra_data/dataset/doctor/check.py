@@ -88,7 +88,7 @@ def _first_of_each(found: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
 
 def check(root: Path) -> Report:
-    """Check the dataset in folder `root`: its files, every value and, if it is ours, what it was written as."""
+    """Check the dataset in folder `root`: its files, every value and, if it is ours, its digests."""
     if not (root / "meta").is_dir() and not (root / "data").is_dir():
         refuse_versions(root)
         refuse_run(root)

@@ -126,7 +126,7 @@ def train(
 
 
 def _learned(learn: Learn, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
-    """Return the policy and the learning curve that `learn`, which may be a function of the user's, returns."""
+    """Return the policy and the learning curve that `learn`, perhaps a function of the user's, returns."""
     match returned := learn(training):
         case (PolicyFile() as policy, dict() as curve):
             return policy, curve
