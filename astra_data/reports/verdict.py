@@ -1,9 +1,9 @@
 """Which method to deploy, by a short rule, and the lines that the page and the terminal show of it.
 
 The best method is the one with the highest mean score over seeds, references apart. It is deployed if it
-succeeds in half of the episodes or more (for scores without a limit: always), and no floor does as well.
-Otherwise none is, for the first of these reasons: a method did not learn to do the task in the simulator of
-its training; what was learned there is lost in the target.
+succeeds in half of the episodes or more (for scores without a limit: always), fails in less than a third of
+them, and no floor does as well. Otherwise none is, for these reasons: a method did not learn to do the task
+in the simulator of its training; what was learned there is lost in the target; the best fails too often.
 """
 
 from collections.abc import Iterator
@@ -20,6 +20,8 @@ from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summa
 ENOUGH = 0.5
 """Share of the largest possible score from which a method can be deployed, and has learned its own
 simulator; also the R² of rewards on held-out episodes from which a grounding predicts them well."""
+_TOO_MANY_FAILURES = 1 / 3
+"""Share of the episodes that end in a failure, such as a fall, from which nothing is deployed."""
 
 
 @dataclass(frozen=True)
@@ -70,18 +72,15 @@ def verdict_of(results: Results) -> Verdict:
 
     limit = results.headline.limit
     least = -np.inf if limit is None else ENOUGH * limit
-    enough = {row for row in (best, floor) if row and worth[row].value >= least}
     is_beaten = floor is not None and worth[floor].value >= worth[best].value
     learned = {row: results.score_of(row, SIMULATED) for row in rivals}
     poor = {row: found for row, found in learned.items() if found and found.value < least}
     poor = dict(sorted(poor.items(), key=lambda item: item[0] not in results.compare))
     causes = [_cause(results, row) for row in poor]
     chosen, advice = None, "Deploy" if in_target else "Try first"
-    if floor in enough and is_beaten:
-        chosen, text = floor, f"{advice} **{method_title(floor)}**, the floor: no method does better."
-    elif best in enough and not is_beaten:
-        chosen, text = best, f"{advice} **{title}**: {score}."
-    else:
+    first = floor if floor and is_beaten else best
+    failing = None if limit is None else _failing(results, first)
+    if worth[first].value < least:
         why = [
             f"{method_title(row)} did not learn its own simulator ({results.headline.text(found.value)})"
             for row, found in poor.items()
@@ -89,6 +88,13 @@ def verdict_of(results: Results) -> Verdict:
         if not why:
             why, causes = [f"the best method, {title}, has {score}"], [*_lost(results, best)]
         text = f"**Deploy none yet**: {listed(why)}."
+    elif failing:
+        text = f"**Deploy none yet**: {method_title(first)} fails in {100 * failing:.0f} % of its episodes."
+    else:
+        chosen = first
+        text = f"{advice} **{title}**: {score}."
+        if is_beaten:
+            text = f"{advice} **{method_title(first)}**, the floor: no method does better."
     seed = _seed(results, chosen) if chosen else 0
     return Verdict(chosen, seed, percent, text, lines, [*causes, *_limits(results, best)])
 
@@ -125,6 +131,12 @@ def _difference(results: Results, best: str, floor: str | None) -> str:
     )
 
 
+def _failing(results: Results, row: str) -> float | None:
+    """Return the share of the episodes in the target that a method fails in, if that is too large."""
+    failed = results.summary(row, "failed") if results.tested_in == "target" else None
+    return failed.value if failed and failed.value >= _TOO_MANY_FAILURES else None
+
+
 def _cause(results: Results, row: str) -> str:
     """Return why a method did not learn its own simulator, and what helps."""
     explained = results.summary(grounded_as(row), "r2_reward", "ground")
@@ -155,9 +167,6 @@ def _lost(results: Results, row: str) -> Iterator[str]:
                 f"{title}: on held-out episodes its correction is no better than none in {listed(worse)}: "
                 "record more episodes, or longer ones."
             )
-    failed = results.summary(row, "failed")
-    if failed and failed.value >= ENOUGH:
-        yield f"{title} fails in {100 * failed.value:.0f} % of its episodes: look at these first."
 
 
 def _limits(results: Results, best: str) -> Iterator[str]:

@@ -66,7 +66,8 @@ class RobotEnv:
         self._objective, self._column, self._commands = objective, state, commands
         self._abstraction = abstraction
         self._robots = [robot() for _ in range(num_envs)]
-        self._takes_seed = "seed" in inspect.signature(self._robots[0].reset).parameters
+        taken = inspect.signature(self._robots[0].reset).parameters
+        self._takes_seed = "seed" in taken or any(one.kind is one.VAR_KEYWORD for one in taken.values())
         self._any_end_fails = getattr(self._robots[0], "any_end_fails", False)
         self.goal = torch.zeros(num_envs, objective.goal_size)
         self.failed = torch.zeros(num_envs, dtype=torch.bool)

@@ -71,8 +71,14 @@ class Noted(Cart):
         return super().reset()
 
 
-def test_the_same_seed_gives_the_same_goals_and_seeds() -> None:
-    task, goals = replace(TASK, robot=Noted), []
+class NotedAmongOptions(Noted):
+    def reset(self, **options: Any) -> list[float]:  # type: ignore[override] # noqa: ANN401
+        return super().reset(**options)
+
+
+@pytest.mark.parametrize("robot", [Noted, NotedAmongOptions])
+def test_the_same_seed_gives_the_same_goals_and_seeds(robot: type[Noted]) -> None:
+    task, goals = replace(TASK, robot=robot), []
     Noted.seeds.clear()
     for seed in (1, 1, 2):
         env = task.target(2, seed=seed)
