@@ -95,6 +95,6 @@ def test_what_a_grounding_of_one_s_own_saves_and_asks_for_is_checked(
     assert not path.exists()
     monkeypatch.setattr(Shifted, "to_file", lambda self: ({"offset": self.shift}, {}))
     save_grounding(path, shifted, no_episodes())
-    told = r"^Shifted.from_file fails with KeyError: 'shift'.*: the file has the tensors offset, and"
+    told = r"^Shifted.from_file, given the tensors offset and .*, fails with KeyError: 'shift'"
     with pytest.raises(BadInputError, match=told):
         load_grounding(path)
