@@ -386,8 +386,12 @@ def _direct(logs: Logs, planar: SimulatorKind | None) -> SimulatorKind:
         left = [one for one in left if one not in moves[-1][1]]
     idle = [command.short for command, found in moves if not found]
     remarks = [f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect"] if idle else []
-    if turned := [one.short for one in left if HEADING.fullmatch(one.plain)]:
-        remarks.append(f"{' and '.join(turned)} {'is' if len(turned) == 1 else 'are'} not in φ")
+    if turned := [one.short for one in left if HEADING.fullmatch(one.plain) or "angle" in one.plain]:
+        is_alone = len(turned) == 1
+        remarks.append(
+            f"{' and '.join(turned)} {'is' if is_alone else 'are'} not in φ, though failures may come of "
+            f"{'it' if is_alone else 'them'}"
+        )
     if whole and not planar:
         remarks.append(f"{', '.join(sorted(whole))} are a quaternion: make yaw of it in φ")
     moves = [(command, found) for command, found in moves if found]

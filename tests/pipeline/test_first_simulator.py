@@ -130,7 +130,7 @@ KINDS: dict[str, tuple[Callable[[], Columns], str]] = {
     "bicycle": (
         bicycle,
         "a bicycle: x, y, heading, moved by speed, steering; wheelbase_m 2.5; "
-        "CHECK: trailer_heading is not in φ",
+        "CHECK: trailer_heading and hitch_angle are not in φ, though failures may come of them",
     ),
     "differential drive": (
         differential,
