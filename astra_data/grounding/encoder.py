@@ -143,7 +143,7 @@ class HistoryEncoder(Encoder):
 
     def sequence(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return latents and hidden states (B, T, Z)."""
-        states = self._states(inputs, self.initial(len(inputs)))
+        states = self.through_episodes(inputs, self.initial(len(inputs)), torch.zeros_like(inputs[..., 0]))
         return self.latent(states), states
 
     def through_episodes(self, inputs: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
@@ -151,14 +151,10 @@ class HistoryEncoder(Encoder):
 
         They begin with `hidden` (B, Z). `start` (B, T) is 1 where a new episode begins, from zero.
         """
-        return self._states(inputs, hidden, 1.0 - start)
-
-    def _states(self, inputs: Tensor, hidden: Tensor, keep: Tensor | None = None) -> Tensor:
-        """Return the hidden states (B, T, Z); each is multiplied by `keep` (B, T) before its step."""
         embedded = functional.elu(self.embedding(inputs.transpose(0, 1)))
         (weights,) = self.recurrence.all_weights
-        kept = torch.ones_like(inputs[..., 0]) if keep is None else keep
-        states = _Recurrence.apply(embedded, hidden, kept.t().unsqueeze(-1), *weights)  # type: ignore[no-untyped-call]
+        keep = (1.0 - start).t().unsqueeze(-1)
+        states = _Recurrence.apply(embedded, hidden, keep, *weights)  # type: ignore[no-untyped-call]
         return torch.as_tensor(states).transpose(0, 1)
 
     def _next(self, embedded: Tensor, hidden: Tensor) -> Tensor:

@@ -91,10 +91,8 @@ def verdict_of(results: Results) -> Verdict:
     elif failing:
         text = f"**Deploy none yet**: {method_title(first)} fails in {100 * failing:.0f} % of its episodes."
     else:
-        chosen = first
-        text = f"{advice} **{title}**: {score}."
-        if is_beaten:
-            text = f"{advice} **{method_title(first)}**, the floor: no method does better."
+        chosen, why_it = first, ", the floor: no method does better" if is_beaten else f": {score}"
+        text = f"{advice} **{method_title(first)}**{why_it}."
     seed = _seed(results, chosen) if chosen else 0
     return Verdict(chosen, seed, percent, text, lines, [*causes, *_limits(results, best)])
 
