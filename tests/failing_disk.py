@@ -24,9 +24,7 @@ def small_files(most: int) -> Iterator[None]:
 
 
 @contextmanager
-def failing(
-    names: str, at: int, error: BaseException, then: BaseException | None = None
-) -> Iterator[list[str]]:
+def failing(names: str, at: int, error: BaseException, then: BaseException | None = None) -> Iterator[list[str]]:
     """Raise `error` at call `at` of the functions `names` of `os`, and `then` at all later ones.
 
     Yields the calls, in order.

@@ -143,9 +143,7 @@ class Handler(BaseHTTPRequestHandler):
         name = f"{asked['organization'] or 'me'}/{asked['name']}"
         if name in self.server.repos:
             return self._answer({"error": "exists", "url": f"{self.server.url}/datasets/{name}"}, 409)
-        self.server.repos[name] = Repository(
-            private=asked.get("visibility", self.server.visibility) == "private"
-        )
+        self.server.repos[name] = Repository(private=asked.get("visibility", self.server.visibility) == "private")
         return self._answer({"url": f"{self.server.url}/datasets/{name}", "id": name})
 
     def validate(self) -> None:
@@ -156,8 +154,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def refs(self, repo: Repository) -> None:
         tags = [
-            {"name": name, "ref": f"refs/tags/{name}", "targetCommit": commit}
-            for name, commit in repo.tags.items()
+            {"name": name, "ref": f"refs/tags/{name}", "targetCommit": commit} for name, commit in repo.tags.items()
         ]
         branches = [{"name": "main", "ref": "refs/heads/main", "targetCommit": repo.head}]
         self._answer({"branches": branches, "tags": tags, "converts": []})
@@ -201,11 +198,7 @@ class Handler(BaseHTTPRequestHandler):
 
         asked = json.loads(self.body)["files"]
         self._answer(
-            {
-                "files": [
-                    {"path": f["path"], "uploadMode": mode(f["path"]), "shouldIgnore": False} for f in asked
-                ]
-            }
+            {"files": [{"path": f["path"], "uploadMode": mode(f["path"]), "shouldIgnore": False} for f in asked]}
         )
 
     def batch(self, repo: Repository) -> None:

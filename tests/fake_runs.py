@@ -60,9 +60,7 @@ def outcomes(success: list[int], seed: int) -> dict[str, list[float]]:
     }
 
 
-def write_evaluation(
-    root: Path, method: str, seed: int, percent: int | None = None, *, name: str = ""
-) -> None:
+def write_evaluation(root: Path, method: str, seed: int, percent: int | None = None, *, name: str = "") -> None:
     folder = root / "evaluate" / (name or method) / seed_folder(seed, percent)
     values: dict[str, object] = {
         "task": "antmaze-u",
@@ -120,8 +118,7 @@ def write_runs(parent: Path) -> Path:
                 ]
                 write_json(
                     root / f"train/{method}/seed_{seed}/curve.json",
-                    MADE
-                    | {"steps_per_second": 48000.0, "simulator_steps_per_second": 96000.0, "points": points},
+                    MADE | {"steps_per_second": 48000.0, "simulator_steps_per_second": 96000.0, "points": points},
                 )
     return root
 
@@ -146,9 +143,7 @@ def write_elsewhere(root: Path, name: str, like: str = "direct_transfer") -> Non
         del values["simulated"]
         write_json(path, values)
         points = [{"steps": 1000, "success": None, "loss": 1.0}]
-        write_json(
-            root / f"train/{name}/seed_{seed}/curve.json", MADE | {"wall_seconds": 3.0, "points": points}
-        )
+        write_json(root / f"train/{name}/seed_{seed}/curve.json", MADE | {"wall_seconds": 3.0, "points": points})
 
 
 def bare_results(recipe: str, rows: Mapping[str, list[int]], settings: dict[str, Any]) -> Results:

@@ -33,9 +33,7 @@ class FakeStages:
         self.asked: dict[str, dict[str, Any]] = {}
         self.failing: set[str] = set()
 
-    def run_here(
-        self, items: Collection[Item], *, watch: Watcher, prepare: Callable[[], object], **_: object
-    ) -> None:
+    def run_here(self, items: Collection[Item], *, watch: Watcher, prepare: Callable[[], object], **_: object) -> None:
         """Run items as an executor does, one after another."""
         for item in items:
             watch.started(item.key)

@@ -65,9 +65,7 @@ def shift_of(fitting: Fitting) -> Tensor:
 METHOD = Method(
     name="shifted", title="Shifted", fit=lambda fitting: (Shifted(shift_of(fitting)), {}), grounding=Shifted
 )
-LOSSY = Method(
-    name="lossy", title="Lossy", fit=lambda fitting: (Lossy(shift_of(fitting)), {}), grounding=Lossy
-)
+LOSSY = Method(name="lossy", title="Lossy", fit=lambda fitting: (Lossy(shift_of(fitting)), {}), grounding=Lossy)
 UNNAMED = replace(LOSSY, grounding=None)
 CLASHING = replace(METHOD, fit=lambda fitting: (Shifted(shift_of(fitting)), {"failures": 3, "machine": ""}))
 
@@ -88,9 +86,7 @@ class Narrow(Shifted):
         return NarrowSimulator(simulator, self.shift)
 
 
-NARROW = Method(
-    name="narrow", title="Narrow", fit=lambda fitting: (Narrow(shift_of(fitting)), {}), grounding=Narrow
-)
+NARROW = Method(name="narrow", title="Narrow", fit=lambda fitting: (Narrow(shift_of(fitting)), {}), grounding=Narrow)
 
 
 class Wide(Shifted):

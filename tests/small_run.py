@@ -16,9 +16,7 @@ _SHORT = replace(_LONG, name=TASK, objective=replace(_LONG.objective, horizon=25
 
 COLLECT = CollectConfig(episodes=8, max_steps=60)
 GROUND = GroundConfig(updates=30, batch_windows=4, window=20, latent_size=16, held_out_share=0.25)
-TRAIN = PpoTrainConfig(
-    num_envs=8, rollout_steps=8, total_steps=8 * 8 * 6, hidden_sizes=(16,), memory_size=8, tries=1
-)
+TRAIN = PpoTrainConfig(num_envs=8, rollout_steps=8, total_steps=8 * 8 * 6, hidden_sizes=(16,), memory_size=8, tries=1)
 ALIGN = AlignConfig(updates=200, batch_windows=4, window=20, held_out_share=0.25)
 
 

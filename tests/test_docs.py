@@ -172,9 +172,7 @@ def test_commands_of_blocks_are_taken_by_the_command_line() -> None:
 
 
 def test_options_named_in_the_text_exist() -> None:
-    named = [
-        (page, code) for page, text in PAGES.items() for code in re.findall(r"`(?:astra-data )(.+?)`", text)
-    ]
+    named = [(page, code) for page, text in PAGES.items() for code in re.findall(r"`(?:astra-data )(.+?)`", text)]
     assert len(named) > 30
     faults = []
     for page, code in named:
@@ -183,9 +181,7 @@ def test_options_named_in_the_text_exist() -> None:
             faults.append(f"{page}: {code}")
             continue
         parameters = COMMANDS[name].params
-        known = {
-            option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)
-        }
+        known = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
         unknown = {word for word in words if word.startswith("--")} - known
         faults += [f"{page}: {code}: no option {option}" for option in unknown]
     assert not faults, "\n".join(faults)
@@ -209,9 +205,7 @@ def test_blocks_that_are_not_run_say_why_and_are_few() -> None:
     assert len(reasons) <= MOST_NOT_RUN
     markers = [marker for text in PAGES.values() for marker in re.findall(r"<!--.*?-->", text)]
     assert len(markers) == len(reasons), "every comment stands right before its block"
-    assert not [
-        block for page in PAGES for block in blocks(page) if block.language == "python" and block.reason
-    ]
+    assert not [block for page in PAGES for block in blocks(page) if block.language == "python" and block.reason]
 
 
 def test_every_fence_is_a_block_of_a_known_language() -> None:
@@ -273,9 +267,7 @@ def test_the_index_leads_to_every_page() -> None:
 
 def test_nothing_that_no_registry_has_is_installed() -> None:
     """Only a folder, uv, and what a robot needs: the package itself may be on no registry."""
-    asked = [
-        (page, found) for page, text in PAGES.items() for found in re.findall(r"pip install ([^&`\n]+)", text)
-    ]
+    asked = [(page, found) for page, text in PAGES.items() for found in re.findall(r"pip install ([^&`\n]+)", text)]
     assert {found.strip() for _, found in asked} <= {"uv", '".[all]"', "numpy onnxruntime"}, asked
 
 

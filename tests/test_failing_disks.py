@@ -62,9 +62,7 @@ pytestmark = pytest.mark.skipif(why_not() is not None, reason=why_not() or "")
 
 def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(TOOLS), "ASTRA_DATA_NO_FSYNC": ""}
-    return subprocess.run(
-        [sys.executable, *command], capture_output=True, text=True, check=False, env=environment
-    )
+    return subprocess.run([sys.executable, *command], capture_output=True, text=True, check=False, env=environment)
 
 
 def test_commands_on_failing_disks_publish_nothing_wrong_and_go_on(tmp_path: Path) -> None:
@@ -104,9 +102,7 @@ def test_the_disk_fails_when_told_and_sees_every_write(tmp_path: Path) -> None:
         ("zeroed", {"new": "old", "synced": "12\0", "unnamed": "1", "unsynced": "\0\0"}),
     ],
 )
-def test_a_power_failure_takes_what_was_not_synced(
-    tmp_path: Path, outcome: Outcome, kept: dict[str, str]
-) -> None:
+def test_a_power_failure_takes_what_was_not_synced(tmp_path: Path, outcome: Outcome, kept: dict[str, str]) -> None:
     root = tmp_path / "disk"
     root.mkdir()
     (root / "old").write_text("old")

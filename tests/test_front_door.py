@@ -48,9 +48,7 @@ def test_these_names_are_public_and_no_others() -> None:
     assert astra_data.__all__ == sorted(PUBLIC)
     assert dir(astra_data) == sorted(PUBLIC)
     tree = ast.parse(Path(astra_data.__file__).read_text())
-    typed = [
-        alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
-    ]
+    typed = [alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
     assert sorted(name for name in typed if name) == sorted(PUBLIC)
     assert (Path(astra_data.__file__).parent / "py.typed").exists()
 

@@ -24,9 +24,7 @@ from astra_data.cli.app import app
 from astra_data.pipeline.recipe import Recipe
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted(
-    path.relative_to(ROOT / "docs").as_posix().removesuffix(".md") for path in (ROOT / "docs").rglob("*.md")
-)
+DOCS = sorted(path.relative_to(ROOT / "docs").as_posix().removesuffix(".md") for path in (ROOT / "docs").rglob("*.md"))
 NOTEBOOKS = sorted((ROOT / "docs/guide/notebooks").glob("*.ipynb"))
 COUNTED = {"blockquote", "em", "h2", "h3", "img", "li", "pre", "strong", "td", "tr"}
 SCHEMA: dict[str, Any] = Recipe.model_json_schema()
@@ -150,9 +148,7 @@ def agrees(row: list[str], key: str, model: dict[str, Any], usual: dict[str, Any
     """Tell whether a row of the reference has the default, the bounds and the meaning of a key's schema."""
     schema = model["properties"][key]
     kind, default, _, meaning = row
-    made: object = (
-        {} if "additionalProperties" in schema else None
-    )  # by a factory, which the schema does not tell
+    made: object = {} if "additionalProperties" in schema else None  # by a factory, which the schema does not tell
     known = usual.get(key, schema.get("default", made))
     expected = "required" if key in model.get("required", []) else "" if known is None else json.dumps(known)
     bounds = [schema, *schema.get("anyOf", []), schema.get("items", {}), *schema.get("prefixItems", [])]

@@ -29,9 +29,7 @@ def identifiers(tree: ast.AST) -> Iterator[tuple[int, str]]:
         match node:
             case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
                 yield node.lineno, name
-            case (
-                ast.arg(arg=name) | ast.keyword(arg=str(name)) | ast.Name(id=name) | ast.Attribute(attr=name)
-            ):
+            case ast.arg(arg=name) | ast.keyword(arg=str(name)) | ast.Name(id=name) | ast.Attribute(attr=name):
                 yield node.lineno, name
             case ast.alias(name=name, asname=other):
                 yield node.lineno, other or name.rpartition(".")[2]

@@ -47,9 +47,7 @@ def main(
         data = random_walks(episodes, steps)
         for title, candidates in measurements(Path(name), data, lerobot):
             figures[title] = {name: rate.clock for name, rate in measure(candidates, rounds).items()}
-    table = Table(
-        "", "per second", "ours is", title=f"{episodes} episodes of {steps} steps, one torch thread"
-    )
+    table = Table("", "per second", "ours is", title=f"{episodes} episodes of {steps} steps, one torch thread")
     for title, rates in figures.items():
         table.add_section()
         table.add_row(f"[bold]{title}")

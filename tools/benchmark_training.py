@@ -77,9 +77,7 @@ def main(
             figures[title] = measure(candidates, 1 if quick else rounds)
     print_rates(figures)
     if json_path is not None:
-        rates_of = {
-            title: {name: asdict(rate) for name, rate in rates.items()} for title, rates in figures.items()
-        }
+        rates_of = {title: {name: asdict(rate) for name, rate in rates.items()} for title, rates in figures.items()}
         report = {"rounds": rounds, "quick": quick, "cores": cores(), "per_second": rates_of}
         json_path.write_text(json.dumps(report, indent=2) + "\n")
 

@@ -112,9 +112,7 @@ class Minari:
         cut = []
         for episode in self._dataset.sample_episodes(min(BATCH // 2, self._dataset.total_episodes)):
             first = rng.integers(len(episode.actions) - LENGTH)
-            cut.append(
-                [a[first : first + LENGTH] for a in (episode.observations, episode.actions, episode.rewards)]
-            )
+            cut.append([a[first : first + LENGTH] for a in (episode.observations, episode.actions, episode.rewards)])
         return len(stacked(cut)[0])
 
 

@@ -48,9 +48,7 @@ class Mutant:
     def diff(self) -> str:
         """Return the change as a unified diff."""
         before = (ROOT / self.path).read_text().splitlines()
-        lines = difflib.unified_diff(
-            before, self.code.splitlines(), str(self.path), str(self.path), "", "", 0, ""
-        )
+        lines = difflib.unified_diff(before, self.code.splitlines(), str(self.path), str(self.path), "", "", 0, "")
         return "\n".join(list(lines)[2:])
 
 
@@ -91,9 +89,7 @@ def tests_of(path: Path) -> list[str]:
     package, _, name = module.rpartition(".")
     folder = Path("tests", *path.parts[1:-1])
     found = [
-        test
-        for test in (folder / f"test_{path.name}", folder / f"test_{folder.name}.py")
-        if (ROOT / test).exists()
+        test for test in (folder / f"test_{path.name}", folder / f"test_{folder.name}.py") if (ROOT / test).exists()
     ]
     for test in sorted(ROOT.glob("tests/**/test_*.py")):
         names = {
@@ -147,19 +143,13 @@ def main(
         file.relative_to(ROOT)
         for room in rooms
         for file in (
-            [ROOT / "astra_data" / room]
-            if room.endswith(".py")
-            else (ROOT / "astra_data" / room).rglob("*.py")
+            [ROOT / "astra_data" / room] if room.endswith(".py") else (ROOT / "astra_data" / room).rglob("*.py")
         )
     ]
     tested = {file: tests for file in files if (tests := tests_of(file))}
-    console.print(
-        f"not run, for no test imports them: {', '.join(map(str, set(files) - set(tested))) or 'none'}"
-    )
+    console.print(f"not run, for no test imports them: {', '.join(map(str, set(files) - set(tested))) or 'none'}")
     drawn = drawn_from(sorted(tested), count, random.Random(seed))
-    sound = [
-        Mutant(file, "none", (ROOT / file).read_text()) for file in dict.fromkeys(one.path for one in drawn)
-    ]
+    sound = [Mutant(file, "none", (ROOT / file).read_text()) for file in dict.fromkeys(one.path for one in drawn)]
     noticed: Counter[str] = Counter()
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -169,9 +159,7 @@ def main(
         copies: SimpleQueue[Path] = SimpleQueue()
         for number in range(jobs):
             copy = Path(folder) / str(number)
-            shutil.copytree(
-                ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", ".*_cache", "runs", "datasets")
-            )
+            shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", ".*_cache", "runs", "datasets"))
             copies.put(copy)
 
         def run(mutant: Mutant) -> None:

@@ -69,9 +69,7 @@ def _outputs(source: str, count: int, namespace: dict[str, Any]) -> list[dict[st
         outputs.append({"output_type": "stream", "name": "stdout", "text": text.splitlines(keepends=True)})
     if value is not None and not source.rstrip().endswith(";"):
         data = {"text/plain": repr(value).splitlines(keepends=True)}
-        outputs.append(
-            {"output_type": "execute_result", "execution_count": count, "metadata": {}, "data": data}
-        )
+        outputs.append({"output_type": "execute_result", "execution_count": count, "metadata": {}, "data": data})
     return outputs + _figures()
 
 

@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 
 
 def main(
-    count: Annotated[
-        int | None, typer.Option(help="Moments per command and failure.", show_default="all")
-    ] = None,
+    count: Annotated[int | None, typer.Option(help="Moments per command and failure.", show_default="all")] = None,
     commands: Annotated[str, typer.Option(help="Names, separated by commas.", show_default="all")] = "",
     failures: Annotated[str, typer.Option(help="Names, separated by commas.", show_default="all")] = "",
     at: Annotated[int | None, typer.Option(help="Only this moment.", show_default=False)] = None,

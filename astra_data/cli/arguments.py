@@ -83,9 +83,7 @@ Source = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(
-        help="Folder of the new dataset.", show_default="its place in $ASTRA_DATA_HOME or ./datasets"
-    ),
+    typer.Option(help="Folder of the new dataset.", show_default="its place in $ASTRA_DATA_HOME or ./datasets"),
 ]
 NewName = Annotated[
     str | None,
@@ -101,12 +99,8 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a 
 Methods = Annotated[
     list[str] | None, typer.Option("--method", metavar="ROW", help="Run only this row; may be repeated.")
 ]
-Seeds = Annotated[
-    list[int] | None, typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.")
-]
-Device = Annotated[
-    str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …", callback=_device)
-]
+Seeds = Annotated[list[int] | None, typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.")]
+Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …", callback=_device)]
 Jobs = Annotated[
     int | None,
     typer.Option(
@@ -250,9 +244,7 @@ def refuse(options: Mapping[str, object], stage: str, table: str | None = None) 
     """Refuse `options` that are given, since a recipe sets them itself."""
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
-        raise BadInputError(
-            f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}"
-        )
+        raise BadInputError(f"{stage}: the recipe's [{table or stage}] sets this: leave out {', '.join(given)}")
 
 
 def refuse_of_recipes(command: str, seeds: Sequence[int] | None, jobs: int | None) -> int | None:

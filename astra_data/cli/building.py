@@ -49,9 +49,7 @@ def collect(
         str | None, typer.Option(help="Name of the dataset.", show_default="task, behavior and seed")
     ] = None,
     out: Out = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the same command after an interruption.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the same command after an interruption.")] = False,
 ) -> None:
     """Record episodes in the target environment."""
     if task.endswith(".toml"):
@@ -123,9 +121,7 @@ def augment(
 
 def label(
     dataset: DatasetName,
-    task: Annotated[
-        str, typer.Option(help="A task: a name, or a place such as cart.py:TASK. Its code is run.")
-    ],
+    task: Annotated[str, typer.Option(help="A task: a name, or a place such as cart.py:TASK. Its code is run.")],
     seed: Annotated[int, typer.Option(help="Random seed of the goals.")] = 0,
     name: NewName = None,
     out: Out = None,

@@ -48,9 +48,7 @@ def subset(
     ] = None,
     stratify: Annotated[
         str | None,
-        typer.Option(
-            help="Key of the episodes' metadata, such as success, whose values keep their proportions."
-        ),
+        typer.Option(help="Key of the episodes' metadata, such as success, whose values keep their proportions."),
     ] = None,
     name: NewName = None,
     out: Out = None,
@@ -143,15 +141,11 @@ def _report(folder: Path) -> None:
     from astra_data.dataset.versions import home_of, versions_at_home
 
     written = Dataset.open(folder)
-    typer.echo(
-        f"finished: {folder} ({written.reference}, {len(written)} episodes, {written.lengths.sum()} steps)"
-    )
+    typer.echo(f"finished: {folder} ({written.reference}, {len(written)} episodes, {written.lengths.sum()} steps)")
     name, version = written.description["name"], written.description["version"]
     versions = [str(known) for known in versions_at_home(name)]
     if folder == home_of(written.description) and versions[-1] == version and len(versions) > 1:
-        typer.echo(
-            f"note: {name} now means this version, no longer data-{versions[-2]}; --name keeps both apart"
-        )
+        typer.echo(f"note: {name} now means this version, no longer data-{versions[-2]}; --name keeps both apart")
 
 
 def inspect(
@@ -162,9 +156,7 @@ def inspect(
     ] = None,
     json: Annotated[
         Path | None,
-        typer.Option(
-            help="File for the check-up's findings, each with all its episodes.", show_default="no file"
-        ),
+        typer.Option(help="File for the check-up's findings, each with all its episodes.", show_default="no file"),
     ] = None,
 ) -> None:
     """Show a dataset's values, episodes, a map of visited positions, and what looks wrong."""
@@ -204,9 +196,7 @@ def list_(
     ] = None,
     clean: Annotated[
         bool,
-        typer.Option(
-            "--clean", help="Instead, remove leftovers of killed commands from the home folder and FOLDER."
-        ),
+        typer.Option("--clean", help="Instead, remove leftovers of killed commands from the home folder and FOLDER."),
     ] = False,
     tasks: Annotated[bool, typer.Option("--tasks", help="Instead, list the named tasks.")] = False,
 ) -> None:
@@ -218,9 +208,7 @@ def list_(
         _clean(folders or [])
         return
     if folders:
-        raise BadInputError(
-            "list: folders are for --clean; without it, list shows the datasets in the home folder"
-        )
+        raise BadInputError("list: folders are for --clean; without it, list shows the datasets in the home folder")
     from rich.table import Table
 
     from astra_data.core.errors import AstraDataError, CorruptDatasetError
@@ -366,9 +354,7 @@ _SHOWN = 5
 
 def log(
     dataset: DatasetName,
-    other: Annotated[
-        str | None, typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.")
-    ] = None,
+    other: Annotated[str | None, typer.Argument(metavar="[OTHER]", help="Show how this one differs from it.")] = None,
 ) -> None:
     """Show what a dataset was made from, as a tree; or how two differ: columns, episodes by uid, origin."""
     from astra_data.dataset.compare import differences, lineage, tree_lines
@@ -393,9 +379,7 @@ def log(
     if found.metadata:
         if not found.values:
             typer.echo("0 episodes differ in values")
-        keys = ", ".join(
-            f"{printable(key)} ({first_few(uids, _SHOWN)})" for key, uids in found.metadata.items()
-        )
+        keys = ", ".join(f"{printable(key)} ({first_few(uids, _SHOWN)})" for key, uids in found.metadata.items())
         different = set().union(*found.metadata.values())
         typer.echo(f"{len(different)} episodes differ in metadata: {keys}")
     for sentence in (*found.schema, *found.description):

@@ -86,8 +86,6 @@ def _tables(spreads: tuple[Spread, ...]) -> Iterator[RenderableType]:
         labels = column.names or [str(index) if column.size > 1 else "" for index in range(column.size)]
         for index, (label, unit) in enumerate(zip(labels, column.units, strict=True)):
             figures = (f"{values[index]:.4g}" for values in (spread.low, spread.mean, spread.high))
-            table.add_row(
-                *map(Text, (printable(label), printable(unit), *figures, sparkline(spread.counts[index])))
-            )
+            table.add_row(*map(Text, (printable(label), printable(unit), *figures, sparkline(spread.counts[index]))))
         yield Text(f"{printable(column.name)} ({column.size}) {column.dtype}", style="bold")
         yield table

@@ -88,9 +88,7 @@ def check(
     root: Root = RUNS,
     verify: Annotated[
         bool,
-        typer.Option(
-            "--verify", help="Read every byte of the artifacts instead of comparing only their sizes."
-        ),
+        typer.Option("--verify", help="Read every byte of the artifacts instead of comparing only their sizes."),
     ] = False,
 ) -> None:
     """Check recipes, listing which artifacts are finished, damaged or stale; or tasks. Nothing is run."""
@@ -124,11 +122,7 @@ def _check_recipe(recipe: Path, root: Path, verify: bool) -> list[str]:
         return []
     again = f"`astra-data run {recipe}` recreates these"
     # What differs in its bytes alone, `run` finds only once a step reads it.
-    how = (
-        f"move them away, and {again}"
-        if verify
-        else f"{again}, except those that the list asks you to remove"
-    )
+    how = f"move them away, and {again}" if verify else f"{again}, except those that the list asks you to remove"
     return [f"{recipe}: {' and '.join(spoilt)}: {how}"]
 
 
@@ -188,17 +182,13 @@ def evaluate(
         run_stage(recipe, "evaluate", methods=methods, seeds=seeds, jobs=jobs, root=root)
         return
     if not (methods and seeds and out) or len(methods) + len(seeds) > 2 or jobs is not None:
-        raise BadInputError(
-            "evaluate: with --policy, give one --method, one --seed and --out, and leave out --jobs"
-        )
+        raise BadInputError("evaluate: with --policy, give one --method, one --seed and --out, and leave out --jobs")
     from astra_data.pipeline.display import shown
     from astra_data.pipeline.grounded_env import evaluate_policy
     from astra_data.worlds.user_code import user_object
 
     with shown("evaluate") as progress:
-        evaluate_policy(
-            root / recipe.stem, methods[0], user_object(policy), out=out, seed=seeds[0], progress=progress
-        )
+        evaluate_policy(root / recipe.stem, methods[0], user_object(policy), out=out, seed=seeds[0], progress=progress)
     typer.echo(f"finished: {out}")
 
 
@@ -245,9 +235,7 @@ def select(
     run: RunFolder,
     row: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="ROW", help="Rank only policies of this row; may be repeated.", show_default="all"
-        ),
+        typer.Option(metavar="ROW", help="Rank only policies of this row; may be repeated.", show_default="all"),
     ] = None,
     judge: Annotated[
         str | None,
@@ -259,21 +247,15 @@ def select(
     ] = None,
     episodes: Annotated[
         int | None,
-        typer.Option(
-            help="Episodes of each policy with each judge.", min=1, show_default="the recipe's, or 100"
-        ),
+        typer.Option(help="Episodes of each policy with each judge.", min=1, show_default="the recipe's, or 100"),
     ] = None,
     trials: Annotated[
         int | None,
-        typer.Option(
-            help="Make the final choice with this many episodes in the target.", min=1, show_default="none"
-        ),
+        typer.Option(help="Make the final choice with this many episodes in the target.", min=1, show_default="none"),
     ] = None,
     field: Annotated[
         int | None,
-        typer.Option(
-            help="With --trials: number of candidates to try.", show_default="as many as the trials allow"
-        ),
+        typer.Option(help="With --trials: number of candidates to try.", show_default="as many as the trials allow"),
     ] = None,
     percent: Annotated[
         int | None,
@@ -311,13 +293,9 @@ def select(
 def deploy(
     run: RunFolder,
     row: Row,
-    out: Annotated[
-        Path | None, typer.Option(help="The new folder.", show_default="RUN/deploy/ROW/seed_SEED")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="RUN/deploy/ROW/seed_SEED")] = None,
     seed: Annotated[int, typer.Option(help="A seed of the run's recipe.")] = 0,
-    percent: Annotated[
-        int | None, typer.Option(help="The dataset size in percent, if the recipe has several.")
-    ] = None,
+    percent: Annotated[int | None, typer.Option(help="The dataset size in percent, if the recipe has several.")] = None,
 ) -> None:
     """Export a trained policy as a folder that runs without this package."""
     from astra_data.core.durable import refuse_existing

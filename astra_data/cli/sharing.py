@@ -10,13 +10,9 @@ from astra_data.core.errors import BadInputError
 
 NotesPath = Annotated[
     Path | None,
-    typer.Option(
-        "--notes", help="TOML file: license, summary, behavior, intended_use, limits.", show_default="none"
-    ),
+    typer.Option("--notes", help="TOML file: license, summary, behavior, intended_use, limits.", show_default="none"),
 ]
-Recordings = Annotated[
-    list[Path], typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.")
-]
+Recordings = Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.")]
 MappingFile = Annotated[
     Path | None,
     typer.Option(
@@ -35,9 +31,7 @@ FileFormat = Annotated[
 ]
 Name = Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")]
 Fps = Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")]
-Task = Annotated[
-    str | None, typer.Option(help="What the robot does in the episodes.", show_default="the mapping's")
-]
+Task = Annotated[str | None, typer.Option(help="What the robot does in the episodes.", show_default="the mapping's")]
 MaxBytes = Annotated[
     int | None,
     typer.Option(
@@ -48,9 +42,7 @@ MaxBytes = Annotated[
 ]
 SkipBad = Annotated[
     bool,
-    typer.Option(
-        "--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end."
-    ),
+    typer.Option("--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end."),
 ]
 
 
@@ -85,9 +77,7 @@ def import_(
 
 def export(
     dataset: DatasetName,
-    format: Annotated[
-        str, typer.Option(help="minari, d4rl, robomimic or d3rlpy; or card: its dataset card.")
-    ],
+    format: Annotated[str, typer.Option(help="minari, d4rl, robomimic or d3rlpy; or card: its dataset card.")],
     out: Annotated[
         Path,
         typer.Option(
@@ -126,14 +116,10 @@ def push(
     dataset: DatasetName,
     url: Annotated[
         str,
-        typer.Argument(
-            metavar="URL", help="user/name on the Hugging Face Hub, s3://, gs://, or a folder: ./shared"
-        ),
+        typer.Argument(metavar="URL", help="user/name on the Hugging Face Hub, s3://, gs://, or a folder: ./shared"),
     ],
     notes: NotesPath = None,
-    private: Annotated[
-        bool, typer.Option("--private", help="Create the repository on the Hub as private.")
-    ] = False,
+    private: Annotated[bool, typer.Option("--private", help="Create the repository on the Hub as private.")] = False,
 ) -> None:
     """Share a version of a dataset, with its card; a shared version never changes."""
     from astra_data.dataset.versions import open_dataset
@@ -170,9 +156,7 @@ def pull(
     from astra_data.pipeline.display import shown
 
     with shown("pull") as progress:
-        dataset = fetch(
-            source, out=out, version=version, max_bytes=max_bytes or MOST_BYTES, progress=progress
-        )
+        dataset = fetch(source, out=out, version=version, max_bytes=max_bytes or MOST_BYTES, progress=progress)
     typer.echo(f"{dataset.reference}: {dataset.root}")
     if made := _made_from_namesake(dataset):
         typer.echo(f"note: it was {made}; --version takes another")

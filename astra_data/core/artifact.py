@@ -168,10 +168,7 @@ def check_made_from(made: Path, read: Mapping[str, str | None]) -> None:
 
 def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:
     """Write the manifest of all that is in `folder` now, leaving out of `made_from` what is None."""
-    files = {
-        name: {"bytes": path.stat().st_size, "sha256": file_digest(path)}
-        for name, path in _files(folder).items()
-    }
+    files = {name: {"bytes": path.stat().st_size, "sha256": file_digest(path)} for name, path in _files(folder).items()}
     digests = {name: digest for name, digest in made_from.items() if digest}
     (folder / MANIFEST).write_text(json.dumps({"files": files, "made_from": digests}, indent=1))
 

@@ -16,9 +16,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
 from astra_data.core.progress import Alarm, Stopwatch
 
-type Nested = (
-    Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
-)
+type Nested = Mapping[Any, "Nested"] | list["Nested"] | tuple["Nested", ...] | Tensor | bool | int | float | None
 """A training state, such as an optimizer's `state_dict()`."""
 CHECKPOINT_SECONDS = 60.0
 
@@ -94,9 +92,7 @@ def understood(
     kind = metadata.get("kind")
     if kind not in kinds:
         found = "a file without a kind" if kind is None else f"kind {kind}"
-        raise BadInputError(
-            f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again"
-        )
+        raise BadInputError(f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again")
     # An infinite deviation is how networks leave out a part of their input.
     not_finite = [
         name
@@ -150,9 +146,7 @@ def _to_json(value: Nested, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 
             return {"tuple": [_to_json(item, tensors) for item in value]}
         case Mapping() if all(isinstance(key, str | int) for key in value):
             return {"items": [[key, _to_json(item, tensors)] for key, item in value.items()]}
-    raise BadInputError(
-        f"expected tensors, numbers, and containers of them by str or int, got {type(value).__name__}"
-    )
+    raise BadInputError(f"expected tensors, numbers, and containers of them by str or int, got {type(value).__name__}")
 
 
 def _from_json(state: Any, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - a training state

@@ -77,9 +77,7 @@ def schema_differences(a: Dataset, b: Dataset) -> list[str]:
 
 def world_differences(a: Dataset, b: Dataset) -> list[str]:
     """List how the environment and the simulator of `b` differ from those of `a`."""
-    ours, theirs = (
-        {key: dataset.description[key] for key in ("environment", "simulator")} for dataset in (a, b)
-    )
+    ours, theirs = ({key: dataset.description[key] for key in ("environment", "simulator")} for dataset in (a, b))
     return list(_value_differences(ours, theirs))
 
 
@@ -120,9 +118,7 @@ def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, list[obje
     """Return what tells each episode's values in the columns `names` from others, by uid."""
     return {
         episode.uid: [
-            (digest_of(values), values.dtype, values.shape)
-            for name, values in episode.columns.items()
-            if name in names
+            (digest_of(values), values.dtype, values.shape) for name, values in episode.columns.items() if name in names
         ]
         for episode in dataset.episodes(names or None)
     }
@@ -139,9 +135,7 @@ def lineage(dataset: Dataset) -> Ancestors:
     def neighbors() -> Ancestors:
         folders = [*sorted(root.parent.glob(f"*/{DATASET_PATH}"))]
         for run in (run for run in root.parents[1:3] if (run / RECORD).exists()):
-            folders += [
-                path for depth in ("*/*", "*/*/*") for path in sorted(run.glob(f"{depth}/{DATASET_PATH}"))
-            ]
+            folders += [path for depth in ("*/*", "*/*/*") for path in sorted(run.glob(f"{depth}/{DATASET_PATH}"))]
         listed = [_described(path.parents[2]) for path in folders]
         return {key: found for one in reversed(listed) for key, found in one.items()}
 
@@ -153,9 +147,7 @@ def lineage(dataset: Dataset) -> Ancestors:
             continue
         at_home = _described(home_of({"name": key[0], "version": key[1]})) if found else None
         found[key] = (
-            (dataset.root, dataset.description)
-            if at_home is None
-            else at_home.get(key) or neighbors().get(key)
+            (dataset.root, dataset.description) if at_home is None else at_home.get(key) or neighbors().get(key)
         )
         todo += _parents(found[key])
     return found
@@ -181,11 +173,7 @@ def tree_lines(ancestors: Ancestors) -> Iterator[str]:
     while steps:  # without recursion: there may be thousands of versions
         key, margin, below = steps.pop()
         parents = _parents(ancestors[key])
-        yield (
-            margin
-            + _line(key, ancestors[key])
-            + ("  (its parents: see above)" if key in seen and parents else "")
-        )
+        yield (margin + _line(key, ancestors[key]) + ("  (its parents: see above)" if key in seen and parents else ""))
         if key in seen:
             continue
         seen.add(key)

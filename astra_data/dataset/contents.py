@@ -79,8 +79,7 @@ def read_contents(root: Path) -> Contents:
 def _parsed(root: Path, description: dict[str, Any]) -> Contents:
     """Read what is sealed, and therefore as the writer wrote it, unless somebody forged it."""
     info, subsets = (
-        json.loads((root / path).read_text(encoding="utf-8"))
-        for path in (layout.INFO_PATH, layout.SUBSETS_PATH)
+        json.loads((root / path).read_text(encoding="utf-8")) for path in (layout.INFO_PATH, layout.SUBSETS_PATH)
     )
     if not is_data_path(info["data_path"]):
         raise BadInputError(f"expected a path inside the dataset's folder, got {info['data_path']!r}")
@@ -98,9 +97,7 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
         raise CorruptDatasetError("; ".join(faults))
     tasks = read_tasks(root)
     if isinstance(tasks, str) or 0 not in tasks:
-        raise CorruptDatasetError(
-            f"{layout.TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}"
-        )
+        raise CorruptDatasetError(f"{layout.TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
     position = {uid: episode for episode, uid in enumerate(uids.tolist())}
     return Contents(
         root=root,

@@ -187,9 +187,7 @@ def alteration(columns: Sequence[str], path: Path, row: int, steps: int, episode
 def write_digests(root: Path, digests: Mapping[str, ArrayLike]) -> None:
     """Write meta/astra/digests.parquet, plain: random bits neither compress nor repeat."""
     table = pa.table({name: pa.array(np.asarray(values, np.uint64)) for name, values in digests.items()})
-    pq.write_table(
-        table, root / DIGESTS_PATH, compression="none", use_dictionary=False, write_statistics=False
-    )
+    pq.write_table(table, root / DIGESTS_PATH, compression="none", use_dictionary=False, write_statistics=False)
 
 
 def read_digests(root: Path, columns: Collection[str], altered: Collection[str] = ()) -> Digests:
@@ -221,9 +219,7 @@ def altered_files(root: Path, description: Mapping[str, Any]) -> list[str]:
     """Return the sealed files in folder `root` that were altered or are missing, and those added to them."""
     sums = {path: value for path, value in description.get("sums", {}).items() if path != DATASET_PATH}
     paths = (*SEALED, *sorted({*sums, *_episodes(root)} - {*SEALED})) if sums else ()
-    return [
-        path for path in paths if not (root / path).is_file() or file_digest(root / path) != sums.get(path)
-    ]
+    return [path for path in paths if not (root / path).is_file() or file_digest(root / path) != sums.get(path)]
 
 
 def _episodes(root: Path) -> list[str]:

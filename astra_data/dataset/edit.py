@@ -60,9 +60,7 @@ def subset(
         6
     """
     if (episodes is None) == (percent is None) or (of is not None and percent is None):
-        raise BadInputError(
-            "a subset needs either a number of episodes or a percentage (optionally with --of)"
-        )
+        raise BadInputError("a subset needs either a number of episodes or a percentage (optionally with --of)")
     count = episodes if percent is None else share(percent, of or len(source))
     assert count is not None
     if not 1 <= count <= len(source):
@@ -132,9 +130,7 @@ def filter_episodes(
             kept &= {
                 uid
                 for uid, value in zip(_uids(source), _facts(source, key), strict=True)
-                if isinstance(value, int | float)
-                and (low is None or value >= low)
-                and (high is None or value <= high)
+                if isinstance(value, int | float) and (low is None or value >= low) and (high is None or value <= high)
             }
     return _write(source, kept, stage="filter", config=config, name=name, out=out)
 
@@ -197,9 +193,7 @@ def _write(
 ) -> Path:
     if not kept:
         raise BadInputError(f"{source.reference}: none of its {len(source)} episodes would be left")
-    with next_version(
-        source, "episodes", stage=stage, config=config, name=name, out=out, subset_seed=seed
-    ) as writer:
+    with next_version(source, "episodes", stage=stage, config=config, name=name, out=out, subset_seed=seed) as writer:
         chosen = [index for index, uid in enumerate(_uids(source)) if uid in kept]
         for episode in source.episodes(episodes=chosen):
             writer.add(episode)
@@ -225,9 +219,7 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
         return successes
     if key not in source.metadata:
         if key in ("success", "return"):
-            raise BadInputError(
-                f"the episodes of {source.reference} have no {key!r}: run `astra-data label --task`"
-            )
+            raise BadInputError(f"the episodes of {source.reference} have no {key!r}: run `astra-data label --task`")
         known = ["length", *source.metadata]
         raise BadInputError(f"the episodes of {source.reference} have no {key!r}{did_you_mean(key, known)}")
     return source.metadata[key]

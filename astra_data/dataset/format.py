@@ -100,9 +100,7 @@ def data_schema(columns: Sequence[Column]) -> pa.Schema:
         listed = {"feature": value, "length": column.size, "_type": "List"}
         features[column.name] = value if column.size == 1 else listed
     metadata = {"huggingface": json.dumps({"info": {"features": features}})}
-    return pa.schema(
-        [(column.name, arrow_type(column.dtype, column.size)) for column in columns], metadata=metadata
-    )
+    return pa.schema([(column.name, arrow_type(column.dtype, column.size)) for column in columns], metadata=metadata)
 
 
 def data_encodings(columns: Sequence[Column]) -> dict[str, str]:
@@ -147,9 +145,7 @@ def tasks_table(task: str) -> pa.Table:
         "attributes": {},
         "pandas_version": "2.3.3",
     }
-    schema = pa.schema(
-        [("task_index", pa.int64()), ("task", pa.string())], metadata={"pandas": json.dumps(pandas)}
-    )
+    schema = pa.schema([("task_index", pa.int64()), ("task", pa.string())], metadata={"pandas": json.dumps(pandas)})
     return pa.table({"task_index": [0], "task": [task]}, schema=schema)
 
 

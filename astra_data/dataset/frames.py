@@ -111,9 +111,7 @@ class Samples(data.Dataset[Batch]):
         """Return `batch` unchanged: it is collated already."""
         return batch
 
-    def batches(
-        self, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False
-    ) -> "Batches":
+    def batches(self, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False) -> "Batches":
         """Draw batches; the arguments are those of `Order`."""
         return Batches(self, Order(len(self), batch_size, seed=seed, shuffle=shuffle, drop_last=drop_last))
 
@@ -262,8 +260,7 @@ class Frames:
         """Return the windows at rows `first` (B,), all inside their episode."""
         shape = (len(first), length)
         batch = {
-            name: take(values, first).view(*shape, *self.columns[name].shape[1:])
-            for name, values in views.items()
+            name: take(values, first).view(*shape, *self.columns[name].shape[1:]) for name, values in views.items()
         }
         return batch | {IS_PAD: first.new_zeros(shape, dtype=torch.bool)}
 

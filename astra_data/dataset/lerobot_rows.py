@@ -48,9 +48,7 @@ class Rows:
         steps, name = len(run) - self.dropped, spec.name
         if name in (names.TERMINATED, names.TRUNCATED, names.DONE):
             terminated, truncated = self._ends(run, steps)
-            return {names.TERMINATED: terminated, names.TRUNCATED: truncated}.get(
-                name, terminated | truncated
-            )
+            return {names.TERMINATED: terminated, names.TRUNCATED: truncated}.get(name, terminated | truncated)
         if name in names.RESERVED:
             start_of = {"uid": uid, "episode": episode, "start": start}
             values = reserved_values(steps, **start_of, fps=self.fps)[name]

@@ -58,9 +58,7 @@ class PlainColumn:
 
     def fits(self, kind: pa.DataType) -> bool:
         """Return whether a file may store it as `kind`; LeRobot's merge writes lists of variable size."""
-        return bool(
-            kind == self.arrow_type or (self.size > 1 and kind == pa.list_(self.arrow_type.value_type))
-        )
+        return bool(kind == self.arrow_type or (self.size > 1 and kind == pa.list_(self.arrow_type.value_type)))
 
 
 class Place(NamedTuple):
@@ -194,9 +192,7 @@ def read_tasks(root: Path) -> dict[int, str] | str:
         rows = _read_lines(root / (name := _FORMAT_2["tasks"]))
         if isinstance(rows, str):
             return f"is not there in format 2, and {name} {rows}"
-        if not rows or not all(
-            type(row.get("task_index")) is int and isinstance(row.get("task"), str) for row in rows
-        ):
+        if not rows or not all(type(row.get("task_index")) is int and isinstance(row.get("task"), str) for row in rows):
             return f"is not there in format 2, and {name} has no text for each task_index"
         return {row["task_index"]: row["task"] for row in rows}
     table = read_small_table(root / layout.TASKS_PATH)
@@ -204,9 +200,7 @@ def read_tasks(root: Path) -> dict[int, str] | str:
         return table
     numbers = [field.name for field in table.schema if pa.types.is_integer(field.type)]
     texts = [
-        field.name
-        for field in table.schema
-        if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
+        field.name for field in table.schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
     ]
     if (table.num_columns, numbers, len(texts)) != (2, [names.TASK_INDEX], 1):
         found = ", ".join(f"{field.name} ({field.type})" for field in table.schema)
@@ -338,11 +332,7 @@ def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple
 
 def flag_faults(columns: Mapping[str, Array], where: str = "") -> Iterator[str]:
     """Yield a sentence for each flag of an episode that ends it early or contradicts another."""
-    flags = {
-        name: values != 0
-        for name in _END_FLAGS
-        if (values := columns.get(name)) is not None and values.ndim == 1
-    }
+    flags = {name: values != 0 for name in _END_FLAGS if (values := columns.get(name)) is not None and values.ndim == 1}
     for name, values in flags.items():
         if values[:-1].any():
             last = len(values) - 1

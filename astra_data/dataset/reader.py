@@ -123,9 +123,7 @@ class Dataset(Contents):
             row += len(next(iter(block.values()), ()))
         return out
 
-    def blocks(
-        self, names: Sequence[str], episodes: Collection[int] | None = None
-    ) -> Iterator[dict[str, Array]]:
+    def blocks(self, names: Sequence[str], episodes: Collection[int] | None = None) -> Iterator[dict[str, Array]]:
         """Yield the values of the columns `names` in blocks of whole episodes; memory stays bounded."""
         for block, _ in self._verified(self.specs(names), self.selected(episodes)):
             yield block
@@ -267,9 +265,7 @@ def refuse_others(root: Path) -> None:
     if not (root / "meta").is_dir():
         refuse_run(root)
         if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
-            advice = (
-                "make them a dataset with `astra-data import` and a mapping, which `astra-data new` writes"
-            )
+            advice = "make them a dataset with `astra-data import` and a mapping, which `astra-data new` writes"
             raise BadInputError(f"{root} contains logs ({logs[0]} and so on): {advice}")
         advice = "check the path (`astra-data list` shows where names are) or run the stage that writes it."
         raise BadInputError(f"{root}: found no dataset; {advice}")

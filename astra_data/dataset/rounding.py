@@ -68,9 +68,7 @@ class Rounding:
             offset[entry] = round(offset[entry] - digit * round((low + high) / 2 / digit), 12)
             helps &= float(np.spacing(np.float32(high - low))) / 3 < _ROUNDED * step
             name = self._column.names[entry] if self._column.names else f"entry {entry}"
-            coarse.append(
-                f"{name} (up to {largest:.6g}) in steps of {spacing:.2g}, but it moves by {step:.2g}"
-            )
+            coarse.append(f"{name} (up to {largest:.6g}) in steps of {spacing:.2g}, but it moves by {step:.2g}")
         if not coarse:
             return None
         listed = ", ".join(f"{one:.1f}" if one == round(one) else f"{one:.15g}" for one in offset)

@@ -115,9 +115,7 @@ class StagedWriter:
             stack.callback(remove_empty, make_folder(self.folder))
             sweep(self.root)
             if not stack.enter_context(held(self.folder)):
-                raise BadInputError(
-                    f"{self.root} is being recorded right now; wait or choose another folder."
-                )
+                raise BadInputError(f"{self.root} is being recorded right now; wait or choose another folder.")
             if self.root.exists():
                 if self._holds_work() and not self._is_written():
                     raise BadInputError(
@@ -277,7 +275,5 @@ def load_staged(path: Path, columns: Sequence[Column]) -> Episode:
             f"{path} is no whole episode ({in_short(error)}); delete it and resume the recording."
         ) from error
     if altered:
-        raise CorruptDatasetError(
-            f"{path} was altered in {', '.join(altered)}; delete it and resume the recording."
-        )
+        raise CorruptDatasetError(f"{path} was altered in {', '.join(altered)}; delete it and resume the recording.")
     return Episode(uid, values, metadata)

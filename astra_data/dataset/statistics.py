@@ -51,9 +51,7 @@ def side_by_side[C: (Column, PlainColumn)](columns: Iterable[C]) -> Iterator[tup
         first += column.size
 
 
-def global_statistics(
-    columns: Sequence[Column], frames: int, paths: Sequence[Path]
-) -> dict[str, dict[str, list[Any]]]:
+def global_statistics(columns: Sequence[Column], frames: int, paths: Sequence[Path]) -> dict[str, dict[str, list[Any]]]:
     """Return meta/stats.json over all `frames`.
 
     Quantiles are exact, so that at least one index of one column is in memory as a whole. Above

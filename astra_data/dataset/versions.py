@@ -78,9 +78,7 @@ def home() -> Path:
     """Return the folder of datasets that have none of their own."""
     folder = Path(os.environ.get("ASTRA_DATA_HOME", "datasets"))
     if folder.exists() and not folder.is_dir():
-        raise BadInputError(
-            f"{folder} is no folder: expected that of the datasets; set $ASTRA_DATA_HOME to one"
-        )
+        raise BadInputError(f"{folder} is no folder: expected that of the datasets; set $ASTRA_DATA_HOME to one")
     return folder
 
 
@@ -109,9 +107,7 @@ def locate(dataset: str | Path) -> Path:
         if folder.is_dir() and (holds or not reference or not versions_at_home(reference["name"])):
             return folder
     if not reference:
-        raise BadInputError(
-            f"{str(dataset)[:300]}: no such folder; expected a folder, name or name@data-1.2.0"
-        )
+        raise BadInputError(f"{str(dataset)[:300]}: no such folder; expected a folder, name or name@data-1.2.0")
     name, version = reference["name"], reference["version"]
     versions = versions_at_home(name)
     if not versions:

@@ -91,9 +91,7 @@ class DatasetWriter:
         given = [column.name for column in columns]
         faults = [f"column {name} is given twice" for name in sorted(set(given)) if given.count(name) > 1]
         faults += [
-            f"column {name}: is filled in by the writer, leave it out"
-            for name in given
-            if name in names.RESERVED
+            f"column {name}: is filled in by the writer, leave it out" for name in given if name in names.RESERVED
         ]
         if not given:
             faults.append("no columns")
@@ -135,9 +133,7 @@ class DatasetWriter:
         with ExitStack() as stack:
             self._folder = stack.enter_context(atomic_folder(self.root))
             encodings = layout.data_encodings(self._stored)
-            self._data = RotatingWriter(
-                self._folder, layout.DATA_PATH, self._schema, encodings, self._compression
-            )
+            self._data = RotatingWriter(self._folder, layout.DATA_PATH, self._schema, encodings, self._compression)
             stack.callback(self._data.abandon)
             self._rows = EpisodeRows(self._folder, self._stored, self._task)
             stack.callback(self._rows.abandon)

@@ -18,9 +18,7 @@ FAR = 5.0
 class RobotPolicy:
     """The policy, for one robot: `start` an episode, then `act` once every control period."""
 
-    def __init__(
-        self, *, rate_hz: float, state: Sequence[str], goal: Sequence[str] = (), folder: Path = HERE
-    ) -> None:
+    def __init__(self, *, rate_hz: float, state: Sequence[str], goal: Sequence[str] = (), folder: Path = HERE) -> None:
         """Take the rate at which it will act, and the names of the values that it will be given."""
         described, graph = intact(folder, "policy.json", "policy.onnx")
         self.about: dict[str, Any] = json.loads(described)

@@ -82,9 +82,7 @@ class TargetEncoder(nn.Module):
         return torch.cat([normal_state, waves, normal_goal, previous_action], dim=-1)
 
 
-def gaussian_mmd(
-    mean_1: Tensor, variance_1: Tensor, mean_2: Tensor, variance_2: Tensor, bandwidths: Tensor
-) -> Tensor:
+def gaussian_mmd(mean_1: Tensor, variance_1: Tensor, mean_2: Tensor, variance_2: Tensor, bandwidths: Tensor) -> Tensor:
     """Return the squared MMD between two diagonal Gaussians in closed form.
 
     With the kernel k(x, y) = exp(-|x - y|² / 2h²), the mean of k over N(m1, v1) and N(m2, v2) is

@@ -14,9 +14,7 @@ _LONGEST_M = 16.0
 """Longest wavelength of position features."""
 
 
-def mlp(
-    sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False
-) -> nn.Sequential:
+def mlp(sizes: tuple[int, ...], activation: type[nn.ELU | nn.ReLU] = nn.ELU, *, inplace: bool = False) -> nn.Sequential:
     """Build linear layers of `sizes` with `activation` between them.
 
     `inplace` saves time where batches are (N, size); with more dimensions the gradient takes longer.

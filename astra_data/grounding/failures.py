@@ -118,9 +118,7 @@ class FailureModel(nn.Module):
         """Take the means and deviations of inputs (N, I)."""
         take_scales(self, {"input": inputs})
 
-    def initial_memory(
-        self, state: Tensor, previous_action: Tensor, averages: Tensor | None = None
-    ) -> Tensor:
+    def initial_memory(self, state: Tensor, previous_action: Tensor, averages: Tensor | None = None) -> Tensor:
         """Return the memory (n, M) of episodes that start in `state` (n, X).
 
         `averages` (n, 15) are those of the history before; by default there is none.
@@ -435,9 +433,7 @@ def _has_both(fails: Tensor) -> bool:
     return bool(fails.any() and not fails.all())
 
 
-def _untrained(
-    task: Task, grounding: Grounding, training: PairedEpisodes, *, sees_latent: bool
-) -> FailureModel:
+def _untrained(task: Task, grounding: Grounding, training: PairedEpisodes, *, sees_latent: bool) -> FailureModel:
     windows, maze, encoder = training.windows, task.objective.layout, grounding.encoder
     shape = FailureShape(
         state_size=windows.state.shape[-1],
@@ -474,9 +470,7 @@ def _drawn(rows: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def replayed_inputs(
-    task: Task, grounding: Grounding, failures: FailureModel, episodes: PairedEpisodes
-) -> Tensor:
+def replayed_inputs(task: Task, grounding: Grounding, failures: FailureModel, episodes: PairedEpisodes) -> Tensor:
     """Return what a failure model sees of each step, (E, T, I), where recorded commands are simulated.
 
     The simulator moves more smoothly than the target, so that a failure announces itself less. Replays of
@@ -504,9 +498,7 @@ def replayed_inputs(
     return replayed
 
 
-def averages_before(
-    task: Task, grounding: Grounding, failures: FailureModel, episodes: PairedEpisodes
-) -> Tensor:
+def averages_before(task: Task, grounding: Grounding, failures: FailureModel, episodes: PairedEpisodes) -> Tensor:
     """Return the averages that a failure model remembers before each step, (E, T, 15), as in replays."""
     with seeded(0, episodes.windows.mask.device):
         after = failures.averages_of(replayed_inputs(task, grounding, failures, episodes))

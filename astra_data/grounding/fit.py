@@ -120,8 +120,7 @@ class HistoryFit:
             )
         predicts_failures = self.failures and has_failures(task, fitting.training)
         training, held_out = (
-            self._rewarded(task, episodes, predicts_failures)
-            for episodes in (fitting.training, fitting.held_out)
+            self._rewarded(task, episodes, predicts_failures) for episodes in (fitting.training, fitting.held_out)
         )
         fitting = replace(fitting, training=training, held_out=held_out)
         corrects_reward = training.windows.own_reward is not None
@@ -180,9 +179,7 @@ def with_own_rewards(task: Task, episodes: PairedEpisodes) -> PairedEpisodes:
     no failure: there the simulator ends the episode and pays, and R_pred is not used.
     """
     windows, objective = episodes.windows, task.objective
-    before, after, goal = (
-        values.flatten(0, 1) for values in (windows.state, windows.next_state, windows.goal)
-    )
+    before, after, goal = (values.flatten(0, 1) for values in (windows.state, windows.next_state, windows.goal))
     shown = objective.decided(after, goal)
     own = objective.reward(before, after, goal, torch.zeros_like(shown)).reshape(windows.mask.shape)
     open_ended = ~shown.reshape(windows.mask.shape)

@@ -166,9 +166,7 @@ class GroundingModel(nn.Module):
         low, high = self.shape.log_variance_bounds
         return mean, low + (high - low) * torch.sigmoid(raw)
 
-    def target_reward(
-        self, latent: Tensor, action: Tensor, own: Tensor, hazard: Tensor | None = None
-    ) -> Tensor:
+    def target_reward(self, latent: Tensor, action: Tensor, own: Tensor, hazard: Tensor | None = None) -> Tensor:
         """Return the target's reward (...) of a step, given the task's `own` (...) on abstract states.
 
         A `hazard` (...), the probability that the step fails by a failure model, adds what failures cost.
@@ -266,9 +264,7 @@ def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def telemetry(
-    model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights
-) -> dict[str, float | None]:
+def telemetry(model: GroundingModel, episodes: PairedEpisodes, weights: LossWeights) -> dict[str, float | None]:
     """Return figures that losses do not show, on `episodes`.
 
     They are: R² of each head that is trained (for the correction: the share of the simulator's error that it
@@ -310,8 +306,7 @@ def correction_r2(corrected: Tensor, windows: PairedWindows, std: Tensor) -> flo
     """
     mask = windows.mask.bool()
     wrong, raw = (
-        ((landed - windows.next_state) / std)[mask].square().sum()
-        for landed in (corrected, windows.simulated_next)
+        ((landed - windows.next_state) / std)[mask].square().sum() for landed in (corrected, windows.simulated_next)
     )
     return _explained(wrong, raw)
 

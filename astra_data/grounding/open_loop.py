@@ -66,9 +66,7 @@ def gap_report(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, se
         report[name] = {}
         for index, quantity in enumerate(task.quantities):
             intervals = [_interval(by_horizon[h][:, index], started[h], rng) for h in horizons]
-            report[name][quantity] = dict(
-                zip(("mean", "low", "high"), zip(*intervals, strict=True), strict=True)
-            )
+            report[name][quantity] = dict(zip(("mean", "low", "high"), zip(*intervals, strict=True), strict=True))
     return report
 
 
@@ -88,9 +86,7 @@ def _starts(
     return episode, (share * possible[episode]).astype(np.int64)
 
 
-def _interval(
-    errors: Tensor, episode: Tensor, rng: np.random.Generator
-) -> tuple[float, float | None, float | None]:
+def _interval(errors: Tensor, episode: Tensor, rng: np.random.Generator) -> tuple[float, float | None, float | None]:
     """Return the mean of `errors` (N,) and its 95 % bootstrap interval, resampling episodes (N,)."""
     values, groups = errors.cpu().numpy(), episode.cpu().numpy()
     counts, sums = np.bincount(groups), np.bincount(groups, values)

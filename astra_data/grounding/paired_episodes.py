@@ -263,9 +263,7 @@ class PairedEpisodes:
             within = dict(self.commands or {}) or "±1"
             faults.append(f"was paired for commands within {within}, {task.name} has {dict(task.limits)}")
         if faults:
-            raise BadInputError(
-                f"{self.reference} {'; '.join(faults)}: pair it again, with the simulator of this task"
-            )
+            raise BadInputError(f"{self.reference} {'; '.join(faults)}: pair it again, with the simulator of this task")
 
     def __len__(self) -> int:
         """Return the number of episodes E."""

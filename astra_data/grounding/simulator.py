@@ -121,9 +121,7 @@ def _remembering_within(simulator: object) -> RememberingSimulator | None:
     return simulator if isinstance(simulator, RememberingSimulator) else None
 
 
-def abstract_simulator(
-    task: Task, num_envs: int, device: str, variation: Variation | None
-) -> PlacedSimulator:
+def abstract_simulator(task: Task, num_envs: int, device: str, variation: Variation | None) -> PlacedSimulator:
     """Build `num_envs` abstract simulators of `task`; with a `variation`, their parameters vary."""
     if variation is None:
         return task.simulator(num_envs, device)

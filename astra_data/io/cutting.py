@@ -103,9 +103,7 @@ class Tally:
         parts = [f"{first_few(empty, _SHOWN)} is empty in all {rows} rows: leave it out"] if empty else []
         for name, (count, place) in self.not_finite.items():
             if count < rows:
-                parts.append(
-                    f"{name} in 1 row, {place}" if count == 1 else f"{name} in {count} rows, first {place}"
-                )
+                parts.append(f"{name} in 1 row, {place}" if count == 1 else f"{name} in {count} rows, first {place}")
         return "; ".join(parts[:_SHOWN]) + (f" and {len(parts) - _SHOWN} more" if len(parts) > _SHOWN else "")
 
 
@@ -155,9 +153,7 @@ class Cutter:
             "/torn": (np.arange(n) == 0) & self._was_torn,
         }
         table |= {f"/ends {name}": fields[name] for name in split.ends}
-        table |= {
-            f"/ends {name}": as_rows(columns[name]) for name in (TERMINATED, TRUNCATED) if name in columns
-        }
+        table |= {f"/ends {name}": as_rows(columns[name]) for name in (TERMINATED, TRUNCATED) if name in columns}
         if split.field:
             table["/field"] = fields[split.field]
         if self._mapping.time:
@@ -210,9 +206,7 @@ class Cutter:
                 where = self._place(table, bad[number])
                 self.tally.bad_episodes.append(f"{where}: a value is not finite: its episode is left out")
                 continue
-            values = {
-                column.name: table[column.name][part] for column in self.columns if column.name in table
-            }
+            values = {column.name: table[column.name][part] for column in self.columns if column.name in table}
             source = {"source": self._parts[table["/part"][part[0]]].origin}
             yield from self._episode(values, source | {"source_row": int(table["/row"][part[0]])})
 
@@ -342,9 +336,7 @@ class Cutter:
         episode of formats that have their own.
         """
         self.tally.notes += self.rounded()
-        timed = [
-            (part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()
-        ]
+        timed = [(part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()]
         if not timed:
             return
         fps, spent = self._mapping.fps, np.array([spent for _, spent in timed])

@@ -35,9 +35,7 @@ from astra_data.io.recording import Source, foreign, refuse_dataset
 Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
 TURNED = "heading|yaw|theta|psi|compass|course|cog|azimuth|hdg"
 HEADING = re.compile(rf"(.+_)?({TURNED})")
-EPISODE = re.compile(
-    r"(ep(isode)?|trial|drive|run|rollout|traj(ectory)?|flight|lap|session|bag)(_?(id|index|nr))?"
-)
+EPISODE = re.compile(r"(ep(isode)?|trial|drive|run|rollout|traj(ectory)?|flight|lap|session|bag)(_?(id|index|nr))?")
 CLOCK = r"time|timestamps?|stamp|clock|utc|epoch|uptime|[mun]?secs?|seconds"
 TIME, STAMP = re.compile(rf"t|(.+_)?({CLOCK})"), re.compile(rf"t|(.+_)?({CLOCK})(_.+|\d+)?")
 """Names of a log's time, and of times of topics too, such as stamp_motors; they never go back."""
@@ -52,14 +50,10 @@ UNCLEAR = re.compile(r"done|ended|truncated|timeout")
 COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|sp|desired|des|target|ref"
 COMMAND = re.compile(rf"(.+_)?({COMMANDED})(_.+|\d+)?|u(_.+|\d+)?")
 COMMAND_WORD = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")
-TORQUE, FORCE = (
-    re.compile(rf"(.+_)?({words})(_.+|\d+)?") for words in ("tau|torque|effort|moment", "force|thrust")
-)
+TORQUE, FORCE = (re.compile(rf"(.+_)?({words})(_.+|\d+)?") for words in ("tau|torque|effort|moment", "force|thrust"))
 PEDAL = re.compile(r"throttle|brake|steer(ing)?(_angle)?")
 NO_PLACE = f"{TURNED}|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque|moment"
-PLACE = re.compile(
-    rf"(?!.*({NO_PLACE}))(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)"
-)
+PLACE = re.compile(rf"(?!.*({NO_PLACE}))(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)")
 GPS = re.compile(r"(?P<stem>(.+_)?)(?P<axis>lat|lon|lng)(itude|gitude)?")
 GOAL_NAME = re.compile(
     r"(?!.*(dist|bearing|_to_|_from_))(.+_)?(goal|destination|waypoint)"
@@ -270,9 +264,7 @@ def _field(name: str, series: Sequence[Floats]) -> Field:
     elif plain == "reward":
         role = "reward"
     elif (
-        (goal := GOAL_NAME.fullmatch(body))
-        and (goal["axis"] or not is_flag)
-        and not any(np.ptp(one) for one in series)
+        (goal := GOAL_NAME.fullmatch(body)) and (goal["axis"] or not is_flag) and not any(np.ptp(one) for one in series)
     ):
         return _with_unit(name, "goal", body, ending, values)
     elif is_constant:
@@ -303,9 +295,7 @@ def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Fl
         unit = "N m" if TORQUE.fullmatch(short) else "N"
     elif role != "command" and (ANGLE.fullmatch(short) or HEADING.fullmatch(short)):
         largest, unit = np.nanmax(np.abs(values)), "rad"
-        scale, why = (
-            (_DEGREE, f"an angle up to {largest:.0f}: degrees") if largest > LARGEST else (scale, why)
-        )
+        scale, why = (_DEGREE, f"an angle up to {largest:.0f}: degrees") if largest > LARGEST else (scale, why)
     elif role != "command" and PLACE.fullmatch(short):
         unit = "m"
     return Field(name, role, short, unit, scale, why if unit != "1" else "no unit in its name")
@@ -321,9 +311,7 @@ def _times(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> li
     times = sorted((field for field in fields if field.role == "time"), key=rank)
     chosen = [field for field in times[:1] if not rank(field)[0]]
     why = f"a time beside {chosen[0].name}" if chosen else "a time that stands still in some rows"
-    return [
-        Field(f.name, "left out", f.short, why=why) if f in times and f not in chosen else f for f in fields
-    ]
+    return [Field(f.name, "left out", f.short, why=why) if f in times and f not in chosen else f for f in fields]
 
 
 def _roles(fields: Sequence[Field]) -> list[Field]:

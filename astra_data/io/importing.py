@@ -114,9 +114,7 @@ class ImportReport:
             f"last rows without a next state: {tally.last_rows} dropped{f' ({lost})' if lost else ''}; "
             f"rows of episodes that were too short: {tally.short_rows}"
             + (
-                f"; terminated rows after the end, dropped: {tally.rows_after_end}"
-                if tally.rows_after_end
-                else ""
+                f"; terminated rows after the end, dropped: {tally.rows_after_end}" if tally.rows_after_end else ""
             ): True,
         }
         return "\n".join(line for line, is_shown in lines.items() if is_shown)
@@ -199,9 +197,7 @@ def import_dataset(
         raise BadInputError(f"{root} exists already: {another}, or delete it")
     frames = count = 0
     origins: set[str] = set()
-    with DatasetWriter(
-        root, cutter.columns, fps=settings.fps, task=settings.task, description=description
-    ) as writer:
+    with DatasetWriter(root, cutter.columns, fps=settings.fps, task=settings.task, description=description) as writer:
         for count, (columns, metadata) in enumerate(chain([first], cuts), start=1):
             writer.add(Episode(count - 1, columns, metadata))
             origins.add(str(metadata["source"]))
@@ -244,9 +240,7 @@ def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> t
     module = FORMATS[file_format]
     if not hasattr(module, "layout"):
         written = ", which `astra-data new NAME --from LOGS` writes" if file_format == "csv" else ""
-        raise BadInputError(
-            f"{source}: {file_format} has no standard fields; pass --mapping FILE.toml{written}"
-        )
+        raise BadInputError(f"{source}: {file_format} has no standard fields; pass --mapping FILE.toml{written}")
     with explained(source, module):
         keys = module.layout(source) | options
     missing = [f"--{key}" for key in ("name", "fps") if key not in keys]
@@ -263,10 +257,8 @@ def _why_none(tally: Tally, mapping: ImportMapping) -> str:
     cuts = Counter(tally.split_points)
     reasons = {
         "gap": f"'{mapping.time}' steps by over gap_s in {cuts['gap']} rows: correct time_scale or gap_s",
-        "back": f"'{mapping.time}' goes back in {cuts['back']} rows, first in {tally.back_first}: sort the "
-        "rows by it",
-        "field": f"'{mapping.split.field}' changes in {cuts['field']} rows: sort by it, or write a file of "
-        "each",
+        "back": f"'{mapping.time}' goes back in {cuts['back']} rows, first in {tally.back_first}: sort the rows by it",
+        "field": f"'{mapping.split.field}' changes in {cuts['field']} rows: sort by it, or write a file of each",
     }
     found = [why for reason, why in reasons.items() if 2 * cuts[reason] > tally.rows]
     return found[0] if found else "and each needs two rows if logs have no next states"
@@ -379,9 +371,7 @@ def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Itera
             row += len(block)
 
 
-def _all_faults(
-    error: BadInputError, sources: Sequence[Source], module: ModuleType, mapping: ImportMapping
-) -> str:
+def _all_faults(error: BadInputError, sources: Sequence[Source], module: ModuleType, mapping: ImportMapping) -> str:
     """Return a line for each fault of the first of `sources` and the beginnings of others, with its files."""
     faults = {sources[0]: str(error)}
     for other in sources[1:]:

@@ -84,9 +84,7 @@ class McapFile:
         known = sorted(self.topics)
         if self.is_cut and not known:
             raise BadInputError(f"{self._source} is cut off before its first message ends: leave it out")
-        missing = [
-            f"no topic '{topic}'{did_you_mean(topic, known)}" for topic in self._wanted if topic not in known
-        ]
+        missing = [f"no topic '{topic}'{did_you_mean(topic, known)}" for topic in self._wanted if topic not in known]
         if missing:
             raise BadInputError(f"{self._source}: {'; '.join(missing)}")
 
@@ -129,9 +127,7 @@ class McapFile:
             indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
             wanted = {number for number, channel in self._channels.items() if channel.topic in self._wanted}
             # Some chunks list no channels.
-            self._chunks = [
-                index for index in indexes if not (of := index.message_index_offsets) or wanted & of.keys()
-            ]
+            self._chunks = [index for index in indexes if not (of := index.message_index_offsets) or wanted & of.keys()]
             self.check_topics()
 
     def _records(self, *, checked: bool) -> Iterator[Any]:
@@ -181,13 +177,9 @@ class McapFile:
         elif chunk.compression:
             raise BadInputError(f"{self._source}: chunks packed as {chunk.compression}, expected zstd or lz4")
         if len(data) != chunk.uncompressed_size:
-            raise BadInputError(
-                f"{self._source}: a chunk has another size than its header says: it is damaged"
-            )
+            raise BadInputError(f"{self._source}: a chunk has another size than its header says: it is damaged")
         if checked and chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
-            raise BadInputError(
-                f"{self._source}: a chunk has another checksum than was written: it is damaged"
-            )
+            raise BadInputError(f"{self._source}: a chunk has another checksum than was written: it is damaged")
         stream, kinds = reading.ReadDataStream(BytesIO(data)), optional("mcap.opcode").Opcode
         while stream.count < len(data):
             kind, length = stream.read1(), stream.read8()

@@ -272,9 +272,7 @@ def find_sources(
     for source in sources:
         if not is_text(f"{source.path}/{source}"):
             raise BadInputError(f"{str(source)!r}: expected a name in UTF-8; rename the file to import it")
-    most = max_bytes or max(
-        SMALL_BYTES, MOST_UNPACKED * sum(file.stat().st_size for file in files_of(sources))
-    )
+    most = max_bytes or max(SMALL_BYTES, MOST_UNPACKED * sum(file.stat().st_size for file in files_of(sources)))
     paths = [source.path / (source.member.name if source.member else "") for source in sources]
     names = _longer([str(source) for source in sources], paths)
     return [replace(source, name=name, most_bytes=most) for source, name in zip(sources, names, strict=True)]
@@ -407,9 +405,7 @@ def _joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
         if name not in found
     ]
     if faults or not groups:
-        raise BadInputError(
-            "; ".join(faults) or f"expected files whose names end with {', '.join(names)}, found none"
-        )
+        raise BadInputError("; ".join(faults) or f"expected files whose names end with {', '.join(names)}, found none")
     return [replace(found[names[0]], parts=found) for found in groups.values()]
 
 

@@ -83,9 +83,7 @@ class Resampler:
         self._values: dict[str, Array] = {}
         self._start: int | None = None
         self._row = self._rows = self._delay_ns = 0
-        often = {
-            topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()
-        }
+        often = {topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()}
         state = mapping.columns[STATE].fields if STATE in mapping.columns else ()
         states = self._expiring & {of[field] for field in state}
         self._states = [topic for topic in states if often.get(topic)]
@@ -94,9 +92,7 @@ class Resampler:
         self._spacing_ns = 1e9 / mapping.fps / most if most else 0.0
         columns = mapping.columns.items()
         self._observed = {of[f] for n, c in columns if n.startswith("observation") for f in c.fields}
-        self._commands = {
-            t: n for n, c in columns if n.startswith(ACTION) for t in map(of.__getitem__, c.fields)
-        }
+        self._commands = {t: n for n, c in columns if n.startswith(ACTION) for t in map(of.__getitem__, c.fields)}
         self._lossy = self._commands.keys() | {of[field] for field in mapping.flag_fields}
 
     def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:

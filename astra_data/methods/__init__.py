@@ -79,8 +79,7 @@ def add_method(name: str, place: str) -> None:
         raise BadInputError(f"method '{name}' is {known} already: give {place} another name")
     if not _NAME.fullmatch(name) or is_plus(name):
         raise BadInputError(
-            f"method '{name}': expected a name of a-z, 0-9 and _ that does not end in {PLUS} and begins with "
-            "a letter"
+            f"method '{name}': expected a name of a-z, 0-9 and _ that does not end in {PLUS} and begins with a letter"
         )
     if is_of_package(name):
         raise BadInputError(f"method '{name}' is one of the package: give {place} another name")
@@ -99,9 +98,7 @@ def add_method(name: str, place: str) -> None:
     if isinstance(method.fit, HistoryFit):
         encoder = method.fit.encoder
         if ENCODERS.setdefault(encoder.kind, encoder) is not encoder:
-            raise BadInputError(
-                f"{place}: there are encoders of kind '{encoder.kind}' already: rename its kind"
-            )
+            raise BadInputError(f"{place}: there are encoders of kind '{encoder.kind}' already: rename its kind")
     if isinstance(method.learn, UserLearner):
         add_policy_kind(method.learn.policy)
     METHODS[name] = replace(method, name=name)

@@ -11,9 +11,7 @@ from astra_data.policies.episodes import Act
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.task import Task
 
-FOLLOWER = Method(
-    name="follower", title="Careful follower", color="#9A9A9A", role="ceiling", learn=None, planar=True
-)
+FOLLOWER = Method(name="follower", title="Careful follower", color="#9A9A9A", role="ceiling", learn=None, planar=True)
 
 
 def careful(task: Task, goal: Tensor) -> Act:
@@ -100,9 +98,7 @@ class CarefulKicker:
         behind = ball - self.clear_m * to_goal
         way = torch.where(distance < 1.5 * self.clear_m, around, behind - robot)
         slower = ((distance - self.kick_m) / self.brake_m).clamp(0.3, 1.0)
-        velocity = torch.where(
-            is_behind, slower * _at_speed(-outward, self.speed), _at_speed(way, self.speed)
-        )
+        velocity = torch.where(is_behind, slower * _at_speed(-outward, self.speed), _at_speed(way, self.speed))
         return torch.cat([velocity, kicks.float()], dim=-1)
 
 

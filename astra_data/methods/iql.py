@@ -63,9 +63,7 @@ def learn_from_episodes(training: Training) -> tuple[PolicyFile, dict[str, Any]]
 
 def clone_behavior(training: Training) -> tuple[PolicyFile, dict[str, Any]]:
     """Imitate all recorded actions equally, as IQL does at temperature 0; see `learn_from_episodes`."""
-    cloning = _config(training).model_copy(
-        update={"temperature": 0.0, "critic_updates": 1, "return_steps": 1}
-    )
+    cloning = _config(training).model_copy(update={"temperature": 0.0, "critic_updates": 1, "return_steps": 1})
     return learn_from_episodes(replace(training, settings=cloning))
 
 

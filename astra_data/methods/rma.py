@@ -48,9 +48,7 @@ class TeacherThenStudent(InSimulator):
         phase_2 = replace(training, progress=part(training.progress, first, 1.0))
         ppo = Ppo(env, teacher, config, horizon=horizon, seed=seed)
         curve = optimize(ppo, env, phase_1)
-        adaptation = Adaptation(
-            env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed
-        )
+        adaptation = Adaptation(env, teacher, settings, rollout_steps=config.rollout_steps, horizon=horizon, seed=seed)
         curve["adaptation"] = optimize(adaptation, env, phase_2, f"adaptation_{CHECKPOINT}")
         for clock in CLOCKS:
             curve[clock] += curve["adaptation"][clock]

@@ -265,9 +265,7 @@ def _outermost(places: Collection[Path], root: Path) -> list[Path]:
     """Return the folders that hold nothing but `places`, and those places that are in none of these."""
     found = set(places)
     while True:
-        whole = {
-            parent for place in found if (parent := place.parent) != root and found >= {*parent.iterdir()}
-        }
+        whole = {parent for place in found if (parent := place.parent) != root and found >= {*parent.iterdir()}}
         if not whole:
             return sorted(found)
         found = {place for place in found if place.parent not in whole} | whole

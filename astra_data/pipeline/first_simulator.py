@@ -104,9 +104,7 @@ class SimulatorKind:
         states = ", ".join(field.short for entry in self.entries for field in entry.fields)
         by = ", ".join(field.short for field in self.logs.of("command") if field.name in self.driven)
         fitted = [f"{name.lower()} {value:g}" for name, value in self.constants.items()]
-        return "; ".join(
-            [f"{self.called}: {states}, moved by {by}", *fitted, *map("CHECK: {}".format, self.remarks)]
-        )
+        return "; ".join([f"{self.called}: {states}, moved by {by}", *fitted, *map("CHECK: {}".format, self.remarks)])
 
     def code(self) -> str:
         """Return its class."""
@@ -126,9 +124,7 @@ class SimulatorKind:
             "variables": unpacked(self.names),
             "commands": unpacked(used),
             "lines": "\n        ".join(self.lines),
-            "shown": ", ".join(
-                code for entry in self.entries for code in entry.shown("{}.cos()", "{}.sin()")
-            ),
+            "shown": ", ".join(code for entry in self.entries for code in entry.shown("{}.cos()", "{}.sin()")),
         }
         return Template(text).substitute(values)
 
@@ -166,12 +162,8 @@ class SimulatorKind:
         episodes = self.episodes()
         steps = JUDGED_STEPS if any(len(states) > JUDGED_STEPS for states, _ in episodes) else 1
         long = [(states, commands) for states, commands in episodes if len(states) > steps]
-        starts, ends = (
-            np.concatenate(rows) for rows in zip(*((s[:-steps], s[steps:]) for s, _ in long), strict=True)
-        )
-        found = self.after(
-            starts, [np.concatenate([c[k : k - steps] for _, c in long]) for k in range(steps)]
-        )
+        starts, ends = (np.concatenate(rows) for rows in zip(*((s[:-steps], s[steps:]) for s, _ in long), strict=True))
+        found = self.after(starts, [np.concatenate([c[k : k - steps] for _, c in long]) for k in range(steps)])
         return np.abs(found - ends).mean(axis=0), np.abs(starts - ends).mean(axis=0)
 
     def slopes(self, moves: Callable[[Floats, Floats], Floats], steps: int) -> list[float]:
@@ -208,9 +200,9 @@ def first_simulator(logs: Logs) -> SimulatorKind:
         raise BadInputError("found no state that a command could move: name it as its command, cmd_q1 and q1")
     if not good:
         return rest
-    merged = {
-        name: getattr(good[0], name) + getattr(rest, name) for name in ("entries", "lines", "remarks")
-    } | {name: getattr(good[0], name) | getattr(rest, name) for name in ("driven", "constants")}
+    merged = {name: getattr(good[0], name) + getattr(rest, name) for name in ("entries", "lines", "remarks")} | {
+        name: getattr(good[0], name) | getattr(rest, name) for name in ("driven", "constants")
+    }
     return replace(good[0], **merged)
 
 
@@ -219,11 +211,7 @@ def identifiers(fields: Sequence[Field], prefix: str = "") -> dict[str, str]:
     found: dict[str, str] = {}
     for one in fields:
         plain = f"{prefix}{one.plain}"
-        if (
-            not plain.isidentifier()
-            or keyword.iskeyword(plain)
-            or plain in ("of", "np", "torch", "state", "self")
-        ):
+        if not plain.isidentifier() or keyword.iskeyword(plain) or plain in ("of", "np", "torch", "state", "self"):
             plain = f"s_{plain}" if f"s_{plain}".isidentifier() else f"s_{len(found)}"
         while plain in found.values():
             plain += "_2"
@@ -242,9 +230,7 @@ def _planar(logs: Logs) -> list[SimulatorKind]:
     position = _position(logs, states)
     if position is None:
         return []
-    place = [
-        StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", position, strict=True)
-    ]
+    place = [StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", position, strict=True)]
     found = []
     for heading, remarks in _headings(states, names, position[0].plain):
         for called, driven, lines, fit in _drives(logs.of("command")):
@@ -272,9 +258,7 @@ def _position(logs: Logs, states: dict[str, Field]) -> tuple[Field, Field] | Non
     return None
 
 
-def _headings(
-    states: dict[str, Field], names: dict[str, str], beside: str
-) -> list[tuple[StateEntry, tuple[str, ...]]]:
+def _headings(states: dict[str, Field], names: dict[str, str], beside: str) -> list[tuple[StateEntry, tuple[str, ...]]]:
     """Return what the heading may be, of cosine and sine, an angle or a quaternion, and remarks of it."""
     near = sorted(states, key=lambda name: (-len(os.path.commonprefix([name, beside])), len(name)))  # noqa: RUF071
     for stem in (name[:-2] for name in near if HEADING.fullmatch(name[:-2])):
@@ -437,9 +421,7 @@ def _moved(command: Field, states: Sequence[Field], *, is_alone: bool) -> list[F
     if BODY.fullmatch(command.plain):
         return [one for one in states if one.plain == command.plain]
     unit = "rad/s" if _is_turn_rate(command) else command.unit
-    fitting = [
-        one for one in states if "1" in (unit, one.unit) or one.unit in (unit, unit.removesuffix("/s"))
-    ]
+    fitting = [one for one in states if "1" in (unit, one.unit) or one.unit in (unit, unit.removesuffix("/s"))]
     same = sorted((one for one in states if _key(one) == _key(command)), key=_is_speed)
     if command.unit in FORCES:
         places, speeds = ([one for one in same if _is_speed(one) is flag][:1] for flag in (False, True))

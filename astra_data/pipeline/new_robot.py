@@ -46,9 +46,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path]) -> SimulatorKind:
     Return the simulator that it begins with.
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
-        raise BadInputError(
-            f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart, that begins with a letter"
-        )
+        raise BadInputError(f"'{name}': expected a name of a-z, 0-9 and _, such as my_cart, that begins with a letter")
     if name in _TAKEN or keyword.iskeyword(name) or _is_installed(name):
         raise BadInputError(f"'{name}': expected a name that Python does not use, such as my_{name}")
     with atomic_folder(out) as folder:
@@ -203,9 +201,7 @@ def _objective(simulator: SimulatorKind) -> dict[str, str]:
     }
     if "east" in simulator.driven.values():
         values["seen"] = "east, north"  # of a robot that is commanded along the axes of the world
-    sizes = [
-        f"\n{name} = {value!r}  # CHECK: fitted to the logs" for name, value in simulator.constants.items()
-    ]
+    sizes = [f"\n{name} = {value!r}  # CHECK: fitted to the logs" for name, value in simulator.constants.items()]
     return {
         "names": _code(tuple(simulator.names)),
         "constants": "".join(sizes),
@@ -259,25 +255,19 @@ def _column(role: Role, logs: Logs) -> str:
     fields, lines = logs.of(role), [f'[columns."{_COLUMNS[role]}"]']
     if fields[0].why.endswith("(CHECK)"):
         called = f"{fields[0].name} is {fields[0].why.removesuffix(' (CHECK)')}"
-        lines.insert(
-            0, f"# CHECK: {called}: a failure? If a success, write next.success; if neither, delete this"
-        )
+        lines.insert(0, f"# CHECK: {called}: a failure? If a success, write next.success; if neither, delete this")
     lines.append(f"fields = {_code([field.name for field in fields])}")
     if role in ("state", "command", "goal"):
         keys = {"names": "short", "unit": "unit", "scale": "scale", "offset": "offset"}
         lines += [f"{key} = {_code([getattr(field, of) for field in fields])}" for key, of in keys.items()]
     if role == "state" and "position" in (roles := _roles(fields)):
-        lines.append(
-            f"role = {_code(roles)}  # how a turn and a shift of the ground act; CHECK the invariant"
-        )
+        lines.append(f"role = {_code(roles)}  # how a turn and a shift of the ground act; CHECK the invariant")
     return "\n".join(line for line in lines if not re.fullmatch(r"offset = \[(0\.0(, )?)+\]", line)) + "\n"
 
 
 def _roles(fields: Sequence[Field]) -> list[str]:
     """Return what each state is to a turn and a shift of the ground: the one pair x, y, and headings."""
-    roles = [
-        "heading" if one.unit == "rad" and HEADING.fullmatch(one.short) else "invariant" for one in fields
-    ]
+    roles = ["heading" if one.unit == "rad" and HEADING.fullmatch(one.short) else "invariant" for one in fields]
     for at, (one, other) in enumerate(pairwise(fields)):
         if (one.short, other.short) == ("x", "y") and one.unit == other.unit == "m":
             roles[at : at + 2] = ["position", "position"]
@@ -288,9 +278,7 @@ def _code(value: str | Iterable[str] | Iterable[float]) -> str:
     """Return a text, a tuple or a list as Python and, but for tuples, TOML; numbers as exact as float32."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
-    inside = ", ".join(
-        _code(one) if isinstance(one, str) else repr(float(f"{one:.9g}") + 0.0) for one in value
-    )
+    inside = ", ".join(_code(one) if isinstance(one, str) else repr(float(f"{one:.9g}") + 0.0) for one in value)
     if isinstance(value, tuple):
         return f"({inside},)" if len(value) == 1 else f"({inside})"
     return f"[{inside}]"

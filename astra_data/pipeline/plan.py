@@ -226,9 +226,7 @@ class _Plan:
         return Item(
             key,
             tuple(dict.fromkeys(made for made in keys.values() if made)),
-            partial(
-                stage.run, **{parameter: known[parameter] for parameter in parameters if parameter in known}
-            ),
+            partial(stage.run, **{parameter: known[parameter] for parameter in parameters if parameter in known}),
             # Of the methods only some train in the target, whose physics uses several threads.
             is_threaded="num_threads" in parameters
             and (method is None or stage.each != "policy" or method.steps_target),

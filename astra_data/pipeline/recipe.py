@@ -239,8 +239,7 @@ class Recipe(Config):
                 raise ValueError(unknown) from None
             if is_plus(row) and not method_named(row).in_simulator:
                 raise ValueError(
-                    f"'{row}' trains nothing in a simulator, so plus settings have no effect: "
-                    f"leave out {PLUS}"
+                    f"'{row}' trains nothing in a simulator, so plus settings have no effect: leave out {PLUS}"
                 )
         return rows
 
@@ -259,8 +258,7 @@ class Recipe(Config):
             raise ValueError(f"select.judge: {error}") from None
         if len(self.seeds) < 2:
             raise ValueError(
-                "select: expected two seeds or more, got 1 (judges are of other seeds): "
-                "remove [select], or add a seed"
+                "select: expected two seeds or more, got 1 (judges are of other seeds): remove [select], or add a seed"
             )
         if not any(method_named(row).trains_without_target for row in self.methods):
             raise ValueError("select: expected a row with policies of abstract states, got none")
@@ -289,17 +287,14 @@ class Recipe(Config):
             "report.paper_success": bool(self.report.paper_success),
         }
         if faults := faults + [setting for setting, is_asked in asked.items() if is_asked]:
-            raise ValueError(
-                f"{self.task} has no maze, which these need: {', '.join(faults)}; leave them out"
-            )
+            raise ValueError(f"{self.task} has no maze, which these need: {', '.join(faults)}; leave them out")
         return self
 
     @model_validator(mode="after")
     def _has_no_repeats_and_no_empty_size(self) -> Self:
         if self.augment and self.sweep.percent:
             raise ValueError(
-                "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one "
-                "of the two"
+                "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one of the two"
             )
         axes = {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}
         for name, values in axes.items():

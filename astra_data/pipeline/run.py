@@ -233,9 +233,7 @@ def make(
         clean(folder)
         again = to_make_again(items, experiment)
         items = [
-            item
-            for item in items
-            if item.key in again or item.stage in ALWAYS_NEW or not experiment.has(item.key)
+            item for item in items if item.key in again or item.stage in ALWAYS_NEW or not experiment.has(item.key)
         ]
         if [item.stage for item in items] == ["report"] and _is_reported(items[0]):
             items = []
@@ -245,8 +243,7 @@ def make(
         console = Console()
         lines = [f"warning: data: {warning}" for warning in (data.warnings if data else ())]
         lines += [
-            f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}"
-            for key, reason in again.items()
+            f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}" for key, reason in again.items()
         ]
         for line in lines:
             console.print(line, markup=False, highlight=False, soft_wrap=True)

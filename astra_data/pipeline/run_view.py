@@ -28,9 +28,7 @@ from astra_data.reports.figures.style import method_color
 from astra_data.robots.registry import task_named
 
 
-def view_run(
-    run: Path, uids: Sequence[int] = (), *, seed: int | None = None, save: Path | None = None
-) -> None:
+def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, save: Path | None = None) -> None:
     """Show episodes of a run's pairs, and replays of their commands in the raw and every grounded simulator.
 
     By default these are the first 5 `uids` that groundings held out, of the first `seed` of the recipe.

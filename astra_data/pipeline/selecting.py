@@ -82,9 +82,7 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
     """Return whether the choice in `folder` is this one; set aside another one."""
     out = folder / FOLDER
     if out.is_symlink():
-        raise BadInputError(
-            f"{out} belongs to {out.resolve().parent}, which this run is based on: run select there"
-        )
+        raise BadInputError(f"{out} belongs to {out.resolve().parent}, which this run is based on: run select there")
     if not out.is_dir():
         return False
     judge = judge_in(recipe, config)

@@ -129,9 +129,7 @@ def copy_recipe(name: str, folder: Path) -> list[Path]:
     places = {RECIPES / path: folder / path for path in sorted(shipped(name).files)}
     for source, place in places.items():
         if place.exists() and (not place.is_file() or place.read_bytes() != source.read_bytes()):
-            raise BadInputError(
-                f"{place} exists and differs from the one in the package: choose another folder"
-            )
+            raise BadInputError(f"{place} exists and differs from the one in the package: choose another folder")
     new = {place: source for source, place in places.items() if not place.exists()}
     for place, source in new.items():
         place.parent.mkdir(parents=True, exist_ok=True)

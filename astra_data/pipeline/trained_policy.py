@@ -108,9 +108,7 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     """
     folder = Path(run)
     if not (folder / RECORD).is_file():
-        raise BadInputError(
-            f"{run}: expected the folder of a run (with {RECORD}): make it with astra-data run"
-        )
+        raise BadInputError(f"{run}: expected the folder of a run (with {RECORD}): make it with astra-data run")
     settings = recorded_settings(folder)
     settings["task"] = found_near(settings["task"], folder)
     check_unchanged(settings["task"], folder)
@@ -119,9 +117,7 @@ def settings_of(run: str | Path) -> dict[str, Any]:
     return settings
 
 
-def _files(
-    settings: dict[str, Any], folder: Path, row: str, seed: int, percent: int | None
-) -> dict[str, Path]:
+def _files(settings: dict[str, Any], folder: Path, row: str, seed: int, percent: int | None) -> dict[str, Path]:
     own_methods = settings.get("own_methods", {})
     add_all(own_methods)
     files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}

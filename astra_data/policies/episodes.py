@@ -124,9 +124,7 @@ class RecordedRange:
             return None
         if isinstance(statistics, str):
             return None
-        least, largest = (
-            torch.from_numpy(np.asarray(statistics[ACTION][end], np.float32)) for end in ("min", "max")
-        )
+        least, largest = (torch.from_numpy(np.asarray(statistics[ACTION][end], np.float32)) for end in ("min", "max"))
         return cls(least, largest, limits)
 
     def count(self, action: Tensor, active: Tensor) -> None:

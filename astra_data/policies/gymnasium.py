@@ -97,9 +97,7 @@ class SingleEnv(gymnasium.Env[Array, Array]):
         self.observation_space, self.action_space = _spaces(env)
         self._age = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start an episode; `options` are not used."""
         super().reset(seed=seed)
         if seed is not None:

@@ -91,9 +91,7 @@ class Policy(nn.Module, ABC):
         hidden = self.memory.step(torch.cat([observation, previous_action], dim=-1), hidden)
         return torch.cat([observation, self.memory.latent(hidden)], dim=-1), hidden
 
-    def remember_sequence(
-        self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
-    ) -> Tensor:
+    def remember_sequence(self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
         """Return the features (B, T, F) of T steps; see `features_of`."""
         return features_of(self.memory, observation, previous_action, hidden, start)
 
@@ -250,9 +248,7 @@ class Teacher(ActorCritic):
         features, hidden = super().remember(seen, previous_action, hidden)
         return torch.cat([features, self.extrinsics(observation)], dim=-1), hidden
 
-    def remember_sequence(
-        self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
-    ) -> Tensor:
+    def remember_sequence(self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
         """Return the features (B, T, F) of `observation` (B, T, O + P); see `Policy`."""
         seen = observation[..., : self.shape.observation_size]
         features = super().remember_sequence(seen, previous_action, hidden, start)
@@ -318,9 +314,7 @@ class Student(ActorCritic):
         features = torch.cat([features, self.adaptation(history)], dim=-1)
         return features, torch.cat([memory, history], dim=-1)
 
-    def remember_sequence(
-        self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor
-    ) -> Tensor:
+    def remember_sequence(self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
         """Return the features (B, T, F) of T steps, from `hidden`; `start` (B, T) is 1 at new episodes."""
         features = []
         for step in range(observation.shape[1]):

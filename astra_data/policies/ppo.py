@@ -58,9 +58,7 @@ class Ppo(Learner):
         policy: the networks being trained.
     """
 
-    def __init__(
-        self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int
-    ) -> None:
+    def __init__(self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int) -> None:
         """Prepare to train `policy` in `env`.
 
         Args:
@@ -99,9 +97,7 @@ class Ppo(Learner):
         self._learn(self._collect())
         faded = min(1.0, (1.0 - self.share_left) / _FADE_SHARE)
         with torch.no_grad():
-            self.policy.log_std.clamp_(
-                max=math.log(self._first_std) + faded * math.log(_FINAL_STD / self._first_std)
-            )
+            self.policy.log_std.clamp_(max=math.log(self._first_std) + faded * math.log(_FINAL_STD / self._first_std))
         figures = {"std": float(self.policy.log_std.detach().exp().mean())}
         refuse_divergence(f"after step {self.steps}", figures)
         return figures

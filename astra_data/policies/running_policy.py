@@ -107,9 +107,7 @@ EncoderKind = Literal["target", "source"]
 Observed = Literal["abstract", "full"]
 
 
-def target_observation(
-    task: Task, state: Tensor, goal: Tensor, latent: Tensor | None, observed: Observed
-) -> Tensor:
+def target_observation(task: Task, state: Tensor, goal: Tensor, latent: Tensor | None, observed: Observed) -> Tensor:
     """Assemble a policy's observation (..., O) of target states (..., S), goals (..., G) and latents, if any.
 
     It is the observation of φ(s), followed, where the full state is observed, by the rest of the state.
@@ -241,8 +239,7 @@ def add_policy_kind(made: type[SavedPolicy]) -> None:
     """Let files hold policies of another learner."""
     if made.kind in _KINDS or KINDS.setdefault(made.kind, made) is not made:
         raise BadInputError(
-            f"policies of kind '{made.kind}' are the package's or another learner's: rename that of "
-            f"{made.__name__}"
+            f"policies of kind '{made.kind}' are the package's or another learner's: rename that of {made.__name__}"
         )
 
 
@@ -307,8 +304,7 @@ def _taken_apart(policy: Policy) -> tuple[str, Mapping[str, Tensor], dict[str, A
         if type(policy) not in kinds:
             known = ", ".join(made.__name__ for made in kinds)
             raise BadInputError(
-                f"a {type(policy).__name__} cannot be read again: expected a {known}, or what an "
-                "UserLearner learns"
+                f"a {type(policy).__name__} cannot be read again: expected a {known}, or what an UserLearner learns"
             )
         return kinds[type(policy)], policy.state_dict(), {}
     saved: Any = policy.acting

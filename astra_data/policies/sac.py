@@ -179,9 +179,7 @@ class Sac(Learner):
         seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
         acting = self.policy.remember_sequence(*seen, steps["hidden"][:, 0], first)
         judging = critics.features(*seen, first)[:, :-1][learned]
-        reward, terminated, taken = (
-            steps[name][:, :-1][learned] for name in ("reward", "terminated", "action")
-        )
+        reward, terminated, taken = (steps[name][:, :-1][learned] for name in ("reward", "terminated", "action"))
         with torch.no_grad():
             action, log_prob = self.policy.sample(acting[:, 1:][learned])
             late = self._late_critics.features(*seen, first)[:, 1:][learned]
@@ -210,9 +208,7 @@ class _Critics(nn.Module):
 
     def features(self, observation: Tensor, previous_action: Tensor, first: Tensor) -> Tensor:
         """Return the features (B, T, F) of windows of (B, T, ...), before which nothing is remembered."""
-        nothing = observation.new_zeros(
-            len(observation), 0 if self.memory is None else self.memory.latent_size
-        )
+        nothing = observation.new_zeros(len(observation), 0 if self.memory is None else self.memory.latent_size)
         return features_of(self.memory, observation, previous_action, nothing, first)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:

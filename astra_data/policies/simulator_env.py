@@ -274,9 +274,7 @@ class Simulation:
 
 
 @torch.no_grad()
-def data_starts(
-    task: Task, world: WorldConfig, episodes: PairedEpisodes, grounding: Grounding
-) -> DataStarts | None:
+def data_starts(task: Task, world: WorldConfig, episodes: PairedEpisodes, grounding: Grounding) -> DataStarts | None:
     """Return the recorded moments that episodes may start from; None unless `world` asks for them."""
     if not world.data_start_share:
         return None

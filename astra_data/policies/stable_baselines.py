@@ -59,9 +59,7 @@ class StableBaselinesEnv(VecEnv):
         """Refuse."""
         raise NotImplementedError
 
-    def env_method(
-        self, method_name: str, *args: object, indices: object = None, **kwargs: object
-    ) -> list[Any]:
+    def env_method(self, method_name: str, *args: object, indices: object = None, **kwargs: object) -> list[Any]:
         """Refuse."""
         raise NotImplementedError
 

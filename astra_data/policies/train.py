@@ -316,9 +316,7 @@ class InTarget:
         return PolicyFile(policy, None, episodes.reference, episodes.content_hash, self.observed), curve
 
 
-def with_restarts(
-    learn: Learn, training: Training, grounding_file: Path | None
-) -> tuple[PolicyFile, dict[str, Any]]:
+def with_restarts(learn: Learn, training: Training, grounding_file: Path | None) -> tuple[PolicyFile, dict[str, Any]]:
     """Train until a policy masters its own simulator, `tries` times at most, each from another seed.
 
     Args:
@@ -419,9 +417,7 @@ class UserLearner(InSimulator):
         torch.manual_seed(derive(training.seed, "policy"))
         learned = self.learn(watched, training)
         if not isinstance(learned, self.policy):
-            raise BadInputError(
-                f"learn returned a {type(learned).__name__}, expected a {self.policy.__name__}"
-            )
+            raise BadInputError(f"learn returned a {type(learned).__name__}, expected a {self.policy.__name__}")
         watched.finish()
         own = UserPolicy(learned, env.observation_size, env.action_size)
         episodes = training.episodes

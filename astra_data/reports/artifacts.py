@@ -245,9 +245,7 @@ def read_tensors(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.flo
     try:
         tensors = load_file(path)
     except SafetensorError as error:
-        raise BadInputError(
-            f"{path} is not a complete safetensors file ({error}); run its stage again"
-        ) from None
+        raise BadInputError(f"{path} is not a complete safetensors file ({error}); run its stage again") from None
     missing = [name for name in names if name not in tensors]
     if missing:
         raise BadInputError(f"{path}: expected tensors {missing}, got {sorted(tensors)}; run its stage again")

@@ -132,9 +132,7 @@ def html(title: str, sections: Sequence[Section], images: Mapping[str, bytes] | 
         if (body := "\n".join(filter(None, (_html(block, images or {}) for block in section.blocks))))
     ]
     links = "".join(
-        f'<li><a href="#{_anchor(section)}">{escape(section.title)}</a></li>'
-        for section, _ in written
-        if section.title
+        f'<li><a href="#{_anchor(section)}">{escape(section.title)}</a></li>' for section, _ in written if section.title
     )
     css = files("astra_data.reports").joinpath("results.css").read_text()
     return "\n".join(
@@ -185,9 +183,7 @@ def _html(block: Block, images: Mapping[str, bytes]) -> str:
 def _html_table(block: TableBlock) -> str:
     labels = [escape(re.sub(r"[`*]", "", name)) for name in (block.title or "TableBlock", *block.head)]
     words = ["", *[' class="word"'] * (block.words - 1), *[""] * len(block.head)]
-    head = "".join(
-        f'<th scope="col"{word}>{inline(name)}</th>' for name, word in zip(block.head, words, strict=False)
-    )
+    head = "".join(f'<th scope="col"{word}>{inline(name)}</th>' for name, word in zip(block.head, words, strict=False))
     lines = ""
     for first, *others in block.lines:
         cells = "".join(

@@ -249,9 +249,7 @@ def read_judged(root: Path) -> Judged | None:
     return read_json(Judged, path) if path.is_file() else None
 
 
-def choice_of(
-    judged: Judgment, percent: int | None, *, measured: Mapping[tuple[str, int], float]
-) -> Choice | None:
+def choice_of(judged: Judgment, percent: int | None, *, measured: Mapping[tuple[str, int], float]) -> Choice | None:
     """Return the choice among the policies of a size, None for the whole; None without a candidate."""
     ranked = judged.ranked(percent)
     return Choice(judged, ranked, measured) if ranked else None
@@ -260,9 +258,7 @@ def choice_of(
 def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | TableBlock]:
     """Return what a page says of a choice, with the first `shown` of its candidates, by default all."""
     judged = choice.judged
-    episodes = (
-        "the same episodes, from other seeds" if judged.shares_episodes else "the episodes of other seeds"
-    )
+    episodes = "the same episodes, from other seeds" if judged.shares_episodes else "the episodes of other seeds"
     lines = [
         [
             *(method_title(one.row), f"{one.seed}", f"{one.lower:.2f}"),
@@ -334,9 +330,7 @@ def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBloc
             f"{state} {trials.spent} of {trials.trials} episodes were used, on the {trials.field} candidates "
             f"that the prediction ranks highest{size}."
         ),
-        TableBlock(
-            "", ["round", "method", "seed", "succeeded", "of", "mean"], trial_lines(judged, trials), words=2
-        ),
+        TableBlock("", ["round", "method", "seed", "succeeded", "of", "mean"], trial_lines(judged, trials), words=2),
         Text(
             "Trials are split equally over rounds, and within a round over its candidates, which get the "
             "same starts and goals. After each round, the better half goes on. Mean: mean success over all "

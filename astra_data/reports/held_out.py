@@ -98,8 +98,7 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     quantities = list(dict.fromkeys(error.quantity for error in results.errors))
     step_s = results.timestep_s
     titles = [
-        f"{steps} step{'s' if steps > 1 else ''}{f' ({steps * step_s:.3g} s)' if step_s else ''}"
-        for steps in horizons
+        f"{steps} step{'s' if steps > 1 else ''}{f' ({steps * step_s:.3g} s)' if step_s else ''}" for steps in horizons
     ]
     for quantity in quantities:
         lines = [
@@ -136,8 +135,7 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     found = {row: {name: results.summary(row, name, "ground") for name in _FITS} for row in rows}
     if shown := [name for name in _FITS if any(of[name] for of in found.values())]:
         yield TableBlock(
-            "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the "
-            "mean)",
+            "R² of what groundings predict on held-out episodes (1: perfect; 0 or less: no better than the mean)",
             ["grounding", *(_FITS[name] for name in shown)],
             [
                 [method_title(row), *(f"{one.value:.2f}" if (one := of[name]) else "-" for name in shown)]
@@ -196,8 +194,7 @@ def _regressions(results: Results, means: "pd.DataFrame") -> Iterator[str]:
         worse = of[(of["grounded"] > of["raw"]) & (of["grounded"] > _EXACT * of.get("still", 0.0))]
         for quantity, lines in worse.groupby(level="quantity", sort=False):
             found = [
-                f"{steps} step{'s' if steps > 1 else ''} ahead ({line['grounded']:.3g}, without "
-                f"{line['raw']:.3g})"
+                f"{steps} step{'s' if steps > 1 else ''} ahead ({line['grounded']:.3g}, without {line['raw']:.3g})"
                 for (_, steps), line in lines.iterrows()
             ]
             yield f"`{quantity}`, {method_title(row)}: {', '.join(found)}"

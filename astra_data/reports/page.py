@@ -174,8 +174,7 @@ def _methods(results: Results) -> Iterator[Block]:
     notes = [
         f"Mean ± standard deviation over seeds, {where}, and the 95 % interval of the mean (Student's t, "
         f"for shares of episodes widened to Wilson's), which needs {LEAST_SEEDS} seeds.",
-        "In its simulator: the same policies in the simulator of their training; lost: how much less it is "
-        f"{where}.",
+        f"In its simulator: the same policies in the simulator of their training; lost: how much less it is {where}.",
         *(column.note for column in shown if column.note),
         "Floor: what is reached without any correction. Ceiling: what a controller reaches that knows the "
         "task. The best of the other methods is bold.",
@@ -298,9 +297,7 @@ def _sizes(results: Results) -> Iterator[Block]:
         found = [results.score_of(row, percent=percent) for percent in results.percents]
         few = [f" ({one.seeds} of {seeds} seeds)" if one and one.seeds != seeds else "" for one in found]
         title = method_title(row)
-        means.append(
-            [title, *(f"{spread(one, score.digits)}{of}" for one, of in zip(found, few, strict=True))]
-        )
+        means.append([title, *(f"{spread(one, score.digits)}{of}" for one, of in zip(found, few, strict=True))])
         intervals.append([title, *(ends(one, score.digits) for one in found)])
     title = f"{score.title.capitalize()} {results.where}, mean ± standard deviation over seeds"
     yield TableBlock(title, head, means)
@@ -328,9 +325,7 @@ def _costs(results: Results) -> Iterator[Block]:
     ]
     elapsed = elapsed_seconds(results)
     total = ["whole recipe", duration(sum(wall.values())), duration(sum(cpu.values()) or None), ""]
-    yield Text(
-        f"Wall time of the whole recipe: {duration(elapsed)}, in which several stages may run at once."
-    )
+    yield Text(f"Wall time of the whole recipe: {duration(elapsed)}, in which several stages may run at once.")
     head = ["stage", "time", "CPU time", "speed"]
     yield TableBlock("Time of each stage, added up over methods and seeds", head, [*lines, total])
     per_row = []
@@ -340,9 +335,7 @@ def _costs(results: Results) -> Iterator[Block]:
         sums = [sum(value for value in of if value is not None) for of in (found, spent)]
         per_row.append([method_title(row), *map(duration, found), *(duration(one or None) for one in sums)])
     head = ["method", *COSTED, "in all", "CPU time"]
-    yield TableBlock(
-        "Time for one seed of each method, with the grounding and alignment that it uses", head, per_row
-    )
+    yield TableBlock("Time for one seed of each method, with the grounding and alignment that it uses", head, per_row)
     yield Text(
         "A dash: no time was recorded. CPU time: of all threads. Speed: of one item while others run, "
         "averaged over seeds. Simulator steps/s: without learning; training steps/s: with learning."

@@ -74,9 +74,7 @@ class OfSeed(Facts):
     @property
     def key(self) -> tuple[Any, ...]:
         """What makes it unique: all of its names and whole numbers."""
-        return tuple(
-            value for name in type(self).model_fields if isinstance(value := getattr(self, name), str | int)
-        )
+        return tuple(value for name in type(self).model_fields if isinstance(value := getattr(self, name), str | int))
 
 
 class Line(OfSeed):
@@ -204,9 +202,7 @@ class Results(Facts):
         """Return the methods tested at the largest size that are no references."""
         return [row for row in self.tested(self.largest) if not method_role(row)]
 
-    def values(
-        self, row: str, measure: str, where: str = TESTED, percent: int | None = None
-    ) -> dict[int, float]:
+    def values(self, row: str, measure: str, where: str = TESTED, percent: int | None = None) -> dict[int, float]:
         """Return the value of a measure by seed, at a size, by default the largest."""
         return self._values.get((row, percent or self.largest, where, measure), {})
 
@@ -218,9 +214,7 @@ class Results(Facts):
                 found.setdefault((line.row, line.percent, line.where, measure), {})[line.seed] = value
         return found
 
-    def summary(
-        self, row: str, measure: str, where: str = TESTED, percent: int | None = None
-    ) -> Estimate | None:
+    def summary(self, row: str, measure: str, where: str = TESTED, percent: int | None = None) -> Estimate | None:
         """Return a measure over the seeds that have it; None where there are none."""
         values = self.values(row, measure, where, percent)
         return summarize([*values.values()], **self._bounds(measure)) if values else None
@@ -237,9 +231,7 @@ class Results(Facts):
     def difference(self, row: str, other: str) -> Estimate | None:
         """Return by how much a method's headline score is higher, paired by seed."""
         measure = self.headline.measure
-        return paired_difference(
-            self.values(row, measure), self.values(other, measure), **self._bounds(measure)
-        )
+        return paired_difference(self.values(row, measure), self.values(other, measure), **self._bounds(measure))
 
     def groundings(self) -> list[str]:
         """Return the methods that ground a simulator, those of the tested methods first."""
@@ -356,10 +348,7 @@ def merge(sources: Sequence[Results]) -> Results:
         BadInputError: the sources differ in task, episodes, robot, judges or data.
     """
     last, judged = sources[-1], [one.judged for one in sources if one.judged]
-    facts = {
-        what: [getattr(one, what) for one in sources]
-        for what in ("task", "episodes", "tested_in", "leg_scale")
-    }
+    facts = {what: [getattr(one, what) for one in sources] for what in ("task", "episodes", "tested_in", "leg_scale")}
     facts["judges"] = [one.model_dump(exclude={"candidates"}) for one in judged]
     for what, values in facts.items():
         if any(value != values[0] for value in values):
@@ -375,9 +364,7 @@ def merge(sources: Sequence[Results]) -> Results:
     return last.model_copy(
         update={
             "rows": tuple(dict.fromkeys([*last.rows, *(row for one in sources for row in one.rows)])),
-            "judged": judged[-1].model_copy(update={"candidates": [*candidates.values()]})
-            if judged
-            else None,
+            "judged": judged[-1].model_copy(update={"candidates": [*candidates.values()]}) if judged else None,
             "origins": merged_origins(origin for one in sources for origin in one.origins),
             "user_code": {name: digest for one in sources for name, digest in one.user_code.items()},
             "datasets": _datasets(sources),
@@ -450,9 +437,7 @@ def elapsed_seconds(results: Results) -> float:
 def stage_seconds(results: Results, clock: str) -> dict[str, float]:
     """Return the time of each stage over all of its artifacts, by "wall_seconds" or "cpu_seconds"."""
     of = results.table[results.table["measure"] == clock]
-    return {
-        str(stage): float(total) for stage, total in of.groupby("where", sort=False)["value"].sum().items()
-    }
+    return {str(stage): float(total) for stage, total in of.groupby("where", sort=False)["value"].sum().items()}
 
 
 def read_results(path: Path) -> Results:

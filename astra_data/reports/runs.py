@@ -147,9 +147,7 @@ class RunReader:
         if file and is_shown:
             steps = [point.steps for point in file.points]
             scores = [point.success if score == SUCCESS else point.episode_steps for point in file.points]
-            self.trainings.append(
-                TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": scores})
-            )
+            self.trainings.append(TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": scores}))
 
     def grounding(self, owner: Owner) -> None:
         """Read times, R², predicted failures and open-loop errors on held-out episodes of a grounding."""

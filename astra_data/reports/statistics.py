@@ -156,9 +156,7 @@ def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: boo
 
     def drawn() -> Floats:
         rows = [pairs[row] for row in rng.integers(len(pairs), size=len(pairs))]
-        return np.concatenate(
-            [pair[:, rng.integers(pair.shape[1], size=pair.shape[1])] for pair in rows], axis=1
-        )
+        return np.concatenate([pair[:, rng.integers(pair.shape[1], size=pair.shape[1])] for pair in rows], axis=1)
 
     pairs, rng = [np.stack(of) for of in zip(first, second, strict=True)], np.random.default_rng(0)
     whole = np.concatenate(pairs, axis=1)

@@ -124,9 +124,7 @@ def _difference(results: Results, best: str, floor: str | None) -> str:
     text = f"{method_title(best)} less {method_title(floor)}: {value}"
     if found.low is None or found.high is None:
         return f"{text}, of too few seeds for an interval: run {LEAST_SEEDS} or more"
-    return f"{text}, 95 %" + (
-        ": these seeds do not show a difference" if found.low <= 0 <= found.high else ""
-    )
+    return f"{text}, 95 %" + (": these seeds do not show a difference" if found.low <= 0 <= found.high else "")
 
 
 def _failing(results: Results, row: str) -> float | None:

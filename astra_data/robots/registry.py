@@ -57,9 +57,7 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
     if place := name if is_user_code(name) else offered(TASK_GROUP).get(name):
         return _task_at(name, place)
     known = (*known_names(), *besides)
-    raise BadInputError(
-        f"unknown task '{name}'{did_you_mean(name, known)}; name your own task like cart.py:TASK"
-    )
+    raise BadInputError(f"unknown task '{name}'{did_you_mean(name, known)}; name your own task like cart.py:TASK")
 
 
 def place_of(name: str) -> str:
@@ -116,8 +114,7 @@ def pairing_named(name: str) -> Pairing:
     missing = [attribute for attribute in needed if not hasattr(made, attribute)]
     if missing:
         raise BadInputError(
-            f"{name} has no {', '.join(missing)}: expected what a Simulator has, see "
-            "astra_data.worlds.protocols"
+            f"{name} has no {', '.join(missing)}: expected what a Simulator has, see astra_data.worlds.protocols"
         )
     column = made.abstract_state
     if not isinstance(column, Column):
@@ -160,7 +157,6 @@ def checked_abstraction(pairing: Pairing, state: Array) -> Array:
         abstract = np.ascontiguousarray(pairing.abstraction(state), dtype=np.float32)
     if abstract.shape != expected:
         raise BadInputError(
-            f"the abstraction of {pairing.id} makes {abstract.shape} of states {state.shape}, "
-            f"expected {expected}"
+            f"the abstraction of {pairing.id} makes {abstract.shape} of states {state.shape}, expected {expected}"
         )
     return abstract

@@ -60,9 +60,7 @@ class Commands(Mapping[str, tuple[float, float]]):
         column = next(column for column in source.schema if column.name == ACTION)
         names = column.labels
         if still := [name for name, low, high in zip(names, least, largest, strict=True) if low == high]:
-            raise BadInputError(
-                f"commands: {', '.join(still)} never changes in {source.reference}: give the bounds"
-            )
+            raise BadInputError(f"commands: {', '.join(still)} never changes in {source.reference}: give the bounds")
         return cls(dict(zip(names, zip(least, largest, strict=True), strict=True)))
 
     def __getitem__(self, name: str) -> tuple[float, float]:

@@ -116,9 +116,7 @@ class GymnasiumRobot:
         if not isinstance(space, gymnasium.spaces.Box):
             return action
         if np.shape(action) != space.shape:
-            raise BadInputError(
-                f"{self.name} takes actions of shape {space.shape}, got {np.shape(action)}: {_ADVICE}"
-            )
+            raise BadInputError(f"{self.name} takes actions of shape {space.shape}, got {np.shape(action)}: {_ADVICE}")
         if self._command is as_given:
             beyond = np.flatnonzero((action < self._least) | (action > self._largest))
             if len(beyond):

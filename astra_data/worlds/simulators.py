@@ -107,9 +107,7 @@ class ColdSteps:
         after_time = slice(1, 1 + one.nq + one.nv)
         initial = np.zeros((len(motion), mujoco.mj_stateSize(one, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
         initial[:, after_time] = motion
-        states, _ = self._rollout.rollout(
-            model, self._data, initial, np.repeat(control[:, None], substeps, axis=1)
-        )
+        states, _ = self._rollout.rollout(model, self._data, initial, np.repeat(control[:, None], substeps, axis=1))
         return np.asarray(states[:, -1, after_time])
 
 
@@ -122,14 +120,10 @@ class MujocoModel(FreeStates):
         state: (B, nq + nv) float32.
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, num_envs: int, *, substeps: int, num_threads: int | None = None
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, *, substeps: int, num_threads: int | None = None) -> None:
         """Allocate B copies in the model's initial state."""
         if model.na:
-            raise BadInputError(
-                f"the model has {model.na} actuator states: expected actuators without states"
-            )
+            raise BadInputError(f"the model has {model.na} actuator states: expected actuators without states")
         # MuJoCo would put a diverging state back to the initial pose, as if the robot had jumped there.
         self.model = copy.deepcopy(model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -53,9 +53,7 @@ def column(name: str, values: Sequence[ColumnEntry], meaning: str) -> Column:
 
 def names_with_units(column: Column) -> list[str]:
     """Return the names of a column's values, with units where these are known: "speed_m_s"."""
-    words = [
-        "_".join(re.findall("[a-z0-9]+", unit.replace("²", "2").replace("°", "deg"))) for unit in column.units
-    ]
+    words = ["_".join(re.findall("[a-z0-9]+", unit.replace("²", "2").replace("°", "deg"))) for unit in column.units]
     return [
         name if word in ("", "1") or name.endswith(f"_{word}") else f"{name}_{word}"
         for name, word in zip(column.labels, words, strict=True)
@@ -205,14 +203,10 @@ class Task:
             expected = "expected 1 step or more, a whole number, such as round(8 / timestep_s)"
             faults.append(f"objective: horizon {horizon}, {expected}")
         if not 0 < self.timestep_s < 2:
-            expected = (
-                "expected above 0 and below 2 s, since datasets have a whole number of steps per second"
-            )
+            expected = "expected above 0 and below 2 s, since datasets have a whole number of steps per second"
             faults.append(f"timestep_s: {expected}: got {self.timestep_s}")
         if not NAME.fullmatch(self.name):
-            faults.append(
-                "name: expected letters, digits, '.', '_' and '-', since datasets are named after it"
-            )
+            faults.append("name: expected letters, digits, '.', '_' and '-', since datasets are named after it")
         if faults:
             raise BadInputError(f"task '{self.name}': {'; '.join(faults)}")
         abstract: Column = self.abstract_state or self.make_simulator.abstract_state  # type: ignore[attr-defined]

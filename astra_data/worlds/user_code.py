@@ -70,9 +70,7 @@ def user_object(name: str) -> Any:  # noqa: ANN401 - any object
     place, _, attribute = name.rpartition(":")
     module = _of_file(Path(place)) if place.endswith(".py") else _of_package(place)
     if not hasattr(module, attribute):
-        raise BadInputError(
-            f"{place} has no '{attribute}'; it has {', '.join(_public_names(module)) or 'nothing'}"
-        )
+        raise BadInputError(f"{place} has no '{attribute}'; it has {', '.join(_public_names(module)) or 'nothing'}")
     return getattr(module, attribute)
 
 
@@ -111,9 +109,7 @@ def _among_neighbors(folder: str) -> Iterator[None]:
 
     Installed packages come first. What the other files imported is theirs again afterwards.
     """
-    files = {
-        name: os.path.realpath(getattr(one, "__file__", None) or "") for name, one in sys.modules.items()
-    }
+    files = {name: os.path.realpath(getattr(one, "__file__", None) or "") for name, one in sys.modules.items()}
     others = {os.path.dirname(file) for name, file in files.items() if _PREFIX in name} - {folder}
     theirs = {
         name: sys.modules.pop(name)
@@ -205,9 +201,7 @@ def _with_neighbors(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast
             tree = ast.parse(path.read_bytes())
         except SyntaxError as error:
             if path.parent == folder:
-                raise BadInputError(
-                    f"{path}, line {error.lineno}: expected Python, got {error.msg}"
-                ) from None
+                raise BadInputError(f"{path}, line {error.lineno}: expected Python, got {error.msg}") from None
             # A package may hold what is never imported, such as a template.
             tree = ast.Module([ast.Expr(ast.Constant(path.read_bytes()))], [])
         yield path, tree
@@ -268,9 +262,7 @@ def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
     is_pair = isinstance(returned, tuple | list) and len(returned) == 2
     if not (is_pair and all(isinstance(values, Mapping) for values in returned)):
         kind = type(returned).__name__
-        raise BadInputError(
-            f"{what}: expected a pair, a dict of tensors and one of JSON values, got a {kind}"
-        )
+        raise BadInputError(f"{what}: expected a pair, a dict of tensors and one of JSON values, got a {kind}")
     tensors, metadata = returned
     faults = [
         f"{name!r} is a {type(value).__name__}, expected a torch tensor, as torch.as_tensor(value) is"
@@ -327,9 +319,7 @@ def expect(
     if dtype is not None and found.dtype != dtype:
         raise BadInputError(f"{what}: expected {dtype}, got {found.dtype}")
     if device is not None and found.device != device:
-        raise BadInputError(
-            f"{what}: expected a tensor on {device}, where its inputs are, got {found.device}"
-        )
+        raise BadInputError(f"{what}: expected a tensor on {device}, where its inputs are, got {found.device}")
     if not found.isfinite().all():
         raise BadInputError(f"{what}: expected finite numbers, got {float(found[~found.isfinite()][0])}")
     return found

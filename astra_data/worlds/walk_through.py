@@ -189,9 +189,7 @@ def _places(task: Task, state: Tensor) -> None:
     found = answered(what, task.objective.places, state)
     _, size = expect(what, found, (_COUNT, -1), device=state.device).shape
     if size % 2:
-        raise BadInputError(
-            f"{what}: expected x and y of K bodies, shape ({_COUNT}, 2 K), got ({_COUNT}, {size})"
-        )
+        raise BadInputError(f"{what}: expected x and y of K bodies, shape ({_COUNT}, 2 K), got ({_COUNT}, {size})")
 
 
 def _judgement(task: Task, before: Tensor, after: Tensor, goal: Tensor) -> None:

@@ -20,9 +20,7 @@ from astra_data.dataset.reader import Dataset
 
 def test_help_loads_none_of_the_large_packages() -> None:
     """They take seconds, and what `--help` and completion say needs none of them."""
-    asked = (
-        "import sys; from astra_data.cli import app as cli; sys.argv = ['astra-data', '--help']; cli.main()"
-    )
+    asked = "import sys; from astra_data.cli import app as cli; sys.argv = ['astra-data', '--help']; cli.main()"
     command = [sys.executable, "-X", "importtime", "-c", asked]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     assert "astra-data" in done.stdout
@@ -107,9 +105,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wrong = 'task = "antmaze-umase"\nmethods = ["nsa"]\nseeds = [0]\n[ground]\nupdats = 1\n[trian]\n'
     (folder / "wrong.toml").write_text(wrong)
     (folder / "runs/cart").mkdir(parents=True)
-    (folder / "runs/cart/recipe.json").write_text(
-        '{"task": "antmaze-umaze", "methods": ["nas"], "seeds": [0]}'
-    )
+    (folder / "runs/cart/recipe.json").write_text('{"task": "antmaze-umaze", "methods": ["nas"], "seeds": [0]}')
     return folder
 
 
@@ -139,9 +135,7 @@ def test_bad_input_is_one_line_and_exit_code_1(
     assert capsys.readouterr().err == f"error: {tmp_path / 'none.toml'} does not exist\n"
 
 
-def test_debugging_shows_the_traceback(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_debugging_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def broken() -> None:
         raise BadInputError("expected this")
 

@@ -181,9 +181,7 @@ def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     result = CliRunner().invoke(app, ["check", "wrong.py:TASK"])
     assert result.exit_code == 1
     assert str(result.exception) == f"task wrong.py:TASK: {told}"
-    (tmp_path / "wrong.toml").write_text(
-        'task = "wrong.py:TASK"\nmethods = ["nas"]\nseeds = [0]\n' + SETTINGS
-    )
+    (tmp_path / "wrong.toml").write_text('task = "wrong.py:TASK"\nmethods = ["nas"]\nseeds = [0]\n' + SETTINGS)
     result = CliRunner().invoke(app, ["check", "wrong.toml"])
     assert result.exit_code == 1
     assert str(result.exception).startswith("wrong.toml: task ") and str(result.exception).endswith(told)
@@ -194,9 +192,7 @@ def test_a_log_is_labeled_by_a_task_in_a_file(tmp_path: Path) -> None:
     columns = [Column(STATE, size=2), Column(ACTION), Column(NEXT_STATE, size=2)]
     about: dict[str, Any] = {"fps": 10, "task": "drive", "description": {"name": "logs", "stage": "import"}}
     with DatasetWriter(tmp_path / "logs", columns, **about) as writer:
-        writer.add(
-            Episode(0, {STATE: state[:-1], ACTION: np.ones(5, np.float32), NEXT_STATE: state[1:].copy()})
-        )
+        writer.add(Episode(0, {STATE: state[:-1], ACTION: np.ones(5, np.float32), NEXT_STATE: state[1:].copy()}))
     goals = []
     for name, more in (("labeled", list[str]()), ("again", ["--seed", "0"]), ("other", ["--seed", "1"])):
         out = f"{tmp_path}/{name}"

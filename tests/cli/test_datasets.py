@@ -27,9 +27,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> None:
-    assert "(fake@data-1.1.0, 2 episodes, " in output_of(
-        "subset", fake, "--percent", "40", "--stratify", "success"
-    )
+    assert "(fake@data-1.1.0, 2 episodes, " in output_of("subset", fake, "--percent", "40", "--stratify", "success")
     assert "(fake@data-1.2.0, 3 episodes, " in output_of("filter", fake, "--without", "13", "--without", "0")
     assert "(fake@data-1.3.0, 2 episodes, " in output_of("filter", fake, "--success")
     assert "(fake@data-1.4.0, 3 episodes, " in output_of("filter", fake, "--no-success")
@@ -124,9 +122,7 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
             raise error
 
 
-def test_what_killed_commands_left_is_removed_on_request(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_killed_commands_left_is_removed_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
     dead, other = tmp_path / "home/ant/.data-1.0.0.tmp-7", tmp_path / "runs/.recipe.json.tmp-7"
     staged = tmp_path / "home/.walks.staged"
@@ -160,9 +156,7 @@ def test_a_damaged_dataset_hides_no_other(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("command", [["list"], ["list", "--clean"], ["inspect", "fake"]])
-def test_a_home_that_is_no_folder_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
-) -> None:
+def test_a_home_that_is_no_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
     (tmp_path / "home").touch()
     monkeypatch.setenv("ASTRA_DATA_HOME", str(tmp_path / "home"))
     error = call(*command).exception

@@ -35,9 +35,7 @@ def test_findings_stand_below_all_else() -> None:
 def inspection(success: int | None) -> Inspection:
     column = Column("action", size=2, names=("vx", "vy"), astra={"unit": ["m/s", "m/s"]})
     counts = np.zeros((2, BINS), np.int64)
-    spread = Spread(
-        column, low=np.array([-1.0, 0.0]), high=np.array([1.0, 0.123456]), mean=np.zeros(2), counts=counts
-    )
+    spread = Spread(column, low=np.array([-1.0, 0.0]), high=np.array([1.0, 0.123456]), mean=np.zeros(2), counts=counts)
     return Inspection(
         reference="fake@data-1.0.0",
         lengths=np.array([600, 1200, 1800]),

@@ -15,9 +15,7 @@ pytestmark = pytest.mark.usefixtures("stages")
 @pytest.fixture
 def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "r.toml"
-    path.write_text(
-        'task = "antmaze-umaze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[train]\ntries = 5\n'
-    )
+    path.write_text('task = "antmaze-umaze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n[train]\ntries = 5\n')
     return path
 
 

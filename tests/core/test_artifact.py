@@ -90,9 +90,7 @@ def test_a_finished_folder_is_replaced_only_on_request_and_after_success(tmp_pat
 
 
 @pytest.mark.parametrize("renames", [0, 1, 2])
-def test_a_kill_while_replacing_loses_nothing(
-    tmp_path: Path, renames: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_while_replacing_loses_nothing(tmp_path: Path, renames: int, monkeypatch: pytest.MonkeyPatch) -> None:
     out, left = tmp_path / "out", [renames]
 
     def replace_until_killed(source: Path, target: Path) -> None:

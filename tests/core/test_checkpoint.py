@@ -85,14 +85,10 @@ def test_a_file_that_its_manifest_does_not_know_is_refused(tmp_path: Path) -> No
         ("layer.weight", 1e30, False),
     ],
 )
-def test_weights_that_are_not_finite_are_refused(
-    tmp_path: Path, name: str, value: float, is_refused: bool
-) -> None:
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path, name: str, value: float, is_refused: bool) -> None:
     path = tmp_path / "a.safetensors"
     save_tensors(path, {name: torch.tensor([1.0, value]), "whole": torch.ones(1)}, {"kind": "toy"})
-    refusal = pytest.raises(
-        BadInputError, match=rf"expected finite weights, found NaN or infinity in {name}: "
-    )
+    refusal = pytest.raises(BadInputError, match=rf"expected finite weights, found NaN or infinity in {name}: ")
     with refusal if is_refused else nullcontext(), understood(path, "a toy", ["toy"], "meta") as (tensors, _):
         assert tensors[name].device.type == "meta"
 

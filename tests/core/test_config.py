@@ -159,9 +159,7 @@ def test_hostile_toml_is_one_line(tmp_path: Path, text: str, told: str) -> None:
 
 def test_a_key_that_stands_below_a_table_by_mistake_is_told_where_it_belongs(tmp_path: Path) -> None:
     told = fault(tmp_path, 'task = "maze"\n[train]\nseeds = [1]\n')
-    assert (
-        told == "FILE: train.seeds: unknown key: 'seeds' belongs to no table: move it above the first [table]"
-    )
+    assert told == "FILE: train.seeds: unknown key: 'seeds' belongs to no table: move it above the first [table]"
 
 
 def test_of_a_file_that_nobody_wrote_by_hand_the_first_faults_are_told() -> None:

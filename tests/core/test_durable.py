@@ -46,9 +46,7 @@ def test_a_disk_that_fails_or_a_kill_at_any_operation_leaves_the_old_file_or_the
             try:
                 write_file(path, b"\0new")
             except (DiskError, Killed) as raised:
-                assert isinstance(raised, Killed) or f"{path} cannot be written: the disk is full." in str(
-                    raised
-                )
+                assert isinstance(raised, Killed) or f"{path} cannot be written: the disk is full." in str(raised)
                 assert path.read_bytes() in ("old é".encode(), b"\0new")
             else:
                 assert path.read_bytes() == b"\0new"
@@ -106,9 +104,7 @@ def test_a_folder_is_whole_or_gone_whenever_its_removal_is_killed(tmp_path: Path
         if folder.exists():
             discard(folder, tmp_path / "set")
     assert at > 5
-    assert [state for _, state in clean(tmp_path)] == ["removed"] * len(names(tmp_path)) or not names(
-        tmp_path
-    )
+    assert [state for _, state in clean(tmp_path)] == ["removed"] * len(names(tmp_path)) or not names(tmp_path)
     assert names(tmp_path) == []
 
 
@@ -181,9 +177,7 @@ def test_the_fault_that_hdf5_hides_in_its_text_is_found() -> None:
 )
 def test_only_faults_of_what_is_written_are_blamed_on_it(name: str, is_ours: bool) -> None:
     error = PermissionError(errno.EACCES, "no", name)
-    expected = pytest.raises(
-        DiskError, match=r"set cannot be written: permission denied\. What .* place, then run"
-    )
+    expected = pytest.raises(DiskError, match=r"set cannot be written: permission denied\. What .* place, then run")
     with expected if is_ours else pytest.raises(PermissionError), writing(Path("a/set")):
         raise error
 
@@ -259,9 +253,7 @@ def test_an_error_inside_is_not_swallowed_and_leaves_nothing(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("writing", [atomic_folder, atomic_file])
-def test_nothing_is_overwritten(
-    tmp_path: Path, writing: Callable[[Path], AbstractContextManager[Path]]
-) -> None:
+def test_nothing_is_overwritten(tmp_path: Path, writing: Callable[[Path], AbstractContextManager[Path]]) -> None:
     target = tmp_path / "set"
 
     def write(path: Path, text: str) -> None:

@@ -77,8 +77,7 @@ def test_ancestors_are_found_at_home_and_beside(tmp_path: Path) -> None:
     both = Dataset.open(merge([left, right], new_uids=True, out=tmp_path / "both"))
     prints = [dataset.content_hash[:8] for dataset in (both, left, first, right)]
     assert list(tree_lines(lineage(both))) == [
-        f"fake@data-1.2.0  {prints[0]}  merge: "
-        "datasets ['fake@data-1.1.0', 'fake@data-1.2.0'], new_uids True",
+        f"fake@data-1.2.0  {prints[0]}  merge: datasets ['fake@data-1.1.0', 'fake@data-1.2.0'], new_uids True",
         f"├── fake@data-1.1.0  {prints[1]}  delete: episodes [13]",
         f"│   └── fake@data-1.0.0  {prints[2]}  collect: episodes 5, noise_m 0.1",
         f"└── fake@data-1.2.0  {prints[3]}  subset: episodes 2, seed 4",
@@ -115,9 +114,7 @@ def test_copies_are_counted_as_the_recording_that_they_are_of(tmp_path: Path) ->
     assert recordings_of(write_fake(tmp_path / "plain")).tolist() == [0, 1, 2, 3, 4]
 
 
-def test_of_a_thousand_merges_of_two_filters_each_is_told_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_thousand_merges_of_two_filters_each_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def described(folder: Path) -> compare.Ancestors:
         name = folder.parent.name
         kind, _, number = name.partition("-")

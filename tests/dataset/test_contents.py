@@ -43,9 +43,7 @@ def forged(**changes: object) -> Callable[[Path], None]:
         (forged(features={"action": 3}), ["its metadata are not those of a dataset"]),
     ],
 )
-def test_damage_is_told_in_one_line(
-    tmp_path: Path, damage: Callable[[Path], object], parts: list[str]
-) -> None:
+def test_damage_is_told_in_one_line(tmp_path: Path, damage: Callable[[Path], object], parts: list[str]) -> None:
     root = write_fake(tmp_path / "set").root
     damage(root)
     with pytest.raises(CorruptDatasetError) as caught:

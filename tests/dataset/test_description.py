@@ -30,9 +30,7 @@ PARENT = {"name": "raw", "version": "1.0.0", "hash": "0"}
 
 
 def test_a_description_is_completed_with_defaults_packages_and_the_machine() -> None:
-    full = complete_description(
-        {"name": "walks", "stage": "pair", "parents": [PARENT], "config": {"a": (1, 2)}}
-    )
+    full = complete_description({"name": "walks", "stage": "pair", "parents": [PARENT], "config": {"a": (1, 2)}})
     assert full["version"] == "1.0.0"
     assert full["parents"] == [PARENT]
     assert full["config"] == {"a": [1, 2]}
@@ -124,9 +122,7 @@ def test_the_file_holds_a_digest_of_each_episode_and_column(fake: Dataset) -> No
     table = pq.read_table(fake.root / DIGESTS_PATH)
     assert set(table.column_names) == set(fake.features)
     for name in (STATE, ACTION, REWARD, "next.done", "mode"):
-        expected = [
-            xxhash.xxh3_64(episode.columns[name].tobytes()).intdigest() for episode in fake_episodes()
-        ]
+        expected = [xxhash.xxh3_64(episode.columns[name].tobytes()).intdigest() for episode in fake_episodes()]
         assert table.column(name).to_pylist() == expected
 
 

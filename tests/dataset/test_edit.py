@@ -40,9 +40,7 @@ def assert_taken_over(source: Dataset, root: Path) -> None:
 
 
 def test_subsets_are_nested_and_described(forty: Dataset, tmp_path: Path) -> None:
-    folders = [
-        subset(forty, percent=percent, out=tmp_path / f"{percent}", seed=3) for percent in (25, 50, 100)
-    ]
+    folders = [subset(forty, percent=percent, out=tmp_path / f"{percent}", seed=3) for percent in (25, 50, 100)]
     assert [len(Dataset.open(folder)) for folder in folders] == [10, 20, 40]
     assert all(uids(small) < uids(large) for small, large in itertools.pairwise(folders))
     for folder in folders:
@@ -116,9 +114,7 @@ def test_an_unknown_episode_deletes_nothing(forty: Dataset, tmp_path: Path) -> N
 
 
 def test_filters_meet_every_condition(forty: Dataset, tmp_path: Path) -> None:
-    folder = filter_episodes(
-        forty, success=True, min_return=2.5, max_return=9.5, max_length=4, out=tmp_path / "set"
-    )
+    folder = filter_episodes(forty, success=True, min_return=2.5, max_return=9.5, max_length=4, out=tmp_path / "set")
     assert uids(folder) == {uid for uid in range(5, 20) if uid % 2 and 2 + uid % 5 <= 4}
     assert_taken_over(forty, folder)
     assert Dataset.open(folder).description["config"] == {
@@ -148,9 +144,7 @@ def test_merge_puts_one_after_the_other(tmp_path: Path) -> None:
     assert made.verify() == []
     assert made.uids.tolist() == [*range(10, 15), *range(5), *range(5, 10)]
     assert made.description["parents"] == [part.identity for part in parts]
-    for found, part in zip(
-        made.episodes(), itertools.chain(*(part.episodes() for part in parts)), strict=True
-    ):
+    for found, part in zip(made.episodes(), itertools.chain(*(part.episodes() for part in parts)), strict=True):
         assert found.metadata == part.metadata
         np.testing.assert_array_equal(found.columns[STATE], part.columns[STATE])
 

@@ -59,9 +59,7 @@ def test_columns_are_mapped_where_their_share_of_the_memory_is_too_small(
 def test_faults_are_told_at_once(fake: Dataset, frames: Frames) -> None:
     with pytest.raises(BadInputError, match="length 0, expected at least 1; stride -1, expected at least 1"):
         frames.windows(0, stride=-1)
-    with pytest.raises(
-        BadInputError, match=r"length 31, expected at most 30, the longest episode's, or padding"
-    ):
+    with pytest.raises(BadInputError, match=r"length 31, expected at most 30, the longest episode's, or padding"):
         frames.windows(31)
     assert len(frames.windows(30)) == 1
     with pytest.raises(BadInputError, match=r"past 6, expected 0 to 5"):

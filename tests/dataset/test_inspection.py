@@ -68,9 +68,7 @@ def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
     root = tmp_path / "still"
     source = write_fake(tmp_path / "fake")
     columns = source.schema
-    with DatasetWriter(
-        root, columns, fps=20, task="rest", description={"name": "still", "stage": "x"}
-    ) as writer:
+    with DatasetWriter(root, columns, fps=20, task="rest", description={"name": "still", "stage": "x"}) as writer:
         for episode in source.episodes():
             episode.columns[STATE][:] = 1.5
             writer.add(episode)

@@ -137,9 +137,7 @@ def test_steps_that_float32_rounds_are_told(tmp_path: Path, caplog: pytest.LogCa
         caplog.clear()
         Dataset.open(root)
         for said in (caplog.messages[0], "; ".join(repair(root, out=tmp_path / f"whole{first}").notes)):
-            assert (
-                "float32 holds y (up to 4.42956e+06) in steps of 0.5, but it moves by 0.63" in said
-            ) == told
+            assert ("float32 holds y (up to 4.42956e+06) in steps of 0.5, but it moves by 0.63" in said) == told
 
 
 def test_repaired_it_is_as_it_was_opened(arm: Dataset, recorded: Path, tmp_path: Path) -> None:
@@ -195,9 +193,7 @@ def test_a_dataset_of_ours_without_its_metadata_keeps_uids_and_next_states(tmp_p
 
 
 def merged_episodes(recorded: Path) -> list[dict[str, Array]]:
-    return [
-        dict(episode.columns) for name in ("a", "b") for episode in Dataset.open(recorded / name).episodes()
-    ]
+    return [dict(episode.columns) for name in ("a", "b") for episode in Dataset.open(recorded / name).episodes()]
 
 
 def test_a_merge_of_lerobot_keeps_every_episode_under_new_uids(recorded: Path, tmp_path: Path) -> None:

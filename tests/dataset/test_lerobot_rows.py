@@ -31,9 +31,7 @@ def rows_and_run(more: Mapping[str, Array]) -> tuple[Rows, Run]:
     return Rows(stored, 10), Run(Path("file"), 0, columns)
 
 
-def values(
-    name: str, dtype: str = "float32", size: int = 1, more: Mapping[str, Array] | None = None
-) -> Array:
+def values(name: str, dtype: str = "float32", size: int = 1, more: Mapping[str, Array] | None = None) -> Array:
     rows, run = rows_and_run(more or {})
     return rows.values(Column(name, dtype, size), run, 3, 100, 9)
 
@@ -122,9 +120,7 @@ def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_ove
 
 
 WHOLE = "expected a whole number of frames per second"
-LACKING = (
-    "lacks the columns episode_index, frame_index, index, task_index, timestamp, which are LeRobot's own"
-)
+LACKING = "lacks the columns episode_index, frame_index, index, task_index, timestamp, which are LeRobot's own"
 OWN = {column.name: column.feature() for column in DEFAULT_COLUMNS}
 
 
@@ -143,9 +139,7 @@ def declared(**features: Any) -> list[Column]:  # noqa: ANN401 - JSON
         (None, None),
     ],
 )
-def test_names_are_taken_where_there_is_one_per_value(
-    labels: object, expected: tuple[str, ...] | None
-) -> None:
+def test_names_are_taken_where_there_is_one_per_value(labels: object, expected: tuple[str, ...] | None) -> None:
     feature = {"dtype": "float64", "shape": [2], "names": labels}
     assert declared(**{STATE: feature}) == [Column(STATE, "float32", 2, expected)]
 
@@ -174,9 +168,7 @@ def test_only_lists_of_numbers_are_columns() -> None:
         ({}, [LACKING, f"has fps None, {WHOLE}"]),
     ],
 )
-def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(
-    info: dict[str, Any], faults: list[str]
-) -> None:
+def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(info: dict[str, Any], faults: list[str]) -> None:
     with pytest.raises(CorruptDatasetError) as refused:
         declared_columns(Path("set"), info)
     assert str(refused.value) == f"set: meta/info.json {' and '.join(faults)}"

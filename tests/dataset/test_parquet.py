@@ -73,9 +73,7 @@ def test_blocks_are_whole_row_groups_of_one_file(
 
 
 @pytest.mark.parametrize("block_rows", [1, 5, 100])
-def test_only_wanted_rows_are_read(
-    paths: list[Path], monkeypatch: pytest.MonkeyPatch, block_rows: int
-) -> None:
+def test_only_wanted_rows_are_read(paths: list[Path], monkeypatch: pytest.MonkeyPatch, block_rows: int) -> None:
     monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
     for rows in ([], [0], [3, 4], [9, 10], [14], [*range(15)]):
         tables = list(read_blocks(paths, ["x"], np.isin(np.arange(15), rows)))

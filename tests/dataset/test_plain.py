@@ -58,9 +58,7 @@ def test_a_column_fits_lists_with_and_without_their_size() -> None:
         ({"task_index": [0], "task": ["walk"], "more": ["x"]}, "expected task_index and one of texts"),
     ],
 )
-def test_tasks_are_texts_by_their_index(
-    tmp_path: Path, table: dict[str, list[object]], found: object
-) -> None:
+def test_tasks_are_texts_by_their_index(tmp_path: Path, table: dict[str, list[object]], found: object) -> None:
     (tmp_path / "meta").mkdir()
     assert read_tasks(tmp_path) == "is missing"
     pq.write_table(pa.table(table), tmp_path / "meta/tasks.parquet")
@@ -122,9 +120,7 @@ def a_run(**changes: Array) -> Run:
         ("state", (2, 1), np.inf, "state is inf in episode 3 frame 2 index 1, expected a finite number"),
     ],
 )
-def test_wrong_values_of_a_run_are_found(
-    name: str, at: int | tuple[int, int], value: float, sentence: str
-) -> None:
+def test_wrong_values_of_a_run_are_found(name: str, at: int | tuple[int, int], value: float, sentence: str) -> None:
     assert list(run_faults(a_run(), number=3, row=20, fps=10)) == []
     values = a_run().columns[name].copy()
     values[at] = value

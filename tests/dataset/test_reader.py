@@ -30,9 +30,7 @@ def test_columns_come_back_whole(fake: Dataset, monkeypatch: pytest.MonkeyPatch,
 
 
 @pytest.mark.parametrize("block_rows", [1, 10, 2**16])
-def test_episodes_come_back_one_by_one(
-    fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int
-) -> None:
+def test_episodes_come_back_one_by_one(fake: Dataset, monkeypatch: pytest.MonkeyPatch, block_rows: int) -> None:
     monkeypatch.setattr(parquet, "BLOCK_ROWS", block_rows)
     for found, expected in zip(fake.episodes(), fake_episodes(), strict=True):
         assert (found.uid, found.metadata) == (expected.uid, dict(sorted(expected.metadata.items())))
@@ -43,9 +41,7 @@ def test_episodes_come_back_one_by_one(
     assert [list(episode.columns) for episode in fake.episodes([STATE])] == [[STATE]] * len(LENGTHS)
 
 
-def test_only_the_row_groups_of_chosen_episodes_are_read(
-    fake: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_row_groups_of_chosen_episodes_are_read(fake: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     read = pq.ParquetFile.read_row_groups
     groups: list[int] = []
 
@@ -72,9 +68,7 @@ def test_what_the_writer_was_told_comes_back(fake: Dataset) -> None:
     assert fake.description["config"] == {"episodes": 5, "noise_m": 0.1}
     assert fake.info["fps"] == 20
     assert fake.reference == "fake@data-1.0.0"
-    assert repr(fake).startswith(
-        "Dataset(fake@data-1.0.0, 5 episodes, 55 steps, observation.state (3) float32"
-    )
+    assert repr(fake).startswith("Dataset(fake@data-1.0.0, 5 episodes, 55 steps, observation.state (3) float32")
 
 
 def test_subsets_are_nested_and_follow_the_uid(fake: Dataset, tmp_path: Path) -> None:
@@ -109,9 +103,7 @@ def test_success_is_taken_from_the_metadata_or_else_from_the_column(tmp_path: Pa
 def test_an_unknown_column_answers_with_the_known_ones(fake: Dataset) -> None:
     with pytest.raises(BadInputError, match=r"has no column reward; it has observation\.state, action"):
         fake.columns(["reward"])
-    with pytest.raises(
-        BadInputError, match=r"expected a list of columns, got the text 'action': write \['act"
-    ):
+    with pytest.raises(BadInputError, match=r"expected a list of columns, got the text 'action': write \['act"):
         fake.columns("action")
 
 

@@ -69,9 +69,7 @@ def test_another_recording_is_not_mixed_in(tmp_path: Path) -> None:
     description = {"name": "fake", "stage": "collect", "config": {"episodes": 6, "noise_m": 0.1}}
     changes = {"description": description, "columns": COLUMNS[1:]}
     with (
-        pytest.raises(
-            BadInputError, match=r"differs in columns.observation.state, description.config.episodes"
-        ),
+        pytest.raises(BadInputError, match=r"differs in columns.observation.state, description.config.episodes"),
         staged_writer(tmp_path / "set", resume=True, **changes),
     ):
         pass
@@ -142,9 +140,7 @@ def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(t
     assert (tmp_path / ".set.staged" / "training.safetensors").read_text() == "half"
 
 
-def test_an_episode_is_on_the_disk_itself_before_it_counts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_is_on_the_disk_itself_before_it_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[str] = []
     for module in ("dataset.staging", "core.durable"):
         monkeypatch.setattr(f"astra_data.{module}.sync", lambda path: synced.append(path.name))
@@ -230,9 +226,7 @@ def test_on_a_full_disk_the_episodes_are_safe_and_the_recording_goes_on(tmp_path
 
 
 @pytest.mark.usefixtures("fsync")
-def test_a_disk_that_fails_at_any_operation_loses_no_episode(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails_at_any_operation_loses_no_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", lambda handle: None)
     episodes = fake_episodes()[:2]
     whole = contents(write_episodes(tmp_path / "whole", episodes))

@@ -34,9 +34,7 @@ def test_statistics_equal_numpy(shape: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("block_values", [1, 100, 2**24])
-def test_global_statistics_are_exact(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_values: int
-) -> None:
+def test_global_statistics_are_exact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_values: int) -> None:
     monkeypatch.setattr(statistics, "BLOCK_VALUES", block_values)
     root = write_fake(tmp_path / "set").root
     stats = json.loads((root / "meta/stats.json").read_text())

@@ -82,9 +82,7 @@ def test_files_rotate_when_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(episode_rows, "ROWS_AT_ONCE", 2)
     split = write_fake(tmp_path / "split")
     names = [str(path.relative_to(split.root)) for path in split.paths]
-    assert names[:3] == [
-        f"data/chunk-{at}.parquet" for at in ("000/file-000", "000/file-001", "001/file-000")
-    ]
+    assert names[:3] == [f"data/chunk-{at}.parquet" for at in ("000/file-000", "000/file-001", "001/file-000")]
     assert len(list((split.root / "meta/episodes").glob("*/*.parquet"))) == 3
     assert split.verify() == []
     assert split.content_hash == whole.content_hash
@@ -135,8 +133,7 @@ def test_a_dataset_needs_an_episode(tmp_path: Path) -> None:
 def test_arguments_are_checked_together(tmp_path: Path) -> None:
     columns = [*COLUMNS, Column("index", "int64"), COLUMNS[0]]
     faults = (
-        f"{STATE} is given twice; .*index: is filled in by the writer.*; fps 0.*; "
-        "compression 'gzip', expected snappy"
+        f"{STATE} is given twice; .*index: is filled in by the writer.*; fps 0.*; compression 'gzip', expected snappy"
     )
     with pytest.raises(BadInputError, match=faults):
         writer(tmp_path / "set", columns=columns, fps=0, compression="gzip")
@@ -185,9 +182,7 @@ def test_every_fault_of_a_bad_episode_is_reported_and_nothing_is_written(tmp_pat
         (TRUNCATED, 3, False, "next.done is True in frame 3, expected False: terminated or truncated"),
     ],
 )
-def test_only_the_last_step_ends_an_episode(
-    tmp_path: Path, name: str, frame: int, value: bool, fault: str
-) -> None:
+def test_only_the_last_step_ends_an_episode(tmp_path: Path, name: str, frame: int, value: bool, fault: str) -> None:
     columns = fake_columns(4, seed=2)
     columns[name][frame] = value
     with writer(tmp_path / "set") as open_writer:

@@ -100,17 +100,12 @@ def test_it_runs_without_this_package_and_without_torch(folder: Path, run: Path,
     here.start(1)
     expected = [here.act(torch.from_numpy(state[None]), torch.tensor([goal]))[0] for state in states]
     np.testing.assert_allclose(json.loads(shown), torch.stack(expected), atol=1e-5, rtol=0)
-    assert (
-        len(alone(moved, "import runpy\nrunpy.run_path('run_policy.py', run_name='__main__')").split("\n"))
-        > 9
-    )
+    assert len(alone(moved, "import runpy\nrunpy.run_path('run_policy.py', run_name='__main__')").split("\n")) > 9
 
 
 def alone(folder: Path, code: str) -> str:
     """Run code in a folder, where neither this package nor torch can be imported."""
-    without = (
-        "import sys\nsys.path.insert(0, '.')\nfor name in ('astra_data', 'torch'): sys.modules[name] = None\n"
-    )
+    without = "import sys\nsys.path.insert(0, '.')\nfor name in ('astra_data', 'torch'): sys.modules[name] = None\n"
     command = [sys.executable, "-I", "-c", without + code]
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 

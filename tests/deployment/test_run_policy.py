@@ -66,9 +66,7 @@ def test_without_its_manifest_no_policy_is_made(content: str, folder: Path, tmp_
         ([0.5, 57.3], "speed is 57.3, recorded is 0 to 2"),
     ],
 )
-def test_a_state_far_outside_what_was_recorded_is_refused(
-    state: list[float], refused: str, folder: Path
-) -> None:
+def test_a_state_far_outside_what_was_recorded_is_refused(state: list[float], refused: str, folder: Path) -> None:
     policy = RobotPolicy(**GIVEN, folder=folder)
     if not refused:
         assert policy.act(state, [1.0]).shape == (1,)
@@ -131,9 +129,7 @@ def test_the_loop_keeps_the_rate_and_begins_without_memory(folder: Path) -> None
     assert not np.array_equal(sent[1], first)
 
 
-def test_the_loop_sleeps_what_the_policy_leaves_of_a_period(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_loop_sleeps_what_the_policy_leaves_of_a_period(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that only measuring and sleeping move: 20 ms, then 150 ms, then 20 ms again, at 10 Hz."""
     now, slept, took = [100.0], list[float](), iter((0.02, 0.15, 0.02))
 

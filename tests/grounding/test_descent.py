@@ -49,9 +49,7 @@ def test_a_fit_that_diverged_ends_before_it_is_kept(tmp_path: Path) -> None:
     descent = Descent(one, CONFIG, checkpoint=checkpoint)
     fit(one, descent, until=2)
     advice = "make learning_rate smaller"
-    with pytest.raises(
-        BadInputError, match=f"diverged by update 2, with a loss that is not finite: {advice}"
-    ):
+    with pytest.raises(BadInputError, match=f"diverged by update 2, with a loss that is not finite: {advice}"):
         descent.keep(1.0, loss=float("nan"))
     with pytest.raises(BadInputError, match=rf"diverged in update 3, with a gradient .*: {advice}"):
         descent.update(one.weight.sum() * float("inf"))
@@ -111,6 +109,4 @@ def test_each_recorded_step_is_seen_32_times_unless_updates_are_given(
     steps: int, updates: int | None, expected: int
 ) -> None:
     """60 000 * 32 are 800 updates of 48 windows of 50 steps."""
-    assert WindowedConfig(updates=updates).descent(steps) == DescentConfig(
-        updates=expected, learning_rate=3e-3
-    )
+    assert WindowedConfig(updates=updates).descent(steps) == DescentConfig(updates=expected, learning_rate=3e-3)

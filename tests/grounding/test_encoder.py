@@ -64,9 +64,7 @@ def test_another_encoder_grounds_aligns_and_acts(tmp_path: Path) -> None:
     for _ in range(3):
         states.append(simulator.step(action))
         actions.append(action)
-    history = model.encoder_input(
-        torch.stack(states, 1), goal[:, None].expand(2, 4, 2), torch.stack(actions, 1)
-    )
+    history = model.encoder_input(torch.stack(states, 1), goal[:, None].expand(2, 4, 2), torch.stack(actions, 1))
     torch.testing.assert_close(simulator.latent, model.encoder.sequence(history)[0][:, -1])
     encoder = TargetEncoder(29, 2, 2, embedding_size=8, latent_size=8, encoder="transformer")
     save_target_encoder(tmp_path / "encoder", encoder)
@@ -143,7 +141,5 @@ def test_gradients_are_those_of_steps_one_after_another(encoder: HistoryEncoder)
 def test_an_mlp_has_activations_between_its_layers_alone() -> None:
     network = mlp((3, 4, 5, 2), torch.nn.ReLU)
     assert [type(layer).__name__ for layer in network] == ["Linear", "ReLU", "Linear", "ReLU", "Linear"]
-    sizes = [
-        (layer.in_features, layer.out_features) for layer in network if isinstance(layer, torch.nn.Linear)
-    ]
+    sizes = [(layer.in_features, layer.out_features) for layer in network if isinstance(layer, torch.nn.Linear)]
     assert sizes == [(3, 4), (4, 5), (5, 2)]

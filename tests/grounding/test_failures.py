@@ -120,9 +120,7 @@ def told(episodes: PairedEpisodes, *, by_latent: bool) -> Tensor:
 
 
 @pytest.mark.parametrize("by_latent", [False, True])
-def test_it_sees_the_latent_where_only_the_latent_tells(
-    by_latent: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_sees_the_latent_where_only_the_latent_tells(by_latent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     episodes = hurried(20, 0)
     seen = told(episodes, by_latent=by_latent)
     monkeypatch.setattr(module, "replayed_inputs", lambda *_: seen)
@@ -250,9 +248,7 @@ def failure_model(*, has_maze: bool = False, latent_size: int = 0) -> FailureMod
     torch.manual_seed(0)
     cells = U_MAZE.fine_walls.shape
     sizes = (cells[0], cells[1]) if has_maze else (0, 0)
-    made = FailureModel(
-        FailureShape(4, 2, TIMESTEP_S, sizes, U_MAZE.fine_m, members=3, latent_size=latent_size)
-    )
+    made = FailureModel(FailureShape(4, 2, TIMESTEP_S, sizes, U_MAZE.fine_m, members=3, latent_size=latent_size))
     if has_maze:
         made.clearance.copy_(torch.from_numpy(U_MAZE.clearance_field))
         made.half_extent.copy_(torch.from_numpy(U_MAZE.half_extent))

@@ -41,9 +41,7 @@ def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
     assert (metadata["kind"], metadata["dataset"], metadata["hash"]) == ("history", "toy@data-1.0.0", "abc")
 
 
-def test_a_grounding_of_the_users_own_is_read_once_it_is_known(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_grounding_of_the_users_own_is_read_once_it_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "grounding.safetensors"
     save_grounding(path, Shifted(torch.ones(2)), no_episodes())
     with pytest.raises(BadInputError, match="found kind shifted"):

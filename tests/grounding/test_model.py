@@ -62,9 +62,7 @@ def untrained() -> GroundingModel:
             "correction": (TRAINING.next_state - TRAINING.simulated_next).flatten(0, 1),
         }
     )
-    model.set_reward_scales(
-        TRAINING.reward.reshape(-1, 1), TRAINING.goes_on.flatten(), TRAINING.failed.flatten()
-    )
+    model.set_reward_scales(TRAINING.reward.reshape(-1, 1), TRAINING.goes_on.flatten(), TRAINING.failed.flatten())
     return model
 
 
@@ -112,9 +110,7 @@ def test_masked_steps_do_not_count() -> None:
     torch.nn.init.normal_(list(model.correction.parameters())[-1])
     mask = TRAINING.mask.clone()
     mask[:, 20:] = 0.0
-    cut = PairedWindows(
-        **{name: values[:, :20] for name, values in vars(TRAINING).items() if values is not None}
-    )
+    cut = PairedWindows(**{name: values[:, :20] for name, values in vars(TRAINING).items() if values is not None})
     spoiled = replace(TRAINING, mask=mask, reward=TRAINING.reward + 1e3 * (1 - mask))
     _, parts = model.losses(spoiled, LossWeights())
     _, expected = model.losses(cut, LossWeights())

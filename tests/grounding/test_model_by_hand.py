@@ -45,9 +45,7 @@ def windows() -> PairedWindows:
 
 def model(*, corrects_reward: bool = True) -> GroundingModel:
     torch.manual_seed(0)
-    made = GroundingModel(
-        GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16,), corrects_reward=corrects_reward)
-    )
+    made = GroundingModel(GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16,), corrects_reward=corrects_reward))
     given = windows()
     columns = {
         "state": 3.0 + 2.0 * given.state,

@@ -63,9 +63,7 @@ def write(
         for episode, length in enumerate(LENGTHS):
             steps = np.array([label(episode, step) for step in range(length)], dtype=np.float32)
             last = np.arange(length) == length - 1
-            values = {
-                name: steps[:, None] + np.arange(size, dtype=np.float32) for name, size in sizes.items()
-            }
+            values = {name: steps[:, None] + np.arange(size, dtype=np.float32) for name, size in sizes.items()}
             # The third episode succeeds, the fourth topples, the others run out of time.
             ended = last & (episode in (2, 3))
             values |= {REWARD: -steps, TERMINATED: ended, TRUNCATED: last & ~ended, DONE: last}
@@ -167,9 +165,7 @@ def test_a_split_is_as_the_dataset_marks_it(tmp_path: Path) -> None:
     assert training.target_state[:, 0, 0].tolist() == [label(episode, 0) for episode in (0, 2, 4)]
     assert held_out.target_state[:, 0, 0].tolist() == [label(episode, 0) for episode in (1, 3)]
     assert training.held_out is not None and not training.held_out.any()
-    with pytest.raises(
-        BadInputError, match="expected episodes to train on, got 2 that augmentation held out"
-    ):
+    with pytest.raises(BadInputError, match="expected episodes to train on, got 2 that augmentation held out"):
         marked.select(torch.tensor([1, 3])).split(0.5, seed=0)
     none = PairedEpisodes.load(write(tmp_path / "none", SIZES, held_out=()))
     assert none.held_out is None
@@ -183,13 +179,8 @@ def test_copies_are_held_out_with_their_recording(tmp_path: Path) -> None:
     assert (chosen.uids.tolist(), chosen.recordings.tolist()) == ([3, 0], [1, 0])
     recorded = [{0}, {1, 3}, {2, 4}]
     splits = [episodes.split(0.34, seed) for seed in range(9)]
-    numbers = [
-        [{int(start) // 100 - 1 for start in part.target_state[:, 0, 0]} for part in split]
-        for split in splits
-    ]
-    assert all(
-        held_out in recorded and training == {0, 1, 2, 3, 4} - held_out for training, held_out in numbers
-    )
+    numbers = [[{int(start) // 100 - 1 for start in part.target_state[:, 0, 0]} for part in split] for split in splits]
+    assert all(held_out in recorded and training == {0, 1, 2, 3, 4} - held_out for training, held_out in numbers)
     assert {min(held_out) for _, held_out in numbers} == {0, 1, 2}
 
 
@@ -235,22 +226,18 @@ def test_pairs_of_another_task_are_told_with_every_mismatch(tmp_path: Path) -> N
     sizes = {STATE: 29, GOAL: 2, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)
     ant = TASKS["antmaze-umaze"]
     PairedEpisodes.load(write(tmp_path / "ant", sizes)).check(ant)
-    other = PairedEpisodes.load(
-        write(tmp_path / "toy", {STATE: 3, GOAL: 5, ACTION: 2} | dict.fromkeys(ABSTRACT, 4))
-    )
+    other = PairedEpisodes.load(write(tmp_path / "toy", {STATE: 3, GOAL: 5, ACTION: 2} | dict.fromkeys(ABSTRACT, 4)))
     with pytest.raises(BadInputError) as caught:
         other.check(ant)
     assert str(caught.value) == (
         "toy@data-1.0.0 has 3 values in a state, antmaze-umaze 29; has 5 values in a goal, antmaze-umaze 2: "
         "pair it again, with the simulator of this task"
     )
-    PairedEpisodes.load(
-        write(tmp_path / "none", {name: size for name, size in sizes.items() if name != GOAL})
-    ).check(ant)  # a simulator is corrected without goals
+    PairedEpisodes.load(write(tmp_path / "none", {name: size for name, size in sizes.items() if name != GOAL})).check(
+        ant
+    )  # a simulator is corrected without goals
     wide = write(tmp_path / "wide", {STATE: 29, GOAL: 2, ACTION: 3} | dict.fromkeys(ABSTRACT, 3))
-    with pytest.raises(
-        BadInputError, match=r"3 values in an abstract state, .* 4; has 3 values in an action"
-    ):
+    with pytest.raises(BadInputError, match=r"3 values in an abstract state, .* 4; has 3 values in an action"):
         PairedEpisodes.load(wide).check(ant)
     bounded = {"vx": (-1.0, 2.0), "vy": (-1.0, 1.0)}
     moved = replace(PairedEpisodes.load(tmp_path / "ant"), commands=Commands(bounded))

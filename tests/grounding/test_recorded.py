@@ -12,9 +12,7 @@ def test_each_step_is_drawn_as_often_as_any_other() -> None:
     assert episodes.shape == (60_000, 1) and steps.shape == drawn.shape == (60_000, 8)
     real = drawn & (steps < LENGTHS[episodes])
     counts = torch.zeros(3, 25)
-    counts.index_put_(
-        (episodes.expand(-1, 8)[real], steps[real]), torch.ones(int(real.sum())), accumulate=True
-    )
+    counts.index_put_((episodes.expand(-1, 8)[real], steps[real]), torch.ones(int(real.sum())), accumulate=True)
     assert [int((row > 0).sum()) for row in counts] == LENGTHS.tolist()
     usual = float(counts.sum() / LENGTHS.sum())
     assert counts[counts > 0].sub(usual).abs().max() < 0.05 * usual

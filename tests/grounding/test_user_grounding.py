@@ -92,9 +92,7 @@ def test_a_step_that_is_no_states_is_refused(
 def test_a_step_that_leaves_its_simulator_uncorrected_is_refused(
     shift_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        ShiftedSimulator, "step", lambda self, action: self.simulator.step(action) + self.shift
-    )
+    monkeypatch.setattr(ShiftedSimulator, "step", lambda self, action: self.simulator.step(action) + self.shift)
     told = (
         rf"^ShiftedSimulator.step: returned states up to {shift_m:.3g}\d* from its simulator's, which would "
         r"go on uncorrected: expected `return self._settle\(before, corrected\)`"

@@ -21,9 +21,7 @@ def converter(columns: dict[str, dict[str, Any]], **more: Any) -> Cutter:  # noq
 
 def convert(spec: dict[str, Any], values: list[Any], name: str = "c") -> tuple[Array, list[bool]]:
     """Return column `name` of one field with `values`, and which rows are finite."""
-    columns, bad = converter({name: {"fields": ("f",), **spec}}).convert(
-        Block({"f": np.array(values)}, "log")
-    )
+    columns, bad = converter({name: {"fields": ("f",), **spec}}).convert(Block({"f": np.array(values)}, "log"))
     return columns[name], [not any(mask[row] for mask in bad.values()) for row in range(len(values))]
 
 
@@ -168,9 +166,7 @@ WAVE = np.cumsum(np.sin(ROWS))
         (-1.0 - 1e-7 * WAVE, 1.0),
     ],
 )
-def test_steps_that_float32_rounds_are_warned_of_with_the_offset_that_helps(
-    values: Array, offset: float
-) -> None:
+def test_steps_that_float32_rounds_are_warned_of_with_the_offset_that_helps(values: Array, offset: float) -> None:
     both = np.stack([ROWS / 8, values], axis=1)
     [warning] = rounding({"scale": (2.0,), "offset": (3.0, 0.0), "names": ("t", "x")}, both / 2)
     assert warning.startswith("columns.c: float32 holds x (up to")

@@ -60,16 +60,13 @@ VECTORS_OF = {
         "episode_1/actions",
     ),
     "robomimic": tuple(
-        f"data/demo_1/{field}"
-        for field in ("obs/state", "next_obs/state", "obs/goal", "next_obs/goal", "actions")
+        f"data/demo_1/{field}" for field in ("obs/state", "next_obs/state", "obs/goal", "next_obs/goal", "actions")
     ),
 }
 
 
 @pytest.mark.parametrize("format", sorted(EXPORTERS))
-def test_one_value_a_step_is_a_vector_of_one(
-    tmp_path: Path, format: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_one_value_a_step_is_a_vector_of_one(tmp_path: Path, format: str, caplog: pytest.LogCaptureFixture) -> None:
     """As the other libraries expect states, goals and actions; rewards that are missing are zeros."""
     single = [Column(name) for name in (STATE, NEXT_STATE, GOAL, ACTION)]
     rest = [column for column in COLUMNS if column.name not in (STATE, ACTION, REWARD)]
@@ -181,9 +178,7 @@ def test_robomimic_has_a_group_per_demonstration(dataset: Dataset, tmp_path: Pat
 
 
 @pytest.mark.parametrize("held_out", [None, 3, 4])
-def test_copies_of_a_recording_are_on_its_side_of_robomimics_masks(
-    tmp_path: Path, held_out: int | None
-) -> None:
+def test_copies_of_a_recording_are_on_its_side_of_robomimics_masks(tmp_path: Path, held_out: int | None) -> None:
     with writer(tmp_path / "set", columns=[*COLUMNS, NEXT]) as open_writer:
         for uid in range(40):
             columns = fake_columns(2, seed=uid)
@@ -194,8 +189,7 @@ def test_copies_of_a_recording_are_on_its_side_of_robomimics_masks(
     export(Dataset.open(tmp_path / "set"), tmp_path / "set.hdf5", format="robomimic")
     with h5py.File(tmp_path / "set.hdf5") as file:
         train, valid = (
-            [int(name.decode().removeprefix("demo_")) for name in file[f"mask/{key}"][()]]
-            for key in ("train", "valid")
+            [int(name.decode().removeprefix("demo_")) for name in file[f"mask/{key}"][()]] for key in ("train", "valid")
         )
     assert sorted(train + valid) == list(range(40))
     (recording,) = {episode % 10 for episode in valid}

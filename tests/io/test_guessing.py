@@ -203,7 +203,5 @@ def test_what_is_of_no_use_is_refused_in_one_line(content: bytes, expected: str,
 
 
 def test_files_have_the_same_fields(tmp_path: Path) -> None:
-    with pytest.raises(
-        BadInputError, match=r"log1.csv: expected the fields of .*log0.csv, \['x', 'cmd'\]: got"
-    ):
+    with pytest.raises(BadInputError, match=r"log1.csv: expected the fields of .*log0.csv, \['x', 'cmd'\]: got"):
         found(tmp_path, {"x": RAMP, "cmd": RAMP}, {"x": RAMP, "cmd_v": RAMP})

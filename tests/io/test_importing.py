@@ -132,9 +132,7 @@ def test_no_recordings_are_refused(tmp_path: Path) -> None:
         import_dataset(sorted(tmp_path.glob("*.csv")))
 
 
-def test_an_episode_that_does_not_fit_into_memory_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_that_does_not_fit_into_memory_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def none_left(self: object, **_: object) -> Iterator[object]:
         raise MemoryError("Unable to allocate 3.3 GiB")
         yield
@@ -151,9 +149,7 @@ def test_what_an_archive_unpacks_to_is_bounded_over_all_its_blocks(tmp_path: Pat
     (tmp_path / "mapping.toml").write_text(MAPPING)
     # Seven fields of 200 rows, eight bytes each.
     with pytest.raises(BadInputError, match=r"log.csv holds values of 11200 bytes or more, .* --max-bytes"):
-        import_dataset(
-            [tmp_path / "log.csv"], tmp_path / "mapping.toml", out=tmp_path / "out", max_bytes=11_199
-        )
+        import_dataset([tmp_path / "log.csv"], tmp_path / "mapping.toml", out=tmp_path / "out", max_bytes=11_199)
     assert not (tmp_path / "out").exists()
     import_dataset([tmp_path / "log.csv"], tmp_path / "mapping.toml", out=tmp_path / "out", max_bytes=11_200)
 
@@ -221,9 +217,7 @@ def test_files_of_other_endings_are_named(tmp_path: Path) -> None:
     assert import_dataset([logs / "0.csv"], mapping, out=tmp_path / "one").unread == ()
 
 
-def test_a_second_import_is_told_to_raise_the_version(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_import_is_told_to_raise_the_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mapping = csv_logs(tmp_path, drive(9))
     import_dataset([tmp_path / "logs"], mapping, out=tmp_path / "out")
     with pytest.raises(BadInputError, match=r"out exists already: give another --out, or delete it"):
@@ -302,9 +296,7 @@ def test_formats_that_are_not_read_are_named_with_what_to_do(tmp_path: Path, nam
 def test_matlabs_older_format_is_named_with_what_to_do(tmp_path: Path) -> None:
     path = tmp_path / "log.mat"
     savemat(path, {name: values for name, values in rows().items()})
-    with pytest.raises(
-        BadInputError, match=r"log\.mat is of MATLAB's format 5, .*save\('NEW\.mat', '-v7\.3'\)"
-    ):
+    with pytest.raises(BadInputError, match=r"log\.mat is of MATLAB's format 5, .*save\('NEW\.mat', '-v7\.3'\)"):
         imported(tmp_path / "out", path)
 
 
@@ -314,9 +306,7 @@ def test_fields_that_are_not_finite_are_named_with_their_places(tmp_path: Path) 
     path = write_table(tmp_path / "log.csv", fields)
     told = "y is empty in all 20 rows: leave it out; x in 1 row, log.csv line 7; command in 2 rows, "
     told += "first log.csv line 5"
-    with pytest.raises(
-        BadInputError, match=f"20 of 20 rows have values that are not finite: {told}; set not_finite"
-    ):
+    with pytest.raises(BadInputError, match=f"20 of 20 rows have values that are not finite: {told}; set not_finite"):
         imported(tmp_path / "refuse", path)
     with pytest.raises(BadInputError, match=rf"no episodes, .*rejected 20 \({told}\)"):
         imported(tmp_path / "drop", path, 'not_finite = "drop"\n' + MAPPING)

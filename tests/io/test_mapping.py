@@ -60,9 +60,7 @@ def test_a_slip_in_a_columns_name_is_told(tmp_path: Path) -> None:
         load_recipe(path, ImportMapping)
 
 
-@pytest.mark.parametrize(
-    ("recipe", "command"), [("quickstart", "run {path}"), ("nao_real", "gap {path} --data LOGS")]
-)
+@pytest.mark.parametrize(("recipe", "command"), [("quickstart", "run {path}"), ("nao_real", "gap {path} --data LOGS")])
 def test_a_recipe_in_place_of_a_mapping_is_told(recipe: str, command: str) -> None:
     path = Path(__file__).parents[2] / f"recipes/{recipe}.toml"
     with pytest.raises(RecipeError) as caught:
@@ -77,9 +75,7 @@ def test_a_gap_of_a_column_is_for_mcap_and_for_what_may_go_stale() -> None:
     given: dict[str, object] = {"name": "log", "task": "drive", "fps": 10, "columns": {STATE: state}}
     mapping = ImportMapping.model_validate(given)
     mapping.refuse_timeless("mcap", "mapping.toml")
-    with pytest.raises(
-        RecipeError, match=r'mapping.toml: columns."observation.state".gap_s: only MCAP has it'
-    ):
+    with pytest.raises(RecipeError, match=r'mapping.toml: columns."observation.state".gap_s: only MCAP has it'):
         mapping.refuse_timeless("csv", "mapping.toml")
     with pytest.raises(ValueError, match="latched holds without limit, and gap_s is a limit"):
         ImportMapping.model_validate(given | {"columns": {STATE: state | {"latched": True}}})

@@ -70,9 +70,7 @@ def test_no_more_is_unpacked_than_the_limit(
 
 @pytest.mark.parametrize("compression", PACKED)
 @pytest.mark.parametrize("declared", [0, 100, 10**6])
-def test_a_chunk_is_unpacked_as_far_as_it_says(
-    tmp_path: Path, compression: CompressionType, declared: int
-) -> None:
+def test_a_chunk_is_unpacked_as_far_as_it_says(tmp_path: Path, compression: CompressionType, declared: int) -> None:
     path = write(tmp_path / "log.mcap", compression=compression)
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()

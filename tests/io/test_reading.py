@@ -60,9 +60,7 @@ def test_an_episode_that_is_bad_is_left_out_and_its_file_is_not(tmp_path: Path) 
     damaged = rows(1)
     damaged["x"][6], damaged["command"][7] = np.nan, np.inf
     write_table(paths[1], damaged)
-    whole, _ = imported(
-        tmp_path / "whole", [write_table(tmp_path / "w" / f"{k}.csv", rows(k)) for k in range(3)]
-    )
+    whole, _ = imported(tmp_path / "whole", [write_table(tmp_path / "w" / f"{k}.csv", rows(k)) for k in range(3)])
     dataset, report = imported(tmp_path, paths, skip_bad=True)
     assert report.left_out == ("1.csv line 8: a value is not finite: its episode is left out",)
     kept = [episode for number, episode in enumerate(whole.episodes()) if number != 4]
@@ -70,9 +68,7 @@ def test_an_episode_that_is_bad_is_left_out_and_its_file_is_not(tmp_path: Path) 
         for name, values in expected.columns.items():
             if name != "episode_uid":
                 np.testing.assert_array_equal(episode.columns[name], values)
-    with pytest.raises(
-        BadInputError, match=r"2 of 60 rows .*: x in 1 row, 1\.csv line 8; command in 1 row, 1\.csv l"
-    ):
+    with pytest.raises(BadInputError, match=r"2 of 60 rows .*: x in 1 row, 1\.csv line 8; command in 1 row, 1\.csv l"):
         imported(tmp_path / "refused", paths)
 
 
@@ -109,8 +105,7 @@ def test_episodes_before_a_fault_in_a_file_are_kept(tmp_path: Path, monkeypatch:
     paths[1].write_text("\n".join(lines))
     dataset, report = imported(tmp_path, paths, skip_bad=True)
     assert [
-        (source, row)
-        for source, row in zip(dataset.metadata["source"], dataset.metadata["source_row"], strict=True)
+        (source, row) for source, row in zip(dataset.metadata["source"], dataset.metadata["source_row"], strict=True)
     ] == [
         *[("0.jsonl", row) for row in (0, 6, 15)],
         ("1.jsonl", 0),
@@ -150,9 +145,7 @@ def test_arrays_of_episodes_are_refused_or_taken_as_such(tmp_path: Path, suffix:
     rng = np.random.default_rng(0)
     fields = {"state": rng.normal(size=(8, 50, 3)), "command": rng.normal(size=(8, 50, 2))}
     path = write_table(tmp_path / f"log{suffix}", fields)
-    with pytest.raises(
-        BadInputError, match=r"all fields have 50 rows in each .*: set stacked = true .* 8 epis"
-    ):
+    with pytest.raises(BadInputError, match=r"all fields have 50 rows in each .*: set stacked = true .* 8 epis"):
         imported(tmp_path, path, STACKED)
     dataset, _ = imported(tmp_path / "yes", path, "stacked = true\n" + STACKED)
     assert dataset.lengths.tolist() == [49] * 8
@@ -169,9 +162,7 @@ def test_rows_of_matrices_are_no_episodes(tmp_path: Path, command: tuple[int, ..
     path = write_table(tmp_path / "log.npz", {"state": np.zeros((200, 4, 3)), "command": np.zeros(command)})
     dataset, _ = imported(tmp_path, path, STACKED)
     assert (dataset.lengths.tolist(), dataset.schema[0].size) == ([199], 12)
-    with pytest.raises(
-        BadInputError, match=r"stacked = true, but the fields' rows have the shapes \(4, 3\), \("
-    ):
+    with pytest.raises(BadInputError, match=r"stacked = true, but the fields' rows have the shapes \(4, 3\), \("):
         imported(tmp_path / "stacked", path, "stacked = true\n" + STACKED)
 
 

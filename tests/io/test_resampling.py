@@ -88,9 +88,7 @@ def test_a_pause_before_all_topics_are_there_ends_nothing(early_ms: float) -> No
 @pytest.mark.parametrize("late_ms", [2000.0, 7_200_000.0])
 def test_clocks_that_never_meet_are_refused_in_a_line(late_ms: float) -> None:
     odom = 50.0 * np.arange(20)
-    told = (
-        rf"log: /cmd begins {late_ms / 1000 - 0.95:.4g} s after the last message of /odom, .* clocks differ"
-    )
+    told = rf"log: /cmd begins {late_ms / 1000 - 0.95:.4g} s after the last message of /odom, .* clocks differ"
     with pytest.raises(BadInputError, match=told):
         sampled(20, odom, late_ms + odom)
     assert sampled(20, odom, 1350 + odom)[1]  # 0.4 s, as long as a state may be held

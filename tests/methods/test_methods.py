@@ -33,9 +33,7 @@ def test_what_the_rows_of_the_paper_differ_in() -> None:
     assert {method.name for method in methods if method.steps_target} == {"target", "full_obs"}
     learned = {method.name: method.learn for method in methods}
     in_simulator = {
-        name: (learn.reward, learn.ranges)
-        for name, learn in learned.items()
-        if isinstance(learn, InSimulator)
+        name: (learn.reward, learn.ranges) for name, learn in learned.items() if isinstance(learn, InSimulator)
     }
     assert in_simulator == {
         "direct_transfer": ("abstract", None),

@@ -51,8 +51,7 @@ episodes = 3
 def recipe(folder: Path, methods: str, own: str) -> Path:
     path = folder / "own.toml"
     path.write_text(
-        f'task = "{ROOT}/tests/small_cart.py:TASK"\nmethods = {methods}\nseeds = [0]\n'
-        f"[own_methods]\n{own}{SMALL}"
+        f'task = "{ROOT}/tests/small_cart.py:TASK"\nmethods = {methods}\nseeds = [0]\n[own_methods]\n{own}{SMALL}'
     )
     return path
 
@@ -160,9 +159,7 @@ def test_causal_compass_finds_the_parameters_that_were_planted(tmp_path: Path) -
 
 
 def test_they_are_rows_from_the_recipe_to_the_page(tmp_path: Path) -> None:
-    own = "".join(
-        f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n' for name in ("delta_action", "nas_golemo", "sb3_ppo")
-    )
+    own = "".join(f'{name} = "{EXAMPLES}/{name}.py:METHOD"\n' for name in ("delta_action", "nas_golemo", "sb3_ppo"))
     rows = '["direct_transfer", "delta_action", "nas_golemo", "sb3_ppo"]'
     path = recipe(tmp_path, rows, own)
     experiment = load_experiment(path, tmp_path / "runs")
@@ -262,7 +259,5 @@ METHOD = Method(name="", title="",
 def test_what_a_method_lacks_is_told_before_anything_runs(tmp_path: Path, rest: str, told: str) -> None:
     (tmp_path / "mine.py").write_text(f"{HEAD}{rest})\n")
     with pytest.raises(RecipeError, match=f"mine.py:METHOD {told}"):
-        load_experiment(
-            recipe(tmp_path, '["mine"]', f'mine = "{tmp_path}/mine.py:METHOD"\n'), tmp_path / "runs"
-        )
+        load_experiment(recipe(tmp_path, '["mine"]', f'mine = "{tmp_path}/mine.py:METHOD"\n'), tmp_path / "runs")
     assert "mine" not in METHODS

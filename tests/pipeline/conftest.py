@@ -89,9 +89,7 @@ def make_cart(folder: Path) -> None:
     user_object(f"{example}/robot.py:record")(folder / "csv", drives=8, seconds=6)
     (folder / "cart.py").write_text((example / "cart.py").read_text())
     import_dataset(sorted((folder / "csv").glob("*.csv")), example / "logs.toml", out=folder / "logs")
-    rows = (
-        'task = "cart.py:TASK"\ndata = "logs"\nmethods = ["direct_transfer", "nas", "astra"]\nseeds = [0]\n'
-    )
+    rows = 'task = "cart.py:TASK"\ndata = "logs"\nmethods = ["direct_transfer", "nas", "astra"]\nseeds = [0]\n'
     tables = small_tables(held_out_share=0.25, episodes=3, train="data_start_share = 0.0")
     (folder / "cart.toml").write_text(rows + tables)
     with pytest.MonkeyPatch.context() as patch:

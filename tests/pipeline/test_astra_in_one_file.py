@@ -58,9 +58,7 @@ def both(folder: Path) -> tuple[Any, ...]:
     model.set_reward_scales(*map(episodes.steps, rewards))
     mine = of_the_file("Grounding")(1, 1, 1)
     mine.set_scales(theirs)
-    scales = {
-        name: values.clone() for name, values in mine.state_dict().items() if name.endswith(("_mean", "_std"))
-    }
+    scales = {name: values.clone() for name, values in mine.state_dict().items() if name.endswith(("_mean", "_std"))}
     mine.load_state_dict({**model.state_dict(), **scales}, strict=False)
     for name, values in scales.items():
         torch.testing.assert_close(values, model.state_dict()[name], **NEAR)

@@ -61,9 +61,7 @@ def recipe(tmp_path: Path) -> Path:
         (-250.0, 900.0, "v may be -1 to 4, recorded is -250 to 900: are both in the same unit?"),
     ],
 )
-def test_bounds_beyond_what_was_recorded_are_told(
-    recipe: Path, least: float, largest: float, expected: str
-) -> None:
+def test_bounds_beyond_what_was_recorded_are_told(recipe: Path, least: float, largest: float, expected: str) -> None:
     write_logs(recipe.parent / "logs", least, largest)
     shown = CliRunner().invoke(app, ["check", str(recipe), "--root", str(recipe.parent / "runs")]).output
     data, *warnings = shown.splitlines()[1 : 4 if expected else 3]
@@ -112,9 +110,7 @@ def test_data_that_were_paired_are_refused(recipe: Path) -> None:
         out=recipe.parent / "logs",
         progress=silent,
     )
-    with pytest.raises(
-        BadInputError, match=r"data: fake@.* is paired already, but a recipe pairs its data itself"
-    ):
+    with pytest.raises(BadInputError, match=r"data: fake@.* is paired already, but a recipe pairs its data itself"):
         check(recipe, root=recipe.parent / "runs")
 
 
@@ -156,8 +152,6 @@ def test_a_task_of_ones_own_is_walked_through_before_a_run(recipe: Path) -> None
     write_logs(recipe.parent / "logs", -1.0, 4.0)
     task = recipe.parent / "rail.py"
     task.write_text(task.read_text().replace("+ ends", "+ nothing"))
-    with pytest.raises(
-        BadInputError, match=r"rail.py:TASK: objective.reward.*'nothing'.* \(rail.py, line \d+\)"
-    ):
+    with pytest.raises(BadInputError, match=r"rail.py:TASK: objective.reward.*'nothing'.* \(rail.py, line \d+\)"):
         run(recipe, root=recipe.parent / "runs")
     assert not (recipe.parent / "runs/rail/label").exists()

@@ -215,9 +215,7 @@ def test_ctrl_c_stops_the_processes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_to_a_run_in_the_background_stops_its_processes(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+def test_a_signal_to_a_run_in_the_background_stops_its_processes(tmp_path: Path, number: signal.Signals) -> None:
     # A shell that starts a run with "&" has it ignore Ctrl-C.
     parent = _hanging_run(tmp_path, handler="SIG_IGN")
     parent.send_signal(number)

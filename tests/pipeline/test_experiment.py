@@ -67,9 +67,7 @@ def test_what_differs_and_what_reads_it_is_made_anew(base: Path, text: str, expe
         ("[25, 100]", "[]", "collect pair"),
     ],
 )
-def test_sizes_that_the_base_has_not_are_made_of_its_pairs(
-    base: Path, theirs: str, ours: str, expected: str
-) -> None:
+def test_sizes_that_the_base_has_not_are_made_of_its_pairs(base: Path, theirs: str, ours: str, expected: str) -> None:
     base.write_text(BASE + (f"[sweep]\npercent = {theirs}\n" if theirs else ""))
     assert borrowed(base, f"[sweep]\npercent = {ours}\n") == {*expected.split()}
 
@@ -110,16 +108,12 @@ def test_a_task_of_the_same_target_shares_the_episodes(
 def test_a_run_reads_what_the_base_made_and_makes_only_the_rest(
     base: Path, longer: Path, tmp_path: Path, stages: FakeStages
 ) -> None:
-    missing = (
-        f"{tmp_path / 'base/train/astra/seed_0'} is missing: run `astra-data run {base} --root {tmp_path}`"
-    )
+    missing = f"{tmp_path / 'base/train/astra/seed_0'} is missing: run `astra-data run {base} --root {tmp_path}`"
     with pytest.raises(MissingStageError, match=re.escape(missing)):
         run(longer, root=tmp_path)
     with pytest.raises(MissingStageError, match=re.escape(missing)):
         run_stage(longer, "evaluate", root=tmp_path)
-    with pytest.raises(
-        BadInputError, match=f"uses the train of {base}: run `astra-data train {base}` instead"
-    ):
+    with pytest.raises(BadInputError, match=f"uses the train of {base}: run `astra-data train {base}` instead"):
         run_stage(longer, "train", root=tmp_path)
     run(base, root=tmp_path)
     stages.made.clear()
@@ -147,9 +141,7 @@ def test_changes_are_told_in_the_base_and_here(base: Path, longer: Path, tmp_pat
     assert found["train/astra/seed_0"].state == "stale" and found["ground/astra/seed_0"].is_finished
     base.write_text(BASE)
     longer.write_text(LONGER.replace("3", "4"))
-    with pytest.raises(
-        RecipeError, match=rf"now 4\) changed .* since {folder} was made: .* remove {folder}/ev"
-    ):
+    with pytest.raises(RecipeError, match=rf"now 4\) changed .* since {folder} was made: .* remove {folder}/ev"):
         run(longer, root=tmp_path)
 
 
@@ -165,9 +157,7 @@ def test_a_stage_that_is_borrowed_no_more_is_made_here_and_then_in_the_way(
     assert stages.asked["train/astra/seed_0"]["config"].tries == 9
     longer.write_text(LONGER)
     shutil.rmtree(folder / "evaluate")
-    with pytest.raises(
-        RecipeError, match=rf"^{folder}/train is in the way: {longer} is based on base, whose"
-    ):
+    with pytest.raises(RecipeError, match=rf"^{folder}/train is in the way: {longer} is based on base, whose"):
         run(longer, root=tmp_path)
 
 

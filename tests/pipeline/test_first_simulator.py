@@ -177,10 +177,7 @@ def test_the_second_command_turns_where_no_name_says_which(tmp_path: Path) -> No
     table = np.column_stack([*columns.values(), a, b])
     np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header="x,y,yaw,cmd_a,cmd_b", comments="")
     doubt = "(CHECK: b is used as a turn rate, although nothing says so)"
-    assert (
-        first_simulator(guess([tmp_path / "log.csv"])).described
-        == f"a unicycle {doubt}: x, y, yaw, moved by a, b"
-    )
+    assert first_simulator(guess([tmp_path / "log.csv"])).described == f"a unicycle {doubt}: x, y, yaw, moved by a, b"
 
 
 @pytest.mark.parametrize(

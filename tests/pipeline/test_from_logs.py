@@ -55,9 +55,7 @@ def test_logs_become_policies_and_a_page_without_a_target(cart: Path) -> None:
         assert evaluation.outcomes == evaluation.grounded and evaluation.raw is not None
     assert evaluation.grounded != evaluation.simulated
     page = (folder / "report/results.md").read_text().splitlines()
-    assert page[2].startswith(
-        "**Nothing was tested on a robot: the task has no target.** All methods were tested"
-    )
+    assert page[2].startswith("**Nothing was tested on a robot: the task has no target.** All methods were tested")
     assert "in which only NAS trained" in page[2]
     text = "\n".join(page[3:])
     assert "over seeds, in the simulator grounded by NAS" in text and "n the target." not in text
@@ -116,9 +114,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     path = path.rename(tmp_path / "linked.toml")
     path.write_text(path.read_text().replace('data = "logs"', 'data = "whole"'))
     experiment = load_experiment(path, tmp_path / "runs")
-    (item,) = [
-        item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"
-    ]
+    (item,) = [item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"]
     item.call(progress=silent)
     assert (experiment.folder / "label/seed_0").is_symlink()
     assert condition(item, experiment).is_finished

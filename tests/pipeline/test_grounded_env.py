@@ -86,9 +86,7 @@ def test_the_row_and_the_recipe_give_the_defaults_and_keywords_change_them(run: 
     assert changed.data_start_share == 1.0 and changed.starts is not None
 
 
-def test_it_is_the_environment_that_the_row_was_trained_in(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_is_the_environment_that_the_row_was_trained_in(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[SimulatorEnv] = []
     build = InSimulator.world
 
@@ -116,9 +114,7 @@ def test_methods_of_the_run_s_own_are_added_when_it_is_opened(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A fresh process knows none of them."""
-    (tmp_path / "mine.py").write_text(
-        "from astra_data.methods import METHODS\nMETHOD = METHODS['direct_transfer']\n"
-    )
+    (tmp_path / "mine.py").write_text("from astra_data.methods import METHODS\nMETHOD = METHODS['direct_transfer']\n")
     own = {"mine": f"{tmp_path}/mine.py:METHOD"}
     settings = settings_of(run) | {"own_methods": own, "methods": ["direct_transfer", "mine"]}
     monkeypatch.setattr(grounded_env, "settings_of", lambda _: settings)

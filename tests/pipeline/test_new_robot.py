@@ -42,9 +42,7 @@ def drives(folder: Path, count: int = 8) -> Path:
         x, y = np.cumsum(0.1 * v * np.cos(yaw)), np.cumsum(0.1 * v * np.sin(yaw))
         folded = (np.arange(50) == 49) * (number % 2)
         goal = np.ones((50, 2)) * [number, -1.0]
-        rows = np.column_stack(
-            [np.arange(50) / 10, x, y, np.arctan2(np.sin(yaw), np.cos(yaw)), v, w, goal, folded]
-        )
+        rows = np.column_stack([np.arange(50) / 10, x, y, np.arctan2(np.sin(yaw), np.cos(yaw)), v, w, goal, folded])
         header = "t,x,y,heading,cmd_v,cmd_w,goal_x,goal_y,folded"
         np.savetxt(folder / f"drive_{number}.csv", rows, "%.5f", ",", header=header, comments="")
     return folder
@@ -85,9 +83,7 @@ def test_a_flag_that_ends_logs_and_goals_are_imported(tmp_path: Path) -> None:
     write_robot("cart", Path("cart"), sorted(logs.iterdir()))
     assert f"astra-data import {logs} --mapping logs.toml  #" in Path("cart/README.md").read_text()
     mapping = Path("cart/logs.toml").read_text()
-    reason = (
-        "# CHECK: folded is 0 or 1, and it ends all 4 of 8 episodes that have a 1: a failure? If a success"
-    )
+    reason = "# CHECK: folded is 0 or 1, and it ends all 4 of 8 episodes that have a 1: a failure? If a success"
     assert f'{reason}, write next.success; if neither, delete this\n[columns."next.terminated"]' in mapping
     command(f"import {logs} --mapping cart/logs.toml --out imported")
     data = Dataset.open("imported")
@@ -110,9 +106,7 @@ def test_starts_of_a_heading_are_where_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("failed", [(), (1,), (1, 2), (0, 1, 2)])
-def test_the_goal_is_where_the_usual_log_ends_that_does_not_fail(
-    failed: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_the_goal_is_where_the_usual_log_ends_that_does_not_fail(failed: tuple[int, ...], tmp_path: Path) -> None:
     ends = np.array([10.0, 30.0, 20.0])
     for number, end in enumerate(ends):
         ramp = np.linspace(0, end, 20)
@@ -201,9 +195,7 @@ def test_a_dataset_in_degrees_is_refused(
 ) -> None:
     meaning = {"unit": units} if units else None
     columns = (Column(STATE, size=3, names=names, astra=meaning), Column(ACTION, size=2))
-    with DatasetWriter(
-        tmp_path / "set", columns=columns, fps=10, task="drive", description=DESCRIPTION
-    ) as out:
+    with DatasetWriter(tmp_path / "set", columns=columns, fps=10, task="drive", description=DESCRIPTION) as out:
         rows = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
         rows[:, 2] = values
         out.add(Episode(0, {STATE: rows[:, :3], ACTION: rows[:, 3:]}))

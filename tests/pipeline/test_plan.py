@@ -34,9 +34,7 @@ def test_rows_read_what_their_method_needs(tmp_path: Path) -> None:
         "align/astra/seed_0",
     )
     assert len(items["report"].inputs) == 8
-    calls = {
-        row: items[f"evaluate/{row}/seed_7"].call for row in ("astra_plus", "direct_transfer", "follower")
-    }
+    calls = {row: items[f"evaluate/{row}/seed_7"].call for row in ("astra_plus", "direct_transfer", "follower")}
     recorded = {row: call.keywords["recorded"] for row, call in calls.items() if isinstance(call, partial)}
     pairs = tmp_path / "pair/seed_7"
     assert recorded == {"astra_plus": pairs, "direct_transfer": pairs, "follower": None}
@@ -103,9 +101,7 @@ def test_who_steps_the_target_gets_threads_and_networks_a_device(tmp_path: Path)
     text = HEAD.replace('"astra_plus"', '"target"')
     recipe = load(tmp_path, text)
     items = plan(recipe, tmp_path / "r.toml", tmp_path, device="cuda")
-    threaded = {
-        item.key.removesuffix("/seed_0") for item in items if item.is_threaded and "seed_0" in item.key
-    }
+    threaded = {item.key.removesuffix("/seed_0") for item in items if item.is_threaded and "seed_0" in item.key}
     rows = ("follower", "direct_transfer", "astra", "target")
     assert threaded == {"collect", "train/target", *(f"evaluate/{row}" for row in rows)}
     on_device = {item.stage for item in items if item.device == "cuda"}
@@ -215,8 +211,7 @@ def test_policies_of_a_size_are_judged_at_that_size(tmp_path: Path) -> None:
         ),
         (SELECT + 'judge = "nash"\n', "nash"),
         (
-            HEAD.replace('"direct_transfer", "astra", "astra_plus"', '"target"')
-            + '[select]\njudge = "nas"\n',
+            HEAD.replace('"direct_transfer", "astra", "astra_plus"', '"target"') + '[select]\njudge = "nas"\n',
             "select: expected a row with policies of abstract states, got none",
         ),
     ],

@@ -99,9 +99,7 @@ def test_a_gpu_that_is_not_there_is_told_at_once(address: str, tmp_path: Path) -
     assert not (tmp_path / "a").exists()
 
 
-def test_a_cluster_that_is_lost_is_told(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_that_is_lost_is_told(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def lose(*_: object, **__: object) -> None:
         raise ray.exceptions.RaySystemError("gone\nfor good")
 

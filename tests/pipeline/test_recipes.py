@@ -13,9 +13,7 @@ EXAMPLES = [path for path in (HOUSE / "recipes/examples").glob("*/*.toml") if pa
 
 
 @pytest.mark.usefixtures("forgotten_methods")
-@pytest.mark.parametrize(
-    "path", sorted({*(HOUSE / "recipes").glob("*.toml"), *EXAMPLES}), ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", sorted({*(HOUSE / "recipes").glob("*.toml"), *EXAMPLES}), ids=lambda path: path.stem)
 def test_a_recipe_loads_and_begins_with_the_command_that_runs_it(path: Path) -> None:
     first, experiment = path.read_text().split("\n\n")[0], load_experiment(path, Path("runs"))
     assert any(
@@ -38,9 +36,7 @@ HUMANOID = 'task = "humanoid-walker2d"\nmethods = ["astra"{}]\nseeds = [0]\n[col
         ("", "[report.paper_success]\nastra = 0.4\n", "report.paper_success"),
     ],
 )
-def test_what_needs_a_maze_is_refused_where_there_is_none(
-    tmp_path: Path, more: str, end: str, asked: str
-) -> None:
+def test_what_needs_a_maze_is_refused_where_there_is_none(tmp_path: Path, more: str, end: str, asked: str) -> None:
     path = tmp_path / "humanoid.toml"
     path.write_text(HUMANOID.format(""))
     assert load_experiment(path, tmp_path).recipe.task == "humanoid-walker2d"

@@ -73,9 +73,7 @@ def test_ridge_learns_what_recorded_joints_do(
     paired = pair(task, dataset=labeled, out=tmp_path / "pairs")
     episodes = PairedEpisodes.load(paired)
     training, held_out = episodes.split(0.25, 0)
-    fitting = Fitting(
-        joints.ANYMAL, GroundConfig(updates=50), None, training, held_out, 0, "cpu", tmp_path, silent
-    )
+    fitting = Fitting(joints.ANYMAL, GroundConfig(updates=50), None, training, held_out, 0, "cpu", tmp_path, silent)
     for method in (windows.RIDGE, windows.NETWORK):
         grounding, _ = method.fit(fitting)
         written = windows.WindowGrounding.from_file(*grounding.to_file(), "cpu")

@@ -21,9 +21,7 @@ from astra_data.reports.results import results_json
 from astra_data.worlds.task import Task
 
 HEAD = 'task = "antmaze-umaze"\nmethods = ["astra", "astra_plus"]\nseeds = [0]\n'
-GROUND, TRAIN, ALIGN, EVALUATE = (
-    f"{stage}/astra/seed_0" for stage in ("ground", "train", "align", "evaluate")
-)
+GROUND, TRAIN, ALIGN, EVALUATE = (f"{stage}/astra/seed_0" for stage in ("ground", "train", "align", "evaluate"))
 MADE_OF_DATA = ("astra", "astra_plus", "target")
 PLUS = ("train/astra_plus/seed_0", "evaluate/astra_plus/seed_0")
 pytestmark = pytest.mark.usefixtures("stages")
@@ -85,9 +83,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(recipe: Path, folder: Pat
     assert not left.exists() and staged.exists()
 
 
-def test_a_failed_run_keeps_what_is_finished_and_goes_on(
-    recipe: Path, tmp_path: Path, stages: FakeStages
-) -> None:
+def test_a_failed_run_keeps_what_is_finished_and_goes_on(recipe: Path, tmp_path: Path, stages: FakeStages) -> None:
     recipe.write_text(HEAD.replace("[0]", "[0, 1]"))
     stages.failing = {"train/astra/seed_1"}
     with pytest.raises(BadInputError, match=r"^train/astra/seed_1: told to fail$"):
@@ -134,9 +130,7 @@ def test_damage_is_set_aside_and_made_again_with_what_was_made_from_it(
     assert made_again(folder) == [f"1/{EVALUATE}", f"1/{TRAIN}", f"2/{EVALUATE}"]
 
 
-def test_altered_bytes_are_found_where_a_step_reads_them(
-    recipe: Path, folder: Path, stages: FakeStages
-) -> None:
+def test_altered_bytes_are_found_where_a_step_reads_them(recipe: Path, folder: Path, stages: FakeStages) -> None:
     grounding = folder / GROUND / "grounding.safetensors"
     whole = grounding.read_bytes()
     alter(grounding)
@@ -274,9 +268,7 @@ def test_a_recipe_with_data_is_labeled_and_has_nothing_to_collect(
     assert stages.asked["label/seed_0"]["data"] == "me/walks"
     assert stages.asked["pair/seed_0"]["dataset"] == folder / "label/seed_0"
     recipe.write_text('data = "you/walks"\n' + HEAD)
-    with pytest.raises(
-        RecipeError, match=r'data \("me/walks", now "you/walks"\) changed in the recipe since'
-    ):
+    with pytest.raises(RecipeError, match=r'data \("me/walks", now "you/walks"\) changed in the recipe since'):
         run(recipe, root=tmp_path, until="pair")
 
 
@@ -292,9 +284,7 @@ def test_a_choice_is_asked_for_by_its_table_and_made_again_with_more_policies(
     run(recipe, root=tmp_path)
     assert stages.made == ["select", "report"] and states(recipe) == {}
     recipe.write_text(rows + "[select]\nepisodes = 3\n")
-    with pytest.raises(
-        RecipeError, match=rf"select \(episodes: 2, now 3\) changed .* remove {folder}/select$"
-    ):
+    with pytest.raises(RecipeError, match=rf"select \(episodes: 2, now 3\) changed .* remove {folder}/select$"):
         run(recipe, root=tmp_path)
     recipe.write_text(rows.replace("1]", "1, 2]") + "[select]\nepisodes = 2\n")
     assert states(recipe)["select"] == ("stale", "made without train/nas/seed_2")
@@ -348,9 +338,7 @@ def test_other_settings_are_refused_where_something_was_made_with_the_old_ones(
     stages.made.clear()
     run(recipe, root=recipe.parent)
     assert {key for key in stages.made if key != "report"} == {
-        key
-        for key in load_experiment(recipe, folder).items
-        if any(key.startswith(f"{one}/") for one in stale)
+        key for key in load_experiment(recipe, folder).items if any(key.startswith(f"{one}/") for one in stale)
     }
     assert states(recipe) == {}
 
@@ -376,9 +364,7 @@ def test_changes_are_told_key_by_key_and_new_keys_have_their_defaults(recipe: Pa
         check(recipe, root=recipe.parent)
 
 
-def test_what_was_begun_with_other_settings_is_refused_alike(
-    recipe: Path, tmp_path: Path, stages: FakeStages
-) -> None:
+def test_what_was_begun_with_other_settings_is_refused_alike(recipe: Path, tmp_path: Path, stages: FakeStages) -> None:
     stages.failing = {TRAIN}
     with pytest.raises(BadInputError):
         run(recipe, root=tmp_path)
@@ -427,10 +413,7 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artifacts_once(
     run(recipe, root=tmp_path)
     assert len(stages.made) == len({*stages.made}) + 1, "the report twice"
     assert [tuple(line.values())[:3] for line in lines(folder)] == [
-        (row, percent, seed)
-        for row in ("nas", "follower")
-        for percent in ("50", "150")
-        for seed in ("0", "1")
+        (row, percent, seed) for row in ("nas", "follower") for percent in ("50", "150") for seed in ("0", "1")
     ]
     shutil.rmtree(folder / "train")
     run(recipe, methods=["follower"], root=tmp_path)

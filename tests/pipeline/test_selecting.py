@@ -45,9 +45,7 @@ def test_the_recipe_says_how_unless_the_call_does(folder: Path, monkeypatch: pyt
     assert select(folder, episodes=8).episodes == 8
 
 
-def test_a_choice_that_is_there_is_kept_and_another_set_aside(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_choice_that_is_there_is_kept_and_another_set_aside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
     def success(self: Judge, policy: object, episodes: int, seed: int) -> float:
@@ -116,9 +114,7 @@ def test_policies_of_every_size_are_judged(folder: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.usefixtures("forgotten_methods")
-def test_rows_are_judged_with_the_groundings_that_they_share(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_are_judged_with_the_groundings_that_they_share(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ensemble = f"{Path(__file__).parents[2]}/recipes/examples/methods/residual_ensemble.py:METHOD"
     changes = {"methods": ["nas_plus", "mine"], "own_methods": {"mine": {"method": ensemble}}}
     rows = asked(folder, monkeypatch, changes).methods

@@ -50,9 +50,7 @@ def test_it_acts_as_the_artifacts_put_together_by_hand(row: str, run: Path) -> N
         assert torch.equal(action, by_hand.act(state, goal))
 
 
-def test_files_of_the_users_are_found_from_everywhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_of_the_users_are_found_from_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = tmp_path / "runs/cart"
     run.mkdir(parents=True)
     own = {"damped": {"method": "damped.py:METHOD", "gain": 2.0}}
@@ -65,9 +63,7 @@ def test_files_of_the_users_are_found_from_everywhere(
     assert found["own_methods"] == {"damped": {"method": f"{tmp_path}/damped.py:METHOD", "gain": 2.0}}
 
 
-def test_a_file_of_the_same_name_here_is_not_that_of_a_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_of_the_same_name_here_is_not_that_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, elsewhere = tmp_path / "cart/runs/cart", tmp_path / "elsewhere"
     for folder in (run, elsewhere):
         folder.mkdir(parents=True)
@@ -88,9 +84,7 @@ def test_a_file_of_the_same_name_here_is_not_that_of_a_run(
 
 
 def test_what_is_missing_is_listed_with_the_stage_that_makes_it(run: Path) -> None:
-    missing = (
-        r"astra_plus, seed 1: expected .*policy.safetensors \(astra-data train\), .*\(astra-data align\)"
-    )
+    missing = r"astra_plus, seed 1: expected .*policy.safetensors \(astra-data train\), .*\(astra-data align\)"
     with pytest.raises(BadInputError, match=missing):
         load_policy(run, "astra_plus", seed=1)
 
@@ -131,18 +125,14 @@ def test_a_row_or_seed_that_the_recipe_lacks_is_told(row: str, seed: int, told: 
 
 
 def test_a_policy_that_is_there_is_loaded_whatever_the_recipe_has_now(run: Path, tmp_path: Path) -> None:
-    (tmp_path / "recipe.json").write_text(
-        json.dumps({"task": "antmaze-umaze", "methods": ["nas"], "seeds": [1]})
-    )
+    (tmp_path / "recipe.json").write_text(json.dumps({"task": "antmaze-umaze", "methods": ["nas"], "seeds": [1]}))
     for stage in ("train", "ground", "align"):
         (tmp_path / stage).symlink_to(run / stage)
     assert load_policy(tmp_path, "astra_plus")
 
 
 def test_a_run_of_several_sizes_is_asked_for_one(run: Path, tmp_path: Path) -> None:
-    (tmp_path / "recipe.json").write_text(
-        json.dumps({"task": "antmaze-umaze", "sweep": {"percent": [25, 100]}})
-    )
+    (tmp_path / "recipe.json").write_text(json.dumps({"task": "antmaze-umaze", "sweep": {"percent": [25, 100]}}))
     for percent, got in ((None, "none"), (50, "50")):
         with pytest.raises(BadInputError, match=rf"percent: expected one of 25, 100, got {got}"):
             load_policy(tmp_path, "astra", percent=percent)

@@ -176,9 +176,7 @@ def test_a_task_without_a_target_is_tried_nowhere(folder: Path) -> None:
         choose_by_trials(folder, 12)
 
 
-def test_trials_are_of_the_size_that_is_asked_for(
-    folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trials_are_of_the_size_that_is_asked_for(folder: Path, tries: Tries, monkeypatch: pytest.MonkeyPatch) -> None:
     judged, made, loaded = select(folder), trained_policy, list[int | None]()
     sized = [one.model_copy(update={"percent": size}) for size in (50, 100) for one in judged.candidates]
     both = judged.model_copy(update={"candidates": sized})
@@ -194,9 +192,7 @@ def test_trials_are_of_the_size_that_is_asked_for(
     found = choose_by_trials(folder, 20, field=4, percent=50)
     assert found.percent == 50 and loaded == [50] * 6
     assert found.rounds[0].candidates == [(one.row, one.seed) for one in both.ranked(50)[:4]]
-    with pytest.raises(
-        BadInputError, match=r"with percent = 100, found 20 made with 50: use the same settings"
-    ):
+    with pytest.raises(BadInputError, match=r"with percent = 100, found 20 made with 50: use the same settings"):
         choose_by_trials(folder, 20, field=4, percent=100)
     alone = judged.model_copy(update={"candidates": judged.candidates[:1]})
     monkeypatch.setattr(module, "select", lambda *_, **__: alone)

@@ -118,17 +118,14 @@ def test_a_recipe_is_the_same_from_every_folder(made: Path, monkeypatch: pytest.
 @pytest.mark.parametrize(
     "asked", ["deploy runs/rail --row nas --out out", "select runs/rail", "view runs/rail --save out.rrd"]
 )
-def test_no_command_takes_a_run_of_another_task(
-    asked: str, made: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_command_takes_a_run_of_another_task(asked: str, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(made)
     edit(made / "rail.py", '"v": (-1.0, 4.0)', '"v": (-1.0, 9.0)')
     before = sorted(made.rglob("*"))
     shown = CliRunner().invoke(app, asked.split())
     assert shown.exit_code == 1 and isinstance(shown.exception, BadInputError)
     assert str(shown.exception) == (
-        f"{made}/rail.py changed since runs/rail was made: "
-        "restore that version, or run the recipe under another name"
+        f"{made}/rail.py changed since runs/rail was made: restore that version, or run the recipe under another name"
     )
     assert sorted(made.rglob("*")) == before
     for load in (load_policy, grounded):
@@ -138,9 +135,7 @@ def test_no_command_takes_a_run_of_another_task(
 
 def test_no_policy_is_of_another_method(made: Path) -> None:
     edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
-    with pytest.raises(
-        BadInputError, match=f"^{made}/mine.py changed since .* was made: restore that version"
-    ):
+    with pytest.raises(BadInputError, match=f"^{made}/mine.py changed since .* was made: restore that version"):
         load_policy(made / "runs/rail", "mine")
     assert task_of(made / "runs/rail") == f"{made}/rail.py:TASK"
 

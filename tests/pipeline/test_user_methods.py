@@ -128,9 +128,7 @@ def test_results_that_were_published_with_other_settings_of_theirs_are_not_the_r
 
 
 @pytest.mark.parametrize("row", ["delta", "delta_plus", "astra"])
-@pytest.mark.parametrize(
-    "table", ["compare = ['{}']", "trajectory_methods = ['{}']", "paper_success.{} = 0.5"]
-)
+@pytest.mark.parametrize("table", ["compare = ['{}']", "trajectory_methods = ['{}']", "paper_success.{} = 0.5"])
 def test_a_report_names_them_like_others_and_a_wrong_name_is_told_before_the_run(
     tmp_path: Path, row: str, table: str
 ) -> None:
@@ -139,7 +137,5 @@ def test_a_report_names_them_like_others_and_a_wrong_name_is_told_before_the_run
     path.write_text(recipe + table.format(row))
     load_experiment(path, tmp_path)
     path.write_text(recipe + table.format("delt"))
-    with pytest.raises(
-        RecipeError, match=r"report\.(compare|trajectory_methods|paper_success): unknown .*'delt'"
-    ):
+    with pytest.raises(RecipeError, match=r"report\.(compare|trajectory_methods|paper_success): unknown .*'delt'"):
         load_experiment(path, tmp_path)

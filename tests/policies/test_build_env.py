@@ -53,9 +53,7 @@ def built(world: WorldConfig, grounding: Grounding, **given: Any) -> SimulatorEn
     return training_env(TASK, Simulation(world), grounding, **options)
 
 
-def test_without_settings_it_is_the_plain_simulator(
-    episodes: PairedEpisodes, grounding: HistoryGrounding
-) -> None:
+def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, grounding: HistoryGrounding) -> None:
     kinds: dict[type[EpisodeSimulator], Grounding] = {
         EpisodeSimulator: NO_GROUNDING,
         GroundedSimulator: grounding,

@@ -193,16 +193,12 @@ def test_a_memory_recalls_what_a_single_observation_does_not_show() -> None:
 
 def test_a_training_that_diverges_says_so() -> None:
     learner = ppo(GoToZero(4), 8, horizon=20, learning_rate=1e30)
-    with pytest.raises(
-        BadInputError, match=r"diverged after step .* std that is not finite: make learning_rate sm"
-    ):
+    with pytest.raises(BadInputError, match=r"diverged after step .* std that is not finite: make learning_rate sm"):
         train(learner)
 
 
 def test_a_single_step_has_no_advantage_over_others() -> None:
-    with pytest.raises(
-        BadInputError, match="rollout_steps: expected 2 or more in a single environment, got 1"
-    ):
+    with pytest.raises(BadInputError, match="rollout_steps: expected 2 or more in a single environment, got 1"):
         ppo(GoToZero(1), 2, horizon=5, rollout_steps=1)
     # Fewer environments than minibatches are enough.
     train(ppo(GoToZero(1), 1, horizon=5, rollout_steps=2))

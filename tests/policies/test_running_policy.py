@@ -29,9 +29,7 @@ def previous(actions: Tensor) -> Tensor:
     return torch.cat([torch.zeros(3, 1, 2), actions[:, :-1]], dim=1)
 
 
-@pytest.mark.parametrize(
-    ("aligned", "in_simulator"), [(False, False), (True, False), (False, True), (True, True)]
-)
+@pytest.mark.parametrize(("aligned", "in_simulator"), [(False, False), (True, False), (False, True), (True, True)])
 @torch.no_grad()
 def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: bool) -> None:
     """Only target states are for ψ^t; ψ^s encodes abstract ones, wherever they come from."""
@@ -51,9 +49,7 @@ def test_latents_are_those_of_the_whole_history(aligned: bool, in_simulator: boo
     observation = policy_observation(TASK.objective, abstract, GOALS, latent)
     torch.testing.assert_close(actions, policy.policy(observation)[0], atol=1e-5, rtol=0)
     assert actions.abs().max() > 0.1
-    assert (
-        running.observation_size == 16 and RunningPolicy(TASK, policy, observed="full").observation_size == 33
-    )
+    assert running.observation_size == 16 and RunningPolicy(TASK, policy, observed="full").observation_size == 33
 
 
 @torch.no_grad()
@@ -63,9 +59,7 @@ def test_a_policy_of_the_raw_simulator_remembers_and_forgets_at_the_start() -> N
     running = RunningPolicy(TASK, policy)
     actions = run(running)
     observation = policy_observation(TASK.objective, STATE[..., [0, 1, 15, 16]], GOALS, None)
-    features = policy.remember_sequence(
-        observation, previous(actions), policy.initial_hidden(3), torch.zeros(3, 6)
-    )
+    features = policy.remember_sequence(observation, previous(actions), policy.initial_hidden(3), torch.zeros(3, 6))
     torch.testing.assert_close(actions, policy.policy(features)[0], atol=1e-5, rtol=0)
     assert torch.equal(run(running), actions)
     drawn = []

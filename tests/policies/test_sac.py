@@ -177,9 +177,7 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
         given = action_values(online, judging[:, :-1][learned], steps["action"][:, :-1][learned])
         wrong = (given - target).square().sum(0).mean()
         action, log_prob = squashed(acting[:, :-1][learned])
-        costs = (
-            temperature * log_prob - action_values(online, judging[:, :-1][learned], action).amin(0)
-        ).mean()
+        costs = (temperature * log_prob - action_values(online, judging[:, :-1][learned], action).amin(0)).mean()
         # The temperature rises where actions are less random than one unit of entropy per dimension below 0.
         calm = -math.log(temperature) * (log_prob.mean() - 1.0)
     torch.testing.assert_close(torch.stack(losses), torch.stack([wrong, costs, calm]), rtol=1e-4, atol=1e-4)

@@ -23,9 +23,7 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
     begin = partial(started, acting, acting.act_in_simulator)
     asked = RecordedRange(torch.tensor([0.0]), torch.tensor([2.0]), TASK.limits)
     runs = [
-        in_simulator(
-            own_world(TASK, simulation, NO_GROUNDING, 9), begin, 40, seed, asked if not seed else None
-        )
+        in_simulator(own_world(TASK, simulation, NO_GROUNDING, 9), begin, 40, seed, asked if not seed else None)
         for simulation in (SIMULATION, Simulation(WorldConfig(), TASK.varied.randomized))
         for seed in (0, 1)
     ]

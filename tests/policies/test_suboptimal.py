@@ -61,9 +61,7 @@ def test_ppo_stops_after_its_steps(tmp_path: Path) -> None:
         shares.append(share)
         notes.append(note)
 
-    trained, metadata = suboptimal_by_ppo(
-        MAZE, steps=250, seed=7, folder=tmp_path, num_threads=1, progress=progress
-    )
+    trained, metadata = suboptimal_by_ppo(MAZE, steps=250, seed=7, folder=tmp_path, num_threads=1, progress=progress)
     (ppo,) = Counting.made
     assert shares == pytest.approx([0.4, 0.8, 1.0])
     assert notes[0].endswith("reward per step 0.250")
@@ -97,9 +95,7 @@ def test_it_goes_on_from_its_checkpoint(
     assert Counting.made[-1].steps == Counting.made[-1].went_on_from == 300
 
 
-@pytest.mark.parametrize(
-    ("lasting", "steps", "trained"), [((10, 20, 60), 10_000, 300), ((10, 20, 30, 40), 350, 400)]
-)
+@pytest.mark.parametrize(("lasting", "steps", "trained"), [((10, 20, 60), 10_000, 300), ((10, 20, 30, 40), 350, 400)])
 def test_sac_stops_once_episodes_last_or_after_its_steps(
     lasting: tuple[int, ...], steps: int, trained: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

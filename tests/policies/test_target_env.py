@@ -21,13 +21,9 @@ def recorded() -> TargetStarts:
     return TargetStarts(torch.cat(states), torch.tensor([[3.0, -4.0], [-4.0, 1.0]]).repeat(5, 1))
 
 
-def world(
-    observed: Observed = "full", share: float = 0.0, count: int = 4, threads: int = 1
-) -> ObservedTargetEnv:
+def world(observed: Observed = "full", share: float = 0.0, count: int = 4, threads: int = 1) -> ObservedTargetEnv:
     starts = recorded() if share else None
-    return ObservedTargetEnv(
-        TASK, count, observed=observed, starts=starts, data_start_share=share, num_threads=threads
-    )
+    return ObservedTargetEnv(TASK, count, observed=observed, starts=starts, data_start_share=share, num_threads=threads)
 
 
 def stretch(env: ObservedTargetEnv, count: int, seed: int) -> list[Tensor]:

@@ -204,8 +204,7 @@ def test_rows_and_their_plus_rows_differ_by_the_plus_settings_alone(
     assert priced.world == known.world.model_copy(update=changes)
     plainly = (str, float, int, bool)
     switches, others = (
-        {name: value for name, value in vars(env).items() if isinstance(value, plainly)}
-        for env in (plain, plus)
+        {name: value for name, value in vars(env).items() if isinstance(value, plainly)} for env in (plain, plus)
     )
     assert switches["data_start_share"] == 0.6 and plain.num_envs == PPO.num_envs
     assert others == switches | changes

@@ -12,9 +12,7 @@ from astra_data.policies.train import InTarget, PpoTrainConfig, TargetConfig, Tr
 from astra_data.robots.registry import TASKS
 
 TASK = TASKS["antmaze-umaze"]
-TRAIN = PpoTrainConfig(
-    num_envs=3, total_steps=999, memory_size=7, data_start_share=0.25, episode_steps=5, discount=0.9
-)
+TRAIN = PpoTrainConfig(num_envs=3, total_steps=999, memory_size=7, data_start_share=0.25, episode_steps=5, discount=0.9)
 
 
 @pytest.fixture
@@ -40,9 +38,7 @@ def training(folder: Path, settings: TargetConfig | None) -> Training:
     mask = torch.ones(2, 4)
     mask[1, 2:] = 0.0
     target, goal = torch.arange(8.0).reshape(2, 4, 1).expand(2, 4, 29), torch.randn(2, 4, 2)
-    episodes = toy_episodes(
-        state, torch.zeros(2, 4, 2), next_state=state, mask=mask, target_state=target, goal=goal
-    )
+    episodes = toy_episodes(state, torch.zeros(2, 4, 2), next_state=state, mask=mask, target_state=target, goal=goal)
     return Training(TASK, TRAIN, settings, episodes, NO_GROUNDING, None, 0, "cpu", folder, silent, 2)
 
 

@@ -111,9 +111,7 @@ def test_its_policy_comes_back_from_the_file(tmp_path: Path) -> None:
     read = running(TASK, PolicyFile.load(tmp_path / "policy.safetensors"))
     read.start(2)
     assert read.act(torch.zeros(2, 2), torch.ones(2, 1)).tolist() == [[0.25], [0.25]]
-    with pytest.raises(
-        BadInputError, match="Constant is a policy of another learner, which cannot be traced"
-    ):
+    with pytest.raises(BadInputError, match="Constant is a policy of another learner, which cannot be traced"):
         write_graph(read, tmp_path)
     del KINDS["constant"]
     with pytest.raises(BadInputError, match="found kind constant"):

@@ -67,9 +67,7 @@ def test_a_malformed_artifact_is_named_with_every_fault(path: Path) -> None:
         ({"grounded": {"position_m": band(1.0) | {"low": [0.5]}}}, r"for position_m, got \[1, 2\]"),
     ],
 )
-def test_a_gap_has_one_error_per_horizon_and_quantity(
-    tmp_path: Path, changes: dict[str, object], message: str
-) -> None:
+def test_a_gap_has_one_error_per_horizon_and_quantity(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     path = tmp_path / "gap.json"
     good = {"horizons": [1, 10], "grounded": {"position_m": band(0.1)}, "raw": {"position_m": band(1.0)}}
     write_json(path, good)

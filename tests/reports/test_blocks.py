@@ -58,9 +58,7 @@ def test_markdown_is_what_github_shows() -> None:
 def test_html_escapes_what_anybody_wrote_and_loads_nothing() -> None:
     hostile = "<script>alert(1)</script>"
     text = Text(f"Task {code(hostile)} {hostile}")
-    page = html(
-        hostile, [Section(hostile, [text, TableBlock(hostile, [hostile], [[hostile]]), Code(hostile)])]
-    )
+    page = html(hostile, [Section(hostile, [text, TableBlock(hostile, [hostile], [[hostile]]), Code(hostile)])])
     assert "<script>" not in page
     assert "default-src 'none'" in page
     assert code("a`b\n# c") == "`ab # c`"

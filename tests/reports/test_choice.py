@@ -37,8 +37,7 @@ Line = tuple[str, int, float, float | None]
 
 def judged(*lines: Line, judges: int = 1) -> Judged:
     candidates = [
-        Candidate(row=row, seed=seed, success={90 + n: lower for n in range(judges)})
-        for row, seed, lower, _ in lines
+        Candidate(row=row, seed=seed, success={90 + n: lower for n in range(judges)}) for row, seed, lower, _ in lines
     ]
     return Judged(judge="nas", episodes=5, candidates=candidates)
 
@@ -137,9 +136,7 @@ def test_the_page_says_who_was_tried_how_often_with_what_success(tmp_path: Path)
     second = TrialRound(trials=2, candidates=[("nas", 1)], tried=[Tried(row="nas", seed=1, success=[1, 1])])
     done = BEGUN.model_copy(update={"rounds": [FIRST, second], "chosen": ("nas", 1), "mean": 0.625})
     page = select_page("cart", JUDGED, done)
-    assert (
-        "**NAS, seed 1**: success 0.62, estimated from the prediction and the trials. 6 of 9 episodes" in page
-    )
+    assert "**NAS, seed 1**: success 0.62, estimated from the prediction and the trials. 6 of 9 episodes" in page
     assert "| 2 | NAS | 1 | 2 | 2 | 0.62 |" in page  # (4 · 0.25 + 4) / (4 + 4)
 
 
@@ -202,9 +199,7 @@ def test_the_best_of_four_is_found_as_often_as_all_outcomes_say() -> None:
         one, other = sorted(range(4), key=lambda n: (-means[n], n))[:2]
         for second in product(range(5), repeat=2):
             chance = binom.pmf(second[0], 4, success[one]) * binom.pmf(second[1], 4, success[other])
-            ends = [
-                (4 * priors[n] + first[n] + more) / 10 for n, more in zip((one, other), second, strict=True)
-            ]
+            ends = [(4 * priors[n] + first[n] + more) / 10 for n, more in zip((one, other), second, strict=True)]
             tied, wins = ends[0] == ends[1], ends[0] > ends[1]
             chosen = min(one, other) if tied else one if wins else other
             expected += weight * chance * (chosen == 3)

@@ -44,18 +44,14 @@ def page(root: Path, *percents: int, seeds: tuple[int, ...] = (0,), rows: tuple[
         ((0.1, 0.2, 0.1), "the error still decreases up to 100 %: more data may help."),
     ],
 )
-def test_enough_is_where_more_makes_no_difference(
-    tmp_path: Path, errors: tuple[float, ...], expected: str
-) -> None:
+def test_enough_is_where_more_makes_no_difference(tmp_path: Path, errors: tuple[float, ...], expected: str) -> None:
     for percent, error in zip((25, 50, 100), errors, strict=True):
         for seed, factor in ((0, 0.5), (1, 1.5)):
             write(tmp_path, percent, seed, error * factor)
     text = page(tmp_path, 100, 25, 50, seeds=(0, 1, 2))
     assert f"- NAS, `x`, 10 steps ahead: {expected}\n" in text
     assert "| size | simulator | 1 step (0.05 s) | 10 steps (0.5 s) |\n" in text
-    assert (
-        f"| 25 % | NAS, grounded | {errors[0]:.3g} [{0.9 * errors[0]:.3g}, {1.1 * errors[0]:.3g}] |" in text
-    )
+    assert f"| 25 % | NAS, grounded | {errors[0]:.3g} [{0.9 * errors[0]:.3g}, {1.1 * errors[0]:.3g}] |" in text
     assert "averaged over seeds 0, 1." in text
 
 
@@ -145,9 +141,7 @@ def test_how_well_failures_are_predicted_is_shown_where_it_was_measured(tmp_path
     assert lines == ["| NAS: failure model | 6 | 0.85 | 0.75 | 0.65 | 0.15 | 0.17 of 0.30 |"]
 
 
-def test_the_figure_pools_the_steps_of_all_seeds_by_bin(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_figure_pools_the_steps_of_all_seeds_by_bin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the whole dataset; a predicted rate of 0.3 is in the bin of 0.2, with twice as many steps."""
     shown: list[Rates] = []
 

@@ -106,9 +106,7 @@ def test_a_difference_is_that_of_a_paired_t_test_on_the_seeds_that_both_have() -
     found = paired_difference(dict(enumerate(ours)) | {9: 5.0}, dict(enumerate(theirs)))
     expected = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
     assert found is not None
-    assert [found.value, found.low, found.high] == pytest.approx(
-        [(ours - theirs).mean(), expected.low, expected.high]
-    )
+    assert [found.value, found.low, found.high] == pytest.approx([(ours - theirs).mean(), expected.low, expected.high])
     assert paired_difference({0: 0.1}, {1: 0.2}) is None
 
 
@@ -133,9 +131,7 @@ def test_the_probability_of_improvement_counts_pairs_and_has_a_95_percent_interv
 
 @pytest.mark.parametrize("in_one_row", [False, True])
 @pytest.mark.parametrize(("ranks", "reference"), [(False, pearsonr), (True, spearmanr)])
-def test_correlations_are_those_of_scipy(
-    ranks: bool, reference: Callable[..., object], in_one_row: bool
-) -> None:
+def test_correlations_are_those_of_scipy(ranks: bool, reference: Callable[..., object], in_one_row: bool) -> None:
     rng = np.random.default_rng(0)
     first = rng.integers(0, 6, 30).astype(float)  # with ties
     second = np.exp(first) + rng.normal(0, 30, 30)
@@ -154,9 +150,7 @@ def test_seeds_of_a_row_are_no_independent_evidence() -> None:
     rng = np.random.default_rng(0)
     rows = rng.normal(0, 1, (2, 6, 1))
     scores, others = rows + rng.normal(0, 0.01, (2, 6, 8))
-    rowwise, apart = (
-        correlation(*(np.split(of.ravel(), parts) for of in (scores, others))) for parts in (6, 48)
-    )
+    rowwise, apart = (correlation(*(np.split(of.ravel(), parts) for of in (scores, others))) for parts in (6, 48))
     assert rowwise and apart and rowwise.low is not None and rowwise.high is not None
     assert apart.low is not None and apart.high is not None
     assert rowwise.high - rowwise.low > 2 * (apart.high - apart.low)

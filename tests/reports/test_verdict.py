@@ -35,10 +35,7 @@ def results(
         for row, scores in of.items()
         for seed, one in enumerate(scores)
     ]
-    lines += [
-        Line(row=row, seed=0, where="ground", values={"r2_reward": value})
-        for row, value in (r2 or {}).items()
-    ]
+    lines += [Line(row=row, seed=0, where="ground", values={"r2_reward": value}) for row, value in (r2 or {}).items()]
     given = {"recipe": "r", "task": "t", "command": "c", "rows": tuple(target), "episodes": 120}
     return Results.model_validate(given | {"lines": lines} | facts)
 
@@ -142,8 +139,7 @@ def test_judges_choose_the_seed_and_without_a_target_the_method() -> None:
     of = {"nas": (0.6, 0.6, 0.6), "astra": (0.8, 0.9, 1.0)}
     shares = {("astra", 0): 0.7, ("astra", 1): 0.4, ("nas", 0): 0.9}
     candidates = [
-        Candidate(row=row, seed=seed, success=dict.fromkeys((7, 8, 9), share))
-        for (row, seed), share in shares.items()
+        Candidate(row=row, seed=seed, success=dict.fromkeys((7, 8, 9), share)) for (row, seed), share in shares.items()
     ]
     judged = Judgment(judge="nas", episodes=50, candidates=candidates)
     found = verdict_of(results(of, judged=judged))

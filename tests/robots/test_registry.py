@@ -130,9 +130,7 @@ def test_a_file_without_a_simulator_is_refused(tmp_path: Path, text: str, told: 
 
 
 def test_installed_packages_offer_simulators_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    offered = [
-        EntryPoint(name, "my_simulator:Glider", SIMULATOR_GROUP) for name in ("glider", "antmaze-umaze")
-    ]
+    offered = [EntryPoint(name, "my_simulator:Glider", SIMULATOR_GROUP) for name in ("glider", "antmaze-umaze")]
     monkeypatch.setattr(user_code, "entry_points", lambda group: {SIMULATOR_GROUP: offered}.get(group, []))
     pairing = pairing_named("glider")
     assert (pairing.id, pairing.origin) == ("glider", {"package": "my_simulator:Glider"})

@@ -30,9 +30,7 @@ def is_fast(state: State, terminated: bool) -> bool:
 
 
 def test_equals_the_environment_stepped_by_hand() -> None:
-    made = partial(
-        GymnasiumRobot, "Pendulum-v1", read_state=angle_and_speed, command=torque, failed=is_fast, g=9.0
-    )
+    made = partial(GymnasiumRobot, "Pendulum-v1", read_state=angle_and_speed, command=torque, failed=is_fast, g=9.0)
     robot = pickle.loads(pickle.dumps(made))()
     env = gymnasium.make("Pendulum-v1", g=9.0).unwrapped
     observation, _ = env.reset(seed=4)
@@ -121,9 +119,7 @@ def corridor(**functions: Any) -> RobotEnv:  # noqa: ANN401
 
 
 def test_an_end_at_the_goal_is_no_failure_without_a_word() -> None:
-    with pytest.raises(
-        BadInputError, match=r"terminated in a step that reached the goal.*GymnasiumRobot a fai"
-    ):
+    with pytest.raises(BadInputError, match=r"terminated in a step that reached the goal.*GymnasiumRobot a fai"):
         corridor().step(torch.tensor([[0.0], [1.0]]))  # to 0.15 and 0.4 m
     env = corridor()
     for _ in range(4):
@@ -134,9 +130,7 @@ def test_an_end_at_the_goal_is_no_failure_without_a_word() -> None:
 def test_commands_that_are_no_actions_are_refused() -> None:
     robot = GymnasiumRobot("Pendulum-v1")
     robot.check_commands(Commands({"torque": (-2.0, 2.0)}))
-    with pytest.raises(
-        BadInputError, match=r"-2 to 2 in entry 0, and the command is -2\.1: narrow the task's"
-    ):
+    with pytest.raises(BadInputError, match=r"-2 to 2 in entry 0, and the command is -2\.1: narrow the task's"):
         robot.check_commands(Commands({"torque": (-2.1, 2.0)}))
     with pytest.raises(BadInputError, match=r"-2 to 2 in entry 0, and the command is 2\.1"):
         robot.check_commands(Commands({"torque": (-2.0, 2.1)}))

@@ -126,12 +126,8 @@ def test_the_step_in_which_a_state_is_lost_is_told() -> None:
 
 
 @pytest.mark.parametrize("found", [[0.0, 1.0], np.zeros(2), None, ([0.0, 1.0], False, {})])
-def test_a_step_that_does_not_say_whether_it_failed_is_refused(
-    found: object, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_that_does_not_say_whether_it_failed_is_refused(found: object, monkeypatch: pytest.MonkeyPatch) -> None:
     env = TASK.target(1, seed=0)
     monkeypatch.setattr(Cart, "step", lambda _cart, _command: found)
-    with pytest.raises(
-        BadInputError, match=r"step of the robot: expected \(state, whether it failed\), got "
-    ):
+    with pytest.raises(BadInputError, match=r"step of the robot: expected \(state, whether it failed\), got "):
         env.step(torch.zeros(1, 1))

@@ -23,9 +23,7 @@ from astra_data.worlds.task import (
 
 
 def test_entries_become_a_column() -> None:
-    place = column(
-        "place", [ColumnEntry(name, "m", "world", "position") for name in ("a", "b")], "where it is"
-    )
+    place = column("place", [ColumnEntry(name, "m", "world", "position") for name in ("a", "b")], "where it is")
     assert place.names == ("a", "b") and place.meaning == "where it is"
     assert place.astra == {"unit": ["m", "m"], "frame": ["world"] * 2, "role": ["position"] * 2}
 

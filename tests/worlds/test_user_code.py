@@ -48,9 +48,7 @@ def test_a_file_is_run_once_and_its_objects_are_found() -> None:
     assert task_named(f"{CART}:LOGS_ALONE") is user_object(f"{CART}:LOGS_ALONE")
 
 
-def test_a_file_imports_those_beside_it_but_hides_no_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_imports_those_beside_it_but_hides_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.path", [*sys.path])
     (tmp_path / "wheels_of_mine.py").write_text("COUNT = 4\n")
     (tmp_path / "json.py").write_text("dumps = None\n")
@@ -93,15 +91,11 @@ def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
         user_object(f"{file}:TAKS")
     with pytest.raises(BadInputError, match=r"none.py does not exist: expected a Python file"):
         user_object(f"{tmp_path}/none.py:TASK")
-    with pytest.raises(
-        BadInputError, match=f"none.py does not exist in {Path.cwd()}: expected a Python file"
-    ):
+    with pytest.raises(BadInputError, match=f"none.py does not exist in {Path.cwd()}: expected a Python file"):
         user_object("none.py:TASK")
 
 
-def test_a_file_is_looked_up_above_a_folder_and_then_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_looked_up_above_a_folder_and_then_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here, project = tmp_path / "here", tmp_path / "project"
     run = project / "runs/cart"
     for folder in (here, run):
@@ -306,7 +300,5 @@ def test_anything_else_is_refused_with_what_it_is(found: object, said: str) -> N
 
 def test_answers_come_where_the_states_are() -> None:
     """Else they meet no other tensor of a training on a GPU; "meta" stands for one."""
-    with pytest.raises(
-        BadInputError, match=r"^pay: expected a tensor on meta, where its inputs are, got cpu$"
-    ):
+    with pytest.raises(BadInputError, match=r"^pay: expected a tensor on meta, where its inputs are, got cpu$"):
         expect("pay", torch.zeros(3), (3,), device=torch.device("meta"))

@@ -48,9 +48,7 @@ def test_objectives_compute_where_states_are(name: str) -> None:
         ),
     ],
 )
-def test_a_rate_that_is_no_whole_number_is_told(
-    timestep_s: float, told: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_rate_that_is_no_whole_number_is_told(timestep_s: float, told: str, caplog: pytest.LogCaptureFixture) -> None:
     assert check_task(replace(TASK, timestep_s=timestep_s)) == []
     assert (f"task rail-cart: {told}" in caplog.text) if told else not caplog.records
 

@@ -124,9 +124,7 @@ def _of_recipe(stage: str) -> Command:
     return Command(line, looks.files, f"runs/tiny/{stage}", _before(stage), is_light=False, adds=True)
 
 
-def _on_collected(
-    line: str, look: looks.Look = looks.dataset, target: str = "out", *, adds: bool = False
-) -> Command:
+def _on_collected(line: str, look: looks.Look = looks.dataset, target: str = "out", *, adds: bool = False) -> Command:
     return Command(line, look, target, is_light=False, adds=adds)
 
 
@@ -195,9 +193,7 @@ def _write_walks(root: Path, name: str, uids: Sequence[int]) -> None:
         Column(GOAL, size=2),
     ]
     description = {"name": name, "stage": "collect", "environment": {"id": "walk"}}
-    with DatasetWriter(
-        root, [*columns, *OUTCOME_COLUMNS], fps=20, task="walk", description=description
-    ) as writer:
+    with DatasetWriter(root, [*columns, *OUTCOME_COLUMNS], fps=20, task="walk", description=description) as writer:
         for number, uid in enumerate(uids):
             length = 5 + number
             rng = np.random.default_rng(uid)

@@ -184,6 +184,4 @@ def read_journal(path: Path) -> Iterator[Operation]:
         for size in (path_length, other_length, length):
             parts.append(data[place : place + size])
             place += size
-        yield Operation(
-            Kind(kind), os.fsdecode(parts[0]), os.fsdecode(parts[1]), offset, parts[2], bool(failed)
-        )
+        yield Operation(Kind(kind), os.fsdecode(parts[0]), os.fsdecode(parts[1]), offset, parts[2], bool(failed))

@@ -70,9 +70,7 @@ def files(path: Path) -> str | None:
 
 def card(path: Path) -> str | None:
     """Describe a card and its figure, which are two files."""
-    return files(path) and _digest(
-        (Path(file.name), _content(file)) for file in sorted(path.parent.glob("out*"))
-    )
+    return files(path) and _digest((Path(file.name), _content(file)) for file in sorted(path.parent.glob("out*")))
 
 
 def remote(path: Path) -> str | None:
@@ -86,9 +84,7 @@ def remote(path: Path) -> str | None:
 def _files(folder: Path) -> list[Path]:
     """Return the visible files below `folder`."""
     found = sorted(path for path in folder.rglob("*") if path.is_file())
-    return [
-        path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
+    return [path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
 
 
 def _content(path: Path) -> bytes:

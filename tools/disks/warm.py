@@ -72,14 +72,7 @@ def warm_up(*, light: bool) -> None:
     """Import what commands import when they run, so that forked processes have it: all of it, or `LIGHT`."""
     top = Path(astra_data.__path__[0])
     for path in sorted(top.rglob("*.py")):
-        name = (
-            path.relative_to(top)
-            .with_suffix("")
-            .as_posix()
-            .replace("/", ".")
-            .removesuffix("__init__")
-            .rstrip(".")
-        )
+        name = path.relative_to(top).with_suffix("").as_posix().replace("/", ".").removesuffix("__init__").rstrip(".")
         is_wanted = name.startswith(LIGHT) and name not in WITH_TORCH if light else "ray" not in name
         if is_wanted and name:
             importlib.import_module(f"astra_data.{name}")

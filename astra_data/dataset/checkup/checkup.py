@@ -418,9 +418,7 @@ class Shift:
     def findings(self, called: str = "") -> list[Finding]:
         """Return by how many rows actions are off, if they are."""
         width = sum(part.shape[1] for part in self._rows[0]) if self._rows else 0
-        if self._steps < 20 * (width + len(LAGS)) or not any(
-            np.ptp(state, axis=0).any() for state, _ in self._rows
-        ):
+        if self._steps < 20 * (width + len(LAGS)) or not any(np.ptp(state, axis=0).any() for state, _ in self._rows):
             return []
         shares = self.explained()
         best, own = LAGS[int(shares.argmax())], float(shares[LAGS.index(0)])

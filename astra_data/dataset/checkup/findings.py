@@ -103,8 +103,7 @@ def full_turns(column: Column) -> Floats:
     """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
     roles = (column.astra or {}).get("role", [""] * column.size)
     turns = [
-        TURNS.get(unit, 2 * np.pi if role == "heading" else 0.0)
-        for unit, role in zip(column.units, roles, strict=True)
+        TURNS.get(unit, 2 * np.pi if role == "heading" else 0.0) for unit, role in zip(column.units, roles, strict=True)
     ]
     return np.array(turns)
 
@@ -235,9 +234,7 @@ class Clock:
     def findings(self, called: str) -> list[Finding]:
         """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""
         found, period_s = [], self.period_s
-        if standing := [
-            u for u, steps_s in zip(self._uids, self._steps_s, strict=True) if (steps_s <= 0).any()
-        ]:
+        if standing := [u for u, steps_s in zip(self._uids, self._steps_s, strict=True) if (steps_s <= 0).any()]:
             what = f"{self._name} stands still or goes back between steps"
             remedy = "store it as seconds since the start (`offset`) or as int64"
             if self._whole:
@@ -286,6 +283,4 @@ class Clock:
         periods = self.period_s * self._fps
         if 1 / FINE <= periods < MOST_PERIODS:
             return ""
-        return "a step takes " + (
-            f"1/{FINE} of a period or less" if periods < 1 else f"{MOST_PERIODS} periods or more"
-        )
+        return "a step takes " + (f"1/{FINE} of a period or less" if periods < 1 else f"{MOST_PERIODS} periods or more")

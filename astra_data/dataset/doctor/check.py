@@ -156,9 +156,7 @@ def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainCol
     return columns
 
 
-def _files_are_readable(
-    root: Path, info: Mapping[str, Any], columns: list[plain.PlainColumn], report: Report
-) -> bool:
+def _files_are_readable(root: Path, info: Mapping[str, Any], columns: list[plain.PlainColumn], report: Report) -> bool:
     """Check which files there are, the footers of all parquet files, and their schemas."""
     known = {root / path for path in _META_FILES} | {*plain.data_files(root), *plain.episodes_files(root)}
     for path in sorted([*(root / "data").rglob("*"), *(root / "meta").rglob("*")]):
@@ -328,14 +326,10 @@ class EpisodeChecks:
         elif self._total:
             kinds = plain.PLAIN_STATISTICS
             every = {name: each for name, each in stored.items() if isinstance(each, dict)}
-            of_each = {
-                (c.name, kind): every.get(c.name, {}).get(kind) for c in self._columns for kind in kinds
-            }
+            of_each = {(c.name, kind): every.get(c.name, {}).get(kind) for c in self._columns for kind in kinds}
             self._compare(of_each, self._total, "")
 
-    def _compare(
-        self, stored: Mapping[tuple[str, str], object], found: Mapping[str, Floats], where: str
-    ) -> None:
+    def _compare(self, stored: Mapping[tuple[str, str], object], found: Mapping[str, Floats], where: str) -> None:
         """Note which statistics differ from those of the values."""
         for column, part in side_by_side(self._columns):
             largest = np.maximum(np.abs(found["min"][part]), np.abs(found["max"][part]))

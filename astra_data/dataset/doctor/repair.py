@@ -187,9 +187,7 @@ def _losses(remains: Remains, episodes: int, content_hash: str) -> Iterator[str]
         yield f"{counted - episodes} of the {counted} episodes that {layout.INFO_PATH} counts are lost"
     is_all = counted == episodes and len(remains.columns) == len(remains.info["features"])
     if is_all and remains.old and remains.old["content_hash"] != content_hash:
-        yield (
-            "a value was altered after it was written, because the content hash differs; which one is unknown"
-        )
+        yield ("a value was altered after it was written, because the content hash differs; which one is unknown")
 
 
 class Joined(NamedTuple):
@@ -242,14 +240,10 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     """Read what `folder` still tells; add to `notes` what is lost or changed."""
     info = read_object(folder / layout.INFO_PATH)
     if isinstance(info, str):
-        raise CorruptDatasetError(
-            f"{folder}: {layout.INFO_PATH} {info}; without it columns and fps are unknown"
-        )
+        raise CorruptDatasetError(f"{folder}: {layout.INFO_PATH} {info}; without it columns and fps are unknown")
     columns, specs, fps = declared_columns(folder, info)
     if sources and names.EPISODE_UID not in info["features"]:
-        raise BadInputError(
-            f"{folder} has no column {names.EPISODE_UID}, by which it joins {sources[0].reference}"
-        )
+        raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {sources[0].reference}")
     tasks = read_tasks(folder)
     rows: Rows | None = Rows({column.name: column for column in columns}, fps)
     has_ours = (folder / layout.OUR_FOLDER).is_dir()

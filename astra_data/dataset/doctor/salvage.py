@@ -129,9 +129,7 @@ def _every_run(
             notes.append(f"{_name(path)} cannot be read: {in_short(error)}")
 
 
-def _runs_of(
-    path: Path, columns: Sequence[plain.PlainColumn], notes: list[str]
-) -> Iterator[tuple[plain.Run, bool]]:
+def _runs_of(path: Path, columns: Sequence[plain.PlainColumn], notes: list[str]) -> Iterator[tuple[plain.Run, bool]]:
     """Yield the runs of a file, and whether the rows after each cannot be read."""
     is_whole = not isinstance(plain.read_footer(path), str)
     schema = pa.schema([(column.name, column.arrow_type) for column in columns])
@@ -287,9 +285,7 @@ def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[_Leaf]) -> l
     return None
 
 
-def _chunks(
-    pages: Sequence[_Page], position: int, leaves: Sequence[_Leaf], rows: int
-) -> list[list[_Page]] | None:
+def _chunks(pages: Sequence[_Page], position: int, leaves: Sequence[_Leaf], rows: int) -> list[list[_Page]] | None:
     chunks: list[list[_Page]] = []
     for leaf in leaves:
         chunk: list[_Page] = []

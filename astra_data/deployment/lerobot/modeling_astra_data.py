@@ -98,6 +98,4 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
             came = "some that are not finite"
         else:
             return given.float().cpu()
-        raise BadInputError(
-            f"{column}: expected finite values (B, {len(names)}), {called} {names}, got {came}"
-        )
+        raise BadInputError(f"{column}: expected finite values (B, {len(names)}), {called} {names}, got {came}")

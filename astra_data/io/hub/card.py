@@ -82,9 +82,7 @@ def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None 
     return [out, figure]
 
 
-def render_card(
-    dataset: Dataset, notes: Notes, *, source: str | None = None, figure: str | None = None
-) -> str:
+def render_card(dataset: Dataset, notes: Notes, *, source: str | None = None, figure: str | None = None) -> str:
     """Return the card of `dataset` as Markdown with the Hub's front matter; `figure` is a path beside it."""
     from huggingface_hub import DatasetCardData  # noqa: PLC0415 - slow to import
 
@@ -153,11 +151,7 @@ from datasets import load_dataset
 
 def _opening(dataset: Dataset) -> str:
     stand_in = dataset.description["environment"].get("stand_in")
-    note = (
-        f" The robot is a simulated stand-in ({in_code(str(stand_in))}) for a physical one."
-        if stand_in
-        else ""
-    )
+    note = f" The robot is a simulated stand-in ({in_code(str(stand_in))}) for a physical one." if stand_in else ""
     return (
         f"Version {dataset.description['version']}: {len(dataset):,} episodes, "
         f"{int(dataset.lengths.sum()):,} steps at {dataset.info['fps']} Hz. "
@@ -179,9 +173,7 @@ def _counts(dataset: Dataset) -> str:
     for key, values in sorted(facts.items()):
         if values and all(isinstance(value, bool) for value in values):
             share = sum(map(bool, values)) / len(values)
-            rows.append(
-                (in_markdown(key), f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.1%})")
-            )
+            rows.append((in_markdown(key), f"{sum(map(bool, values)):,} of {len(values):,} episodes ({share:.1%})"))
         elif key == "return" and values:
             returns = np.array(values, dtype=np.float64)
             rows.append((key, f"mean {returns.mean():.2f}; {returns.min():.2f} to {returns.max():.2f}"))
@@ -202,10 +194,7 @@ def _columns(dataset: Dataset) -> str:
             shape = f"({column.size},)"
             rows.append((in_code(column.name), column.dtype, shape, _units(column), meaning))
     plain = [f"`{column.name}`" for column in columns if column.name in RESERVED and not column.meaning]
-    order = [
-        f"In {' and '.join(map(in_code, same))}, in order: {', '.join(names)}."
-        for names, same in wide.items()
-    ]
+    order = [f"In {' and '.join(map(in_code, same))}, in order: {', '.join(names)}." for names, same in wide.items()]
     return "\n\n".join(
         [
             _table(("column", "type", "shape", "units", "meaning"), rows),

@@ -150,15 +150,11 @@ def pull(
     if named and asked != named:
         raise BadInputError(f"{source} names {named.tag}, but the version asked for is {version}.")
     if isinstance(place, HubStore) and not source.startswith("hf://") and Path(place.repo).is_dir():
-        raise BadInputError(
-            f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub"
-        )
+        raise BadInputError(f"{source} is a folder here: pull ./{source}, or hf://datasets/{source} of the Hub")
     known = place.versions()
     if not known:
         if isinstance(place, UrlStore):
-            inside = [
-                f"{place}/{name}" for name in place.names()[:MOST_NAMED] if place.below(name).versions()
-            ]
+            inside = [f"{place}/{name}" for name in place.names()[:MOST_NAMED] if place.below(name).versions()]
             if inside:
                 raise BadInputError(f"{place} is a folder of datasets: pull one of {', '.join(inside)}")
         raise SharingError(
@@ -267,9 +263,7 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Li
     except AstraDataError:
         is_other = True
     if is_other:
-        raise BadInputError(
-            f"{target} exists already and holds something else; delete it or choose another folder."
-        )
+        raise BadInputError(f"{target} exists already and holds something else; delete it or choose another folder.")
     if changed:
         raise CorruptDatasetError(
             f"{target} was altered: it differs from what is shared in {', '.join(changed)}. "

@@ -123,9 +123,7 @@ class RemoteFolder:
         try:
             return dict(json.loads(text))
         except (RecursionError, TypeError, ValueError) as error:
-            raise SharingError(
-                f"{self.name}: {layout.DATASET_PATH} is not a JSON object ({error})."
-            ) from error
+            raise SharingError(f"{self.name}: {layout.DATASET_PATH} is not a JSON object ({error}).") from error
 
     def altered(self, sums: Mapping[str, Listed]) -> list[str]:
         """Return which files of `sums` are missing here or differ, as far as is known without a download.
@@ -282,9 +280,7 @@ class UrlStore:
         with explained(self.url):
             self._filesystem.invalidate_cache()
             found = (version for name in self.names() if (version := Version.from_tag(name)))
-            return sorted(
-                v for v in found if self._filesystem.exists(f"{self.folder(v).path}/{layout.DATASET_PATH}")
-            )
+            return sorted(v for v in found if self._filesystem.exists(f"{self.folder(v).path}/{layout.DATASET_PATH}"))
 
     def names(self) -> list[str]:
         """Return the names of the folders in it."""
@@ -393,9 +389,7 @@ def _of_the_hub(place: str, error: Exception) -> AstraDataError | None:
         status = cause.response.status_code
         causes = dict.fromkeys(
             (401, 403), "no rights to do this; log in with `hf auth login` and a token that may write."
-        ) | dict.fromkeys(
-            (409, 412), "it was changed by somebody else at the same time; run the same command again."
-        )
+        ) | dict.fromkeys((409, 412), "it was changed by somebody else at the same time; run the same command again.")
         answered = f"it answered {status}: {cause.server_message or cause}"
         return SharingError(f"{place}: {causes.get(status, answered)}")
     return None

@@ -76,9 +76,7 @@ def parse_sums(text: str, source: str) -> dict[str, Listed]:
     halves = sorted(sizes.keys() ^ sums.keys())
     faults += [f"{path} is listed without {'sha256' if path in sizes else 'size'}" for path in halves]
     if faults:
-        raise SharingError(
-            f"{source}: {SUMS_PATH} cannot be trusted: {'; '.join(faults)}. Nothing was downloaded."
-        )
+        raise SharingError(f"{source}: {SUMS_PATH} cannot be trusted: {'; '.join(faults)}. Nothing was downloaded.")
     return {path: Listed(digest, sizes[path]) for path, digest in sums.items()}
 
 

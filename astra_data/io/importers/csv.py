@@ -121,9 +121,7 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     if time is None:
         raise BadInputError(f"{source}: files are joined by time: set `time` to the field with the times")
     if apart := [f for f in mapping.all_fields if f != time and f.partition(":")[0] not in source.parts]:
-        raise BadInputError(
-            f"{source}: {', '.join(apart)}: expected the file of each field, such as state.csv:x"
-        )
+        raise BadInputError(f"{source}: {', '.join(apart)}: expected the file of each field, such as state.csv:x")
     numbers = [time, *_plain(mapping.fields)]
     main, *rest = mapping.files
     tables: dict[str, dict[str, Array]] = {}
@@ -142,9 +140,7 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     for name in rest:
         times = tables[name].pop(time)
         if not (np.diff(times) >= 0).all():
-            raise BadInputError(
-                f"{source.parts[name]}: '{time}' goes back or is missing: sort its rows by it"
-            )
+            raise BadInputError(f"{source.parts[name]}: '{time}' goes back or is missing: sort its rows by it")
         last = np.searchsorted(times, now, side="right") - 1
         is_known &= last >= 0
         gap = (mapping.split.gap_s or np.inf) / mapping.time_scale
@@ -152,9 +148,7 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         values |= {field: column[last] for field, column in tables[name].items() if len(times)}
     kept = np.flatnonzero(is_known)
     if len(now) and not len(kept):
-        raise BadInputError(
-            f"{source}: no row has rows of {', '.join(rest)} before it that are recent enough"
-        )
+        raise BadInputError(f"{source}: no row has rows of {', '.join(rest)} before it that are recent enough")
     for rows in np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else ():
         part = {field: column[rows] for field, column in values.items()}
         yield Block(
@@ -279,9 +273,7 @@ def _lists(texts: pa.StringArray, source: Source, field: str, row: int) -> Array
     rows: list[list[float]] = []
     for number, cell in enumerate(cells):
         try:
-            rows.append(
-                [float(word) for word in re.split(r"[,;\s]+", cell[1].strip()) if word] if cell else []
-            )
+            rows.append([float(word) for word in re.split(r"[,;\s]+", cell[1].strip()) if word] if cell else [])
         except ValueError:
             rows.append([])
         if not rows[-1] or len(rows[-1]) != len(rows[0]):

@@ -58,8 +58,7 @@ def _blocks(
     for first in range(0, n, BLOCK_ROWS):
         rows = slice(first, min(first + BLOCK_ROWS, n))
         values = {
-            field: dataset[..., rows].T if mapping.transposed else dataset[rows]
-            for field, dataset in used.items()
+            field: dataset[..., rows].T if mapping.transposed else dataset[rows] for field, dataset in used.items()
         }
         values |= {field: _at_the_end(value, rows, n) for field, value in ends.items()}
         yield Block(values, origin, starts=mapping.episodes is not None and first == 0, known=known)

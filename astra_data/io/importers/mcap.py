@@ -209,9 +209,7 @@ def _rows(
         _log.warning("%s", silence)
 
 
-def _block(
-    source: Source, rows: list[tuple[dict[str, Array], dict[str, int]]], topic_of: Mapping[str, str]
-) -> Block:
+def _block(source: Source, rows: list[tuple[dict[str, Array], dict[str, int]]], topic_of: Mapping[str, str]) -> Block:
     """Return rows, each with the times of its topics, which name the places of values that are not finite."""
     values = {name: np.stack([row[name] for row, _ in rows]) for name in rows[0][0]}
     places = {

@@ -24,9 +24,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
             sum(archive.getinfo(known[field]).file_size for field in mapping.all_fields if field in known)
         )
         files = {
-            field: exits.enter_context(archive.open(known[field]))
-            for field in mapping.all_fields
-            if field in known
+            field: exits.enter_context(archive.open(known[field])) for field in mapping.all_fields if field in known
         }
         headers = {field: _header(file, source) for field, file in files.items()}
         shapes = {field: (0,) for field in known} | {field: shape for field, (shape, _) in headers.items()}
@@ -34,8 +32,7 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         for first in range(0, n, BLOCK_ROWS):
             rows = min(BLOCK_ROWS, n - first)
             values = {
-                field: _rows(files[field], (rows, *shape[1:]), dtype)
-                for field, (shape, dtype) in headers.items()
+                field: _rows(files[field], (rows, *shape[1:]), dtype) for field, (shape, dtype) in headers.items()
             }
             yield Block(values, str(source), known=known)
         for file in files.values():

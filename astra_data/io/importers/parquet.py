@@ -45,9 +45,7 @@ def _values_of(metadata: pq.FileMetaData, fields: set[str]) -> int:
     return sum(
         chunk.num_values
         for chunk in chunks
-        if any(
-            chunk.path_in_schema == field or chunk.path_in_schema.startswith(f"{field}.") for field in fields
-        )
+        if any(chunk.path_in_schema == field or chunk.path_in_schema.startswith(f"{field}.") for field in fields)
     )
 
 

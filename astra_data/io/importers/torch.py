@@ -41,8 +41,7 @@ def layout(source: Source) -> dict[str, Any]:
     missing = [field for field in (TIME, *PACE.values()) if field not in tensors]
     if missing:
         raise BadInputError(
-            f"{source}: not a joint log of PACE (time, dof_pos, des_dof_pos): no {', '.join(missing)}; pass "
-            "--mapping"
+            f"{source}: not a joint log of PACE (time, dof_pos, des_dof_pos): no {', '.join(missing)}; pass --mapping"
         )
     times = tensors[TIME].double().numpy().ravel()
     if len(times) < 2 or not times[-1] > times[0]:

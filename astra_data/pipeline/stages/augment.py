@@ -201,9 +201,7 @@ def _check(source: Dataset, world: Task) -> None:
     if "held_out" in source.metadata:
         faults.append("held_out: it has been augmented; augment its parent")
     faults += [
-        f"{column.name}: it has no roles, which say how it is rotated"
-        for column in _moving(source)
-        if not column.roles
+        f"{column.name}: it has no roles, which say how it is rotated" for column in _moving(source) if not column.roles
     ]
     if faults:
         raise BadInputError(f"{source.root} cannot be augmented for {world.name}: {'; '.join(faults)}")
@@ -236,9 +234,7 @@ def _shares(
     if config.episodes is not None:
         kept = count if config.keep_originals else len(held)
         if config.episodes < kept:
-            raise BadInputError(
-                f"--episodes {config.episodes}: expected at least {kept}, the number of episodes kept"
-            )
+            raise BadInputError(f"--episodes {config.episodes}: expected at least {kept}, the number of episodes kept")
         each, more = divmod(config.episodes - kept, int(usable.sum()))
         copies[usable] = each
         copies[training[usable[training]][:more]] += 1

@@ -246,9 +246,7 @@ def _behavior(
         by = partial(suboptimal_by_sac, steps=_SAC_STEPS, episode_steps=_SAC_EPISODE_STEPS)
         if config.behavior == "suboptimal_ppo":
             by = partial(suboptimal_by_ppo, steps=config.ppo_steps)
-        policy, metadata = by(
-            task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress
-        )
+        policy, metadata = by(task, seed=seed, folder=writer.folder, num_threads=num_threads, progress=progress)
         writer.policy = writer.folder / POLICY
         policy.save(writer.policy)
         metadata["policy_sha256"] = file_digest(writer.policy)

@@ -171,9 +171,7 @@ def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
         REWARD: reward.astype(np.float32),
         SUCCESS: success.numpy(),
     }
-    columns = (
-        computed | dict(given) | {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
-    )
+    columns = computed | dict(given) | {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
     kept = {key: values[:length] for key, values in columns.items()}
     return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
 

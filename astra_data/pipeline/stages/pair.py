@@ -81,9 +81,7 @@ def pair(
     _check(source, pairing)
     stopwatch = Stopwatch()
     batch = built(pairing, BATCH)
-    bounds = (
-        {} if pairing.commands is None else {"commands": {k: list(v) for k, v in pairing.commands.items()}}
-    )
+    bounds = {} if pairing.commands is None else {"commands": {k: list(v) for k, v in pairing.commands.items()}}
     meanings = {
         ABSTRACT_STATE: "abstract state of the target before the action",
         ABSTRACT_NEXT_STATE: "abstract state of the target after the action",
@@ -120,9 +118,7 @@ def pair(
             farthest = np.maximum(farthest, np.abs(paired[ABSTRACT_STATE]).max(axis=0))
             first = 0
             for episode in episodes:
-                values = {
-                    name: as_column(array[first : first + len(episode)]) for name, array in paired.items()
-                }
+                values = {name: as_column(array[first : first + len(episode)]) for name, array in paired.items()}
                 writer.add(Episode(episode.uid, {**episode.columns, **values}, episode.metadata))
                 first += len(episode)
             steps += first
@@ -187,9 +183,7 @@ def pair_steps(
         largest = max(largest, float(difference.max()))
         reached = stepped(batch, torch.from_numpy(as_rows(action[rows])), f"step of {pairing.id}").numpy()
         if reached.shape != wanted.shape:
-            raise BadInputError(
-                f"step of {pairing.id} returns shape {reached.shape}, expected {tuple(wanted.shape)}"
-            )
+            raise BadInputError(f"step of {pairing.id} returns shape {reached.shape}, expected {tuple(wanted.shape)}")
         if not np.isfinite(reached).all():
             row, entry = np.argwhere(~np.isfinite(reached))[0]
             raise BadInputError(

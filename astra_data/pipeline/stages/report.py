@@ -148,9 +148,7 @@ def _digests(recipe: Reported, root: Path, command: str, config: ReportConfig) -
         for seed in recipe.seeds
     ]
     read = {key: root / key / EVALUATION for key in keys} | {FOLDER: root / FOLDER / SELECTED}
-    settings = json.dumps(
-        [asdict(recipe), command, config.model_dump(), origin()], sort_keys=True, default=str
-    )
+    settings = json.dumps([asdict(recipe), command, config.model_dump(), origin()], sort_keys=True, default=str)
     digests = {key: file_digest(file) for key, file in read.items() if file.exists()}
     return digests | {"settings": sha256(settings.encode()).hexdigest()}
 

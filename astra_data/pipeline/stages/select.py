@@ -88,8 +88,7 @@ def judge_of(judge: str | None, rows: Sequence[str]) -> str:
     asked = judge or reference_of(rows) or next(grounding, None)
     if asked is None or not method_named(asked).grounds:
         raise BadInputError(
-            "expected a row that grounds its simulator, such as nas or astra, as judge, got "
-            f"{asked or 'none'}"
+            f"expected a row that grounds its simulator, such as nas or astra, as judge, got {asked or 'none'}"
         )
     return grounded_as(asked)
 
@@ -112,9 +111,7 @@ def benches(recipe: Reported, judge: str) -> list[Bench]:
                 seed,
                 percent,
                 artifact_key("train", row, seed, percent),
-                artifact_key("ground", grounded_as(row), seed, percent)
-                if method_named(row).grounds
-                else None,
+                artifact_key("ground", grounded_as(row), seed, percent) if method_named(row).grounds else None,
             )
             for row, base in able.items()
             for seed in recipe.seeds
@@ -130,9 +127,7 @@ def digests(of: list[Bench], root: Path) -> dict[str, str]:
     return {key: file_digest(file) for key, file in files.items()}
 
 
-def select(
-    recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Path, progress: Progress = silent
-) -> None:
+def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Path, progress: Progress = silent) -> None:
     """Try every finished policy of a recipe in groundings of other seeds; write `root`/select, ranked.
 
     Where a recipe has `data`, all seeds share their episodes, and the page says so. Policies of a size are
@@ -151,10 +146,7 @@ def select(
         known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
         for bench in contests:
             groundings = {seed: root / key / GROUNDING for seed, key in bench.judges.items()}
-            judges = {
-                seed: Judge(task_named(recipe.task), load_grounding(file))
-                for seed, file in groundings.items()
-            }
+            judges = {seed: Judge(task_named(recipe.task), load_grounding(file)) for seed, file in groundings.items()}
             for entry in bench.entries:
                 policy, success = entry.load(root, recipe.task), {}
                 for other in bench.judges:
@@ -166,9 +158,7 @@ def select(
                         known[read] = judges[other].success(policy, config.episodes, drawn)
                     success[other] = known[read]
                 write_file(begun, json.dumps(known))
-                found.append(
-                    Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success)
-                )
+                found.append(Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success))
                 note = f"{entry.row}, seed {entry.seed}: {found[-1].predicted:.2f}"
                 progress(len(found) / total * 0.99, note)
         judged = Judged(

@@ -7,9 +7,7 @@ from astra_data.dataset import edit
 from astra_data.dataset.reader import Dataset
 
 
-def subset(
-    dataset: Path, *, percent: int, of: int | None = None, out: Path, progress: Progress = silent
-) -> Path:
+def subset(dataset: Path, *, percent: int, of: int | None = None, out: Path, progress: Progress = silent) -> Path:
     """Write `percent` per cent of `of` episodes of `dataset` to `out`, as a dataset of its own.
 
     The dataset's stored permutation decides which episodes are taken; `percent` may exceed 100, which is by

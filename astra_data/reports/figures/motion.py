@@ -59,9 +59,7 @@ def can_replay(task: Task) -> bool:
 
 def replay_commands(task: Task) -> CommandReplay:
     """Drive one simulated and 60 target robots from the center of the start cell by the same commands."""
-    command = np.concatenate(
-        [np.tile(velocity, (round(seconds * task.fps), 1)) for velocity, seconds in _COMMANDS]
-    )
+    command = np.concatenate([np.tile(velocity, (round(seconds * task.fps), 1)) for velocity, seconds in _COMMANDS])
     robots = task.target(_ROBOTS, seed=0)
     robots.reset()
     states = robots.state.double().numpy()
@@ -217,9 +215,7 @@ def dynamics_mismatch(replay: CommandReplay) -> Figure:
             Line2D([], [], color=INK, lw=1.2, label="command, x"),
             Line2D([], [], color=INK, lw=1.2, ls=":", label="command, y"),
         ]
-        figure.legend(
-            handles=handles, loc="outside upper center", ncols=6, columnspacing=1.2, handlelength=1.6
-        )
+        figure.legend(handles=handles, loc="outside upper center", ncols=6, columnspacing=1.2, handlelength=1.6)
         return figure
 
 

@@ -65,9 +65,7 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
                     at = place + (np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else np.zeros(1))
                     drawn["one seed"] = axes.plot(seeds, at, "o", mew=0.9, ms=3.5, zorder=4, **_DOT)[0]
                 if own and score == results.headline:
-                    drawn["in its own simulator"] = axes.plot(own.value, place, "D", ms=5, zorder=5, **_DOT)[
-                        0
-                    ]
+                    drawn["in its own simulator"] = axes.plot(own.value, place, "D", ms=5, zorder=5, **_DOT)[0]
             axes.set_yticks(range(len(rows)), labels)
             axes.tick_params(axis="y", length=0)
             axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -78,9 +76,7 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
             axes.grid(visible=False, axis="y")
             axes.grid(visible=True, axis="x")
             names = [*drawn]
-            figure.legend(
-                [*drawn.values()], names, loc="outside upper center", ncols=len(names), columnspacing=1.4
-            )
+            figure.legend([*drawn.values()], names, loc="outside upper center", ncols=len(names), columnspacing=1.4)
             return figure
 
     return draw

@@ -164,9 +164,7 @@ class VelocityController:
         """Load weights from `path`, by default the checkpoint shipped with the package."""
         source = path or Path(str(files("astra_data.robots.ant") / "velocity_controller.safetensors"))
         tensors = load_file(source)
-        layers = [
-            (tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in range(len(tensors) // 2)
-        ]
+        layers = [(tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in range(len(tensors) // 2)]
         return cls(layers, float(tensors["torque_scale"]))
 
     def __call__(self, qpos: Floats, qvel: Floats, command: Floats) -> Floats:

@@ -120,9 +120,7 @@ class HumanoidWalker2d(FreeStates):
         plain = self._model
         if self._models[0] is plain:
             self._models = [copy(plain) for _ in self.state]
-        friction, timestep_scale = (
-            parameters[name][:, 0].tolist() for name in ("friction", "timestep_scale")
-        )
+        friction, timestep_scale = (parameters[name][:, 0].tolist() for name in ("friction", "timestep_scale"))
         for model, factor, scale in zip(self._models, friction, timestep_scale, strict=True):
             model.dof_damping[:] = factor * plain.dof_damping
             model.opt.timestep = scale * plain.opt.timestep

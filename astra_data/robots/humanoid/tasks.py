@@ -104,11 +104,7 @@ class Walking(Objective):
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:
         """Return the reward (B,) of a step between states (B, X), a fall where `failed` (B,)."""
         task = self.locomotion
-        return (
-            task.forward_reward * self.velocity(before, after)
-            + task.healthy_reward
-            + self.failure_reward * failed
-        )
+        return task.forward_reward * self.velocity(before, after) + task.healthy_reward + self.failure_reward * failed
 
 
 @dataclass(frozen=True)
@@ -217,8 +213,7 @@ def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 2
         viewer = OffScreenViewer(model, data, width, height)
     except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
         raise BadInputError(
-            f"expected OpenGL that works without a window, found none ({error}): set MUJOCO_GL to egl or "
-            "osmesa"
+            f"expected OpenGL that works without a window, found none ({error}): set MUJOCO_GL to egl or osmesa"
         ) from error
     # Along y, so that x goes to the right.
     viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = 3.8, 90.0, -8.0
@@ -303,9 +298,7 @@ def _task(
     )
 
 
-WALKER2D = _task(
-    "walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, beyond_walker2d, _WALKER_QUANTITIES
-)
+WALKER2D = _task("walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, beyond_walker2d, _WALKER_QUANTITIES)
 KINEMATICS = _task(
     "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, beyond_kinematics, _JOINT_QUANTITIES
 )

@@ -163,9 +163,7 @@ class BallAgent(PlanarStates):
         knock_m_s: speed of a ball that the mass walks into. kick_reach_m: distance between the centers below
         which the mass can kick the ball. kick_m_s: speed of a kicked ball.
         """
-        super().__init__(
-            maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device
-        )
+        super().__init__(maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device)
         self.parameters |= {"reach_m": reach_m, "knock_m_s": knock_m_s}
         self.parameters |= {"kick_reach_m": kick_reach_m, "kick_m_s": kick_m_s}
         self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)

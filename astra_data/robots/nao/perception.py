@@ -112,9 +112,7 @@ class BallSight:
         self.unseen_s[rows] = 0.0
         self._error[rows] = 0.0
 
-    def update(
-        self, ball: Floats, pose: Floats, estimated: Floats, rng: np.random.Generator, active: Bools
-    ) -> None:
+    def update(self, ball: Floats, pose: Floats, estimated: Floats, rng: np.random.Generator, active: Bools) -> None:
         """Update the estimates of the robots in `active` (B,) after a step to the true `ball` (B, 2).
 
         Their true poses are `pose` (B, 3), their `estimated` ones (B, 3).

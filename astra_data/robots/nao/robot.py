@@ -67,9 +67,7 @@ FALLEN_COSINE = 0.7
 """A robot has fallen when the cosine between its up axis and the vertical is below this (45°)."""
 MOTORS = len(TO_MOTORS)
 
-_STATE = int(
-    mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL
-)
+_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
 # Ankles among the motors: pitch, roll; left, right.
 _ANKLES = ((4, 5), (10, 11))
 
@@ -160,9 +158,7 @@ class BatchedBodies:
             mujoco.mj_getState(model, data, self.state[row], _STATE)
             self.pressure[row] = data.sensordata
 
-    def _walk(
-        self, model: mujoco.MjModel, data: mujoco.MjData, row: int, targets: Targets, noise: Floats
-    ) -> int:
+    def _walk(self, model: mujoco.MjModel, data: mujoco.MjData, row: int, targets: Targets, noise: Floats) -> int:
         style, sent, rates, step = self.style, self.sent[row], data.qvel[3:6], mujoco.mj_step
         planned = (targets.angles[row] + self.traits.joint_offset_rad[row])[:, TO_MOTORS]
         supports, lifts_off = targets.supports[row].tolist(), targets.lifts_off[row].tolist()
@@ -326,9 +322,7 @@ class BatchedNao:
     @property
     def velocity(self) -> Floats:
         """True velocity of the torsos on the floor, x, y in m/s, turn in rad/s, (B, 3)."""
-        turn = np.einsum(
-            "bi,bi->b", rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2], self.bodies.qvel[:, 3:6]
-        )
+        turn = np.einsum("bi,bi->b", rotation_matrix(self.bodies.qpos[:, 3:7])[:, 2], self.bodies.qvel[:, 3:6])
         return np.concatenate([self.bodies.qvel[:, :2], turn[:, None]], axis=1)
 
     @property

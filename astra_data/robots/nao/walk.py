@@ -367,9 +367,7 @@ class Targets:
     def reached(self, ticks: NDArray[np.intp]) -> Gait:
         """Return the gait of robots that followed `ticks` (B,) of them."""
         parts = {
-            part.name: np.stack([getattr(gait, part.name) for gait in self.gaits])[
-                ticks, np.arange(len(ticks))
-            ]
+            part.name: np.stack([getattr(gait, part.name) for gait in self.gaits])[ticks, np.arange(len(ticks))]
             for part in fields(Gait)
         }
         return Gait(**parts)
@@ -421,9 +419,7 @@ class WalkEngine:
         supporting = -behind - (ahead - behind) * phase
         offset = np.stack([supporting, swinging], axis=1)
         left = gait.left_swings.astype(np.intp)
-        offset = np.stack(
-            [offset[np.arange(len(left)), left], offset[np.arange(len(left)), 1 - left]], axis=1
-        )
+        offset = np.stack([offset[np.arange(len(left)), left], offset[np.arange(len(left)), 1 - left]], axis=1)
 
         yaw, apart = offset[..., 2], np.array([HIP_OFFSET_Y_M, -HIP_OFFSET_Y_M])
         x, y = offset[..., 0], offset[..., 1] + apart

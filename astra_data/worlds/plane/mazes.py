@@ -50,9 +50,7 @@ class Maze:
             ]
         per_cell = self.scale / self.fine_m if self.fine_m > 0 else 0.0
         if self.scale <= 0 or round(per_cell) < 2 or abs(per_cell - round(per_cell)) > 1e-6:
-            faults.append(
-                f"fine_m: expected a half of the scale, {self.scale} m, or a smaller part, got {self.fine_m}"
-            )
+            faults.append(f"fine_m: expected a half of the scale, {self.scale} m, or a smaller part, got {self.fine_m}")
         if faults:
             raise BadInputError(f"maze: {'; '.join(faults)}")
 
@@ -139,9 +137,7 @@ class Maze:
         entries = (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets)))
         graph = scipy.sparse.coo_array(entries, shape=(count, count)).tocsr()
         source = int(numbers[goal_cell])
-        lengths = (
-            np.asarray(scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=source)) * self.fine_m
-        )
+        lengths = np.asarray(scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=source)) * self.fine_m
         field = np.full(free.shape, np.inf)
         field[free] = lengths
         away, nearest = scipy.ndimage.distance_transform_edt(np.isinf(field), return_indices=True)

@@ -164,8 +164,6 @@ class PointMass(PlanarStates):
     def step(self, action: Tensor) -> Tensor:
         """Apply commands `action` (B, 2), clipped to ±1 per axis; return the new state (B, 4)."""
         position = self.state[:, :2]
-        moved, self.blocked = self.free.slide(
-            position, position + self.commanded_velocity(action) * self.period_s
-        )
+        moved, self.blocked = self.free.slide(position, position + self.commanded_velocity(action) * self.period_s)
         self.state = torch.cat([moved, (moved - position) / self.period_s], dim=-1)
         return self.state

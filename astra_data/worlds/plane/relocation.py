@@ -112,9 +112,7 @@ class Relocation:
             if world.ball_index is None or not self._begins_decided(before[0], goal):
                 judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
                 length = len(judged[DONE])
-                return Copy(
-                    {name: values[:length] for name, values in columns.items()} | judged, change, steps
-                )
+                return Copy({name: values[:length] for name, values in columns.items()} | judged, change, steps)
         return None
 
     def _begins_decided(self, state: Array, goal: Array) -> bool:
@@ -141,9 +139,7 @@ class Relocation:
         return rng.uniform(low, np.maximum(low, high), (_SHIFTS, 2))
 
 
-def outcomes(
-    objective: Objective, before: Array, after: Array, goal: Array, toppled: Array
-) -> dict[str, Array]:
+def outcomes(objective: Objective, before: Array, after: Array, goal: Array, toppled: Array) -> dict[str, Array]:
     """Return the outcome columns of an episode as the task pays them, up to the step that ends it, (T',).
 
     Steps lead from abstract states `before` to `after`, (T, X); in `toppled` (T,) ones the robot toppled.

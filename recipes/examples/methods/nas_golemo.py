@@ -121,9 +121,7 @@ def fit(fitting):
 
     optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     for epoch in range(config.epochs):
-        for episode in (
-            generator(fitting.seed, f"grounding epoch {epoch}").permutation(len(training)).tolist()
-        ):
+        for episode in generator(fitting.seed, f"grounding epoch {epoch}").permutation(len(training)).tolist():
             given = training.select(torch.tensor([episode])).windows
             loss = loss_of(given, given.mask.bool())
             optimizer.zero_grad()

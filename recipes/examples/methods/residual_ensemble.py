@@ -76,9 +76,7 @@ def fit(fitting):
     for update in range(fitting.descent.updates):
         drawn = torch.randint(len(state), (256,), device=fitting.device)
         loss = sum(
-            (member(ensemble.inputs(state[rows], action[rows])) - error[rows] / ensemble.error)
-            .square()
-            .mean()
+            (member(ensemble.inputs(state[rows], action[rows])) - error[rows] / ensemble.error).square().mean()
             for member, rows in zip(ensemble.members, bootstraps[:, drawn], strict=True)
         )
         optimizer.zero_grad()

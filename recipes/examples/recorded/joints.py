@@ -59,9 +59,7 @@ def task(name, joints, timestep_s, time_constant_s=None):
         abstract_state=column,
         abstraction=lambda state: state,
         commands=dict.fromkeys(targets, (-math.pi, math.pi)),
-        make_simulator=partial(
-            Joints, joints=len(joints), timestep_s=timestep_s, time_constant_s=time_constant_s
-        ),
+        make_simulator=partial(Joints, joints=len(joints), timestep_s=timestep_s, time_constant_s=time_constant_s),
         objective=Recorded([0.0] * column.size, len(targets)),
         quantities={"joints_rad": tuple(range(len(joints)))},
     )

@@ -64,9 +64,7 @@ class PlanarWalker(FreeStates):
         forward action f; here along the arc of a constant velocity.
         """
         turn, forward, left, _ = action.unbind(-1)
-        share = torch.stack(
-            [torch.where(forward > 0, 0.8 * forward + 0.2, 0.5 * forward), left, 0.6 * turn], -1
-        )
+        share = torch.stack([torch.where(forward > 0, 0.8 * forward + 0.2, 0.5 * forward), left, 0.6 * turn], -1)
         least, largest = FASTEST.to(action.device).unbind(-1)
         ahead, aside, turned = (share * torch.where(share > 0, largest, least) * STEP_S).unbind(-1)
         along, across = torch.sinc(turned / torch.pi), torch.sinc(turned / 2 / torch.pi) * (turned / 2).sin()

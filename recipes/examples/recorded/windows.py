@@ -130,9 +130,7 @@ def fit(fitting, is_network):
 
 
 fit_ridge, fit_network = (partial(fit, is_network=is_network) for is_network in (False, True))
-RIDGE = Method(
-    name="ridge", title="Ridge regression", color="#8C564B", fit=fit_ridge, grounding=WindowGrounding
-)
+RIDGE = Method(name="ridge", title="Ridge regression", color="#8C564B", fit=fit_ridge, grounding=WindowGrounding)
 NETWORK = Method(
     name="network", title="Network of one step", color="#E377C2", fit=fit_network, grounding=WindowGrounding
 )

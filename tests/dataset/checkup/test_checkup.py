@@ -266,8 +266,7 @@ def test_every_way_to_end_is_counted() -> None:
     ]
     outcomes = counted(ends, [True, False, False, None, False, None])
     assert str(outcomes) == (
-        "1 in success, 1 in failure, 1 terminated, success unknown, "
-        "2 after 50 steps, the longest (a time limit), 1 cut"
+        "1 in success, 1 in failure, 1 terminated, success unknown, 2 after 50 steps, the longest (a time limit), 1 cut"
     )
     assert outcomes.failures == [1]
     assert str(counted([(9, False), (12, False)], None)) == "2 cut"

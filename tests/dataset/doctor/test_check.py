@@ -250,9 +250,7 @@ def told(root: Path) -> list[str]:
 
 def test_the_statistics_of_episodes_are_compared_as_estimates(plain: Path) -> None:
     found = json.loads((plain / "meta/stats.json").read_text())["mode"]["max"][0]
-    number = next(
-        number for number, episode in enumerate(fake_episodes()) if episode.columns["mode"].max() == found
-    )
+    number = next(number for number, episode in enumerate(fake_episodes()) if episode.columns["mode"].max() == found)
     alter(EPISODES, "stats/mode/max", number, [found * (1 + 1e-4)])(plain)
     alter(EPISODES, "stats/mode/q50", number, [1.0])(plain)  # an estimate of lerobot's: not compared
     assert told(plain) == []
@@ -274,9 +272,7 @@ def test_the_statistics_of_episodes_are_compared_as_estimates(plain: Path) -> No
         ("mode", "count", 1),
     ],
 )
-def test_the_statistics_of_a_plain_dataset_are_compared(
-    plain: Path, name: str, kind: str, change: float
-) -> None:
+def test_the_statistics_of_a_plain_dataset_are_compared(plain: Path, name: str, kind: str, change: float) -> None:
     path = plain / "meta/stats.json"
     stats = json.loads(path.read_text())
     assert told(plain) == []
@@ -337,9 +333,7 @@ def test_lerobot_reads_the_same_windows(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @LEROBOT
-def test_what_lerobot_reads_otherwise_or_not_at_all_is_a_fault(
-    plain: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_lerobot_reads_otherwise_or_not_at_all_is_a_fault(plain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # lerobot takes boundaries from meta/episodes: the last ends a step off.
     alter(EPISODES, "dataset_to_index", 4, 54)(plain)
     faults = compared(plain, monkeypatch)

@@ -85,9 +85,7 @@ def test_every_saved_episode_of_a_killed_writer_is_recovered(
 
 
 @pytest.mark.parametrize("share", [0.05, 0.62])
-def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(
-    killed: Path, tmp_path: Path, share: float
-) -> None:
+def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(killed: Path, tmp_path: Path, share: float) -> None:
     root = tmp_path / "cut"
     shutil.copytree(killed / "saved", root)
     size = (root / DATA).stat().st_size
@@ -100,9 +98,7 @@ def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(
         assert "no whole row group" in str(error)
         return
     assert abs(repaired.episodes - 25 * share) < 3
-    assert (
-        f"{25 - repaired.episodes} of the 25 episodes that meta/info.json counts are lost" in repaired.notes
-    )
+    assert f"{25 - repaired.episodes} of the 25 episodes that meta/info.json counts are lost" in repaired.notes
     assert_saved(tmp_path / "saved", repaired.episodes)
 
 
@@ -321,8 +317,7 @@ def test_altered_metadata_is_not_taken_over(tmp_path: Path) -> None:
     edit(SUBSETS_PATH, uids=uids[::-1])(root)
     repaired = repair(root, out=tmp_path / "saved")
     assert repaired.notes == [
-        f"{METADATA_PATH} was altered after it was written: "
-        "success, return and the like of the episodes are lost",
+        f"{METADATA_PATH} was altered after it was written: success, return and the like of the episodes are lost",
         f"{SUBSETS_PATH} was altered after it was written: the order of the subsets is that of seed 0",
     ]
     saved = Dataset.open(tmp_path / "saved")
@@ -341,10 +336,7 @@ def test_episodes_with_other_values_than_the_original_are_left_out(tmp_path: Pat
     pq.write_table(table.set_column(at, table.field(REWARD), pa.array(rewards, pa.float32())), edited / DATA)
     uid, *others = original.uids.tolist()
     repaired = repair(edited, out=tmp_path / "joined", like=original)
-    assert (
-        f"left out the episode of uid {uid}: its values are not those in {original.reference}"
-        in repaired.notes
-    )
+    assert f"left out the episode of uid {uid}: its values are not those in {original.reference}" in repaired.notes
     joined = Dataset.open(tmp_path / "joined")
     assert joined.uids.tolist() == others
     assert joined.metadata == {key: values[1:] for key, values in original.metadata.items()}

@@ -45,9 +45,7 @@ def salvaged(root: Path, digests: Digests | None = None) -> tuple[list[int], lis
         (drop(EPISODES), [0, 1, 2, 3, 4], "meta/episodes was missing and was rebuilt from the data"),
     ],
 )
-def test_what_is_intact_is_read(
-    tmp_path: Path, damage: Callable[[Path], object], left: list[int], note: str
-) -> None:
+def test_what_is_intact_is_read(tmp_path: Path, damage: Callable[[Path], object], left: list[int], note: str) -> None:
     root = write_fake(tmp_path / "set").root
     damage(root)
     uids, notes = salvaged(root)
@@ -59,9 +57,7 @@ def test_what_is_intact_is_read(
 @pytest.mark.parametrize(
     "damage", [alter(DATA, "index", 9, 70), alter(DATA, "action", 9, [0.5, 0]), alter(DATA, "mode", 19, 3)]
 )
-def test_with_digests_an_altered_episode_costs_no_other(
-    tmp_path: Path, damage: Callable[[Path], object]
-) -> None:
+def test_with_digests_an_altered_episode_costs_no_other(tmp_path: Path, damage: Callable[[Path], object]) -> None:
     dataset = write_fake(tmp_path / "set")
     digests = read_digests(dataset.root, dataset.features)
     damage(dataset.root)
@@ -83,9 +79,7 @@ def deface(path: Path, group: int, column: str) -> None:
 
 @pytest.mark.parametrize("column", ["action", "episode_index", "frame_index"])
 @pytest.mark.parametrize("is_digested", [False, True])
-def test_an_unreadable_row_group_costs_its_episode_alone(
-    tmp_path: Path, column: str, *, is_digested: bool
-) -> None:
+def test_an_unreadable_row_group_costs_its_episode_alone(tmp_path: Path, column: str, *, is_digested: bool) -> None:
     dataset = write_fake(tmp_path / "set")
     digests = read_digests(dataset.root, dataset.features) if is_digested else None
     deface(dataset.root / DATA, 2, column)
@@ -165,15 +159,11 @@ def test_a_lost_file_costs_its_episodes_alone(
 
 @pytest.mark.parametrize("compression", ["snappy", "zstd"])
 @pytest.mark.parametrize("use_dictionary", [True, False])
-def test_footers_are_rebuilt_for_many_pages_per_column(
-    tmp_path: Path, compression: str, use_dictionary: bool
-) -> None:
+def test_footers_are_rebuilt_for_many_pages_per_column(tmp_path: Path, compression: str, use_dictionary: bool) -> None:
     rng = np.random.default_rng(0)
     rows = 5000
     listed = pa.FixedSizeListArray.from_arrays(pa.array(rng.normal(size=3 * rows).astype(np.float32)), 3)
-    schema = pa.schema(
-        [("few", pa.int64()), ("listed", listed.type), ("flag", pa.bool_()), ("many", pa.float64())]
-    )
+    schema = pa.schema([("few", pa.int64()), ("listed", listed.type), ("flag", pa.bool_()), ("many", pa.float64())])
     arrays = [rng.integers(0, 3, rows), listed, rng.random(rows) < 0.5, rng.normal(size=rows)]
     table = pa.Table.from_arrays([pa.array(array) for array in arrays], schema=schema)
     for version in ("1.0", "2.0"):
@@ -203,9 +193,7 @@ def test_pages_of_narrow_values_are_not_taken_for_those_of_a_wide_column(tmp_pat
     values = rng.normal(size=1000)
     table = pa.table({"narrow": values.astype(np.float32), "wide": values[::-1].copy()})
     path = tmp_path / "pages.parquet"
-    pq.write_table(
-        table, path, data_page_size=1, write_batch_size=250, use_dictionary=False, compression="snappy"
-    )
+    pq.write_table(table, path, data_page_size=1, write_batch_size=250, use_dictionary=False, compression="snappy")
     whole = path.read_bytes()
     path.write_bytes(whole[: -8 - int.from_bytes(whole[-8:-4], "little")])
     metadata = rebuilt_metadata(path, table.schema)

@@ -21,9 +21,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.card import Notes, render_card, write_card
 from astra_data.robots.registry import TASKS
 
-NOTES = Notes(
-    license="mit", summary="A sum.", behavior="It walks.", intended_use="For tests.", limits="Nothing real."
-)
+NOTES = Notes(license="mit", summary="A sum.", behavior="It walks.", intended_use="For tests.", limits="Nothing real.")
 
 
 def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:

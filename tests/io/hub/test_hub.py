@@ -39,9 +39,7 @@ def test_what_is_pulled_is_what_was_pushed(hub: Hub, fake: Dataset, home: Path) 
     assert contents(pulled.root) == contents(fake.root)
 
 
-def test_every_version_keeps_its_tag_and_main_shows_the_newest(
-    hub: Hub, fake: Dataset, tmp_path: Path
-) -> None:
+def test_every_version_keeps_its_tag_and_main_shows_the_newest(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
     push(fake.root, "me/it")
     repo = hub.repos["me/it"]
     first = dict(repo.tags)
@@ -65,9 +63,7 @@ def test_every_version_keeps_its_tag_and_main_shows_the_newest(
     assert contents(pull("me/it@data-1.0.0", out=tmp_path / "b").root) == contents(fake.root)
     with pytest.raises(BadInputError, match=r"no version data-3\.0\.0; it has data-1\.0\.0, data-1\.10\.0"):
         pull("me/it", version="3.0.0")
-    with pytest.raises(
-        BadInputError, match=r"has data-1\.10\.0 already.*data-1\.9\.0 can no longer be added"
-    ):
+    with pytest.raises(BadInputError, match=r"has data-1\.10\.0 already.*data-1\.9\.0 can no longer be added"):
         push(versioned(tmp_path / "late", "1.9.0").root, "me/it")
 
 
@@ -191,9 +187,7 @@ def test_a_plain_lerobot_dataset_is_neither_pulled_nor_overwritten(hub: Hub, fak
     with pytest.raises(BadInputError, match="holds a dataset that astra-data did not push"):
         push(fake.root, "me/it")
     repo.tags["data-1.0.0"] = repo.head
-    with pytest.raises(
-        SharingError, match=r"has no meta/astra/dataset\.json: it was not pushed by astra-data"
-    ):
+    with pytest.raises(SharingError, match=r"has no meta/astra/dataset\.json: it was not pushed by astra-data"):
         pull("me/it")
     assert repo.history[-1] == "by lerobot"
 

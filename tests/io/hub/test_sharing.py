@@ -41,9 +41,7 @@ def source(shared: Path) -> str:
 
 def resign(shared: Path) -> None:
     """Make SHA256SUMS agree with the files, as one who wishes harm would."""
-    files = {
-        path: content for path, content in contents(shared).items() if path.startswith(("data/", "meta/"))
-    }
+    files = {path: content for path, content in contents(shared).items() if path.startswith(("data/", "meta/"))}
     lines = [f"{hashlib.sha256(content).hexdigest()}  {path}\n" for path, content in files.items()]
     lines += [f"# {len(content)} bytes  {path}\n" for path, content in files.items()]
     (shared / "SHA256SUMS").write_text("".join(lines))
@@ -53,9 +51,7 @@ def hidden(out: Path) -> list[str]:
     return [path.name for path in out.parent.iterdir() if path.name.startswith(f".{out.name}")]
 
 
-def test_killed_at_any_moment_a_pull_leaves_nothing_unreadable(
-    fake: Dataset, shared: Path, tmp_path: Path
-) -> None:
+def test_killed_at_any_moment_a_pull_leaves_nothing_unreadable(fake: Dataset, shared: Path, tmp_path: Path) -> None:
     script = Path(__file__).parents[2] / "killed_pulls.py"
     command = [sys.executable, str(script), source(shared), str(tmp_path / "out"), str(fake.root), "6"]
     told = subprocess.run(command, capture_output=True, text=True)
@@ -91,9 +87,7 @@ def test_a_copy_that_was_altered_is_told(fake: Dataset, shared: Path, tmp_path: 
         # A changed byte, and a file that is shorter: of a data file, it can then not even be opened.
         for content in (bytes([whole[100] ^ 1]).join([whole[:100], whole[101:]]), whole[:-20]):
             (copy / path).write_bytes(content)
-            with pytest.raises(
-                CorruptDatasetError, match=r"was altered: .*Delete it, or pull to another"
-            ) as caught:
+            with pytest.raises(CorruptDatasetError, match=r"was altered: .*Delete it, or pull to another") as caught:
                 pull(source(shared), out=copy)
             assert ".." not in str(caught.value), "two messages in one"
         (copy / path).write_bytes(whole)
@@ -122,9 +116,7 @@ def test_a_folder_that_is_a_link_is_not_read(shared: Path, tmp_path: Path) -> No
         pull(source(shared), out=tmp_path / "out")
 
 
-def test_more_bytes_than_asked_for_are_refused_before_anything_is_fetched(
-    shared: Path, tmp_path: Path
-) -> None:
+def test_more_bytes_than_asked_for_are_refused_before_anything_is_fetched(shared: Path, tmp_path: Path) -> None:
     size = sum(len(content) for path, content in contents(shared).items() if "README" not in path)
     size -= (shared / "SHA256SUMS").stat().st_size
     with pytest.raises(SharingError, match=rf"has {size} bytes, of which at most {size - 1} .*--max-bytes"):
@@ -173,9 +165,7 @@ def test_a_listing_that_leads_out_of_the_folder_fetches_nothing(shared: Path, tm
     assert not hidden(tmp_path / "out")
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("name", "../../away"), ("name", ".."), ("name", 3), ("version", "9.0.0")]
-)
+@pytest.mark.parametrize(("key", "value"), [("name", "../../away"), ("name", ".."), ("name", 3), ("version", "9.0.0")])
 def test_a_description_cannot_choose_its_place(key: str, value: object, shared: Path, home: Path) -> None:
     description = json.loads((shared / "meta/astra/dataset.json").read_text()) | {key: value}
     (shared / "meta/astra/dataset.json").write_text(json.dumps(description))
@@ -228,9 +218,7 @@ def test_whole_files_are_not_fetched_again_and_others_are(
     assert not hidden(tmp_path / "out")
 
 
-def test_folders_in_folders_are_not_listed(
-    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_in_folders_are_not_listed(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A server may list one more in each, without end."""
     listed: list[str] = []
     ls = LocalFileSystem.ls
@@ -244,9 +232,7 @@ def test_folders_in_folders_are_not_listed(
     assert set(listed) == {str(shared.parent)}
 
 
-def test_no_more_is_fetched_than_is_listed(
-    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_more_is_fetched_than_is_listed(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the place does not know sizes, as some servers."""
     sizes = {path: len(content) for path, content in contents(shared).items()}
     total = sum(size for path, size in sizes.items() if path.startswith(("data", "meta")))
@@ -367,9 +353,7 @@ def test_a_second_push_sends_nothing(fake: Dataset, tmp_path: Path) -> None:
     assert contents(tmp_path / "shared") == before
 
 
-def test_notes_are_in_the_card_and_their_faults_are_told_before_anything_is_sent(
-    fake: Dataset, tmp_path: Path
-) -> None:
+def test_notes_are_in_the_card_and_their_faults_are_told_before_anything_is_sent(fake: Dataset, tmp_path: Path) -> None:
     notes = tmp_path / "notes.toml"
     notes.write_text('sumary = "It runs."\n')
     with pytest.raises(RecipeError, match="did you mean 'summary'"):

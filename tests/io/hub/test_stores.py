@@ -92,9 +92,7 @@ def test_a_version_there_never_changes(any_place: str, fake: Dataset, tmp_path: 
         push(changed(tmp_path / "changed").root, any_place)
 
 
-def test_the_newest_version_is_pulled_unless_another_is_named(
-    place: str, fake: Dataset, tmp_path: Path
-) -> None:
+def test_the_newest_version_is_pulled_unless_another_is_named(place: str, fake: Dataset, tmp_path: Path) -> None:
     push(fake.root, place)
     for version in ("1.10.0", "1.9.0"):
         push(write_fake(tmp_path / version, description={**DESCRIPTION, "version": version}).root, place)
@@ -129,9 +127,7 @@ def test_an_upload_that_stopped_is_not_there_and_is_finished_by_the_next(
     assert contents(pull(f"{place}/fake", out=tmp_path / "out").root) == contents(fake.root)
 
 
-def test_a_folder_of_datasets_is_answered_with_their_addresses(
-    place: str, fake: Dataset, tmp_path: Path
-) -> None:
+def test_a_folder_of_datasets_is_answered_with_their_addresses(place: str, fake: Dataset, tmp_path: Path) -> None:
     other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "walks"})
     for dataset in (other, fake):
         push(dataset.root, place)
@@ -200,12 +196,8 @@ def test_missing_rights_are_told(s3: str, fake: Dataset, monkeypatch: pytest.Mon
         store.versions()
 
 
-@pytest.mark.parametrize(
-    ("url", "module", "extra"), [("s3://b/x", "s3fs", "s3"), ("gs://b/x", "gcsfs", "gcs")]
-)
-def test_a_missing_back_end_is_told(
-    url: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("url", "module", "extra"), [("s3://b/x", "s3fs", "s3"), ("gs://b/x", "gcsfs", "gcs")])
+def test_a_missing_back_end_is_told(url: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     # fsspec remembers what it has imported before.
     known = sys.modules["fsspec.registry"].__dict__["_registry"]

@@ -15,13 +15,9 @@ DATA = "data/chunk-000/file-000.parquet"
 
 def test_sums_are_those_of_sha256sum(fake: Dataset, tmp_path: Path) -> None:
     (tmp_path / SUMS_PATH).write_text(make_sums(fake.root))
-    told = subprocess.run(
-        ["sha256sum", "-c", tmp_path / SUMS_PATH], cwd=fake.root, capture_output=True, text=True
-    )
+    told = subprocess.run(["sha256sum", "-c", tmp_path / SUMS_PATH], cwd=fake.root, capture_output=True, text=True)
     assert told.returncode == 0
-    assert (
-        told.stdout.count(": OK") == len(contents(fake.root)) == len(parse_sums(make_sums(fake.root), "it"))
-    )
+    assert told.stdout.count(": OK") == len(contents(fake.root)) == len(parse_sums(make_sums(fake.root), "it"))
 
 
 def test_sizes_are_listed_and_sums_without_them_are_refused(fake: Dataset) -> None:

@@ -75,9 +75,7 @@ def test_lines_that_are_empty_are_counted(tmp_path: Path, end: str) -> None:
 def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
     path = write_table(tmp_path / "log.csv", rows())
     path.write_text(path.read_text().replace("True", "perhaps"))
-    with pytest.raises(
-        BadInputError, match=r"log.csv line \d+: field 'fell': expected numbers.*got 'perhaps'"
-    ):
+    with pytest.raises(BadInputError, match=r"log.csv line \d+: field 'fell': expected numbers.*got 'perhaps'"):
         imported(tmp_path, path)
 
 
@@ -199,9 +197,7 @@ def test_files_that_cannot_be_joined_are_refused(tmp_path: Path) -> None:
     ):
         mapping = JOINED.replace(old, new)
         with pytest.raises(BadInputError, match=told):
-            imported(
-                tmp_path / "x", tmp_path / "logs", mapping if new else mapping.replace("gap_s = 0.15\n", "")
-            )
+            imported(tmp_path / "x", tmp_path / "logs", mapping if new else mapping.replace("gap_s = 0.15\n", ""))
     control = tmp_path / "logs/control.csv"
     control.write_text("t,u\n1.0,1\n0.5,2\n")
     with pytest.raises(BadInputError, match=r"control\.csv: 't' goes back or is missing: sort"):
@@ -223,9 +219,7 @@ def test_a_cell_may_be_a_list(tmp_path: Path, cell: str) -> None:
         [k, -k - 0.5, 100] for k in range(4)
     ]
     path.write_text(path.read_text() + "[1 2],3\n")
-    with pytest.raises(
-        BadInputError, match=r"field 'pose': expected a list of 3 numbers as in .* got '\[1 2\]'"
-    ):
+    with pytest.raises(BadInputError, match=r"field 'pose': expected a list of 3 numbers as in .* got '\[1 2\]'"):
         imported(tmp_path / "bad", path, mapping)
 
 

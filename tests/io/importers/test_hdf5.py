@@ -54,9 +54,7 @@ def test_without_next_observations_episodes_lose_their_last_row(tmp_path: Path) 
     np.testing.assert_array_equal(got[TRUNCATED], np.arange(10) == 9)
     fields["rewards"][5] += fields["rewards"][6]
     np.testing.assert_array_equal(got[REWARD], np.delete(fields["rewards"], [6, 11]))
-    assert dataset.metadata["return"] == pytest.approx(
-        [fields["rewards"][:6].sum(), fields["rewards"][7:11].sum()]
-    )
+    assert dataset.metadata["return"] == pytest.approx([fields["rewards"][:6].sum(), fields["rewards"][7:11].sum()])
     assert "taken without a mapping: observation.state from observations; action from act" in str(report)
 
 
@@ -254,10 +252,7 @@ def test_commands_among_observations_are_left_out_and_the_success_of_a_demonstra
     assert dataset.successes() == [True, False, True]
     assert [episode.columns["next.success"].sum() for episode in dataset.episodes()] == [1, 0, 1]
     told = str(report)
-    assert (
-        "observation.state from obs/contraction, obs/joint_pos; next.success from @success; without obs/"
-        in told
-    )
+    assert "observation.state from obs/contraction, obs/joint_pos; next.success from @success; without obs/" in told
     assert "\nfields left out: obs/actions, obs/camera, obs/last_action, states\n" in told
 
 

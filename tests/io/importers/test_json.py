@@ -72,9 +72,7 @@ def test_a_line_that_is_no_row_is_told_with_its_place(tmp_path: Path, line: str,
 
 
 @pytest.mark.parametrize("n", [3, 64])
-def test_a_last_line_that_is_cut_off_is_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int
-) -> None:
+def test_a_last_line_that_is_cut_off_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int) -> None:
     monkeypatch.setattr(json, "BLOCK_ROWS", 64)
     path = tmp_path / "log.jsonl"
     for tail, torn, more in (("", 0, 0), ('{"x": 1, "on": tr', 1, 0), ('{"x": 1, "on": true}', 0, 1)):
@@ -112,9 +110,7 @@ fps = 10
 fields = ["pose/at", "pose/yaw/rad"]
 """
     dataset, report = imported(tmp_path, path, mapping)
-    assert dataset.columns(["observation.state"])["observation.state"].tolist() == [
-        [k, -k, 0.5 * k] for k in range(5)
-    ]
+    assert dataset.columns(["observation.state"])["observation.state"].tolist() == [[k, -k, 0.5 * k] for k in range(5)]
     assert report.tally.unused_fields == ["u"]
     with pytest.raises(BadInputError, match=r"no field 'pose/yaw'.*(known: |did you mean ')"):
         imported(tmp_path / "bad", path, mapping.replace("pose/yaw/rad", "pose/yaw"))

@@ -49,9 +49,7 @@ def test_a_latched_topic_is_held_without_limit(tmp_path: Path) -> None:
 
 
 def test_time_far_apart_costs_nothing(tmp_path: Path) -> None:
-    messages = [
-        m for t in (0.0, 1e9) for k in range(3) for m in (pose(t + k / 10, 1), command(t + k / 10, 1))
-    ]
+    messages = [m for t in (0.0, 1e9) for k in range(3) for m in (pose(t + k / 10, 1), command(t + k / 10, 1))]
     dataset, _ = imported(tmp_path, write_json(tmp_path / "log.mcap", messages), MAPPING)
     assert dataset.lengths.tolist() == [2, 2]
 
@@ -159,19 +157,13 @@ def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
     path = write_json(tmp_path / "log.mcap", sorted(messages, key=lambda message: message[1]))
     imported(tmp_path, path, MAPPING)
     [warning] = caplog.messages
-    assert (
-        "log.mcap: /command is silent for over 0.35 s (split.gap_s) 3 times while others are not" in warning
-    )
+    assert "log.mcap: /command is silent for over 0.35 s (split.gap_s) 3 times while others are not" in warning
     assert "latched = true" in warning
     assert "That is right if the robot stops by itself" in warning
 
 
 def drive(begin: float, end: float) -> list[tuple[str, float, dict[str, Any]]]:
-    return [
-        m
-        for k in range(round(10 * begin), round(10 * end))
-        for m in (pose(k / 10, k), command(k / 10 + 0.02, k))
-    ]
+    return [m for k in range(round(10 * begin), round(10 * end)) for m in (pose(k / 10, k), command(k / 10 + 0.02, k))]
 
 
 def test_where_a_clock_is_set_back_an_episode_begins_and_is_counted(tmp_path: Path) -> None:
@@ -190,9 +182,7 @@ def test_a_bag_that_is_cut_off_is_read_up_to_there_and_counted(tmp_path: Path) -
         with path.open("wb") as file:
             writer = McapWriter(file, chunk_size=400)
             writer.start()
-            channels = {
-                topic: writer.register_channel(topic, "json", schema_id=0) for topic in ("/pose", "/command")
-            }
+            channels = {topic: writer.register_channel(topic, "json", schema_id=0) for topic in ("/pose", "/command")}
             for topic, time, content in drive(0, 3):
                 writer.add_message(channels[topic], ns(time), json.dumps(content).encode(), ns(time))
             writer.finish()  # type: ignore[no-untyped-call]
@@ -203,9 +193,7 @@ def test_a_bag_that_is_cut_off_is_read_up_to_there_and_counted(tmp_path: Path) -
     assert len(first) == 29 and 5 < len(second) < 20
     np.testing.assert_array_equal(second.columns[STATE], first.columns[STATE][: len(second)])
     assert report.tally.torn_rows == report.tally.rejected_rows == 1
-    told = (
-        f"rejected rows: 1; cut off at the end of their files: 1, the first is 1.mcap row {len(second) + 1}"
-    )
+    told = f"rejected rows: 1; cut off at the end of their files: 1, the first is 1.mcap row {len(second) + 1}"
     assert told in str(report)
     cut.write_bytes(written[:-1])
     assert import_dataset([cut], tmp_path / "mapping.toml", out=tmp_path / "all").tally.torn_rows == 0
@@ -257,9 +245,7 @@ def test_the_parts_of_a_split_bag_are_not_joined_without_a_word(tmp_path: Path) 
     for number, part in enumerate((messages[:40], messages[40:])):
         write_json(folder / f"bag_{number}.mcap", part)
     joined = f"{MAPPING}files = false\n"
-    with pytest.raises(
-        BadInputError, match=r"bag: split.files = false cannot join its 2 MCAP files, .*ros2 bag conv"
-    ):
+    with pytest.raises(BadInputError, match=r"bag: split.files = false cannot join its 2 MCAP files, .*ros2 bag conv"):
         imported(tmp_path, folder, joined)
     _, report = imported(tmp_path, folder, MAPPING)
     assert report.tally.split_points == {"file": 1, "source": 1}
@@ -354,9 +340,7 @@ def test_what_a_message_lacks_is_told_with_what_it_has(field: str, content: Any,
     assert str(error.value) == fault
 
 
-@pytest.mark.parametrize(
-    ("field", "left"), [("velocity[left]", 1.0), ("velocity", None), ("velocity.0", None)]
-)
+@pytest.mark.parametrize(("field", "left"), [("velocity[left]", 1.0), ("velocity", None), ("velocity.0", None)])
 def test_joints_in_another_order_are_told_apart_by_name_alone(field: str, left: float | None) -> None:
     of_joint = MessageField(f"/joints:{field}")
     of_joint.value(named(["left", "right"], [1.0, 2.0]))

@@ -74,9 +74,7 @@ fields = ["infos/success"]
 fields = ["infos/speed"]
 """
     dataset, report = imported(tmp_path, path, mapping)
-    assert "infos/speed, infos/success: of one entry more than steps, each step has the one after it" in str(
-        report
-    )
+    assert "infos/speed, infos/success: of one entry more than steps, each step has the one after it" in str(report)
     left = ["actions", "infos/unused", "observations/achieved_goal", "observations/desired_goal"]
     assert sorted(report.tally.unused_fields)[: len(left)] == left
     for got, length in zip(dataset.episodes(), LENGTHS, strict=True):

@@ -76,9 +76,7 @@ def test_every_kind_of_number_and_list_is_read(tmp_path: Path) -> None:
         ([True, None, False], "1 values are missing, and bool has no NaN"),
     ],
 )
-def test_what_is_no_number_in_each_row_is_told(
-    tmp_path: Path, column: pa.Array | list[Any], message: str
-) -> None:
+def test_what_is_no_number_in_each_row_is_told(tmp_path: Path, column: pa.Array | list[Any], message: str) -> None:
     with pytest.raises(BadInputError, match=rf"log\.parquet: field 'a': {message}"):
         read(tmp_path / "log.parquet", {"a": column})
 
@@ -87,9 +85,7 @@ def test_the_values_of_lists_count_and_those_of_other_columns_do_not(tmp_path: P
     lists = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(3000)), 3)
     path = tmp_path / "log.parquet"
     pq.write_table(pa.table({"x": lists, "xy": np.zeros(1000)}), path)
-    mapping = ImportMapping.model_validate(
-        {"name": "n", "task": "t", "fps": 1, "columns": {"x": {"fields": ("x",)}}}
-    )
+    mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": {"x": {"fields": ("x",)}}})
     with pytest.raises(BadInputError, match="holds values of 24000 bytes or more"):
         next(parquet.read(Source(path, None, path, most_bytes=23_999), mapping))
     assert len(next(parquet.read(Source(path, None, path, most_bytes=24_000), mapping)))

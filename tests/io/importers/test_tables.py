@@ -13,9 +13,7 @@ from astra_data.io.importers import hdf5, npz, parquet
 
 @pytest.mark.parametrize("block_rows", [4, 2**13])
 @pytest.mark.parametrize("name", TABLES)
-def test_every_value_arrives(
-    tmp_path: Path, name: str, block_rows: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_value_arrives(tmp_path: Path, name: str, block_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (npz, hdf5, parquet):
         monkeypatch.setattr(module, "BLOCK_ROWS", block_rows)
     fields = rows()
@@ -48,9 +46,7 @@ def test_missing_fields_are_all_told(tmp_path: Path, name: str) -> None:
     fields["commando"] = fields.pop("command")
     del fields["gait"]
     path = write_table(tmp_path / name, fields)
-    with pytest.raises(
-        BadInputError, match=r"no field 'command': did you mean 'commando'\?.*no field 'gait'"
-    ):
+    with pytest.raises(BadInputError, match=r"no field 'command': did you mean 'commando'\?.*no field 'gait'"):
         imported(tmp_path, path)
     assert not (tmp_path / "out").exists()
 
@@ -65,8 +61,6 @@ def test_ragged_fields_are_told(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_text_for_numbers_is_told(tmp_path: Path, name: str) -> None:
     fields = rows()
-    path = write_table(
-        tmp_path / name, fields | {"reward": np.full(20, b"much" if name == "log.h5" else "much")}
-    )
+    path = write_table(tmp_path / name, fields | {"reward": np.full(20, b"much" if name == "log.h5" else "much")})
     with pytest.raises(BadInputError, match=r"field 'reward'.*expected numbers"):
         imported(tmp_path, path)

@@ -29,9 +29,7 @@ def anymal(path: Path, count: int = 1200) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("block_rows", [500, 2**13])
-def test_a_log_of_pace_arrives_row_by_row(
-    tmp_path: Path, block_rows: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_of_pace_arrives_row_by_row(tmp_path: Path, block_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importer, "BLOCK_ROWS", block_rows)
     log = anymal(tmp_path / "chirp_data.pt")
     report = import_dataset([tmp_path / "chirp_data.pt"], PACE, out=tmp_path / "out")
@@ -100,9 +98,7 @@ def test_what_does_not_fit_is_told(tmp_path: Path, content: object, told: str) -
         import_dataset([tmp_path / "log.pt"], PACE, out=tmp_path / "out")
 
 
-def test_what_unpacks_to_far_more_than_its_size_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_unpacks_to_far_more_than_its_size_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("astra_data.io.recording.SMALL_BYTES", 10**5)
     log = {name: torch.zeros(10**5, 2) for name in ("time", "dof_pos", "des_dof_pos")}
     torch.save(log, tmp_path / "plain.pt")

@@ -42,9 +42,7 @@ def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
     assert metrics["deployed"] == ("target" if metrics["latent_r2"] >= 0.9 else "source")
 
 
-def test_the_agreement_is_that_of_held_out_episodes_alone(
-    paired: Path, grounded: Path, aligned: Path
-) -> None:
+def test_the_agreement_is_that_of_held_out_episodes_alone(paired: Path, grounded: Path, aligned: Path) -> None:
     model = load_history_model(grounded / "grounding.safetensors")
     encoder = load_target_encoder(aligned / "target_encoder.safetensors")
     _, held_out = PairedEpisodes.load(paired).split(ALIGN.held_out_share, 0)
@@ -78,14 +76,10 @@ def test_states_are_scaled_by_training_episodes_alone(paired: Path, aligned: Pat
     encoder = load_target_encoder(aligned / "target_encoder.safetensors")
     values = np.concatenate(training).astype(np.float64)
     np.testing.assert_allclose(encoder.state_mean.numpy(), values.mean(0), atol=1e-4)
-    np.testing.assert_allclose(
-        encoder.state_std.numpy(), values.std(0, ddof=1).clip(1e-3), rtol=1e-3, atol=1e-5
-    )
+    np.testing.assert_allclose(encoder.state_std.numpy(), values.std(0, ddof=1).clip(1e-3), rtol=1e-3, atol=1e-5)
 
 
-def test_the_paired_weight_adds_the_distance_of_paired_latents(
-    paired: Path, grounded: Path, tmp_path: Path
-) -> None:
+def test_the_paired_weight_adds_the_distance_of_paired_latents(paired: Path, grounded: Path, tmp_path: Path) -> None:
     """It is far larger than the discrepancy here, so that a few updates with it come closer."""
     distances = []
     for weight in (0.0, 100.0):
@@ -114,18 +108,14 @@ def test_where_phi_drops_the_place_the_encoder_does_not_see_it(
     align(config, dataset=paired, grounding=grounded, seed=0, out=out, device="cpu", progress=silent)
     scale = load_target_encoder(out / "target_encoder.safetensors").state_std
     assert scale[:2].isinf().all()
-    torch.testing.assert_close(
-        scale[2:], load_target_encoder(aligned / "target_encoder.safetensors").state_std[2:]
-    )
+    torch.testing.assert_close(scale[2:], load_target_encoder(aligned / "target_encoder.safetensors").state_std[2:])
 
 
 def stop(fraction: float, note: str) -> None:
     raise Stopped
 
 
-def test_after_an_interruption_it_goes_on(
-    paired: Path, grounded: Path, aligned: Path, tmp_path: Path
-) -> None:
+def test_after_an_interruption_it_goes_on(paired: Path, grounded: Path, aligned: Path, tmp_path: Path) -> None:
     out = tmp_path / "interrupted"
 
     def begin(progress: Progress) -> None:

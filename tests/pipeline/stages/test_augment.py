@@ -125,10 +125,7 @@ def test_the_target_does_what_copies_say(collected: Path, augmented: Path) -> No
     """Put the ant where a copy was, give it the copy's command, and it lands where the copy did."""
     pairs = list(copies(Dataset.open(collected), Dataset.open(augmented)))
     moved, original = (
-        [
-            np.concatenate([pair[side].columns[name] for pair in pairs])[::6]
-            for name in (STATE, ACTION, NEXT_STATE)
-        ]
+        [np.concatenate([pair[side].columns[name] for pair in pairs])[::6] for name in (STATE, ACTION, NEXT_STATE)]
         for side in (0, 1)
     )
 
@@ -277,19 +274,13 @@ def test_copies_differ_from_what_they_are_of() -> None:
         ({"episodes": 7}, r"--episodes 7: expected at least 8, the number of episodes kept"),
     ],
 )
-def test_what_cannot_be_done_is_told(
-    collected: Path, tmp_path: Path, changes: dict[str, Any], told: str
-) -> None:
+def test_what_cannot_be_done_is_told(collected: Path, tmp_path: Path, changes: dict[str, Any], told: str) -> None:
     with pytest.raises(BadInputError, match=told):
-        augment(
-            None, AugmentConfig(**changes), dataset=collected, seed=0, out=tmp_path / "out", progress=silent
-        )
+        augment(None, AugmentConfig(**changes), dataset=collected, seed=0, out=tmp_path / "out", progress=silent)
     assert not list(tmp_path.iterdir())
 
 
-def test_datasets_that_do_not_fit_are_refused(
-    collected: Path, augmented: Path, paired: Path, tmp_path: Path
-) -> None:
+def test_datasets_that_do_not_fit_are_refused(collected: Path, augmented: Path, paired: Path, tmp_path: Path) -> None:
     source = Dataset.open(collected)
     silent_columns = [replace(c, astra=None) if c.name == STATE else c for c in source.schema]
     mute = tmp_path / "mute"

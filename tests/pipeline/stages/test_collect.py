@@ -215,9 +215,7 @@ def test_only_as_many_episodes_are_kept_as_have_the_steps(
 
 def test_too_few_episodes_for_the_steps_are_told(task: str, tmp_path: Path) -> None:
     config = TINY.model_copy(update={"episodes": 2, "max_steps": 5, "least_steps": 11})
-    with pytest.raises(
-        BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: raise episodes"
-    ):
+    with pytest.raises(BadInputError, match=r"least_steps: expected 11, got 10 in 2 episodes: raise episodes"):
         collect(task, config, seed=0, out=tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()
 

@@ -175,9 +175,7 @@ def test_simulators_that_all_rows_share_begin_and_reward_alike(
 
 def test_longer_legs_change_the_target_alone(task: str, tmp_path: Path) -> None:
     usual, paths = make(task, "follower", tmp_path / "usual")
-    longer, others = make(
-        task, "follower", tmp_path / "longer", config=CONFIG.model_copy(update={"leg_scale": 1.25})
-    )
+    longer, others = make(task, "follower", tmp_path / "longer", config=CONFIG.model_copy(update={"leg_scale": 1.25}))
     assert (usual["leg_scale"], longer["leg_scale"]) == (1.0, 1.25)
     assert longer["raw"] == usual["raw"]
     assert torch.equal(others["goal"], paths["goal"])
@@ -227,9 +225,7 @@ def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
     task: str, trained: Path, grounded: Path, tmp_path: Path
 ) -> None:
     inputs = {"policy": trained, "grounding": grounded}
-    first, second = (
-        make(task, "astra", tmp_path / str(threads), inputs, num_threads=threads) for threads in (1, 2)
-    )
+    first, second = (make(task, "astra", tmp_path / str(threads), inputs, num_threads=threads) for threads in (1, 2))
     assert first[0]["encoder"] == "source"
     for world in ("target", "simulated"):
         assert first[0][world] == second[0][world]
@@ -238,9 +234,7 @@ def test_the_same_seed_gives_the_same_outcome_on_any_number_of_threads(
 def test_where_there_are_pictures_the_states_of_the_first_episode_are_kept(
     task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(
-        TASKS, task, replace(TASKS[task], photograph=lambda states: np.zeros((1, 2, 2, 3), np.uint8))
-    )
+    monkeypatch.setitem(TASKS, task, replace(TASKS[task], photograph=lambda states: np.zeros((1, 2, 2, 3), np.uint8)))
     told, paths = make(task, "follower", tmp_path / "out")
     filmed, steps = paths["target.state"], int(told["target"]["steps"][0])
     assert filmed.shape == (steps + 1, 29)
@@ -262,9 +256,7 @@ def test_an_episode_ends_with_its_success(
     assert min(told["target"]["return"]) > 9.0  # the bonus, and a step's progress
 
 
-def test_a_student_is_tested_in_the_target_and_in_its_varied_simulator(
-    task: str, paired: Path, tmp_path: Path
-) -> None:
+def test_a_student_is_tested_in_the_target_and_in_its_varied_simulator(task: str, paired: Path, tmp_path: Path) -> None:
     settings = RmaConfig(history_length=40, adaptation_steps=64)
     policy = tmp_path / "policy"
     inputs = {"dataset": paired, "grounding": None, "settings": settings}
@@ -283,22 +275,16 @@ def test_missing_inputs_are_told(task: str, trained: Path, tmp_path: Path) -> No
     with pytest.raises(BadInputError, match=r"policy.safetensors does not exist") as caught:
         make(task, "direct_transfer", tmp_path / "out", {"policy": tmp_path})
     assert "\n" not in str(caught.value)
-    with pytest.raises(
-        BadInputError, match="'follower' has no policy: leave it out, or name the policy's row"
-    ):
+    with pytest.raises(BadInputError, match="'follower' has no policy: leave it out, or name the policy's row"):
         make(task, "follower", tmp_path / "out", {"policy": trained})
 
 
 def test_what_does_not_fit_is_refused_before_any_episode(
     task: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(
-        BadInputError, match=r"the policy takes 24 values, .* gives 8: expected a policy of this"
-    ):
+    with pytest.raises(BadInputError, match=r"the policy takes 24 values, .* gives 8: expected a policy of this"):
         make(task, "direct_transfer", tmp_path / "out", {"policy": trained})
     (tmp_path / "out").mkdir()
-    monkeypatch.setattr(
-        "astra_data.pipeline.stages.evaluate.task_named", lambda name: pytest.fail("work was begun")
-    )
+    monkeypatch.setattr("astra_data.pipeline.stages.evaluate.task_named", lambda name: pytest.fail("work was begun"))
     with pytest.raises(BadInputError, match=r"out is already finished: remove it"):
         make(task, "follower", tmp_path / "out")

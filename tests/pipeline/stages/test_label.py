@@ -69,11 +69,7 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     # 0.4 m a step: the episode ends with the step that reaches the goal, between 1 and 2 m.
     goal = float(fast.columns[GOAL][0])
     assert len(fast) == int(np.ceil(goal / 0.4)) and 1.0 <= goal <= 2.0
-    assert (
-        fast.columns[SUCCESS].tolist()
-        == fast.columns[TERMINATED].tolist()
-        == [False] * (len(fast) - 1) + [True]
-    )
+    assert fast.columns[SUCCESS].tolist() == fast.columns[TERMINATED].tolist() == [False] * (len(fast) - 1) + [True]
     assert not fast.columns[TRUNCATED].any()
     np.testing.assert_allclose(fast.columns[REWARD][-1], 10.4, atol=1e-5)
     assert labeled.metadata["success"] == [False, True] and labeled.metadata["failed"] == [False, False]
@@ -83,9 +79,7 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     assert notes[-1] == f"1 successes, 0 failures in {10 + len(fast)} steps"
 
 
-def test_steps_that_do_not_lead_to_the_next_row_are_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_steps_that_do_not_lead_to_the_next_row_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     ahead = drive(0.5, 10)
     ahead[NEXT_STATE] = ahead[NEXT_STATE] + np.float32(0.01)
     told = f"steps whose {NEXT_STATE} is not the state of the next row: 9 of 9"
@@ -137,9 +131,7 @@ def test_failures_of_all_episodes_are_told(
     episodes = [drive(0.1, 5) | {TERMINATED: last & end, SUCCESS: last & False} for end in ends]
     columns = [column for column in OUTCOME_COLUMNS if column.name in (TERMINATED, *more)]
     kept = {column.name for column in (*COLUMNS, *columns)}
-    logs = write(
-        tmp_path / "logs", [{key: one[key] for key in one if key in kept} for one in episodes], (*columns,)
-    )
+    logs = write(tmp_path / "logs", [{key: one[key] for key in one if key in kept} for one in episodes], (*columns,))
     told = "logs@data-1.0.0: each of the 2 episodes ends as next.terminated and counts as a failure"
     assert any(remark.startswith(told) for remark in remarks(Dataset.open(logs), task_named(CART))) == is_told
 
@@ -185,14 +177,10 @@ def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
     lasted = with_outcomes(task, long, 0)
     assert lasted.columns[SUCCESS].tolist() == [False] * 9 + [True]
     assert lasted.metadata["success"] and lasted.columns[TRUNCATED].tolist() == [False] * 9 + [True]
-    fell = with_outcomes(
-        task, Episode(0, dict(long.columns) | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0
-    )
+    fell = with_outcomes(task, Episode(0, dict(long.columns) | {TERMINATED: lasted.columns[TRUNCATED]}, {}), 0)
     assert not fell.columns[SUCCESS].any() and fell.metadata["failed"]
     for over in ({}, {TERMINATED: lasted.columns[TRUNCATED]}):
-        told = with_outcomes(
-            task, Episode(0, dict(long.columns) | over | {SUCCESS: lasted.columns[SUCCESS]}, {}), 0
-        )
+        told = with_outcomes(task, Episode(0, dict(long.columns) | over | {SUCCESS: lasted.columns[SUCCESS]}, {}), 0)
         assert told.metadata["success"] and not told.metadata["failed"]
         assert not told.columns[TERMINATED].any()
         assert told.columns[TRUNCATED].tolist() == [False] * 9 + [True]
@@ -235,9 +223,7 @@ def test_the_seed_decides_the_goals(tmp_path: Path) -> None:
 
 def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
     logs = write(tmp_path / "logs", [drive(0.1, 3)])
-    with pytest.raises(
-        BadInputError, match=r"observation.state has 2 values, expected those of antmaze-umaze: 29"
-    ):
+    with pytest.raises(BadInputError, match=r"observation.state has 2 values, expected those of antmaze-umaze: 29"):
         label("antmaze-umaze", data=logs, out=tmp_path / "out")
     labeled = label(CART, data=logs, out=tmp_path / "labeled")
     with pytest.raises(BadInputError, match="already has goals and outcomes: there is nothing to label"):

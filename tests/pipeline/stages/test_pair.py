@@ -221,9 +221,7 @@ def test_names_that_are_not_the_tasks_are_told(
         (None, r"has the values .* in observation.state, expected the order "),
     ],
 )
-def test_data_of_another_robot_are_refused(
-    collected: Path, tmp_path: Path, state: Column | None, told: str
-) -> None:
+def test_data_of_another_robot_are_refused(collected: Path, tmp_path: Path, state: Column | None, told: str) -> None:
     source = Dataset.open(collected)
     columns = {column.name: column for column in source.schema}
     if state is None:

@@ -108,9 +108,7 @@ def test_a_finished_report_is_current_until_something_changes(root: Path) -> Non
     asked: dict[str, Any] = {"root": root, "command": COMMAND, "config": CONFIG}
     assert is_current(FakeRecipe(), **asked, publish=None)
     assert not is_current(replace(FakeRecipe(), seeds=(0, 1)), **asked)
-    assert not is_current(
-        FakeRecipe(), **asked | {"config": CONFIG.model_copy(update={"trajectory_episodes": 3})}
-    )
+    assert not is_current(FakeRecipe(), **asked | {"config": CONFIG.model_copy(update={"trajectory_episodes": 3})})
     path = root / "evaluate/astra/seed_0/evaluation.json"
     before = path.read_text()
     edit_json(path, wall_seconds=11.0)
@@ -298,9 +296,7 @@ def test_methods_without_simulator_or_seeds_and_datasets_are_reported(root: Path
         ({"seed": None}, r"evaluation.json is not .*seed: "),
     ],
 )
-def test_what_cannot_stand_in_one_table_is_refused(
-    root: Path, changes: dict[str, object], message: str
-) -> None:
+def test_what_cannot_stand_in_one_table_is_refused(root: Path, changes: dict[str, object], message: str) -> None:
     edit_json(root / "evaluate/astra/seed_1/evaluation.json", **changes)
     with pytest.raises(BadInputError, match=message):
         make(root)

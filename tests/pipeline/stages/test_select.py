@@ -95,9 +95,7 @@ def test_the_artifact_names_all_that_it_was_made_from(root: Path) -> None:
         judged(root)
 
 
-def test_an_interrupted_choice_goes_on_with_the_next_policy(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_choice_goes_on_with_the_next_policy(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, original, asked = judged(root), Judge.success, []
     shutil.rmtree(root / "select")
 
@@ -116,9 +114,7 @@ def test_an_interrupted_choice_goes_on_with_the_next_policy(
     assert not (root / "select/begun.json").exists()
 
 
-def test_another_policy_is_judged_anew_after_an_interruption(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_policy_is_judged_anew_after_an_interruption(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
     def success(self: Judge, policy: object, episodes: int, seed: int) -> float:
@@ -145,9 +141,7 @@ def test_judges_of_the_same_episodes_are_named(root: Path) -> None:
     found = judged(root, reported(root, methods=("nas",), settings={"data": "logs@data-1.0.0"}))
     assert found.shares_episodes
     page = (root / "select/select.md").read_text()
-    assert (
-        "fitted to the same episodes" in page and "no judge is independent of the policies it judges" in page
-    )
+    assert "fitted to the same episodes" in page and "no judge is independent of the policies it judges" in page
 
 
 def test_what_is_not_there_is_asked_for(root: Path) -> None:

@@ -222,8 +222,7 @@ def test_a_simulator_that_is_not_mastered_is_trained_in_again(
     assert {file.name for file in (tmp_path / "twice").iterdir()} >= {"policy.safetensors", "curve.json"}
     assert not list((tmp_path / "twice").glob("try_*"))
     assert (
-        make(task, "nas", paired, grounded, tmp_path / "once")
-        == (tmp_path / "twice/policy.safetensors").read_bytes()
+        make(task, "nas", paired, grounded, tmp_path / "once") == (tmp_path / "twice/policy.safetensors").read_bytes()
     )
 
 

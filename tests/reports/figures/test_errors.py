@@ -90,9 +90,7 @@ def test_validity_draws_a_dot_per_policy_in_its_methods_color() -> None:
         *(("nas", 0, "raw", 1.0), ("nas", 1, "raw", 2.0), ("astra_plus", 0, "raw", 5.0)),
         ("nas", 0, "grounded", 7.0),
     ]
-    lines = [
-        Line(row=row, seed=seed, where=where, values={"return": one}) for row, seed, where, one in returns
-    ]
+    lines = [Line(row=row, seed=seed, where=where, values={"return": one}) for row, seed, where, one in returns]
     found = Results(recipe="r", task="t", command="", rows=("nas", "astra_plus"), episodes=1, lines=lines)
     figure = predictive_validity(found, SCENE)
     assert figure is not None

@@ -177,9 +177,7 @@ def test_each_axis_of_a_mismatch_has_its_own_values_and_bands() -> None:
     assert np.asarray(speed.lines[1].get_ydata()) == pytest.approx(5.0)
     # A command holds during the step that ends at its time.
     assert [line.get_drawstyle() for line in sent.lines] == ["steps-pre"] * 2
-    means = [
-        dynamics_mismatch(CommandReplay(time_s, command, simulated, target)).axes[0].lines[0].get_ydata()
-    ]
+    means = [dynamics_mismatch(CommandReplay(time_s, command, simulated, target)).axes[0].lines[0].get_ydata()]
     assert np.asarray(means)[0] == pytest.approx([51.0, 51.0, 1.0])
     for axes, at, apart in ((x, 1.0, 1.0), (y, 2.0, 2.0)):
         mean, one = (np.asarray(line.get_ydata()) for line in axes.lines)

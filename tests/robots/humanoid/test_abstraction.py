@@ -101,7 +101,5 @@ def test_the_lean_of_the_torso_is_told_from_within() -> None:
     state = states(20)
     abstract = humanoid_to_extended_kinematics(state)
     for row, ours in zip(state, abstract[:, 40:], strict=True):
-        np.testing.assert_allclose(
-            ours[:3], posed_abstraction(row).body("torso").xmat.reshape(3, 3)[2], atol=1e-12
-        )
+        np.testing.assert_allclose(ours[:3], posed_abstraction(row).body("torso").xmat.reshape(3, 3)[2], atol=1e-12)
         np.testing.assert_array_equal(ours[3:], row[27:30])

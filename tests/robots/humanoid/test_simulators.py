@@ -235,9 +235,7 @@ def test_the_center_of_mass_moves_as_if_the_lower_foot_stood(bent: int) -> None:
     before[0, bent] = -0.4
     simulator.reset_to(before)
     after = simulator.step(torch.tensor([[0.1, -0.5, 0.3, 0.2]]))
-    (mass, feet), (later_mass, later_feet) = (
-        level(state[0, :17].double().numpy()) for state in (before, after)
-    )
+    (mass, feet), (later_mass, later_feet) = (level(state[0, :17].double().numpy()) for state in (before, after))
     foot = {5: 0, 9: 1}[bent]
     assert feet[foot, 2] < feet[1 - foot, 2] - 0.01
     way = (later_mass - later_feet[foot]) - (mass - feet[foot])

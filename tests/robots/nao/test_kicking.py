@@ -35,9 +35,7 @@ def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     diagonal = 0.5**0.5
     assert velocity[0].tolist() == pytest.approx([0.7 * diagonal, 0.7 * diagonal], abs=1e-6)
     assert place[0].tolist() == pytest.approx([0.1 + 0.19 * diagonal, 0.19 * diagonal], abs=1e-6)
-    beside, turned = knock(
-        before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7, turn_rad=torch.pi / 4
-    )
+    beside, turned = knock(before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7, turn_rad=torch.pi / 4)
     # It begins where the body touches it, whichever way it leaves.
     assert torch.equal(beside, place)
     assert turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
@@ -254,9 +252,7 @@ def test_starts_are_where_the_task_says() -> None:
         ((0.0, -2.0), False, False),
     ],
 )
-def test_a_ball_is_in_the_goal_in_the_field_or_out(
-    ball: tuple[float, float], reached: bool, missed: bool
-) -> None:
+def test_a_ball_is_in_the_goal_in_the_field_or_out(ball: tuple[float, float], reached: bool, missed: bool) -> None:
     where = state((0.0, 0.0), ball)
     assert bool(TASK.reached(where, GOAL)) == reached
     assert bool(TASK.missed(where, GOAL)) == missed

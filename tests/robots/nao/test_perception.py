@@ -76,9 +76,7 @@ def test_the_ball_is_seen_worse_from_afar(distance: float, spread: float) -> Non
 
 @pytest.mark.parametrize("heading", [0.0, 3.0, -3.0])
 @pytest.mark.parametrize(("bearing_deg", "seen"), [(99, True), (-99, True), (101, False), (-101, False)])
-def test_a_ball_is_seen_up_to_100_degrees_to_either_side(
-    heading: float, bearing_deg: float, seen: bool
-) -> None:
+def test_a_ball_is_seen_up_to_100_degrees_to_either_side(heading: float, bearing_deg: float, seen: bool) -> None:
     sight = BallSight(1, PerceptionErrors(ball_missed=0.0), STEP_S)
     sight.reset(np.array([0]), np.zeros((1, 2)))
     angle = np.arctan2(np.sin(heading + np.radians(bearing_deg)), np.cos(heading + np.radians(bearing_deg)))

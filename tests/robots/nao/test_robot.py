@@ -40,9 +40,7 @@ def test_masses_and_joints_are_the_published_ones() -> None:
     fixed = 1.0496 + 0.0784 + 0.6594 + 2 * (0.0930 + 0.1578 + 0.0648 + 0.0776 + 0.1853)
     masses = (0.0698, 0.1405, 0.3897, 0.3014, 0.1342, 0.1718)
     assert model.body("Torso").mass[0] == pytest.approx(fixed)
-    assert [model.joint(joint).name for joint in range(1, 13)] == [
-        side + name for side in "LR" for name in LEG
-    ]
+    assert [model.joint(joint).name for joint in range(1, 13)] == [side + name for side in "LR" for name in LEG]
     for side, sign in (("L", 1.0), ("R", -1.0)):
         np.testing.assert_allclose([model.body(side + name).mass[0] for name in LEG], masses)
         for name in LEG[1:]:
@@ -88,9 +86,7 @@ STANDING = leg_angles(WalkEngine(StepPlanner(np.ones(1)), STYLE).feet(Gait.stand
 FIRST = 3  # the longest delay: so many angles are under way when a control step begins
 
 
-def bodies(
-    count: int = 1, *, height_m: float = 0.0, style: WalkStyle = STYLE, **traits: NDArray[Any]
-) -> BatchedBodies:
+def bodies(count: int = 1, *, height_m: float = 0.0, style: WalkStyle = STYLE, **traits: NDArray[Any]) -> BatchedBodies:
     drawn = replace(Traits.draw(IDENTICAL, count, np.random.default_rng(0)), **traits)
     made = BatchedBodies(nao_model(), drawn, longest_delay_ticks=FIRST, style=style, num_threads=1)
     qpos = np.tile(made.model.qpos0, (count, 1))
@@ -171,9 +167,7 @@ def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
     ("lifts_off", "lean_deg", "waits"),
     [(1, -5, True), (1, 5, False), (-1, 5, True), (-1, -5, False), (0, -5, False)],
 )
-def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(
-    lifts_off: int, lean_deg: float, waits: bool
-) -> None:
+def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(lifts_off: int, lean_deg: float, waits: bool) -> None:
     robots = bodies()
     half = np.radians(lean_deg) / 2
     robots.qpos[0, 3:5] = np.cos(half), np.sin(half)  # positive rolls are to the right
@@ -185,9 +179,7 @@ def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(("degrees", "fallen"), [(44.5, False), (-44.5, False), (46.5, True), (-46.5, True)])
-def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(
-    axis: int, degrees: float, fallen: bool
-) -> None:
+def test_a_robot_that_leans_by_over_45_degrees_any_way_has_fallen(axis: int, degrees: float, fallen: bool) -> None:
     """In the air, where nothing turns it."""
     robots, half = bodies(height_m=1.0), np.radians(degrees) / 2
     robots.qpos[0, 3] = np.cos(half)

@@ -72,9 +72,7 @@ def test_goals_have_to_be_within_their_cell() -> None:
     distance = Navigation(narrow, horizon=1, spread_m=0.11, path_clearance_m=0.1).goal_distance
     rows, columns = narrow.fine_index(distance.lattice.double().numpy())
     # Each field is least at its own goal.
-    assert [divmod(int(field.argmin()), 50) for field in distance.fields] == [
-        *zip(rows, columns, strict=True)
-    ]
+    assert [divmod(int(field.argmin()), 50) for field in distance.fields] == [*zip(rows, columns, strict=True)]
 
 
 def test_paths_to_the_goal_keep_the_clearance() -> None:
@@ -102,9 +100,7 @@ class Straight(Navigation):
     """Progress is paid as the crow flies."""
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
-        return torch.pairwise_distance(before[:, :2], goal, eps=0) - torch.pairwise_distance(
-            after[:, :2], goal, eps=0
-        )
+        return torch.pairwise_distance(before[:, :2], goal, eps=0) - torch.pairwise_distance(after[:, :2], goal, eps=0)
 
 
 STRAIGHT = Straight(U_MAZE, horizon=10)
@@ -126,9 +122,7 @@ class Dots(PlanarTarget):
         return torch.tensor([True, False, False])
 
 
-def judged(
-    target: PlanarTarget, after: Sequence[Sequence[float]], fallen: Sequence[bool] = (False,) * 3
-) -> Step:
+def judged(target: PlanarTarget, after: Sequence[Sequence[float]], fallen: Sequence[bool] = (False,) * 3) -> Step:
     """Return the outcome of a step from the origin, whose goals are at (1, 0)."""
     target.goal = torch.tensor([[1.0, 0.0]] * 3)
     return target._judged(torch.zeros(3, 2), torch.tensor(after), np.array(fallen))

@@ -95,9 +95,7 @@ def test_what_fits_nowhere_is_given_up() -> None:
 
 
 @pytest.mark.parametrize(("toppled_at", "length", "success"), [(None, 16, True), (9, 10, False)])
-def test_an_episode_ends_at_the_goal_or_where_it_topples(
-    toppled_at: int | None, length: int, success: bool
-) -> None:
+def test_an_episode_ends_at_the_goal_or_where_it_topples(toppled_at: int | None, length: int, success: bool) -> None:
     # 0.1 m per step along the lower corridor; within 0.45 m of the goal from step 15 on.
     path = straight((AIM[0] + 2.0, AIM[1]), (AIM[0] - 1.0, AIM[1]), 30)
     before, after = (TASK.abstraction(path.columns[name]) for name in (STATE, NEXT_STATE))
