@@ -112,6 +112,22 @@ def test_a_command_passes_its_options_to_its_stage(
     assert {key: value for key, value in told[2].items() if given_by_default.get(key) != value} == expected
 
 
+@pytest.mark.parametrize(
+    ("words", "folder"),
+    [("", "deploy/nas/seed_0"), ("--seed 1 --percent 50", "deploy/nas/percent_050/seed_1"), ("--out there", "there")],
+)
+def test_a_policy_is_deployed_within_its_run_unless_out_says_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, folder: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = Path("runs/cart")
+    run.mkdir(parents=True)
+    (run / "recipe.json").write_text("{}")
+    monkeypatch.setattr("astra_data.deployment.folder.deploy", lambda run, row, out, **_: out)
+    result = CliRunner().invoke(cli.app, ["deploy", str(run), "--row", "nas", *words.split()])
+    assert result.output == f"finished: {Path(folder) if '--out' in words else run / folder}\n"
+
+
 def test_faults_of_all_recipes_are_told(recipe: Path, tmp_path: Path) -> None:
     broken = [tmp_path / "a.toml", tmp_path / "b.toml"]
     for path in broken:

@@ -1,3 +1,6 @@
+import re
+from pathlib import Path
+
 import pytest
 from html_pages import read_page
 
@@ -73,6 +76,18 @@ def test_each_value_carries_the_title_of_its_column_which_phones_show_beside_it(
     assert (image["width"], image["height"]) == ("200", "100")
     css = html("r", [])
     assert "attr(data-label)" in css and "filter: invert" in css
+
+
+def test_figures_drawn_on_white_are_dark_where_the_page_is() -> None:
+    pictures = [Picture("drawn", "A figure", ""), Picture("seen", "A photograph", "", photo=True)]
+    text = html("r", [Section("", pictures)], {"drawn": PNG, "seen": PNG})
+    drawn, seen = read_page(text).attributes("img")
+    assert (drawn.get("class"), seen.get("class")) == (None, "photo")
+    dark = re.findall(r"prefers-color-scheme: dark\) \{(.*?)\n\}", text, flags=re.DOTALL)
+    (rule,) = (line for block in dark for line in block.splitlines() if "img" in line)
+    assert rule.split(maxsplit=2)[:2] == [".plate", "img:not(.photo)"] and "invert(" in rule
+    site = (Path(__file__).parents[2] / "docs/site.css").read_text()
+    assert re.search(r'data-md-color-scheme="slate"\] .*img \{ filter: invert\(', site)
 
 
 def test_columns_of_words_are_aligned_left_and_of_numbers_right() -> None:

@@ -71,8 +71,10 @@ def test_a_correction_that_makes_the_simulator_worse_is_named(tmp_path: Path) ->
     write(tmp_path, 100, 0, 0.2)
     warning = "**Here the correction makes the simulator worse.**"
     assert warning not in page(tmp_path, 50, 100)
-    write(tmp_path, 50, 0, 0.1, grounded={"mean": [0.1, 9.0]})
-    write(tmp_path, 100, 0, 0.2, grounded={"mean": [0.2, 4.5]})
+    write(tmp_path, 50, 0, 0.1, grounded={"mean": [0.1, 9.0], "low": [0.09, 8.0]})
+    write(tmp_path, 100, 0, 0.2, grounded={"mean": [0.2, 4.5], "low": [0.18, 4.3]})
+    assert warning not in page(tmp_path, 50, 100)  # without a correction it is up to 4.4
+    write(tmp_path, 100, 0, 0.2, grounded={"mean": [0.2, 4.5], "low": [0.18, 4.41]})
     # By the most data: there it is 0.2 after a step, as half of what it is without, and 4 without after ten.
     text = page(tmp_path, 50, 100)
     assert warning in text and "- `x`, NAS: 10 steps ahead (4.5, without 4)\n" in text
@@ -114,6 +116,14 @@ def test_nothing_finished_is_no_page_and_a_malformed_file_one_line(tmp_path: Pat
     (tmp_path / "ground/nas/percent_025/seed_0/gap.json").write_text("{}")
     with pytest.raises(BadInputError, match="is not what its stage writes"):
         page(tmp_path, 25)
+
+
+def test_how_well_rewards_and_states_are_predicted_stands_on_the_page(tmp_path: Path) -> None:
+    write(tmp_path, 100, 0, 0.1)
+    epochs = [{"r2_state": 0.1, "r2_reward": 0.9}, {"r2_state": 0.97, "r2_reward": -2.7}]
+    (tmp_path / "ground/nas/percent_100/seed_0/metrics.json").write_text(json.dumps({"epochs": epochs}))
+    text = page(tmp_path, 100)
+    assert "| grounding | state | reward of steps that go on |\n" in text and "| NAS | 0.97 | -2.70 |" in text
 
 
 def write_failures(root: Path, seed: int, auc: float, last: float | None = None) -> None:

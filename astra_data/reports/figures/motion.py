@@ -94,20 +94,30 @@ RIM = 0.35
 
 
 def trajectories(results: Results, scene: Scene) -> Figure | None:
-    """Draw one maze per method: dashed in the simulator, solid where tested; failures end with a cross."""
-    folders = scene.folders(results)
-    if scene.task.plane is None or not folders:
+    """Draw the plane once per method: dashed in the simulator, solid where tested; failures end with a cross.
+
+    Return None where no method has positions in a plane (`Objective.places`).
+    """
+    maze = scene.task.maze if scene.task.plane else None
+    panels = {row: _walked(folder, scene.episodes) for row, folder in scene.folders(results).items()}
+    shown = np.concatenate([path.reshape(-1, 2) for one in panels.values() for path in one.paths] or [np.empty((0, 2))])
+    if not np.isfinite(shown).any():
         return None
-    maze = scene.task.maze
-    columns = min(len(folders), COLUMNS)
-    rows = -(-len(folders) // columns)
-    across, up = (float(np.ptp(ends)) for ends in _view(maze))
+    view = _view(maze) if maze else _around(shown)
+    columns = min(len(panels), COLUMNS)
+    rows = -(-len(panels) // columns)
+    across, up = (float(np.ptp(ends)) for ends in view)
     with style():
         height = (PANEL_INCHES * up / across + 0.3) * rows + 0.35
         figure = Figure(figsize=(max(4.2, PANEL_INCHES * columns), height), layout="constrained")
-        for place, (row, folder) in enumerate(folders.items()):
+        for place, (row, panel) in enumerate(panels.items()):
             axes = figure.add_subplot(rows, columns, place + 1)
-            _maze_panel(axes, maze, folder, scene.episodes)
+            axes.set(xlim=view[0], ylim=view[1], aspect="equal")
+            if maze:
+                draw_walls(axes, maze)
+            else:
+                axes.tick_params(labelsize=6)
+            panel.draw(axes, maze)
             title = method_title(row)
             # The number has to find room beside it.
             size = TITLE_POINTS * min(1.0, TITLE_LETTERS / len(title))
@@ -118,26 +128,56 @@ def trajectories(results: Results, scene: Scene) -> Figure | None:
             Line2D([], [], color=SIMULATED, ls="--", label="in its simulator"),
             Line2D([], [], color=DEPLOYED, label=results.where),
             Line2D([], [], color=INK, marker="x", ls="", mew=1.8, label="failed here"),
-            Line2D([], [], marker="*", ls="", ms=11, mfc="#FFD23F", mec=INK, mew=0.8, label="goal"),
         ]
+        if maze:
+            handles.append(Line2D([], [], marker="*", ls="", ms=11, mfc="#FFD23F", mec=INK, mew=0.8, label="goal"))
         ncols = 4 if columns > 2 else 2
         figure.legend(handles=handles, loc="outside lower center", ncols=ncols, columnspacing=1.6)
         return figure
 
 
-def _maze_panel(axes: Axes, maze: Maze, folder: Path, episodes: int) -> None:
-    """Draw the first episodes of an evaluation; in m, of the robot and of a ball."""
+@dataclass(frozen=True)
+class _Walked:
+    """The first N episodes of an evaluation: paths (N, T, 2 K) in m, tested and simulated, and goals (N, G)."""
+
+    tested: Floats
+    tested_success: Bools
+    simulated: Floats
+    simulated_success: Bools
+    goal: Floats
+
+    @property
+    def paths(self) -> tuple[Floats, Floats]:
+        return self.tested, self.simulated
+
+    def draw(self, axes: Axes, maze: Maze | None) -> None:
+        _paths(axes, self.tested, self.tested_success, DEPLOYED, "-")
+        _paths(axes, self.simulated, self.simulated_success, SIMULATED, "--")
+        for x, y in _goals(maze, self.goal) if maze else ():
+            axes.plot(x, y, "*", ms=13, mfc="#FFD23F", mec=INK, mew=0.8, zorder=6)
+
+
+def _walked(folder: Path, episodes: int) -> _Walked:
     evaluation = read_json(Evaluation, folder / EVALUATION)
     tested = f"{evaluation.tested_in}.position"
     tensors = read_tensors(folder / TRAJECTORIES, (tested, "goal"))
-    draw_walls(axes, maze)
-    success = np.array(evaluation.outcomes.success[:episodes], dtype=bool)
-    _paths(axes, tensors[tested][:episodes], success, DEPLOYED, "-")
-    if evaluation.simulated is not None and "simulated.position" in tensors:
-        success = np.array(evaluation.simulated.success[:episodes], dtype=bool)
-        _paths(axes, tensors["simulated.position"][: len(success)], success, SIMULATED, "--")
-    for x, y in _goals(maze, tensors["goal"][:episodes]):
-        axes.plot(x, y, "*", ms=13, mfc="#FFD23F", mec=INK, mew=0.8, zorder=6)
+    simulated, outcomes = tensors.get("simulated.position"), evaluation.simulated
+    if simulated is None or outcomes is None:
+        simulated, outcomes = tensors[tested][:0], evaluation.outcomes
+    return _Walked(
+        tensors[tested][:episodes],
+        np.array(evaluation.outcomes.success[:episodes], dtype=bool),
+        simulated[:episodes],
+        np.array(outcomes.success[: min(episodes, len(simulated))], dtype=bool),
+        tensors["goal"][:episodes],
+    )
+
+
+def _around(points: Floats) -> tuple[Floats, Floats]:
+    """Return (left, right) and (bottom, top) in m: all points (N, 2), and a tenth of the larger side around them."""
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    rim = max(0.1 * float((high - low).max()), 0.1)
+    return np.array([low[0] - rim, high[0] + rim]), np.array([low[1] - rim, high[1] + rim])
 
 
 def strips(results: Results, scene: Scene) -> Figure | None:
@@ -238,7 +278,7 @@ def _goals(maze: Maze, goals: Floats) -> list[Floats]:
 
 
 def draw_walls(axes: Axes, maze: Maze) -> None:
-    """Draw the walls of a maze, and show no more than it."""
+    """Draw the walls of a maze, and no axes."""
     corner = maze.scale / 2
     cells = []
     for row, column in maze.wall_cells():
@@ -246,10 +286,6 @@ def draw_walls(axes: Axes, maze: Maze) -> None:
         cells.append(Rectangle((x - corner, y - corner), maze.scale, maze.scale))
     # The thin edge in the wall's own color closes the hairlines between neighboring cells.
     axes.add_collection(PatchCollection(cells, fc=WALL, ec=WALL, lw=0.5, zorder=1))
-    (left, right), (bottom, top) = _view(maze)
-    axes.set_xlim(left, right)
-    axes.set_ylim(bottom, top)
-    axes.set_aspect("equal")
     axes.set_axis_off()
 
 

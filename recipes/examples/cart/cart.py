@@ -49,6 +49,9 @@ class Deliver(Objective):
         ahead, left = heading_x * east + heading_y * north, heading_x * north - heading_y * east
         return torch.stack([ahead, left], dim=-1) / 3.0
 
+    def places(self, state):  # x and y in m, for the figure of paths
+        return state[..., :2]
+
     def far(self, state):
         return (state[:, :2] - state.new_tensor(DOCK_M)).norm(dim=-1)
 

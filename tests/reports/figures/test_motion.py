@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ from astra_data.robots.nao.target import NaoEnv
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.protocols import Step
+from astra_data.worlds.user_code import user_object
+
+CART = Path(__file__).parents[3] / "recipes/examples/cart/cart.py"
 
 
 def results(*rows: str, **changes: object) -> Results:
@@ -51,6 +55,7 @@ def write(
     goal: NDArray[np.float64] | None = None,
     ball: bool = False,
     simulated: bool = True,
+    positions: int = 2,
 ) -> None:
     folder = root / f"evaluate/{row}/seed_0"
     folder.mkdir(parents=True)
@@ -59,11 +64,11 @@ def write(
         **{measure: [0, 1, 1] for measure in ("failed", "wall_contact", "steps", "return")},
     }
     values = {"task": "t", "method": row, "seed": 0, "episodes": 3, "target": outcomes}
-    target = np.concatenate([paths(), paths() + 0.5], axis=-1) if ball else paths()
+    target = np.concatenate([paths(), paths() + 0.5], axis=-1) if ball else paths()[..., :positions]
     tensors = {"target.position": target, "goal": np.full((3, 2), -4.0) if goal is None else goal}
     if simulated:
         values["simulated"] = outcomes
-        tensors["simulated.position"] = paths()
+        tensors["simulated.position"] = paths()[..., :positions]
     tensors["target.state"] = np.zeros((40, 4))
     (folder / "evaluation.json").write_text(json.dumps(values))
     save_file(tensors, folder / "trajectories.safetensors")
@@ -100,9 +105,25 @@ def test_trajectories_draw_a_panel_per_method_with_crosses_where_episodes_fail(s
     assert not [line for line in follower.lines if line.get_color() == SIMULATED]
     (walls,) = astra.collections
     assert len(walls.get_paths()) == len(U_MAZE.wall_cells())
-    assert trajectories(results("astra"), replace(scene, task=TASKS["humanoid-walker2d"])) is None
     named = replace(scene, methods=("astra", "nas"))
     assert len(drawn(trajectories(results("astra", "follower"), named)).axes) == 1
+
+
+def test_without_a_maze_paths_are_drawn_where_they_lead(scene: Scene) -> None:
+    cart = replace(scene, task=user_object(f"{CART}:TASK"))
+    write(scene.root, "astra", goal=np.zeros((3, 0)))
+    write(scene.root, "nas", goal=np.zeros((3, 0)), simulated=False)
+    astra, nas = drawn(trajectories(results("astra", "nas"), cart)).axes
+    assert [line.get_color() for line in astra.lines if line.get_linestyle() != "None"] == [DEPLOYED] * 3 + [
+        SIMULATED
+    ] * 3
+    # From -4 to 4 in x and at 4 in y, and a tenth around it.
+    assert nas.get_xlim() == pytest.approx((-4.8, 4.8)) and nas.get_ylim() == pytest.approx((3.2, 4.8))
+    assert not [line for line in astra.lines if line.get_marker() == "*"] and not astra.collections
+    write(scene.root, "rma", goal=np.zeros((3, 0)), positions=0)
+    assert trajectories(results("rma"), replace(scene, task=TASKS["humanoid-walker2d"])) is None
+    state = torch.tensor([[0.5, -0.25, 1.0, 0.0]])
+    assert cart.task.objective.places(state).tolist() == [[0.5, -0.25]]
 
 
 def test_a_star_stands_at_the_mean_goal_of_each_cell_and_a_ball_has_a_path_of_its_own(scene: Scene) -> None:
