@@ -41,14 +41,12 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     show_version: Annotated[
-        bool,
-        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
     no_fsync: Annotated[
         bool,
         typer.Option(
-            "--no-fsync",
-            help="Do not wait for the disk: faster, but a power failure may lose what was written.",
+            "--no-fsync", help="Do not wait for the disk: faster, but a power failure may lose what was written."
         ),
     ] = False,
 ) -> None:
@@ -109,10 +107,7 @@ for panel, commands in PANELS.items():
         epilog = f"Example: astra-data {example}"
         app.command(example.split()[0], rich_help_panel=panel, epilog=epilog)(command)
 app.add_typer(
-    starting.app,
-    name="recipes",
-    help="List or copy the package's recipes and mappings.",
-    rich_help_panel="Recipes",
+    starting.app, name="recipes", help="List or copy the package's recipes and mappings.", rich_help_panel="Recipes"
 )
 
 

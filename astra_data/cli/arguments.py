@@ -70,8 +70,7 @@ def _device(name: str) -> str:
 
 
 DatasetName = Annotated[
-    str,
-    typer.Argument(metavar="DATASET", help="A folder, name@data-1.2.0, or a name (for its highest version)."),
+    str, typer.Argument(metavar="DATASET", help="A folder, name@data-1.2.0, or a name (for its highest version).")
 ]
 Source = Annotated[
     str,

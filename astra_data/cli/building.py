@@ -105,8 +105,7 @@ def augment(
     task: Annotated[
         str | None,
         typer.Option(
-            help="Task that computes the rewards and endings of the copies.",
-            show_default="the dataset's own task",
+            help="Task that computes the rewards and endings of the copies.", show_default="the dataset's own task"
         ),
     ] = None,
     name: NewName = None,

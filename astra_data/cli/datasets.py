@@ -33,9 +33,7 @@ def subset(
     of: Annotated[
         int | None,
         typer.Option(
-            min=1,
-            help="Number of episodes that counts as 100 percent.",
-            show_default="all episodes of DATASET",
+            min=1, help="Number of episodes that counts as 100 percent.", show_default="all episodes of DATASET"
         ),
     ] = None,
     seeds: Annotated[
@@ -66,26 +64,14 @@ def subset(
     from astra_data.dataset.versions import open_dataset
 
     source = open_dataset(dataset)
-    _report(
-        write(
-            source,
-            episodes=episodes,
-            percent=percent,
-            of=of,
-            seed=seed,
-            stratify=stratify,
-            name=name,
-            out=out,
-        )
-    )
+    _report(write(source, episodes=episodes, percent=percent, of=of, seed=seed, stratify=stratify, name=name, out=out))
 
 
 def merge(
     datasets: Annotated[
         list[str],
         typer.Argument(
-            metavar="DATASET",
-            help="Two or more datasets with the same columns, fps, task, environment and simulator.",
+            metavar="DATASET", help="Two or more datasets with the same columns, fps, task, environment and simulator."
         ),
     ],
     new_uids: Annotated[
@@ -104,8 +90,7 @@ def merge(
 def filter_(
     dataset: DatasetName,
     without: Annotated[
-        list[int] | None,
-        typer.Option(metavar="UID", help="Leave out the episode with this uid; may be repeated."),
+        list[int] | None, typer.Option(metavar="UID", help="Leave out the episode with this uid; may be repeated.")
     ] = None,
     success: Annotated[
         bool | None, typer.Option("--success/--no-success", help="Keep only successes, or only failures.")
@@ -151,8 +136,7 @@ def _report(folder: Path) -> None:
 def inspect(
     dataset: DatasetName,
     plot: Annotated[
-        Path | None,
-        typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures"),
+        Path | None, typer.Option(help="Folder for figures of positions and velocities.", show_default="no figures")
     ] = None,
     json: Annotated[
         Path | None,
@@ -228,12 +212,7 @@ def list_(
                 faults.append(str(error))
                 continue
             steps = int(found.lengths.sum())
-            facts = (
-                printable(found.description["stage"]),
-                f"{len(found):,}",
-                f"{steps:,}",
-                found.content_hash[:12],
-            )
+            facts = (printable(found.description["stage"]), f"{len(found):,}", f"{steps:,}", found.content_hash[:12])
             table.add_row(found.reference, *facts)
     show_table(table)
     if faults:

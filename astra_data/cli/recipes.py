@@ -25,8 +25,7 @@ from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.core.naming import RUNS, artifact_key
 
 Publish = Annotated[
-    bool,
-    typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe."),
+    bool, typer.Option("--publish", help="Add the results to those in the folder results/ next to the recipe.")
 ]
 Row = Annotated[str, typer.Option(metavar="ROW", help="A row of the run's recipe, such as astra_plus.")]
 
@@ -81,14 +80,12 @@ def check(
     recipes: Annotated[
         list[str],
         typer.Argument(
-            metavar="RECIPE|TASK...",
-            help="Recipes (TOML files); or tasks: names, or places like cart.py:TASK.",
+            metavar="RECIPE|TASK...", help="Recipes (TOML files); or tasks: names, or places like cart.py:TASK."
         ),
     ],
     root: Root = RUNS,
     verify: Annotated[
-        bool,
-        typer.Option("--verify", help="Read every byte of the artifacts instead of comparing only their sizes."),
+        bool, typer.Option("--verify", help="Read every byte of the artifacts instead of comparing only their sizes.")
     ] = False,
 ) -> None:
     """Check recipes, listing which artifacts are finished, damaged or stale; or tasks. Nothing is run."""
@@ -258,8 +255,7 @@ def select(
         typer.Option(help="With --trials: number of candidates to try.", show_default="as many as the trials allow"),
     ] = None,
     percent: Annotated[
-        int | None,
-        typer.Option(help="With --trials, after a sweep: the dataset size whose policies are tried."),
+        int | None, typer.Option(help="With --trials, after a sweep: the dataset size whose policies are tried.")
     ] = None,
 ) -> None:
     """Rank the trained policies of a run without the target, or with a few trials in it."""

@@ -41,8 +41,7 @@ MaxBytes = Annotated[
     ),
 ]
 SkipBad = Annotated[
-    bool,
-    typer.Option("--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end."),
+    bool, typer.Option("--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end.")
 ]
 
 
@@ -137,8 +136,7 @@ def pull(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SOURCE",
-            help="user/name on the Hugging Face Hub, or the URL or path of the dataset's folder.",
+            metavar="SOURCE", help="user/name on the Hugging Face Hub, or the URL or path of the dataset's folder."
         ),
     ],
     out: Out = None,
@@ -146,8 +144,7 @@ def pull(
         str | None, typer.Option(help="Version to download, such as 1.2.0.", show_default="the newest")
     ] = None,
     max_bytes: Annotated[
-        int | None,
-        typer.Option(min=1, help="Refuse a dataset whose files are larger in total.", show_default="100 GB"),
+        int | None, typer.Option(min=1, help="Refuse a dataset whose files are larger in total.", show_default="100 GB")
     ] = None,
 ) -> None:
     """Download and verify a shared dataset; run again to continue, or to verify the copy."""

@@ -14,12 +14,10 @@ _NAMED = 5
 def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the robot: a-z, 0-9 and _.")],
     logs: Annotated[
-        list[Path] | None,
-        typer.Option("--from", help="The robot's logs: CSV files, folders of them, or a dataset."),
+        list[Path] | None, typer.Option("--from", help="The robot's logs: CSV files, folders of them, or a dataset.")
     ] = None,
     more: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[LOG]...", help="More logs, so that --from logs/*.csv works."),
+        list[Path] | None, typer.Argument(metavar="[LOG]...", help="More logs, so that --from logs/*.csv works.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="The new folder.", show_default="NAME")] = None,
 ) -> None:

@@ -45,11 +45,7 @@ def refuse_finished(out: Path) -> None:
 
 @contextmanager
 def finished_folder(
-    out: Path,
-    *,
-    replace: bool = False,
-    config: str | None = None,
-    made_from: Mapping[str, str | None] | None = None,
+    out: Path, *, replace: bool = False, config: str | None = None, made_from: Mapping[str, str | None] | None = None
 ) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds, without checkpoints of trainings.
 

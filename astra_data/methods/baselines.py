@@ -9,10 +9,7 @@ DIRECT_TRANSFER = Method(name="direct_transfer", title="Direct transfer", color=
 
 
 DOMAIN_RANDOMIZATION = Method(
-    name="domain_randomization",
-    title="Domain randomization",
-    color="#CC79A7",
-    learn=InSimulator(ranges="randomized"),
+    name="domain_randomization", title="Domain randomization", color="#CC79A7", learn=InSimulator(ranges="randomized")
 )
 
 

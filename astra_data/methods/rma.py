@@ -57,9 +57,5 @@ class TeacherThenStudent(InSimulator):
 
 
 RMA = Method(
-    name="rma",
-    title="RMA",
-    color="#A6761D",
-    learn=TeacherThenStudent(ranges="wide"),
-    table=Table("rma", RmaConfig),
+    name="rma", title="RMA", color="#A6761D", learn=TeacherThenStudent(ranges="wide"), table=Table("rma", RmaConfig)
 )

@@ -88,10 +88,7 @@ class Watcher(Protocol):
 
 
 def run_in_order(
-    items: Collection[Item],
-    jobs: int | None,
-    begin: Callable[[Item], object],
-    wait: Callable[[], Collection[str]],
+    items: Collection[Item], jobs: int | None, begin: Callable[[Item], object], wait: Callable[[], Collection[str]]
 ) -> None:
     """Begin each item, in order of preference, as soon as its inputs are finished, at most `jobs` at a time.
 

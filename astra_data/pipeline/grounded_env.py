@@ -96,9 +96,7 @@ def evaluate_policy(
     evaluate = _planned(run, tested, "evaluate", row, seed, percent, ("target_encoder", "reference"))
     episodes = training.episodes
     evaluate(
-        policy=PolicyFile(own, simulation, episodes.reference, episodes.content_hash),
-        out=Path(out),
-        progress=progress,
+        policy=PolicyFile(own, simulation, episodes.reference, episodes.content_hash), out=Path(out), progress=progress
     )
 
 

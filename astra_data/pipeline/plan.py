@@ -61,11 +61,7 @@ class Selection:
 
     @classmethod
     def of(
-        cls,
-        recipe: Recipe,
-        methods: Sequence[str] = (),
-        seeds: Sequence[int] = (),
-        percents: Sequence[int] = (),
+        cls, recipe: Recipe, methods: Sequence[str] = (), seeds: Sequence[int] = (), percents: Sequence[int] = ()
     ) -> "Selection":
         """Return those that are named; of an axis on which nothing is named, all."""
         for method in methods:

@@ -57,10 +57,7 @@ def view_run(run: Path, uids: Sequence[int] = (), *, seed: int | None = None, sa
             held_out = episodes.split(share, drawn)[1]
             simulators[row_of_key(item.key)] = load_grounding(made)
     wanted = torch.tensor(uids or held_out.uids[:5].tolist())
-    episodes, task = (
-        episodes.select(torch.isin(episodes.uids, wanted).nonzero()[:, 0]),
-        task_named(recipe.task),
-    )
+    episodes, task = (episodes.select(torch.isin(episodes.uids, wanted).nonzero()[:, 0]), task_named(recipe.task))
     episodes.check(task)
     replays = {name: replay_open_loop(task, one, episodes, seed=0) for name, one in simulators.items()}
 

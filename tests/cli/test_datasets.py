@@ -229,11 +229,7 @@ def test_validate_and_repair(
     ],
 )
 def test_repair_is_not_advised_where_it_cannot_help(
-    content: str,
-    fault: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    content: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = write_fake(tmp_path / "set").root
     (root / "meta/info.json").write_text(content)

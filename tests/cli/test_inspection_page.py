@@ -15,10 +15,7 @@ NOTHING = Checkup("fake@data-1.0.0", ("endings: 3 cut", "rate: 20 Hz declared"),
 
 
 def test_findings_stand_below_all_else() -> None:
-    findings = (
-        Finding("warning", "a [gap] of 3 s", "begin there", (4, 9)),
-        Finding("note", "constant: x", "check it"),
-    )
+    findings = (Finding("warning", "a [gap] of 3 s", "begin there", (4, 9)), Finding("note", "constant: x", "check it"))
     file = StringIO()
     checkup = replace(NOTHING, findings=findings)
     Console(file=file, width=120).print(inspection_page(inspection(success=1), checkup))

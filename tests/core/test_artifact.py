@@ -9,13 +9,7 @@ import pytest
 import torch
 from failing_disk import failing
 
-from astra_data.core.artifact import (
-    CHECKPOINT,
-    MANIFEST,
-    finished_folder,
-    read_manifest,
-    write_manifest,
-)
+from astra_data.core.artifact import CHECKPOINT, MANIFEST, finished_folder, read_manifest, write_manifest
 from astra_data.core.checkpoint import save_tensors
 from astra_data.core.errors import BadInputError, DiskError
 
@@ -83,10 +77,7 @@ def test_a_finished_folder_is_replaced_only_on_request_and_after_success(tmp_pat
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["old"]
     with finished_folder(tmp_path / "out", replace=True) as folder:
         (folder / "new").touch()
-    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
-        "out",
-        "out/new",
-    ]
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["out", "out/new"]
 
 
 @pytest.mark.parametrize("renames", [0, 1, 2])
@@ -114,10 +105,7 @@ def test_a_kill_while_replacing_loses_nothing(tmp_path: Path, renames: int, monk
     assert [path.name for path in out.iterdir()] == ["new" if renames == 2 else "old"]
     with finished_folder(out, replace=True) as folder:
         (folder / "newer").touch()
-    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
-        "out",
-        "out/newer",
-    ]
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["out", "out/newer"]
 
 
 @pytest.mark.usefixtures("fsync")

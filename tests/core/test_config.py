@@ -4,14 +4,7 @@ from typing import Literal
 import pytest
 from pydantic import ConfigDict, Field, ValidationError
 
-from astra_data.core.config import (
-    Config,
-    faults_of,
-    in_full,
-    load_recipe,
-    own_settings,
-    validated,
-)
+from astra_data.core.config import Config, faults_of, in_full, load_recipe, own_settings, validated
 from astra_data.core.errors import BadInputError, RecipeError
 
 

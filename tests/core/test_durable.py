@@ -155,10 +155,7 @@ def test_cleaning_spares_what_lives_and_what_is_resumed(tmp_path: Path) -> None:
 
 def test_the_fault_that_hdf5_hides_in_its_text_is_found() -> None:
     text = "Can't decrement id ref count (file write failed: time = Mon\n, filename = 'x', errno = 28, error"
-    with (
-        pytest.raises(DiskError, match=r"out\.hdf5 cannot be written: the disk is full"),
-        writing(Path("out.hdf5")),
-    ):
+    with pytest.raises(DiskError, match=r"out\.hdf5 cannot be written: the disk is full"), writing(Path("out.hdf5")):
         raise RuntimeError(text)
     assert "a file cannot be read or written: the disk is full" in str(disk_error(RuntimeError(text)))
 

@@ -24,14 +24,7 @@ Learn = Callable[..., tuple[PolicyFile, dict[str, Any]]]
 
 TASK = TASKS["antmaze-umaze"]
 STEPS = 30
-CONFIG = IqlConfig(
-    critic_updates=12,
-    policy_updates=8,
-    fine_tuning_updates=5,
-    batch_windows=4,
-    window=10,
-    burn_in=2,
-)
+CONFIG = IqlConfig(critic_updates=12, policy_updates=8, fine_tuning_updates=5, batch_windows=4, window=10, burn_in=2)
 
 
 @pytest.fixture

@@ -63,11 +63,7 @@ def fitting(folder: Path, moved_by: float = 0.0, task: Task = TASK) -> Fitting:
     action = 1.2 * torch.rand(8, 20, 1, generator=generator) - 0.6
     simulated = state + 0.1 * TASK.limits.in_units(action)
     windows = SimpleNamespace(
-        state=state,
-        action=action,
-        next_state=simulated + moved_by,
-        simulated_next=simulated,
-        mask=torch.ones(8, 20),
+        state=state, action=action, next_state=simulated + moved_by, simulated_next=simulated, mask=torch.ones(8, 20)
     )
     episodes: Any = SimpleNamespace(
         windows=windows,
@@ -243,10 +239,7 @@ METHOD = Method(name="", title="",
 @pytest.mark.parametrize(
     ("rest", "told"),
     [
-        (
-            "fit=fit, table=Table('mine', Ours)",
-            "has settings that nothing reads: expected configures=.ground",
-        ),
+        ("fit=fit, table=Table('mine', Ours)", "has settings that nothing reads: expected configures=.ground"),
         ("table=Table('mine', Ours), configures='ground'", "has settings that nothing reads: .* needs fit"),
         (
             "fit=fit, table=Table('mine', Theirs), configures='ground'",

@@ -104,12 +104,7 @@ def test_data_are_not_asked_for_once_they_are_labeled(recipe: Path, monkeypatch:
 
 def test_data_that_were_paired_are_refused(recipe: Path) -> None:
     write_logs(recipe.parent / "first", -1.0, 4.0)
-    pair(
-        f"{recipe.parent}/rail.py:TASK",
-        dataset=recipe.parent / "first",
-        out=recipe.parent / "logs",
-        progress=silent,
-    )
+    pair(f"{recipe.parent}/rail.py:TASK", dataset=recipe.parent / "first", out=recipe.parent / "logs", progress=silent)
     with pytest.raises(BadInputError, match=r"data: fake@.* is paired already, but a recipe pairs its data itself"):
         check(recipe, root=recipe.parent / "runs")
 

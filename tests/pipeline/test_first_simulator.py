@@ -66,14 +66,7 @@ def bicycle() -> Columns:
     v, angle = held((-1, 2), (-0.5, 0.5))
     x, y, yaw = driven(v, 0 * v, v * np.tan(angle) / 2.5)
     hitch = np.sin(yaw)
-    place = {
-        "trailer_x": x - 4,
-        "trailer_y": y,
-        "trailer_heading": yaw / 2,
-        "x": x,
-        "y": y,
-        "heading": wrapped(yaw),
-    }
+    place = {"trailer_x": x - 4, "trailer_y": y, "trailer_heading": yaw / 2, "x": x, "y": y, "heading": wrapped(yaw)}
     return place | {"hitch_angle": hitch, "cmd_speed": v, "cmd_steering": angle}
 
 
@@ -106,11 +99,7 @@ def drone() -> Columns:
 def arm() -> Columns:
     """Joints that rates move, a gripper that is where it is put, and a fan that moves nothing."""
     rates, grip, fan = held((-1, 1)), held((0, 1)), held((0, 9))
-    states = {
-        "elbow_deg": 90 + np.degrees(summed(rates[0])),
-        "grip": np.roll(grip[0], 1),
-        "load": np.arange(240.0),
-    }
+    states = {"elbow_deg": 90 + np.degrees(summed(rates[0])), "grip": np.roll(grip[0], 1), "load": np.arange(240.0)}
     return states | {"cmd_elbow_dps": np.degrees(rates[0]), "cmd_grip": grip[0], "cmd_fan": fan[0]}
 
 
@@ -136,14 +125,8 @@ KINDS: dict[str, tuple[Callable[[], Columns], str]] = {
         differential,
         "a differential drive: x, y, theta, moved by left, right; speed_per_command 0.1; track_m 0.4",
     ),
-    "vessel": (
-        vessel,
-        "a holonomic base: x, y, qz, qw, moved by surge, sway, yaw_rate; CHECK: heave has no effect",
-    ),
-    "drone": (
-        drone,
-        "a holonomic base, driven along x and y: x, y, yaw_x, yaw_y, z, moved by vx, vy, vz, yawspeed",
-    ),
+    "vessel": (vessel, "a holonomic base: x, y, qz, qw, moved by surge, sway, yaw_rate; CHECK: heave has no effect"),
+    "drone": (drone, "a holonomic base, driven along x and y: x, y, yaw_x, yaw_y, z, moved by vx, vy, vz, yawspeed"),
     "arm": (arm, "values that commands move: elbow, grip, moved by elbow, grip; CHECK: fan has no effect"),
     "pushed": (pushed, "values that commands move: q1, dq1, moved by tau1; dq1_per_force 2.5"),
 }

@@ -82,8 +82,7 @@ def test_a_worker_that_does_not_share_the_folder_is_told(
     record = Record()
     items = [Item("a", (), partial(touch, tmp_path / "a", ()))]
     with pytest.raises(
-        AstraDataError,
-        match=r"^a: .* cannot use .*elsewhere, which .* must share: No such file or directory$",
+        AstraDataError, match=r"^a: .* cannot use .*elsewhere, which .* must share: No such file or directory$"
     ):
         execute_on_cluster(items, address=address, jobs=None, logs=tmp_path / "logs", watch=record)
     assert record.events == [("failed", "a")]

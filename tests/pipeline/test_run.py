@@ -382,14 +382,7 @@ def test_what_was_begun_with_other_settings_is_refused_alike(recipe: Path, tmp_p
 def test_rows_and_seeds_come_and_go_without_changing_others(recipe: Path, folder: Path) -> None:
     assert changed(recipe, HEAD.replace('"astra", "astra_plus"', '"astra", "direct_transfer"')) == []
     assert changed(recipe, HEAD.replace("[0]", "[1]")) == []
-    assert changed(recipe, HEAD.replace("umaze", "long")) == [
-        "align",
-        "collect",
-        "evaluate",
-        "ground",
-        "pair",
-        "train",
-    ]
+    assert changed(recipe, HEAD.replace("umaze", "long")) == ["align", "collect", "evaluate", "ground", "pair", "train"]
 
 
 SWEEP = HEAD.replace('"astra", "astra_plus"', '"nas", "follower"').replace("[0]", "[0, 1]") + (

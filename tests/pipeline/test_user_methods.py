@@ -84,9 +84,7 @@ delta = {{ method = "{place}", memory = {memory} }}
 """
 
 
-def test_a_recipe_that_changes_their_settings_borrows_nothing_made_with_those_of_its_base(
-    tmp_path: Path,
-) -> None:
+def test_a_recipe_that_changes_their_settings_borrows_nothing_made_with_those_of_its_base(tmp_path: Path) -> None:
     (tmp_path / "base.toml").write_text(OWN.format(place=DELTA, memory=32))
     other = tmp_path / "other.toml"
     for memory, borrowed in ((32, {"collect", "pair", "ground", "train", "evaluate"}), (8, None)):

@@ -25,15 +25,7 @@ from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive, generator, held_out_episodes
-from astra_data.dataset.columns import (
-    ABSTRACT_STATE,
-    GOAL,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    STATE,
-    Column,
-    Episode,
-)
+from astra_data.dataset.columns import ABSTRACT_STATE, GOAL, NEXT_STATE, OUTCOME_COLUMNS, STATE, Column, Episode
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset

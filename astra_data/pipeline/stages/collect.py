@@ -230,12 +230,7 @@ def _keep(least_steps: int, writer: StagedWriter) -> None:
 
 
 def _behavior(
-    task: Task,
-    config: CollectConfig,
-    seed: int,
-    writer: StagedWriter,
-    num_threads: int | None,
-    progress: Progress,
+    task: Task, config: CollectConfig, seed: int, writer: StagedWriter, num_threads: int | None, progress: Progress
 ) -> tuple[Behavior, dict[str, Any]]:
     """Return the behavior and its metadata; a policy trained for it is stored in the dataset."""
     if commands := {"random": RandomCommands, "stress": StressCommands}.get(config.behavior):

@@ -23,25 +23,11 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, Stopwatch, silent
 from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
-from astra_data.grounding.files import (
-    GROUNDING,
-    TARGET_ENCODER,
-    grounding_at,
-    load_grounding,
-    load_target_encoder,
-)
+from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, load_grounding, load_target_encoder
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.policies.episodes import (
-    Act,
-    Begin,
-    RecordedRange,
-    in_simulator,
-    in_target,
-    own_world,
-    started,
-)
+from astra_data.policies.episodes import Act, Begin, RecordedRange, in_simulator, in_target, own_world, started
 from astra_data.policies.running_policy import POLICY, EncoderKind, PolicyFile, UserPolicy, running
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES

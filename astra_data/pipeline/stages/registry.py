@@ -67,9 +67,7 @@ STAGES: dict[str, Stage] = {
         Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result=POLICY),
         Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result=TARGET_ENCODER),
         Stage(
-            *("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig),
-            asked_by="select",
-            result=SELECTED,
+            *("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig), asked_by="select", result=SELECTED
         ),
         Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig, result=EVALUATION),
         Stage("report", report, "recipe", ("evaluate",), ReportConfig),

@@ -13,17 +13,7 @@ from stopping import Stopped
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import silent
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Episode,
-)
+from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.staging import StagedWriter
@@ -123,12 +113,7 @@ def test_an_interrupted_recording_goes_on_to_the_same_bytes(
     [("task", True, False), (None, True, True), (None, False, False), ("anywhere", True, True)],
 )
 def test_episodes_begin_where_the_task_does_or_by_default_anywhere_in_a_maze(
-    start: str | None,
-    has_maze: bool,
-    anywhere: bool,
-    task: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    start: str | None, has_maze: bool, anywhere: bool, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not has_maze:
         monkeypatch.setitem(TASKS, task, replace(TASKS[task], plane=None))
@@ -161,13 +146,7 @@ def test_a_part_of_a_policys_episodes_may_have_random_commands(task: str, tmp_pa
     kinds = (("policy", "suboptimal_ppo", 0.0), ("random", "random", 0.0), ("mixed", "suboptimal_ppo", 0.5))
     for name, behavior, share in kinds:
         config = TINY.model_copy(
-            update={
-                "behavior": behavior,
-                "random_share": share,
-                "ppo_steps": 1,
-                "max_steps": 3,
-                "episodes": 4,
-            }
+            update={"behavior": behavior, "random_share": share, "ppo_steps": 1, "max_steps": 3, "episodes": 4}
         )
         collect(task, config, seed=0, out=tmp_path / name, progress=silent)
         datasets[name] = Dataset.open(tmp_path / name)

@@ -137,17 +137,13 @@ def test_failures_of_all_episodes_are_told(
 
 
 @pytest.mark.parametrize(
-    ("first", "last", "is_told"),
-    [(0.95, 0.95, True), (1.9, 1.9, False), (1.9, 0.95, True), (0.95, 1.9, False)],
+    ("first", "last", "is_told"), [(0.95, 0.95, True), (1.9, 1.9, False), (1.9, 0.95, True), (0.95, 1.9, False)]
 )
 def test_who_terminates_at_the_goal_of_that_moment_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, first: float, last: float, is_told: bool
 ) -> None:
     """Goals may move: the cart ends at 1 m."""
-    ended = drive(1.0, 10) | {
-        TERMINATED: np.arange(10) == 9,
-        GOAL: np.linspace(first, last, 10, dtype=np.float32),
-    }
+    ended = drive(1.0, 10) | {TERMINATED: np.arange(10) == 9, GOAL: np.linspace(first, last, 10, dtype=np.float32)}
     more = (Column(GOAL), *(column for column in OUTCOME_COLUMNS if column.name == TERMINATED))
     label(CART, data=write(tmp_path / "logs", [ended, ended], more), out=tmp_path / "labeled")
     told = "2 episodes terminate at their goal and are labeled as failures"
@@ -235,11 +231,7 @@ def test_what_is_no_log_of_the_task_is_refused(tmp_path: Path) -> None:
     ("names", "units", "fault"),
     [
         (("x", "speed"), ["m", "m/s"], None),
-        (
-            ("speed", "x"),
-            ["", ""],
-            "has the values speed, x in observation.state, expected the order x, speed",
-        ),
+        (("speed", "x"), ["", ""], "has the values speed, x in observation.state, expected the order x, speed"),
         (("x", "speed"), ["mm", "m/s"], "has x of observation.state in mm, expected m: scale it on import"),
     ],
 )
@@ -251,11 +243,7 @@ def test_states_in_another_order_or_other_units_are_refused(
     astra = None if units is None else {"unit": units}
     columns = [Column(name, size=2, names=names, astra=astra) for name in (STATE, NEXT_STATE)]
     with DatasetWriter(
-        tmp_path / "logs",
-        [*columns, COLUMNS[1]],
-        fps=10,
-        task="drive",
-        description={"name": "logs", "stage": "import"},
+        tmp_path / "logs", [*columns, COLUMNS[1]], fps=10, task="drive", description={"name": "logs", "stage": "import"}
     ) as writer:
         writer.add(Episode(0, drive(0.1, 3), {}))
     logs = Dataset.open(tmp_path / "logs")

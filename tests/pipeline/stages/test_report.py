@@ -153,11 +153,7 @@ def draw_only(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_publishing_adds_to_what_is_there(
-    rough: None,
-    root: Path,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
+    rough: None, root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draw_only("trajectories", monkeypatch)
     folder = tmp_path / "results"

@@ -274,12 +274,5 @@ def test_a_policy_of_short_commands_is_no_start_of_fine_tuning(
     monkeypatch.setattr("astra_data.policies.train.command_limit", lambda task, episodes: 0.5)
     make(task, "direct_transfer_plus", paired, None, tmp_path / "limited")
     with pytest.raises(BadInputError, match="command_limit, which has no effect on 'direct_transfer_iql'"):
-        train(
-            task,
-            "direct_transfer_iql",
-            TRAIN,
-            dataset=paired,
-            initial=tmp_path / "limited",
-            out=tmp_path / "tuned",
-        )
+        train(task, "direct_transfer_iql", TRAIN, dataset=paired, initial=tmp_path / "limited", out=tmp_path / "tuned")
     assert not (tmp_path / "tuned").exists()

@@ -35,13 +35,7 @@ def make(task: str, row: str, dataset: Path, out: Path, progress: Progress = sil
 
 @pytest.mark.parametrize(("row", "observed", "size"), [("target", "abstract", 8), ("full_obs", "full", 33)])
 def test_the_upper_bounds_learn_in_the_target_and_go_on_after_an_interruption(
-    task: str,
-    paired: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    row: str,
-    observed: str,
-    size: int,
+    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, row: str, observed: str, size: int
 ) -> None:
     monkeypatch.setattr("astra_data.core.checkpoint.CHECKPOINT_SECONDS", 0.0)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
