@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.shell_completion import BashComplete
 from failing_disk import small_files
 from fake_dataset import write_fake
 from typer.main import get_command
@@ -117,6 +118,13 @@ def test_every_command_has_an_example_of_options_that_it_has() -> None:
         assert {word for word in words if word.startswith("--")} <= options
     shown = CliRunner().invoke(cli.app, ["run", "-h"], env={"COLUMNS": "100"}).output
     assert "Example: astra-data run recipes/quickstart.toml" in shown and "ground, train, align" in shown
+
+
+def test_the_shell_completes_commands_and_stages() -> None:
+    shell = BashComplete(get_command(cli.app), {}, "astra-data", "_ASTRA_DATA_COMPLETE")
+    assert [found.value for found in shell.get_completions([], "de")] == ["deploy"]
+    assert [found.value for found in shell.get_completions(["run", "--until"], "g")] == ["ground"]
+    assert "--install-completion" in CliRunner().invoke(cli.app, ["--help"]).output
 
 
 def test_help_names_what_options_take() -> None:
