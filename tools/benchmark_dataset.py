@@ -121,14 +121,7 @@ def random_walks(episodes: int, steps: int) -> list[Episode]:
     last = np.arange(steps) == steps - 1
     return [
         Episode(
-            uid,
-            {
-                STATE: values(29),
-                ABSTRACT_STATE: values(4),
-                ACTION: values(2),
-                REWARD: values(1)[:, 0],
-                DONE: last,
-            },
+            uid, {STATE: values(29), ABSTRACT_STATE: values(4), ACTION: values(2), REWARD: values(1)[:, 0], DONE: last}
         )
         for uid in range(episodes)
     ]
@@ -137,10 +130,7 @@ def random_walks(episodes: int, steps: int) -> list[Episode]:
 def write(root: Path, data: list[Episode], compression: str) -> int:
     """Write our dataset, with its statistics, hash and validation."""
     shutil.rmtree(root, ignore_errors=True)
-    settings: dict[str, Any] = {
-        "description": {"name": "walks", "stage": "import"},
-        "compression": compression,
-    }
+    settings: dict[str, Any] = {"description": {"name": "walks", "stage": "import"}, "compression": compression}
     with DatasetWriter(root, COLUMNS, fps=FPS, task="walk", **settings) as writer:
         for episode in data:
             writer.add(episode)

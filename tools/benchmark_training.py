@@ -179,13 +179,7 @@ def iql(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
 
     command = ["--no-project", "--python", "3.12", "--with", "d3rlpy", "--with", f"torch=={TORCH}", "python"]
     command += [str(PEERS / "d3rlpy_iql.py"), str(observation_size), str(action_size)]
-    return (
-        "implicit Q-learning, updates of critics and policy",
-        {
-            OURS: ours,
-            "d3rlpy": peer(stack, *command),
-        },
-    )
+    return ("implicit Q-learning, updates of critics and policy", {OURS: ours, "d3rlpy": peer(stack, *command)})
 
 
 def target(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
@@ -210,10 +204,7 @@ def target(quick: bool, stack: ExitStack) -> tuple[str, Candidates]:
             theirs.step(rng.uniform(-1, 1, (count, 2)))
         return steps * count
 
-    return (
-        f"AntMaze, steps of {ANTS} ants",
-        {OURS: ours, f"Gymnasium's AsyncVectorEnv, {count} processes": processes},
-    )
+    return (f"AntMaze, steps of {ANTS} ants", {OURS: ours, f"Gymnasium's AsyncVectorEnv, {count} processes": processes})
 
 
 class DrivenAnt(gymnasium.ActionWrapper[Any, Any, Any]):
@@ -232,12 +223,7 @@ class DrivenAnt(gymnasium.ActionWrapper[Any, Any, Any]):
         return self._controller(qpos, qvel, action[None])[0]
 
 
-MEASUREMENTS = {
-    Part.ppo: grounded_ppo,
-    Part.recurrent: recurrent_ppo,
-    Part.iql: iql,
-    Part.target: target,
-}
+MEASUREMENTS = {Part.ppo: grounded_ppo, Part.recurrent: recurrent_ppo, Part.iql: iql, Part.target: target}
 
 
 if __name__ == "__main__":

@@ -21,16 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from astra_data.core.progress import silent
-from astra_data.dataset.columns import (
-    ACTION,
-    GOAL,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    REWARD,
-    STATE,
-    Array,
-    Episode,
-)
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, OUTCOME_COLUMNS, REWARD, STATE, Array, Episode
 from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter

@@ -151,11 +151,7 @@ def main(
     drawn = drawn_from(sorted(tested), count, random.Random(seed))
     sound = [Mutant(file, "none", (ROOT / file).read_text()) for file in dict.fromkeys(one.path for one in drawn)]
     noticed: Counter[str] = Counter()
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        ThreadPoolExecutor(jobs) as pool,
-        Progress(console=console) as bar,
-    ):
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool, Progress(console=console) as bar:
         copies: SimpleQueue[Path] = SimpleQueue()
         for number in range(jobs):
             copy = Path(folder) / str(number)

@@ -91,12 +91,7 @@ class ColdSteps:
         self._rollout = Rollout(nthread=len(self._data))
 
     def __call__(
-        self,
-        model: mujoco.MjModel | Sequence[mujoco.MjModel],
-        motion: Floats,
-        control: Floats,
-        *,
-        substeps: int,
+        self, model: mujoco.MjModel | Sequence[mujoco.MjModel], motion: Floats, control: Floats, *, substeps: int
     ) -> Floats:
         """Return where `substeps` physics steps from `motion`, qpos then qvel (B, nq + nv), lead.
 

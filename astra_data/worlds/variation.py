@@ -111,11 +111,7 @@ class PlanarVariation(Variation):
 class BallVariation(PlanarVariation):
     """Ranges for a robot in a plane, with a ball."""
 
-    steering: ClassVar[tuple[str, ...]] = (
-        *PlanarVariation.steering,
-        "ball_friction",
-        "contact_direction_deg",
-    )
+    steering: ClassVar[tuple[str, ...]] = (*PlanarVariation.steering, "ball_friction", "contact_direction_deg")
 
     ball_friction: FactorRange = (1.0, 1.0)
     """Factor on the deceleration of the rolling ball."""

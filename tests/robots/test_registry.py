@@ -62,9 +62,7 @@ def test_simulators_vary(task: Task) -> None:
     torch.testing.assert_close(landed[2], task.simulator(3).step(action))
 
 
-def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("rail-cart", "antmaze-umaze")
     points = [EntryPoint(name, "small_cart:TASK", TASK_GROUP) for name in names]
     monkeypatch.setattr(user_code, "entry_points", lambda group: points)
@@ -113,10 +111,7 @@ def test_a_class_of_a_file_is_known_by_its_name_and_the_files_digest() -> None:
     [
         ("1 / 0", r"importing .*sim.py fails with ZeroDivisionError: division by zero \(sim.py, line 1\)$"),
         ("class Other: pass", r"sim.py has no 'Mine'; it has Other$"),
-        (
-            "class Mine: pass",
-            r"has no abstract_state, abstraction, parameters, reset_to, step: expected what a",
-        ),
+        ("class Mine: pass", r"has no abstract_state, abstraction, parameters, reset_to, step: expected what a"),
         (
             "class Mine:\n    abstract_state = abstraction = parameters = reset_to = step = 1",
             r"sim.py:Mine.abstract_state is a int, expected a Column",

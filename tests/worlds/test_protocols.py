@@ -134,10 +134,7 @@ def members(protocol: type) -> set[str]:
 
 
 def test_a_user_writes_what_the_module_shows() -> None:
-    assert members(Simulator) == {
-        *("abstract_state", "abstraction", "parameters"),
-        *("state", "reset_to", "step"),
-    }
+    assert members(Simulator) == {*("abstract_state", "abstraction", "parameters"), *("state", "reset_to", "step")}
     glider: Simulator = my_simulator.Glider(1)
     assert all(hasattr(glider, name) for name in members(Simulator))
 

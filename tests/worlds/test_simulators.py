@@ -165,11 +165,7 @@ def test_a_watched_floor_is_felt_by_those_who_touch_it() -> None:
 def test_what_is_measured_is_of_the_copys_own_last_step() -> None:
     model = ant_model()
     physics = BatchedPhysics(
-        model,
-        3,
-        substeps=5,
-        measure=lambda data: (data.ctrl[0], data.actuator_force[0], data.qpos[2]),
-        num_threads=2,
+        model, 3, substeps=5, measure=lambda data: (data.ctrl[0], data.actuator_force[0], data.qpos[2]), num_threads=2
     )
     qpos, qvel = standing(3)
     qpos[:, 2] = [1.0, 2.0, 3.0]

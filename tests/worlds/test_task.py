@@ -13,13 +13,7 @@ from astra_data.policies.collecting import WallWatch
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import DrivenSimulator
 from astra_data.worlds.plane.mazes import U_MAZE
-from astra_data.worlds.task import (
-    ColumnEntry,
-    Task,
-    column,
-    free_body,
-    names_with_units,
-)
+from astra_data.worlds.task import ColumnEntry, Task, column, free_body, names_with_units
 
 
 def test_entries_become_a_column() -> None:
@@ -146,10 +140,7 @@ def test_a_task_without_a_target_says_so() -> None:
     [
         ({"commands": {"v": (0.0, 1.0), "w": (0.0, 1.0)}}, "objective: action_size 1, expected .* 2"),
         (
-            {
-                "commands": {"v": (0.0, 1.0), "w": (0.0, 1.0)},
-                "action": Column("action", size=2, names=("w", "v")),
-            },
+            {"commands": {"v": (0.0, 1.0), "w": (0.0, 1.0)}, "action": Column("action", size=2, names=("w", "v"))},
             "action: names w, v, expected v, w$",
         ),
         ({"action": Column("action", size=2)}, "action: 2 values, expected 1"),

@@ -38,14 +38,8 @@ def test_objectives_compute_where_states_are(name: str) -> None:
         (0.1, ""),
         (0.0333, ""),
         (0.015, ""),  # 66.67, by less than 0.5 %
-        (
-            0.15,
-            "timestep_s 0.15: a dataset has a whole number of steps per second, 7, and so its steps are 4.8%",
-        ),
-        (
-            0.11,
-            "timestep_s 0.11: a dataset has a whole number of steps per second, 9, and so its steps are 1.0%",
-        ),
+        (0.15, "timestep_s 0.15: a dataset has a whole number of steps per second, 7, and so its steps are 4.8%"),
+        (0.11, "timestep_s 0.11: a dataset has a whole number of steps per second, 9, and so its steps are 1.0%"),
     ],
 )
 def test_a_rate_that_is_no_whole_number_is_told(timestep_s: float, told: str, caplog: pytest.LogCaptureFixture) -> None:
@@ -95,22 +89,13 @@ class Own:
 
 
 WRONG: list[tuple[Task, str]] = [
-    (
-        simulator(__init__=Own.single),
-        "make_simulator(3).state, 3 states at once: expected shape (3, 1), got (1,)",
-    ),
-    (
-        simulator(reset_to=Own.deaf),
-        "make_simulator: after reset_to(state), state: expected 3 in row 2, entry 0, got 0",
-    ),
+    (simulator(__init__=Own.single), "make_simulator(3).state, 3 states at once: expected shape (3, 1), got (1,)"),
+    (simulator(reset_to=Own.deaf), "make_simulator: after reset_to(state), state: expected 3 in row 2, entry 0, got 0"),
     (
         simulator(reset_to=Own.whole),
         "make_simulator: after reset_to(state, rows), state: expected 1 in row 2, entry 0, got 3",
     ),
-    (
-        simulator(step=Own.lost),
-        "make_simulator: step(command) of shape (3, 1): expected finite numbers, got nan",
-    ),
+    (simulator(step=Own.lost), "make_simulator: step(command) of shape (3, 1): expected finite numbers, got nan"),
     (simulator(step=Own.stuck), "make_simulator: step(command) fails with ValueError: flat battery"),
     (
         objective(reward=lambda self, before, after, goal, failed: after - before),
@@ -149,10 +134,7 @@ WRONG: list[tuple[Task, str]] = [
         replace(TASK, quantities={"x": (0,), "y": (0, 1), "z": (-2,)}),
         "quantities: y, z: expected indices below 1, of states",
     ),
-    (
-        replace(TASK, beyond=lambda state: state[..., 0]),
-        "beyond of states (3, 2): expected shape (3, any), got (3,)",
-    ),
+    (replace(TASK, beyond=lambda state: state[..., 0]), "beyond of states (3, 2): expected shape (3, any), got (3,)"),
 ]
 
 

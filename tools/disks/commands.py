@@ -186,12 +186,7 @@ def make_inputs(given: Path, run: Callable[[str], object], names: Collection[str
 
 def _write_walks(root: Path, name: str, uids: Sequence[int]) -> None:
     """Write a dataset with every column that an export needs, an episode of 5 to 7 steps for each uid."""
-    columns = [
-        Column(STATE, size=3),
-        Column(NEXT_STATE, size=3),
-        Column(ACTION, size=2),
-        Column(GOAL, size=2),
-    ]
+    columns = [Column(STATE, size=3), Column(NEXT_STATE, size=3), Column(ACTION, size=2), Column(GOAL, size=2)]
     description = {"name": name, "stage": "collect", "environment": {"id": "walk"}}
     with DatasetWriter(root, [*columns, *OUTCOME_COLUMNS], fps=20, task="walk", description=description) as writer:
         for number, uid in enumerate(uids):

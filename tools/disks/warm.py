@@ -27,13 +27,7 @@ from astra_data.core.provenance import git_commit, package_versions
 
 LIGHT = ("cli", "dataset", "io")
 """Rooms that commands on datasets need."""
-WITH_TORCH = (
-    "dataset.frames",
-    "dataset.samples",
-    "dataset.step_windows",
-    "io.hub.card",
-    "io.hub.sharing",
-)
+WITH_TORCH = ("dataset.frames", "dataset.samples", "dataset.step_windows", "io.hub.card", "io.hub.sharing")
 """Modules of theirs that load torch: a process with torch takes several times as long to fork."""
 LIBRARIES = ("pandas", "fsspec.implementations.local")
 

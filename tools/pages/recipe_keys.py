@@ -22,15 +22,7 @@ each section below it. A key that is left out has its default; without one it is
 says what happens then. Units are those of the key's name. Numbers of things are at most 10¹², of things that
 are in memory at the same time 10⁶.
 """
-UNITS = {
-    "m_s": "m/s",
-    "s": "s",
-    "m": "m",
-    "deg": "°",
-    "steps": "steps",
-    "episodes": "episodes",
-    "percent": "%",
-}
+UNITS = {"m_s": "m/s", "s": "s", "m": "m", "deg": "°", "steps": "steps", "episodes": "episodes", "percent": "%"}
 """By the last words of a key's name."""
 _SAFETY = 10**6
 """Bounds from here on are those of the introduction."""

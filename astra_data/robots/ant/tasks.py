@@ -27,16 +27,7 @@ from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, Plan
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.protocols import Step, rows_in
 from astra_data.worlds.simulators import BatchedPhysics, add_walls, wall_geoms
-from astra_data.worlds.task import (
-    PLANAR_GOAL,
-    PLANAR_STATE,
-    Plane,
-    Task,
-    Varied,
-    column,
-    entries,
-    free_body,
-)
+from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, Plane, Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
 STATE_SIZE = 29
@@ -211,11 +202,7 @@ class AntMazeEnv(PlanarTarget):
         self.controller = controller or VelocityController.load()
         model = ant_model(objective.maze, leg_scale=leg_scale)
         self.physics = BatchedPhysics(
-            model,
-            num_envs,
-            substeps=CONTROL_SUBSTEPS,
-            watched_geoms=wall_geoms(model),
-            num_threads=num_threads,
+            model, num_envs, substeps=CONTROL_SUBSTEPS, watched_geoms=wall_geoms(model), num_threads=num_threads
         )
         self.reseed(seed)
 

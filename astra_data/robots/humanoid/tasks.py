@@ -32,11 +32,7 @@ from astra_data.robots.humanoid.abstraction import (
     mass_and_feet,
     mass_velocity,
 )
-from astra_data.robots.humanoid.simulators import (
-    HumanoidExtendedKinematics,
-    HumanoidKinematics,
-    HumanoidWalker2d,
-)
+from astra_data.robots.humanoid.simulators import HumanoidExtendedKinematics, HumanoidKinematics, HumanoidWalker2d
 from astra_data.robots.humanoid.target import (
     COMMANDED,
     DAMPING,
@@ -153,10 +149,7 @@ class JointWalking(Walking):
 class MassWalking(Walking):
     """Walking of joints, center of mass and the torso's lean, states (..., 46)."""
 
-    spread = (
-        *JointWalking.spread,
-        *([POSITION_M] * 3 + [VELOCITY_M_S] * 3 + [LEAN_RAD] * 3 + [SPIN_RAD_S] * 3),
-    )
+    spread = (*JointWalking.spread, *([POSITION_M] * 3 + [VELOCITY_M_S] * 3 + [LEAN_RAD] * 3 + [SPIN_RAD_S] * 3))
     phi = humanoid_to_extended_kinematics
 
     lowest_mass_m: float = 0.65

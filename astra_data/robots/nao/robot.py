@@ -86,13 +86,7 @@ class BatchedBodies:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        traits: Traits,
-        *,
-        longest_delay_ticks: int,
-        style: WalkStyle,
-        num_threads: int,
+        self, model: mujoco.MjModel, traits: Traits, *, longest_delay_ticks: int, style: WalkStyle, num_threads: int
     ) -> None:
         """Allocate one body for each of `traits`' B robots; `reset` them before they are stepped."""
         self.model = model

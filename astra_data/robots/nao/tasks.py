@@ -11,16 +11,7 @@ from astra_data.robots.nao.walk import JOINTS, TICK_S
 from astra_data.worlds.plane.mazes import FIELD, S_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
-from astra_data.worlds.task import (
-    PLANAR_GOAL,
-    PLANAR_STATE,
-    ColumnEntry,
-    Plane,
-    Task,
-    Varied,
-    column,
-    entries,
-)
+from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, Plane, Task, Varied, column, entries
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
 _RADIUS_M = 0.1
@@ -58,10 +49,7 @@ _STATE = [
     *entries("planned_forward planned_left", "m/s", "body", "invariant"),
     ColumnEntry("planned_turn", "rad/s", "body", "invariant"),
 ]
-_BALL = [
-    *entries("ball_x ball_y", "m", "world", "position"),
-    *entries("ball_vx ball_vy", "m/s", "world", "vector"),
-]
+_BALL = [*entries("ball_x ball_y", "m", "world", "position"), *entries("ball_vx ball_vy", "m/s", "world", "vector")]
 _UNSEEN = ColumnEntry("ball_unseen", "s", "body", "invariant")
 _COMMAND = [*entries("command_vx command_vy", "0.25 m/s", "world", "vector")]
 _KICK = ColumnEntry("kick", "1", "body", "invariant")

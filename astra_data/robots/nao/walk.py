@@ -402,10 +402,7 @@ class WalkEngine:
             lifts_off.append((begins & (gait.kind == STRIDE)) * np.where(gait.left_swings, 1, -1))
             gaits.append(replace(gait))
         return Targets(
-            leg_angles(np.stack(feet, axis=1)),
-            np.stack(supports, axis=1),
-            np.stack(lifts_off, axis=1),
-            gaits,
+            leg_angles(np.stack(feet, axis=1)), np.stack(supports, axis=1), np.stack(lifts_off, axis=1), gaits
         )
 
     def feet(self, gait: Gait) -> Floats:

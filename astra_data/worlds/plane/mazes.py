@@ -170,11 +170,7 @@ S_MAZE = Maze(
 """An S with corridors of 1 m on half a field of RoboCup's Standard Platform League. Ours too."""
 
 FIELD = Maze(
-    rows=("1" * 12, *("1" + "0" * 10 + "1",) * 10, "1" * 12),
-    scale=0.5,
-    start=(5, 2),
-    goal=(5, 9),
-    fine_m=0.05,
+    rows=("1" * 12, *("1" + "0" * 10 + "1",) * 10, "1" * 12), scale=0.5, start=(5, 2), goal=(5, 9), fine_m=0.05
 )
 """A room of 5 m by 5 m for playing with a ball."""
 

@@ -138,12 +138,7 @@ class VariedPlanar(VariedSimulator):
         true = self.simulator.step(command)
         half_widths = [
             parameters[name].expand(-1, 2)
-            for name in (
-                "position_noise_m",
-                "velocity_noise_m_s",
-                "ball_position_noise_m",
-                "ball_velocity_noise_m_s",
-            )
+            for name in ("position_noise_m", "velocity_noise_m_s", "ball_position_noise_m", "ball_velocity_noise_m_s")
             if name in parameters
         ]
         self._observed = true + (torch.rand_like(true) * 2.0 - 1.0) * torch.cat(half_widths, dim=-1)

@@ -7,14 +7,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.robots.humanoid.target import (
-    COMMANDED,
-    JOINTS,
-    CommandRanges,
-    HumanoidEnv,
-    Locomotion,
-    humanoid_model,
-)
+from astra_data.robots.humanoid.target import COMMANDED, JOINTS, CommandRanges, HumanoidEnv, Locomotion, humanoid_model
 
 
 def test_joints_are_listed_as_the_model_lists_them() -> None:

@@ -5,15 +5,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.robots.nao.kicking import (
-    ROLLING_M_S2,
-    BallAgent,
-    Kicking,
-    asks_to_kick,
-    kick_away,
-    knock,
-    roll,
-)
+from astra_data.robots.nao.kicking import ROLLING_M_S2, BallAgent, Kicking, asks_to_kick, kick_away, knock, roll
 from astra_data.worlds.plane.mazes import FIELD
 from astra_data.worlds.plane.point_mass import VariedPlanar
 from astra_data.worlds.variation import BallVariation

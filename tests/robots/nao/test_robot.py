@@ -8,14 +8,7 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
-from astra_data.robots.nao.robot import (
-    MOTORS,
-    SUBSTEPS,
-    TICKS,
-    BatchedBodies,
-    BatchedNao,
-    nao_model,
-)
+from astra_data.robots.nao.robot import MOTORS, SUBSTEPS, TICKS, BatchedBodies, BatchedNao, nao_model
 from astra_data.robots.nao.walk import (
     HIP_OFFSET_Z_M,
     IDENTICAL,
@@ -164,8 +157,7 @@ def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lifts_off", "lean_deg", "waits"),
-    [(1, -5, True), (1, 5, False), (-1, 5, True), (-1, -5, False), (0, -5, False)],
+    ("lifts_off", "lean_deg", "waits"), [(1, -5, True), (1, 5, False), (-1, 5, True), (-1, -5, False), (0, -5, False)]
 )
 def test_a_foot_that_the_torso_leans_over_waits_to_be_lifted(lifts_off: int, lean_deg: float, waits: bool) -> None:
     robots = bodies()

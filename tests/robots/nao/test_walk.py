@@ -65,11 +65,7 @@ def test_each_trait_has_its_own_range() -> None:
     traits = Traits.draw(spread, 4000, np.random.default_rng(0))
     assert np.degrees(traits.joint_offset_rad).std() == pytest.approx(2.0, rel=0.02)
     assert np.degrees(traits.joint_offset_rad).mean() == pytest.approx(0.0, abs=0.05)
-    for values, low, high in (
-        (traits.stiffness, 0.6, 1.0),
-        (traits.friction, 0.2, 0.3),
-        (traits.quality, 0.5, 0.6),
-    ):
+    for values, low, high in ((traits.stiffness, 0.6, 1.0), (traits.friction, 0.2, 0.3), (traits.quality, 0.5, 0.6)):
         assert low <= values.min() and values.max() <= high
         assert values.mean() == pytest.approx((low + high) / 2, abs=0.03 * (high - low))
     assert np.unique(traits.delay_ticks).tolist() == [1, 2, 3, 4]
