@@ -15,10 +15,8 @@ from astra_data.worlds.protocols import AbstractSimulator
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import expect_tensor, explained, file_of, is_user_code, offered, user_object
 
-TASK_GROUP = "astra_data.tasks"
-"""The group of entry points under which installed packages offer tasks."""
-SIMULATOR_GROUP = "astra_data.simulators"
-"""Likewise, of abstract simulators."""
+TASK_GROUP = "astra_data.tasks"  # the group of entry points under which installed packages offer tasks
+SIMULATOR_GROUP = "astra_data.simulators"  # likewise, of abstract simulators
 
 
 def _task_at(name: str, place: str) -> Task:
@@ -48,10 +46,7 @@ def known_names() -> tuple[str, ...]:
 
 
 def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
-    """Return a task of this or an installed package, or that of "cart.py:TASK" or "package.module:TASK".
-
-    `besides` are other names that an unknown one may have meant.
-    """
+    """Return the task of that name, or at "cart.py:TASK"; `besides` are names that an unknown one may have meant."""
     if name in TASKS:
         return TASKS[name]
     if place := name if is_user_code(name) else offered(TASK_GROUP).get(name):
@@ -74,10 +69,8 @@ def known_tasks() -> dict[str, Task]:
 class Pairing:
     """An abstract simulator, and the map φ to its states; what a task tells is None or empty without one."""
 
-    id: str
-    """The simulator's name in the dataset."""
-    origin: Mapping[str, str]
-    """The task that it belongs to, the sha256 of its file, or its place in a package."""
+    id: str  # the simulator's name in the dataset
+    origin: Mapping[str, str]  # the task that it belongs to, the sha256 of its file, or its place in a package
     maze: Maze | None
     abstract_state: Column
     abstraction: Callable[[Array], Array]
@@ -88,11 +81,7 @@ class Pairing:
 
 
 def pairing_named(name: str) -> Pairing:
-    """Return the simulator of the task `name`, of an installed package, or of a file as `path.py:MySim`.
-
-    A simulator is a class as `Simulator` of `astra_data.worlds.protocols`; its file or package is run. A task
-    comes before a simulator of the same name.
-    """
+    """Return the simulator of a task, of an installed package, or a class at `path.py:MySim`; a task comes first."""
     if name not in TASKS and name.endswith(".py"):
         raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
     made = _made_by(name)

@@ -44,12 +44,7 @@ class Commands(Mapping[str, tuple[float, float]]):
 
     @classmethod
     def recorded(cls, dataset: str | Path) -> Self:
-        """Return the range of the commands in a dataset, named as every command takes it, as the bounds.
-
-        Raises:
-            BadInputError: there is no such dataset, it has no commands, or one of them never changes.
-            CorruptDatasetError: it is incomplete or was altered.
-        """
+        """Return the range of the commands in a dataset, named as every command takes it, as the bounds."""
         source = open_dataset(dataset)
         statistics = source.statistics()
         if isinstance(statistics, str):
@@ -90,14 +85,7 @@ class Commands(Mapping[str, tuple[float, float]]):
 
 
 class DrivenSimulator:
-    """B abstract simulators of a task, given actions of ±1.
-
-    States may be corrected to anywhere, and no parameter can be set, unless the simulator says otherwise (see
-    `PlacedSimulator` and `TaskSimulator`).
-
-    Attributes:
-        simulator: the simulator itself, whose commands have units.
-    """
+    """B abstract simulators of a task, given actions of ±1 and states on any device; what they lack does nothing."""
 
     def __init__(self, simulator: SteppedSimulator, commands: Commands, device: str) -> None:
         """Drive `simulator` within the bounds of `commands`; states are given and taken on `device`."""

@@ -1,7 +1,4 @@
-"""Rotations of bodies in space; motions of the planar frame, and what they do to the values of a column.
-
-The dynamics of a robot on a level floor do not depend on where it is and which way it faces.
-"""
+"""Rotations of bodies in space; motions of the planar frame, and what they do to the values of a column."""
 
 from dataclasses import dataclass
 
@@ -21,11 +18,7 @@ def wrapped[Angle: (Floats, Tensor)](angle: Angle) -> Angle:
 
 @dataclass(frozen=True)
 class PlanarMap:
-    """A rigid motion of the plane: p ↦ R(rotation) p + shift.
-
-    Attributes:
-        rotation_rad: angle of R, counterclockwise. shift_m: (x, y).
-    """
+    """A rigid motion of the plane: p ↦ R(rotation) p + shift."""
 
     rotation_rad: float = 0.0
     shift_m: tuple[float, float] = (0.0, 0.0)

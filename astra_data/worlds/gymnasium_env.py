@@ -16,8 +16,7 @@ from astra_data.worlds.simulators import NumpySimulator
 from astra_data.worlds.user_code import answered, explained
 
 Env = gymnasium.Env[Any, Any]
-_SLACK = 1e-5
-"""Share of the range of an action by which rounding may carry it beyond."""
+_SLACK = 1e-5  # share of the range of an action by which rounding may carry it beyond
 _ADVICE = "give GymnasiumRobot a command, a function of a command and a state that returns an action"
 
 
@@ -54,12 +53,7 @@ def _name(env_id: str | Callable[..., Env]) -> str:
 class GymnasiumRobot:
     """One environment of Gymnasium as a robot: its rewards, goals and time limit are left out.
 
-    `partial(GymnasiumRobot, "gymnasium_robotics:FetchReach-v4")` is the `robot` of a task; it can be pickled
-    where the three functions can.
-
-    Attributes:
-        name: its id, or the name of its class. env: the environment.
-        any_end_fails: whether each end of the environment is taken for a failure, as no `failed` is given.
+    `partial(GymnasiumRobot, "gymnasium_robotics:FetchReach-v4")` is the `robot` of a task.
 
     Example:
         >>> from astra_data.worlds.gymnasium_env import GymnasiumRobot
@@ -79,12 +73,9 @@ class GymnasiumRobot:
     ) -> None:
         """Make the environment.
 
-        env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0"; or the class
-        itself, or a function that makes the environment. read_state: makes the state (S,) of the environment,
-        without its wrappers, and an observation. command: makes an action of it of a command (A,)
-        and the state that it is given in. failed: whether the robot failed, from the state after a step and
-        whether the environment terminated; by default the latter, and to terminate at the task's goal is an
-        error.
+        env_id: as `gymnasium.make` takes it, "module:Env-v0", a class, or a function that makes it. read_state: the
+        state (S,) of the environment and an observation. command: the action of a command (A,) and the state. failed:
+        whether the robot failed, of a state and whether the environment terminated; by default whether it did.
         """
         self.name, self.env = _name(env_id), made(env_id, **options)
         self._read_state, self._command, self._failed = read_state, command, failed
@@ -128,15 +119,11 @@ class GymnasiumRobot:
         return action
 
 
-_TOLERANCE = 1e-4
-"""Of a state that was written and read again: states are float32."""
+_TOLERANCE = 1e-4  # of a state that was written and read again: states are float32
 
 
 class GymnasiumSimulator(NumpySimulator):
-    """B abstract states that one environment of Gymnasium steps, one after another.
-
-    A policy is trained in millions of steps, so it is for environments that step quickly, and for pairing.
-    """
+    """B abstract states that one environment of Gymnasium steps, one by one: for pairing, or where it is quick."""
 
     def __init__(
         self,
@@ -149,12 +136,9 @@ class GymnasiumSimulator(NumpySimulator):
         parameters: Mapping[str, float] | None = None,
         **options: Any,  # noqa: ANN401 - handed on
     ) -> None:
-        """Make the environment, and begin with B states of zeros.
+        """Make the environment, and begin with B states of zeros, each of `size`.
 
-        env_id: as `gymnasium.make` takes it, with the module that registers it: "module:Env-v0". size: of a
-        state, X. read: returns the abstract state (X,) of the environment, without its wrappers. write: sets
-        it, so that `read` returns it again; this is tried after the first step. All that a step depends on
-        has to be in it. parameters: numbers or texts about it, by default none.
+        read: returns the abstract state (X,) of the unwrapped environment. write: sets it, so that `read` returns it.
         """
         env = made(env_id, **options)
         inner, is_checked = env.unwrapped, False

@@ -16,13 +16,11 @@ from astra_data.worlds.plane.mazes import Maze
 class Score:
     """A measure of episodes; the larger, the better."""
 
-    measure: str
-    """Its name in evaluation.json, which has one number per episode."""
+    measure: str  # its name in evaluation.json, which has one number per episode
     title: str  # of a table's column
     quantity: str  # name of its mean over episodes, within a sentence
     digits: int  # shown behind the decimal point
-    limit: float | None = None
-    """The largest possible value, at which axes end; None where there is none."""
+    limit: float | None = None  # the largest possible value, at which axes end; None where there is none
 
     def text(self, value: float) -> str:
         """Return a value with its digits."""
@@ -36,8 +34,7 @@ SURVIVED_STEPS = Score("steps", "survived steps", "number of survived steps", 0)
 RETURN = Score("return", "return", "return", 1)
 
 
-NO_LIMIT = 2.0
-"""Of the length of velocity commands: longer than any of ±1 on two axes."""
+NO_LIMIT = 2.0  # of the length of velocity commands: longer than any of ±1 on two axes
 
 
 @dataclass(frozen=True)
@@ -87,10 +84,7 @@ class Objective(ABC):
         return np.empty((count, 0))
 
     def observe(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Assemble the observation of states (..., X) and goals (..., G), each part scaled to about 1.
-
-        By default both as they are.
-        """
+        """Assemble the observation of states (..., X) and goals (..., G), each part about 1; by default as they are."""
         return torch.cat([state, goal], dim=-1)
 
     def limit_command(self, action: Tensor, limit: float) -> Tensor:
@@ -106,10 +100,7 @@ class Objective(ABC):
         return state[..., :0]
 
     def succeeded(self, reached: Tensor, failed: Tensor, step: int) -> Tensor:
-        """Return which episodes (B,) succeed in their `step`, counted from 1.
-
-        They `reached` their goals, or `failed`, in it, (B,) bool.
-        """
+        """Return which episodes (B,) succeed in their `step` from 1, in which they `reached` goals, or `failed`."""
         return ~failed if self.is_lasting and step >= self.horizon else reached
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:

@@ -1,11 +1,7 @@
 """Interfaces of abstract simulators, a user's `Simulator` among them, and of batched environments.
 
-    observation = env.reset()                    (B, O)
-    step = env.step(action)                      action (B, A) -> Step, each field (B, ...)
-    observation = env.reset(step.terminated)     restarts the finished rows only
-
-`step.observation` is always the state that the action led to, also in the last step of an episode, so that
-learners can bootstrap from it. No row restarts by itself.
+`step.observation` is always the state that the action led to, also in the last step of an episode, so that learners
+can bootstrap from it. No row restarts by itself.
 """
 
 from collections.abc import Mapping
@@ -84,10 +80,7 @@ class PlacedSimulator(SteppedSimulator, Protocol):
         """Which states (B,) were stopped at the edge of the free space in the last step, bool."""
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
-        """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X).
-
-        What the correction cannot tell may be drawn, with torch's generator.
-        """
+        """Move from `before` as far toward `landed`, both (B, X), as there is room, or draw where; return it (B, X)."""
 
 
 def keep_clear(simulator: object, distance_m: float) -> None:

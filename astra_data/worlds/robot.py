@@ -22,12 +22,7 @@ State = NDArray[np.floating[Any]] | Sequence[float]
 
 
 class Robot(Protocol):
-    """A simulated robot: as many are made as episodes run side by side, and nobody waits for the time.
-
-    `astra-data deploy` is for a physical one.
-
-    `reset` may take a keyword `seed`, for what is random about it.
-    """
+    """A simulated robot, of which many run side by side; `reset` may take a keyword `seed`, for what is random."""
 
     def reset(self) -> State:
         """Bring the robot to where an episode starts; return its state (S,)."""
@@ -37,12 +32,7 @@ class Robot(Protocol):
 
 
 class RobotEnv:
-    """B robots, stepped one after another, as a batched target environment.
-
-    Attributes:
-        goal: (B, G) float32. failed: which robots failed in their last step, by their own account or the
-        objective's, (B,) bool. wall_contact: none of them, (B,) bool: robots do not tell.
-    """
+    """B robots, stepped one after another, as a batched target environment; they do not tell of walls."""
 
     def __init__(
         self,
@@ -57,11 +47,7 @@ class RobotEnv:
         num_threads: int | None = None,
         start_anywhere: bool = False,
     ) -> None:
-        """Build B robots.
-
-        robot: builds one. state: the column of its states. commands: the bounds of its commands. abstraction:
-        φ.
-        """
+        """Build B robots, with the column of their states, the bounds of their commands, and φ."""
         self.num_envs, self.action_size = num_envs, len(commands)
         self._objective, self._column, self._commands = objective, state, commands
         self._abstraction = abstraction

@@ -20,11 +20,7 @@ from astra_data.worlds.plane.mazes import Maze
 
 
 class FreeStates:
-    """B states (B, X) in a space without obstacles.
-
-    Attributes:
-        state: (B, X) float32.
-    """
+    """B states (B, X) float32 in a space without obstacles."""
 
     def __init__(self, state: Tensor) -> None:
         """Begin at `state` (B, X)."""
@@ -47,12 +43,7 @@ class FreeStates:
 
 
 class NumpySimulator(FreeStates):
-    """B abstract states that a NumPy function steps; `partial` makes of it what builds B of them.
-
-    Attributes:
-        state: (B, X) float32.
-        parameters: what a dataset paired with it records about it.
-    """
+    """B abstract states (B, X) that a NumPy function steps; `partial` makes of it what builds B of them."""
 
     def __init__(
         self,
@@ -62,10 +53,9 @@ class NumpySimulator(FreeStates):
         size: int,
         parameters: Mapping[str, float] | None = None,
     ) -> None:
-        """Begin with B states of zeros.
+        """Begin with B states of zeros, each of `size`; `parameters` are numbers or texts that datasets record.
 
-        function: maps states (B, X) and commands (B, A), both float64, to the next states (B, X). size: of a
-        state, X. parameters: numbers or texts about it, by default none.
+        `function` maps states (B, X) and commands (B, A), both float64, to the next states (B, X).
         """
         super().__init__(torch.zeros(num_envs, size))
         self._function = function
@@ -79,11 +69,7 @@ class NumpySimulator(FreeStates):
 
 
 class ColdSteps:
-    """Steps of B copies of a MuJoCo model without actuator states, by several threads.
-
-    Every step starts cold, without the solver's warm start from the last one: pairs need that, for their
-    states have just been reset.
-    """
+    """Steps of B copies of a MuJoCo model without actuator states, nor the solver's warm start, as pairs need it."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int | None = None) -> None:
         """Prepare steps of `num_envs` copies of `model`; there is by default one thread per core."""
@@ -93,11 +79,7 @@ class ColdSteps:
     def __call__(
         self, model: mujoco.MjModel | Sequence[mujoco.MjModel], motion: Floats, control: Floats, *, substeps: int
     ) -> Floats:
-        """Return where `substeps` physics steps from `motion`, qpos then qvel (B, nq + nv), lead.
-
-        `model` is one for all, or one for each of the B copies, which differ in numbers alone; the `control`
-        of the actuators (B, nu) is constant.
-        """
+        """Return where `substeps` physics steps lead from `motion`, qpos then qvel (B, N); `control` (B, nu) stays."""
         one = model if isinstance(model, mujoco.MjModel) else model[0]
         after_time = slice(1, 1 + one.nq + one.nv)
         initial = np.zeros((len(motion), mujoco.mj_stateSize(one, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
@@ -107,13 +89,7 @@ class ColdSteps:
 
 
 class MujocoModel(FreeStates):
-    """B copies of a MuJoCo model; state: qpos (nq) then qvel (nv), action: the motors' controls (nu).
-
-    Every step starts cold.
-
-    Attributes:
-        state: (B, nq + nv) float32.
-    """
+    """B copies of a MuJoCo model, stepped cold; state: qpos (nq) then qvel (nv), action: the motors' controls (nu)."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, *, substeps: int, num_threads: int | None = None) -> None:
         """Allocate B copies in the model's initial state."""
@@ -182,15 +158,7 @@ def share_out(
 
 
 class BatchedPhysics:
-    """B independent copies of `model`, stepped `substeps` physics steps per control step.
-
-    Attributes:
-        qpos: positions, (B, nq) float64, refreshed by `step` and `set_state`. qvel: velocities, (B, nv)
-        float64, likewise. state: the full state of each copy, warm start included, (B, N) float64; a copy of
-        it can be written back. touching: whether anything touched a watched geom at the end of the copy's
-        last step, (B,) bool. measured: the numbers that `measure` read off each copy when it was last stepped
-        or set, (B, M) float64.
-    """
+    """B independent copies of `model`, stepped `substeps` physics steps per control step."""
 
     def __init__(
         self,
@@ -202,20 +170,16 @@ class BatchedPhysics:
         measure: Callable[[mujoco.MjData], Sequence[float]] | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Allocate B copies in the model's initial state.
-
-        watched_geoms: first and last id of the geoms whose contacts are reported, by default none. measure:
-        reads M numbers off a copy that was just stepped or set, without changing its state.
-        """
+        """Allocate B copies in the initial state; watch contacts of geoms, first to last; `measure` M numbers each."""
         self.model = model
         self.num_envs = num_envs
         self.substeps = substeps
         self.num_threads = min(num_threads or cores(), num_envs)
         self._watched = frozenset(range(watched_geoms[0], watched_geoms[1] + 1) if watched_geoms else ())
         self._measure = measure
-        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))
+        self.state: Floats = np.zeros((num_envs, mujoco.mj_stateSize(model, _STATE)))  # warm start included
         self.qpos, self.qvel = views(model, self.state)
-        self.touching: Bools = np.zeros(num_envs, dtype=bool)
+        self.touching: Bools = np.zeros(num_envs, dtype=bool)  # a watched geom, at the end of the last step
         self._control: Floats = self.state[:, self.state.shape[1] - model.nu :]
         self._rows = list(self.state)
         self._data = [mujoco.MjData(model) for _ in range(self.num_threads)]

@@ -92,8 +92,7 @@ class Varied:
 
     kind: Callable[[TaskSimulator, Variation], VariedSimulator]
     """Builds the varied simulator from a plain one and the ranges."""
-    randomized: Variation
-    """What domain randomization varies, in which ranges."""
+    randomized: Variation  # what domain randomization varies, in which ranges
     wide: Variation
     """What COMPASS varies or identifies, and RMA adapts to; of the kind of all parameters that there are."""
 
@@ -102,8 +101,7 @@ class Varied:
 class Plane:
     """Properties that only tasks in a maze have."""
 
-    wall_reach_m: float
-    """A robot whose clearance in the maze is larger than this touches no wall."""
+    wall_reach_m: float  # a robot whose clearance in the maze is larger than this touches no wall
 
 
 _FROM_SIMULATOR: Any = None
@@ -280,11 +278,7 @@ class Task:
         return round(1.0 / self.timestep_s)
 
     def target(self, num_envs: int, **options: Any) -> TargetEnv:  # noqa: ANN401 - handed on
-        """Build `num_envs` target environments, driven by actions of ±1; `options` are their own.
-
-        Raises:
-            BadInputError: the task has no target.
-        """
+        """Build `num_envs` target environments, driven by actions of ±1; `options` are their own."""
         if self.make_target is not None:
             return self.make_target(self.objective, num_envs, **options)
         if self.robot is None:

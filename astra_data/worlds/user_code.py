@@ -23,8 +23,7 @@ from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.protocols import AbstractSimulator
 
-_PREFIX = "astra_data_user_"
-"""Of the names of modules that are files of the user's."""
+_PREFIX = "astra_data_user_"  # of the names of modules that are files of the user's
 _PACKAGE = Path(__file__).parents[1]
 _NOT_READ = (".log", ".py", ".pyc")
 """Endings of files that code names and does not read as data: what it writes, and code, which it imports."""
@@ -105,10 +104,7 @@ def _of_package(name: str) -> ModuleType:
 
 @contextmanager
 def _among_neighbors(folder: str) -> Iterator[None]:
-    """Let a file import those in its `folder`, not files of the same names beside other files of the user's.
-
-    Installed packages come first. What the other files imported is theirs again afterwards.
-    """
+    """Let a file import those in its `folder`, not files of the same names beside other files of the user's."""
     files = {name: os.path.realpath(getattr(one, "__file__", None) or "") for name, one in sys.modules.items()}
     others = {os.path.dirname(file) for name, file in files.items() if _PREFIX in name} - {folder}
     theirs = {
@@ -156,10 +152,7 @@ def explained(what: str) -> Iterator[None]:
 
 
 def _place(error: BaseException) -> str:
-    """Return the file and line of the user's code at which `error` was raised, or else where it was.
-
-    Nothing is returned where that is this package or the import system, or where the message has it already.
-    """
+    """Return the file and line of the user's code at which `error` was raised; nothing where the message has it."""
     if isinstance(error, SyntaxError):
         return ""
     users = {module.__file__ for name, module in sys.modules.items() if name.startswith(_PREFIX)}
@@ -173,9 +166,7 @@ def _place(error: BaseException) -> str:
 def code_digest(name: str) -> str | None:
     """Return a digest of the code that `name` begins with; None where it is this package's, or not found.
 
-    Of a file, the files and packages beside it that it imports count too; of an installed module, all of its
-    package. So do models and data beside these that they name, such as a robot.xml; what they find without
-    its name, comments and layout do not.
+    Of a file, the files beside it that it imports count, of a module all of its package; and models and data they name.
     """
     place = name.rpartition(":")[0]
     file = Path(place)
@@ -213,10 +204,7 @@ def _with_neighbors(files: list[Path], folder: Path) -> Iterator[tuple[Path, ast
 
 
 def _installed(module: str) -> tuple[list[Path], Path]:
-    """Return the files of the outermost package that a module is in, or its own file, and their folder.
-
-    There are none of this package, and of what is not found. None is run.
-    """
+    """Return the files of the outermost package of a module, or its own, and their folder; none of this package."""
     top, spec = module.partition(".")[0], None
     with suppress(ImportError, ValueError):
         spec = importlib.util.find_spec(top) if top != _PACKAGE.name else None
@@ -229,10 +217,7 @@ def _installed(module: str) -> tuple[list[Path], Path]:
 
 
 def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
-    """Return the models and data in the folder of `place` whose paths within it are texts in it.
-
-    Or parts of their paths are, as in `folder / "data" / "weights.npz"`.
-    """
+    """Return the files in the folder of `place`, models and data, whose paths, or their parts, are texts in it."""
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     paths = [Path(text) for text in texts if isinstance(text, str) and Path(text).parts]
     paths = [path for path in paths if not path.is_absolute() and ".." not in path.parts]
@@ -283,12 +268,7 @@ def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
 def restored[Learned](
     made: type[Learned], tensors: dict[str, Tensor], metadata: Mapping[str, Any], *device: str
 ) -> Learned:
-    """Return what `from_file` of the class `made` returns.
-
-    Raises:
-        BadInputError: it is a class of the user's, and fails.
-        KeyError, TypeError, ValueError, RuntimeError: it is one of the package, and fails.
-    """
+    """Return what `from_file` of the class `made` returns; one of the user's that fails is a BadInputError."""
     from_file: Callable[..., Learned] = made.from_file  # type: ignore[attr-defined]
     if made.__module__.partition(".")[0] == _PACKAGE.name:
         return from_file(tensors, metadata, *device)

@@ -30,17 +30,10 @@ NoiseRange = Annotated[Range, AfterValidator(_not_below_zero)]
 
 
 class Variation(Config):
-    """Ranges of the P parameters of an episode, drawn uniformly; by default all are the plain simulator's.
+    """Ranges of the P parameters of an episode, drawn uniformly; by default all are the plain simulator's."""
 
-    Attributes:
-        steering: parameters that replays of recordings identify. Noise is none of them: it brings no replay
-            closer to a recording, however noisy the target is.
-        sensing: scales of sensors, plain in replays. Replays begin at recorded states, so a scale could bring
-            them closer only by hiding errors of the motion, and its effect drowns all others.
-    """
-
-    steering: ClassVar[tuple[str, ...]] = ()
-    sensing: ClassVar[tuple[str, ...]] = ()
+    steering: ClassVar[tuple[str, ...]] = ()  # what replays of recordings identify; noise brings none closer to any
+    sensing: ClassVar[tuple[str, ...]] = ()  # scales of sensors, plain in replays: they would hide errors of the motion
 
     @staticmethod
     def of_json(ranges: Mapping[str, Sequence[float]]) -> "Variation":
@@ -84,11 +77,7 @@ class Variation(Config):
 
 
 class PlanarVariation(Variation):
-    """Ranges for a robot in a plane.
-
-    Friction, action scale and timestep all scale the distance that a command covers, so positions identify
-    only the product of the three; velocities, that of the first two.
-    """
+    """Ranges for a robot in a plane; positions identify only the product of friction, action scale and timestep."""
 
     steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
 
@@ -135,11 +124,7 @@ class CommandVariation(Variation):
 
 
 class JointVariation(Variation):
-    """Ranges for joints under position control.
-
-    Friction and timestep both change how far a joint gets to its target: where nothing else moves the joint,
-    angles identify little but their quotient; rates, the first alone.
-    """
+    """Ranges for joints under position control; angles identify little but the quotient of friction and timestep."""
 
     steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "timestep_scale")
     sensing: ClassVar[tuple[str, ...]] = ("observation_scale",)
@@ -157,14 +142,7 @@ class JointVariation(Variation):
 
 
 class VariedSimulator(ABC):
-    """B simulators with parameters that differ from row to row, observed through sensors.
-
-    With plain parameters it is the plain simulator. Noise is drawn from torch's global generator.
-
-    Attributes:
-        simulator: the simulator itself, whose states are the true ones.
-        variation: the ranges of the parameters. parameters: (B, P), in the order of its `names`.
-    """
+    """B simulators with parameters that differ from row to row, observed through sensors."""
 
     def __init__(self, simulator: TaskSimulator, variation: Variation) -> None:
         """Draw parameters of `simulator` from `variation`."""
@@ -232,8 +210,5 @@ read as factors on one of 0.02 s."""
 
 
 def noisy_command(action: Tensor, deviation: Tensor) -> Tensor:
-    """Return commands (B, A) with Gaussian noise of standard deviation `deviation` (B, 1), clipped to ±1.
-
-    Noise is drawn from torch's global generator.
-    """
+    """Return commands (B, A) with Gaussian noise of standard deviation `deviation` (B, 1), clipped to ±1."""
     return (action + deviation * torch.randn_like(action)).clamp(-1.0, 1.0)

@@ -15,24 +15,16 @@ from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import answered, expect, expect_tensor, explained, judged, paid, stepped
 
 _COUNT = 3
-_EVEN = 0.005
-"""Relative error of a rate that is taken for a whole number, as by `new`."""
-_MOST_UNEVEN = 0.1
-"""Largest one that is not refused, as by imports."""
-_TOLERANCE = 1e-4
-"""Between states, relative to their size: simulators compute in single precision."""
+_EVEN = 0.005  # relative error of a rate that is taken for a whole number, as by `new`
+_MOST_UNEVEN = 0.1  # largest one that is not refused, as by imports
+_TOLERANCE = 1e-4  # between states, relative to their size: simulators compute in single precision
 _log = logging.getLogger(__name__)
 
 
 def check_task(task: Task, device: str = "cpu") -> list[str]:
     """Return one line for each piece of a task that is not as it should be; none if all is well.
 
-    Three states are drawn, set, stepped and judged. A robot is reset and is given no command; target
-    environments that the task builds itself are left out.
-
-    Args:
-        task: what to walk through.
-        device: torch device on which policies would be trained for it.
+    States are drawn, set, stepped and judged; a robot is reset, but not moved. `device`: where policies are trained.
     """
     faults: list[str] = []
 

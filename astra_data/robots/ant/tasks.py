@@ -1,9 +1,4 @@
-"""The ant's body: its MuJoCo model, its heading frame, its four-fold symmetry, its low-level controller.
-
-The controller turns a planar world-frame velocity command into eight joint torques. It observes the body in a
-heading frame. The four legs are exact copies, so the frame is first turned by the multiple of 90° for which
-the command points within ±45° of the x axis, and the legs are renumbered to match.
-"""
+"""The ant: its MuJoCo model, its low-level controller of velocities, its environment in a maze, its tasks."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -30,31 +25,23 @@ from astra_data.worlds.simulators import BatchedPhysics, add_walls, wall_geoms
 from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, Plane, Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
-STATE_SIZE = 29
-"""qpos (15): x, y, z, quaternion, 8 joint angles; qvel (14): linear, angular, 8 joint rates."""
+STATE_SIZE = 29  # qpos (15): x, y, z, quaternion, 8 joint angles; qvel (14): linear, angular, 8 joint rates
 POSITIONS = 15
-CONTROL_SUBSTEPS = 5
-"""Physics steps per control step: 5 x 0.01 s = 20 Hz, as in Gymnasium."""
+CONTROL_SUBSTEPS = 5  # physics steps per control step: 5 x 0.01 s = 20 Hz, as in Gymnasium
 TIMESTEP_S = 0.05
-INTEGRATOR = "RK4"
-"""Gymnasium's; "Euler" is 3.7 times faster, but has other contact dynamics."""
-TOPPLE_COSINE = 0.2
-"""The ant has toppled when the cosine between its up axis and the vertical falls below this."""
+INTEGRATOR = "RK4"  # Gymnasium's; "Euler" is 3.7 times faster, but has other contact dynamics
+TOPPLE_COSINE = 0.2  # the ant has toppled when the cosine between its up axis and the vertical falls below this
 TORSO_HEIGHT_M = 0.75
 WALL_REACH_M = 1.3
 """With more clearance than this on the maze's grid the ant touches no wall: a stretched leg ends 1.21 m from
 the torso's center, and the grid is up to 0.1 m off."""
-WALL_HEIGHT = 0.5
-"""In units of the maze scale, as in gymnasium-robotics."""
+WALL_HEIGHT = 0.5  # in units of the maze scale, as in gymnasium-robotics
 # Ankle axes alternate; these signs make every leg look like leg 1 (angle 30..70 degrees).
 _ANKLE_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def ant_model(maze: Maze | None = None, *, leg_scale: float = 1.0) -> mujoco.MjModel:
-    """Build Gymnasium's ant, on an open plane or in a `maze`, with walls where gymnasium-robotics has them.
-
-    leg_scale: factor on the length of all leg segments (1.25 in the paper's morphology test).
-    """
+    """Build Gymnasium's ant, in a `maze` as gymnasium-robotics has it or on a plane; `leg_scale` lengthens its legs."""
     root = ElementTree.parse(Path(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))).getroot()
     root.findall("option")[0].set("integrator", INTEGRATOR)
     world = root.findall("worldbody")[0]
@@ -85,12 +72,9 @@ def up_cosine(quaternion: Floats) -> Floats:
 
 
 def canonical_view(qpos: Floats, qvel: Floats, command: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Describe body and command in the heading frame that is turned toward the command.
+    """Describe body and command (B, 2) in the heading frame, turned by quarters (legs are copies) toward the command.
 
-    Of qpos (B, 15), qvel (B, 14) and the world-frame planar velocity command (B, 2) in m/s, return the
-    controller's observation (B, 28): height - 0.6, up axis (3), linear velocity (3), angular velocity (3),
-    hip and ankle angles (4 + 4), their rates (4 + 4), command (2); and how many quarter turns (B,) lie
-    between the body's own numbering of its legs and the observation's.
+    Return the observation (B, 28), and how many quarter turns (B,) lie between the body's numbering of legs and its.
     """
     rotation = rotation_matrix(qpos[:, 3:7])
     yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
@@ -139,11 +123,7 @@ def torques_to_body(torques: Floats, quarters: NDArray[np.intp]) -> Floats:
 
 
 class VelocityController:
-    """The frozen low-level controller: world-frame planar velocity command in, joint torques out.
-
-    A two-layer ReLU network with tanh output, stored as safetensors. It is evaluated in torch because numpy's
-    matrix products leave a thread per core spinning, which halves the speed of the physics.
-    """
+    """The frozen low-level controller, a ReLU network: world-frame planar velocity command in, joint torques out."""
 
     def __init__(self, layers: Sequence[tuple[Tensor, Tensor]], torque_scale: float) -> None:
         """Take (weight, bias) of each layer, and the largest torque as a share of the motors' limit."""
@@ -169,14 +149,7 @@ class VelocityController:
 
 
 class AntMazeEnv(PlanarTarget):
-    """B ants in a maze; action: world-frame velocity command in m/s, (B, 2), clipped to ±1 per axis.
-
-    State (B, 29): qpos (15) then qvel (14), as in Gymnasium. Observation (B, 31): state, then goal (2).
-    Reaching the goal and toppling end an episode; wall contacts are recorded, not punished.
-
-    Attributes:
-        state: (B, 29) float32. goal: (B, 2) float32. failed: (B,) bool, toppled in the last step.
-    """
+    """B ants in a maze, states qpos, qvel (B, 29); action: world-frame velocity in m/s, (B, 2), clipped to ±1."""
 
     observation_size = STATE_SIZE + 2
     action_size = 2
@@ -192,11 +165,7 @@ class AntMazeEnv(PlanarTarget):
         controller: VelocityController | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Build B ants.
-
-        leg_scale: factor on the legs' length. controller: the low-level controller, by default the one
-        shipped.
-        """
+        """Build B ants; `leg_scale` is a factor on the legs' length, `controller` by default the one shipped."""
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.leg_scale = leg_scale
         self.controller = controller or VelocityController.load()
@@ -263,19 +232,12 @@ _JOINT_RATES = slice(-8, None)
 
 
 def ant_to_point_mass[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
-    """Keep the planar position and velocity of an ant's state: (..., 29) to [x, y, vx, vy] (..., 4).
-
-    Position in m and velocity in m/s, both of the torso in the world frame. Dropped: height, orientation,
-    all joints, and every rate but the two planar ones.
-    """
+    """Keep the torso's planar position in m and velocity in m/s: (..., 29) to [x, y, vx, vy] (..., 4)."""
     return state[..., _PLANAR]
 
 
 def ant_beyond_point_mass(state: Tensor) -> Tensor:
-    """Return the part of an ant's state that `ant_to_point_mass` drops: (..., 29) to (..., 25).
-
-    In the order of the state and in SI units, but for joint rates, which reach 10 rad/s: a fifth of those.
-    """
+    """Return what `ant_to_point_mass` drops: (..., 29) to (..., 25), in SI units, but a fifth of the joint rates."""
     rest = state[..., _REST]
     rest[..., _JOINT_RATES] *= 0.2
     return rest

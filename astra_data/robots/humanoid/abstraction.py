@@ -1,8 +1,4 @@
-"""φ of the humanoid, one function per abstract simulator, and the forward kinematics that it needs.
-
-φ maps target states (..., 47), numpy in, numpy out, torch in, torch out, and drops the position on the floor,
-which the dynamics do not depend on. Kinematics are in the torso's frame, in m.
-"""
+"""φ of the humanoid for each abstract simulator, (..., 47) to (..., X), and the forward kinematics that it needs."""
 
 from collections.abc import Callable
 from functools import cache
@@ -137,19 +133,13 @@ def _place(joints: Tensor) -> _Placed:
 
 
 def mass_and_feet(joints: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the center of mass (..., 3), and the centers of the left and the right foot (..., 2, 3).
-
-    `joints` (..., 17) are angles in rad, in the order of the state.
-    """
+    """Return center of mass (..., 3), left and right foot (..., 2, 3) in the torso's frame, of angles (..., 17)."""
     placed = _place(joints)
     return placed.mass, placed.feet
 
 
 def mass_velocity(joints: Tensor, rates: Tensor) -> Tensor:
-    """Return the velocity (..., 3) in m/s of the center of mass relative to the torso.
-
-    `joints` (..., 17) are angles in rad, `rates` (..., 17) their rates in rad/s.
-    """
+    """Return the center of mass's velocity (..., 3) in m/s relative to the torso, of angles and rates (..., 17)."""
     placed, skeleton = _place(joints), _skeleton(joints.dtype, joints.device)
     lever = skeleton.moved @ placed.centers - skeleton.moved.sum(-1, keepdim=True) * placed.anchors
     velocity: Tensor = (rates.unsqueeze(-1) * torch.linalg.cross(placed.axes, lever)).sum(-2)
@@ -186,11 +176,8 @@ class Phi:
 def humanoid_to_walker2d(state: Tensor) -> Tensor:
     """Keep the state of a planar walker: (..., 47) to (..., 15).
 
-    Height in m and pitch in rad of the torso, the angles of left hip, left knee, right hip, right knee; the
-    torso's horizontal velocity along its heading in m/s, then the velocities of all of these; and whether
-    left and right foot touch the floor, 1 or 0. The pitch is the angle of the torso's forward axis below the
-    horizon. Dropped: the velocity to the side, the heading, roll and turning of the torso, and the joints
-    that no command moves, though the feet's heights depend on those too.
+    Height and pitch (of the forward axis, below the horizon), the commanded joints' angles; horizontal velocity along
+    the heading, then the rates of all of these; whether the feet touch the floor, 1 or 0.
     """
     height, spin = state[..., _HEIGHT], state[..., _SPIN]
     joints, turn = state[..., _JOINTS], rotation(state[..., _QUATERNION])
@@ -210,10 +197,7 @@ def humanoid_to_walker2d(state: Tensor) -> Tensor:
 
 @Phi
 def humanoid_to_kinematics(state: Tensor) -> Tensor:
-    """Keep the angles in rad and rates in rad/s of all joints: (..., 47) to (..., 34).
-
-    Dropped: position, orientation and velocity of the body.
-    """
+    """Keep the angles in rad and rates in rad/s of all joints: (..., 47) to (..., 34)."""
     return torch.cat([state[..., _JOINTS], state[..., _RATES]], dim=-1)
 
 
@@ -221,12 +205,8 @@ def humanoid_to_kinematics(state: Tensor) -> Tensor:
 def humanoid_to_extended_kinematics(state: Tensor) -> Tensor:
     """Keep all joints, the motion of the center of mass and the lean of the torso: (..., 47) to (..., 46).
 
-    After the joints (34): x and y of the center of mass relative to the midpoint of the feet, and its height
-    above the floor, in m; its velocity (3) in m/s. These are in a level frame whose x axis is the torso's
-    heading, so that steps look the same in all directions. The center of mass of a falling humanoid first
-    leaves the area above the feet, then drops. Then, in the torso's frame, the direction of up (3) and the
-    torso's angular velocity (3) in rad/s: what the paper calls robot-level information, citing a robot that
-    observes both (Radosavovic et al. 2024). Dropped: the heading.
+    Along the heading: center of mass from the midpoint of the feet, its height, its velocity; in the torso's frame: the
+    direction of up and the angular velocity, the paper's robot-level information (of Radosavovic et al. 2024).
     """
     joints, rates = state[..., _JOINTS], state[..., _RATES]
     turn = rotation(state[..., _QUATERNION])
@@ -244,11 +224,7 @@ def humanoid_to_extended_kinematics(state: Tensor) -> Tensor:
 
 
 def beyond_walker2d(state: Tensor) -> Tensor:
-    """Return the part that `humanoid_to_walker2d` drops: (..., 47) to (..., 34), in spreads.
-
-    The torso's orientation and angular velocity, its velocity to the left, and the joints that no command
-    moves.
-    """
+    """Return what `humanoid_to_walker2d` drops except x and y: (..., 47) to (..., 34), in spreads."""
     seen = in_spreads(state)
     velocity = _headed(rotation(state[..., _QUATERNION]), state[..., _VELOCITY])
     rest = [joint for joint in range(len(JOINTS)) if joint not in COMMANDED]
@@ -265,10 +241,7 @@ def beyond_kinematics(state: Tensor) -> Tensor:
 
 
 def beyond_extended_kinematics(state: Tensor) -> Tensor:
-    """Return what `humanoid_to_extended_kinematics` drops except x and y: (..., 47) to (..., 2).
-
-    The heading, as cosine and sine.
-    """
+    """Return the heading, which `humanoid_to_extended_kinematics` drops, as cosine and sine: (..., 47) to (..., 2)."""
     return _heading(rotation(state[..., _QUATERNION]))
 
 

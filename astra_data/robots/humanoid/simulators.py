@@ -1,8 +1,4 @@
-"""The most abstract simulator of the humanoid: a walker in the plane of x and z, legs under one rigid link.
-
-Its MuJoCo model, walker2d.xml, has the lengths, masses, joints and motors of the humanoid's in its initial
-pose, the same physics and position control. What it leaves out: docs/results/humanoid.md.
-"""
+"""The humanoid's abstract simulators: a planar walker, see walker2d.xml, joints alone, and joints with the body."""
 
 from collections.abc import Mapping
 from copy import copy
@@ -38,10 +34,7 @@ from astra_data.worlds.simulators import ColdSteps, FreeStates
 
 
 def walker_model() -> mujoco.MjModel:
-    """Build the walker; qpos (7): x, z and pitch of the torso, left hip, left knee, right hip, right knee.
-
-    Controls are the targets of these four joints in rad, held as `humanoid_model` holds them.
-    """
+    """Build the walker; qpos (7): x, z and pitch of the torso, left hip, left knee, right hip, right knee."""
     return mujoco.MjModel.from_xml_path(str(files("astra_data.robots.humanoid") / "walker2d.xml"))
 
 
@@ -54,10 +47,7 @@ _LEG_M = (
 
 
 def sole_clearance(pose: Tensor) -> Tensor:
-    """Return the heights of the left and the right sole above the floor, (..., 2) in m.
-
-    `pose` (..., 6): height in m and pitch of the torso, left hip, left knee, right hip, right knee in rad.
-    """
+    """Return heights of left and right sole above the floor, (..., 2), of `pose` (..., 6): z, pitch, hips and knees."""
     height, pitch, hip, knee = pose[..., :1], pose[..., 1:2], pose[..., [2, 4]], pose[..., [3, 5]]
     for (x, z), angle in zip(_LEG_M, (pitch, pitch + hip, pitch + hip - knee), strict=True):
         height = height - x * torch.sin(angle) + z * torch.cos(angle)
@@ -71,12 +61,7 @@ _CONTACTS = slice(13, 15)
 
 
 class HumanoidWalker2d(FreeStates):
-    """B walkers; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
-
-    Attributes:
-        state: (B, 15) float32, as `humanoid_to_walker2d` makes it.
-        memory: depth of the floors below 0 in m, (B, 1) float64.
-    """
+    """B walkers, states (B, 15); action: angles of left hip, left knee, right hip, right knee (B, 4), clipped to ±1."""
 
     action_size = 4
     abstract_state = Column(
@@ -111,12 +96,7 @@ class HumanoidWalker2d(FreeStates):
         return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
-        """Use other joints and control steps from the next step on.
-
-        "friction" (B, 1) is a factor on the damping of the joints; "timestep_scale" one on the control step,
-        which keeps its number of physics steps. At 5/3 the longer physics steps put poses off by 0.3 % and
-        rates by 1.2 % of what they change by in a step.
-        """
+        """Use factors (B, 1) on the joints' damping and on the control step, of as many physics steps, from now on."""
         plain = self._model
         if self._models[0] is plain:
             self._models = [copy(plain) for _ in self.state]
@@ -166,11 +146,7 @@ _UNITS = ["rad"] * _COUNT + ["rad/s"] * _COUNT
 
 
 class HumanoidKinematics(FreeStates):
-    """B humanoids' joints; action: angles of left hip and knee, right hip and knee, (B, 4), clipped to ±1.
-
-    Attributes:
-        state: (B, 34) float32, as `humanoid_to_kinematics` makes it.
-    """
+    """B humanoids' joints, (B, 34); action: angles of left hip and knee, right hip and knee, (B, 4), clipped to ±1."""
 
     action_size = 4
     abstract_state = Column(
@@ -182,8 +158,7 @@ class HumanoidKinematics(FreeStates):
     )
     abstraction = humanoid_to_kinematics
 
-    ranges = CommandRanges()
-    """Joint angles of commands."""
+    ranges = CommandRanges()  # joint angles of commands
 
     def __init__(self, num_envs: int, *, device: str = "cpu") -> None:
         """Set B humanoids' joints to zero."""
@@ -218,11 +193,7 @@ class HumanoidKinematics(FreeStates):
 
 
 class HumanoidExtendedKinematics(HumanoidKinematics):
-    """The same, with the center of mass and its velocity, and lean and angular velocity of the torso.
-
-    Attributes:
-        state: (B, 46) float32, as `humanoid_to_extended_kinematics` makes it.
-    """
+    """The same, with the center of mass and its velocity, and lean and angular velocity of the torso, (B, 46)."""
 
     abstract_state = Column(
         ABSTRACT_STATE,
@@ -243,10 +214,7 @@ class HumanoidExtendedKinematics(HumanoidKinematics):
     abstraction = humanoid_to_extended_kinematics
 
     def __init__(self, num_envs: int, *, follow_s: float = 0.3, device: str = "cpu") -> None:
-        """Build B standing humanoids.
-
-        follow_s: time constant of the body's velocity and angular velocity, above 0.
-        """
+        """Build B standing humanoids; `follow_s` is the time constant of the body's velocity and angular velocity."""
         super().__init__(num_envs, device=device)
         self.follow_s = follow_s
 

@@ -1,8 +1,4 @@
-"""The humanoid's MuJoCo model, the spreads of its states, and the rewards of walking.
-
-Its own motors move it, or position control of every joint. Four joints follow commands: hips and knees, each
-about one axis. All others are held at zero.
-"""
+"""The humanoid's MuJoCo model, the spreads of its states, and the environment of walking with its rewards."""
 
 from dataclasses import dataclass
 from importlib.resources import files
@@ -30,26 +26,19 @@ JOINTS = (
 """In the order of the state."""
 COMMANDED = tuple(JOINTS.index(name) for name in ("left_hip_y", "left_knee", "right_hip_y", "right_knee"))
 """The commanded joints among all, in the order of actions."""
-FEET = ("left_foot", "right_foot")
-"""Geoms that are spheres at the ends of the shins."""
+FEET = ("left_foot", "right_foot")  # geoms that are spheres at the ends of the shins
 FOOT_RADIUS_M = 0.075
 
-POSITIONS = 24
-"""qpos: x, y, z, quaternion, 17 joint angles."""
-STATE_SIZE = 47
-"""qpos, then qvel (23): linear, angular, 17 joint rates."""
+POSITIONS = 24  # qpos: x, y, z, quaternion, 17 joint angles
+STATE_SIZE = 47  # qpos, then qvel (23): linear, angular, 17 joint rates
 STANDING = (0.0, 0.0, 1.4, 1.0, *[0.0] * 43)
 """The state in which the model starts: upright, at rest, every joint at zero."""
-CONTROL_SUBSTEPS = 5
-"""Physics steps per control step: 5 x 0.003 s, as in Gymnasium."""
+CONTROL_SUBSTEPS = 5  # physics steps per control step: 5 x 0.003 s, as in Gymnasium
 TIMESTEP_S = 0.015
 
-STIFFNESS = 200.0
-"""In N m/rad: the paper's proportional gain."""
-DAMPING = 10.0
-"""In N m s/rad: the paper's derivative gain."""
-MOTOR_RANGE = 0.4
-"""Gymnasium's motors take controls of ±0.4, times their gear the torque in N m."""
+STIFFNESS = 200.0  # in N m/rad: the paper's proportional gain
+DAMPING = 10.0  # in N m s/rad: the paper's derivative gain
+MOTOR_RANGE = 0.4  # Gymnasium's motors take controls of ±0.4, times their gear the torque in N m
 
 CONTACT_M = 0.002
 """A foot touches the floor when its sole is closer to it than this: the sum of both margins in the model."""
@@ -58,11 +47,9 @@ Actuators = Literal["positions", "motors"]
 
 
 def humanoid_model(actuators: Actuators = "positions") -> mujoco.MjModel:
-    """Load Gymnasium's humanoid.
+    """Load Gymnasium's humanoid: with "motors" unchanged, with "positions" controlled by joint angles in rad.
 
-    With "motors" it is unchanged. With "positions", controls are joint angles in rad that MuJoCo holds with
-    the paper's gains in every physics step, with torques up to those of the motors. If torques were computed
-    only once per control step, the same gains would make the joints chatter.
+    MuJoCo then holds them in every physics step, up to the motors' torques; once per control step they would chatter.
     """
     path = Path(str(files("gymnasium.envs.mujoco") / "assets" / "humanoid.xml"))
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -80,10 +67,7 @@ def humanoid_model(actuators: Actuators = "positions") -> mujoco.MjModel:
 
 @dataclass(frozen=True)
 class CommandRanges:
-    """Joint angles in degrees of the commands -1 and 1; not in the paper.
-
-    Random commands over the joints' full ranges make the humanoid fall in 19 control steps, over these in 65.
-    """
+    """Joint angles of the commands -1 and 1; not in the paper. Random ones over the full ranges make it fall soon."""
 
     hip_deg: tuple[float, float] = (-50.0, 20.0)
     knee_deg: tuple[float, float] = (-70.0, -2.0)
@@ -131,23 +115,15 @@ _QUATERNION = slice(3, 7)
 
 @dataclass(frozen=True)
 class Locomotion:
-    """Rewards, starts and ends of episodes.
+    """Rewards, starts and ends of episodes."""
 
-    Attributes:
-        forward_reward: per m/s of the center of mass along x. healthy_reward: for every step that ends at a
-        healthy height. healthy_m: range of healthy heights of the torso, outside of which the episode ends.
-        effort_cost: per unit of the sum of the squared controls. contact_cost: per unit of the sum of the
-        squared contact forces and torques. contact_cost_limit: the largest contact cost of a step.
-        reset_noise: half width of the uniform noise on positions and velocities at the start.
-    """
-
-    forward_reward: float = 1.25
-    healthy_reward: float = 5.0
-    healthy_m: tuple[float, float] = (1.0, 2.0)
-    effort_cost: float = 0.1
-    contact_cost: float = 5e-7
-    contact_cost_limit: float = 10.0
-    reset_noise: float = 0.01
+    forward_reward: float = 1.25  # per m/s of the center of mass along x
+    healthy_reward: float = 5.0  # for every step that ends at a healthy height
+    healthy_m: tuple[float, float] = (1.0, 2.0)  # heights of the torso, outside of which the episode ends
+    effort_cost: float = 0.1  # per unit of the sum of the squared controls
+    contact_cost: float = 5e-7  # per unit of the sum of the squared contact forces and torques
+    contact_cost_limit: float = 10.0  # of a step
+    reset_noise: float = 0.01  # half width of the uniform noise on positions and velocities at the start
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> Floats:
         """Draw target states (count, 47): almost upright and at rest."""
@@ -162,11 +138,7 @@ class Locomotion:
         return np.asarray((height > low) & (height < high))
 
     def reward(self, velocity: Floats, healthy: Bools, effort: Floats, contact: Floats) -> Floats:
-        """Return the reward (B,) of a step that ended `healthy` (B,) or not.
-
-        `velocity` is that of the center of mass along x in m/s; `effort` and `contact` are the sums of the
-        squared controls, and of the squared contact forces and torques of all bodies, (B,).
-        """
+        """Return the rewards (B,); `effort`, `contact`: sums of squared controls and of squared contact forces."""
         cost = self.effort_cost * effort
         cost = cost + np.minimum(self.contact_cost * contact, self.contact_cost_limit)
         return np.asarray(self.forward_reward * velocity + self.healthy_reward * healthy - cost)
@@ -175,14 +147,8 @@ class Locomotion:
 class HumanoidEnv:
     """B humanoids; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
 
-    State (B, 47): qpos (24) then qvel (23), as in Gymnasium. Observation (B, 45): the state without x and y,
-    as Humanoid-v5's begins. Only falling ends an episode. The reward's control cost is that of Gymnasium's
-    motors: position actuators count by the torques that they apply, each divided by the gear of the motor in
-    its place. Otherwise targets would cost, not effort.
-
-    Attributes:
-        physics: their bodies. goal: (B, 0), there is none.
-        failed: (B,) bool, at an unhealthy height after the last step.
+    State (B, 47): qpos, qvel. Observation (B, 45): the state without x and y. Only falling ends an episode. Position
+    actuators cost by their torques over the motors' gears: otherwise targets would cost, not effort.
     """
 
     observation_size = STATE_SIZE - 2
@@ -198,10 +164,7 @@ class HumanoidEnv:
         actuators: Actuators = "positions",
         num_threads: int | None = None,
     ) -> None:
-        """Build B humanoids.
-
-        locomotion: reward, ends and starts. actuators: meaning of the controls, see `humanoid_model`.
-        """
+        """Build B humanoids with rewards, ends and starts of `locomotion`; `actuators`: see `humanoid_model`."""
         if start_anywhere:
             raise BadInputError("collect.start: expected 'task' for a humanoid, got 'anywhere'")
         self.locomotion, self.num_envs = locomotion, num_envs
@@ -218,10 +181,7 @@ class HumanoidEnv:
         self.reseed(seed)
 
     def _measure(self, data: mujoco.MjData) -> tuple[float, float, float]:
-        """Return x of the center of mass, and the sums of squared controls and contact forces.
-
-        As in Gymnasium, they are of the last evaluation of the dynamics, not of the state after it.
-        """
+        """Return x of the center of mass, the sums of squared controls and contact forces, of the last evaluation."""
         mujoco.mj_rnePostConstraint(self._model, data)
         control = data.actuator_force / self._torque_per_control
         contact = data.cfrc_ext.ravel()

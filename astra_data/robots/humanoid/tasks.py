@@ -1,9 +1,4 @@
-"""The humanoid's tasks: walking of Gymnasium's humanoid, with three abstract simulators (Section V-B).
-
-The objectives reward forward velocity and staying up, as `Locomotion` does; the costs of effort and contact
-forces, which are small in the target, are left out. There is no goal to reach: an episode that lasts to the
-horizon without a fall succeeds.
-"""
+"""The humanoid's tasks: walking of Gymnasium's humanoid, with three abstract simulators (Section V-B)."""
 
 import os
 from abc import abstractmethod
@@ -67,13 +62,10 @@ class Walking(Objective):
 
     action_size = len(COMMANDED)
     is_lasting = True
-    spread: ClassVar[tuple[float, ...]]
-    """Typical deviation of each entry of a state from standing, (X,)."""
-    phi: ClassVar[Phi]
-    """φ of target states (count, 47), (count, X)."""
+    spread: ClassVar[tuple[float, ...]]  # typical deviation of each entry of a state from standing, (X,)
+    phi: ClassVar[Phi]  # φ of target states (count, 47), (count, X)
 
-    locomotion: Locomotion = field(default_factory=Locomotion)
-    """Rewards and starts of the target."""
+    locomotion: Locomotion = field(default_factory=Locomotion)  # rewards and starts of the target
     failure_reward: float = field(default=-5.0, kw_only=True)
     """Minus the reward for staying up, which a step that ends in a fall does not get."""
 
@@ -166,11 +158,7 @@ class MassWalking(Walking):
 
 
 class VariedHumanoid(VariedSimulator):
-    """B of one of the humanoid's simulators, each with the parameters of a `JointVariation`.
-
-    A command gets noise, is clipped to ±1 and scaled; the simulator clips the result again. Sensors show the
-    true state, scaled; rewards and falls are those of the observed state and of steps of the plain length.
-    """
+    """B of the humanoid's simulators, each with a `JointVariation`; rewards and falls are of the observed state."""
 
     @property
     def _scale(self) -> Tensor:
@@ -219,8 +207,7 @@ def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 2
     return np.stack(pictures)
 
 
-_HORIZON = 1000
-"""Of Gymnasium's Humanoid-v5: 15 s."""
+_HORIZON = 1000  # of Gymnasium's Humanoid-v5: 15 s
 
 _COMMANDS = ("left_hip", "left_knee", "right_hip", "right_knee")
 _COMMAND = entries(" ".join(_COMMANDS), "1", "joint", "invariant")

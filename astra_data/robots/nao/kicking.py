@@ -1,10 +1,4 @@
-"""Kicking: a rolling ball, the point mass with a ball that simulates it, and the objective.
-
-The paper prints no reward. Ours: meters by which the ball comes closer to the goal, plus half the meters by
-which the robot comes closer to the point behind the ball, +10 for a goal, -10 for a ball that leaves the
-field elsewhere and for falling. Lines and goal are those of RoboCup's Standard Platform League, at smaller
-distances.
-"""
+"""Kicking: a rolling ball, the point mass with a ball that simulates it, and the objective; the reward is ours."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,12 +15,9 @@ from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.plane.navigation import PlanarObjective
 from astra_data.worlds.plane.point_mass import PlanarStates
 
-ROLLING_M_S2 = 0.30
-"""Deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)."""
-BALL_RADIUS_M = 0.05
-"""Of the same ball."""
-_KICKS_ABOVE = 0.5
-"""A third entry of a command above this asks for a kick."""
+ROLLING_M_S2 = 0.30  # deceleration of the ball of RoboCup's Standard Platform League (B-Human's ballSpecification)
+BALL_RADIUS_M = 0.05  # of the same ball
+_KICKS_ABOVE = 0.5  # a third entry of a command above this asks for a kick
 
 
 def asks_to_kick(command: Tensor) -> Tensor:
@@ -42,10 +33,7 @@ def asks_to_kick(command: Tensor) -> Tensor:
 def roll(
     position: Tensor, velocity: Tensor, period_s: Tensor | float, deceleration_m_s2: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """Roll balls at `position` with `velocity`, both (B, 2), slowed by an even friction until they lie.
-
-    Return positions and velocities (B, 2). Periods and decelerations are (B, 1) or one for all.
-    """
+    """Roll balls (B, 2), slowed by an even friction until they lie; return positions and velocities (B, 2)."""
     speed = velocity.norm(dim=-1, keepdim=True)
     slower = (speed - deceleration_m_s2 * period_s).clamp_min(0.0)
     rolling_s = (speed - slower) / deceleration_m_s2
@@ -66,8 +54,7 @@ def knock(
 ) -> tuple[Tensor, Tensor]:
     """Move the balls that bodies walk into, from `before` to `after`; return places and velocities, (B, 2).
 
-    reach_m: distance between the centers below which a body touches a ball. speed_m_s: of a touched ball,
-    (B, 1) or one for all, along the line between the centers turned by turn_rad, (B,) or one for all.
+    They leave with `speed_m_s` along the line between the centers, closer than `reach_m`, turned by `turn_rad`.
     """
     direction, distance = _seen_from(after, ball)
     approaches = ((after - before) * direction).sum(-1, keepdim=True) > 0
@@ -89,10 +76,7 @@ def kick_away(
     speed_m_s: Tensor | float,
     turn_rad: Tensor | float = 0.0,
 ) -> Tensor:
-    """Return the velocities (B, 2) of the balls; bodies that are `asked` (B, 1) kick those within reach.
-
-    reach_m, speed_m_s, turn_rad: of a kick, as of `knock`.
-    """
+    """Return the velocities (B, 2) of balls; bodies that are `asked` (B, 1) kick those within reach: see `knock`."""
     direction, distance = _seen_from(body, ball)
     leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
     return torch.where(asked & (distance < reach_m), leaving * speed_m_s, velocity)
@@ -110,33 +94,18 @@ _LIES_M_S = 0.15
 never quite zero."""
 _LEAVES_M_S = 0.5
 """Least speed with which corrections set a ball rolling that lay; the NAO's did about that in its kicks."""
-_NOTHING_M_S = 0.05
-"""Corrections to less than this set no ball rolling: scatter alone is as fast."""
-_TURN_RAD = 0.4
-"""Deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO."""
-_FADES = 0.75
-"""Share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps."""
+_NOTHING_M_S = 0.05  # corrections to less than this set no ball rolling: scatter alone is as fast
+_TURN_RAD = 0.4  # deviation of the ways in which hit balls leave from the simulator's, as in recorded kicks of the NAO
+_FADES = 0.75  # share of the evidence of a hit that counts in the next step: a foot meets the ball within four steps
 
 
 class BallAgent(PlanarStates):
     """B point masses, each with a ball: [x, y, vx, vy, ball x, ball y, ball vx, ball vy], in m and m/s.
 
-    A command is the velocity of the next step, in units of the top speed along each axis, and whether to
-    stand and kick. Walls stop the mass, not the ball. A kicked ball within reach leaves at one speed along
-    the line between the centers, one that the mass walks into at another. Left out: the legs, the positions
-    and timing of the feet, and the robot's heading.
-
-    Corrections move only balls that rolled or were touched in the step, and say how fast they are, not where
-    they go: recorded balls keep to the way that they rolled, and leave along the line between the centers,
-    scattered, more than they keep to what is expected of them. Those that rolled go on, or lie again if that
-    is slow. Whether one that lay starts to roll is drawn, such that the speed expected after the step is the
-    corrected one: an expected correction mixes balls that are hit with others that are missed into one that
-    creeps, or never moves. It is drawn once for as long as the ball lies: what makes a kick miss stays while
-    nothing moves, and policies that kick from too far would else wait until it works.
-
-    Attributes:
-        memory: of each ball, the evidence of a hit that it takes to roll, in [0, 1), and what there was of
-            late, (B, 2).
+    A command is the velocity of the next step, ±1 of the top speed per axis, and whether to stand and kick. Corrections
+    move only balls that rolled or were touched, and say how fast, not where to. Whether one that lay starts to roll is
+    drawn, once for as long as it lies, so that the expected speed is the corrected one: it would else creep, or
+    policies that kick from too far would wait until it works.
     """
 
     state_size = 8
@@ -156,13 +125,7 @@ class BallAgent(PlanarStates):
         kick_m_s: float,
         device: str = "cpu",
     ) -> None:
-        """Build B of them.
-
-        radius_m: distance that the mass keeps from walls, a multiple of the maze's `fine_m`. speed_m_s: top
-        speed along each axis. reach_m: distance between the centers below which the mass touches the ball.
-        knock_m_s: speed of a ball that the mass walks into. kick_reach_m: distance between the centers below
-        which the mass can kick the ball. kick_m_s: speed of a kicked ball.
-        """
+        """Build B of them, which touch the ball within `reach_m` of it and can kick it within `kick_reach_m`."""
         super().__init__(maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device)
         self.parameters |= {"reach_m": reach_m, "knock_m_s": knock_m_s}
         self.parameters |= {"kick_reach_m": kick_reach_m, "kick_m_s": kick_m_s}
@@ -228,34 +191,23 @@ class BallAgent(PlanarStates):
         return self.state
 
 
-_NEAR_M = (0.18, 0.5)
-"""Distances from the ball at which recorded episodes begin; a foot reaches as far as the first."""
+_NEAR_M = (0.18, 0.5)  # distances from the ball at which recorded episodes begin; a foot reaches as far as the first
 
 
 @dataclass(frozen=True)
 class Kicking(PlanarObjective):
-    """Get the ball into the goal at the right end of `maze`, an empty field, within `horizon` steps.
-
-    Abstract states begin with robot position and velocity, ball position and velocity, (..., 8). The goal
-    (..., 2) is the middle of the goal line. Actions (..., 3) end with whether to kick.
-
-    Attributes:
-        goal_line_m: x of the goal line. goal_half_width_m: of the goal on it. side_line_m: |y| of the side
-        lines. back_line_m: x of the line behind. ball_x_m, ball_y_m: ranges of the ball's position at the
-        start. distance_m: of the robot from the ball at the start. behind_m: distance from the ball of the
-        point behind it that the shaping reward leads to.
-    """
+    """Get the ball into the goal at the right end of `maze`, an empty field; goals (..., 2): the goal line's middle."""
 
     action_size = 3
 
-    goal_line_m: float = 1.5
+    goal_line_m: float = 1.5  # its x
     goal_half_width_m: float = 0.75
-    side_line_m: float = 2.0
+    side_line_m: float = 2.0  # |y| of both
     back_line_m: float = -2.0
-    ball_x_m: tuple[float, float] = (-0.5, 0.0)
+    ball_x_m: tuple[float, float] = (-0.5, 0.0)  # at the start
     ball_y_m: tuple[float, float] = (-0.6, 0.6)
-    distance_m: tuple[float, float] = (0.4, 1.0)
-    behind_m: float = 0.2
+    distance_m: tuple[float, float] = (0.4, 1.0)  # of the robot from the ball at the start
+    behind_m: float = 0.2  # distance from the ball of the point behind it that the shaping reward leads to
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states (count, 8) at rest: the ball in front of the goal, the robot around it."""

@@ -13,42 +13,25 @@ from astra_data.worlds.geometry import wrapped
 class PerceptionErrors:
     """Errors of the estimates; all can be zero."""
 
-    white_m: float = 0.005
-    """Standard deviation of the position's error from step to step."""
-    drift_m: float = 0.03
-    """Standard deviation, per axis, of the part that drifts."""
-    drift_rad: float = float(np.radians(2.0))
-    """Of the heading, likewise."""
-    drift_s: float = 2.0
-    """Time constant of both."""
-    jumps_per_s: float = 5 / 60
-    """Rate at which the estimated position jumps; the error then decays like the drift."""
-    jump_m: tuple[float, float] = (0.1, 0.3)
-    """Range of the distance of a jump."""
-    latency_s: float = 0.067
-    """Age of an estimate: half of the camera's period of 33 ms, and 50 ms of processing."""
-    ball_m: float = 0.012
-    """Standard deviation, per axis, of the ball's position at the robot's feet."""
-    ball_m_per_m: float = 0.033
-    """Its increase per meter of distance."""
-    ball_most_m: float = 0.106
-    """Its upper limit."""
-    ball_s: float = 0.5
-    """Time constant of the ball's error."""
-    ball_missed: float = 0.1
-    """Probability that a ball in view is not seen in a step."""
+    white_m: float = 0.005  # standard deviation of the position's error from step to step
+    drift_m: float = 0.03  # standard deviation, per axis, of the part that drifts
+    drift_rad: float = float(np.radians(2.0))  # of the heading, likewise
+    drift_s: float = 2.0  # time constant of both
+    jumps_per_s: float = 5 / 60  # rate at which the estimated position jumps; the error then decays like the drift
+    jump_m: tuple[float, float] = (0.1, 0.3)  # range of the distance of a jump
+    latency_s: float = 0.067  # age of an estimate: half of the camera's period of 33 ms, and 50 ms of processing
+    ball_m: float = 0.012  # standard deviation, per axis, of the ball's position at the robot's feet
+    ball_m_per_m: float = 0.033  # its increase per meter of distance
+    ball_most_m: float = 0.106  # its upper limit
+    ball_s: float = 0.5  # time constant of the ball's error
+    ball_missed: float = 0.1  # probability that a ball in view is not seen in a step
     ball_seen_rad: float = float(np.radians(100.0))
     """Largest bearing at which a ball is seen: the head turns by 68 degrees, the camera sees 28 more."""
-    ball_speed_keep: float = 0.6
-    """Weight of the previous estimate of the ball's velocity when the ball is seen again."""
+    ball_speed_keep: float = 0.6  # weight of the previous estimate of the ball's velocity when the ball is seen again
 
 
 class Localisation:
-    """Estimated poses of B robots.
-
-    Attributes:
-        pose: estimated x, y in m and heading in rad, (B, 3).
-    """
+    """Estimated poses of B robots: x, y in m and heading in rad."""
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:
         """Start without errors; control steps last `step_s`."""
@@ -91,11 +74,7 @@ class Localisation:
 
 
 class BallSight:
-    """Estimates of B robots of their balls, in the world frame.
-
-    Attributes:
-        position: in m, (B, 2). velocity: in m/s, (B, 2). unseen_s: time since the ball was last seen, (B,).
-    """
+    """Estimates of B robots of their balls, in the world frame."""
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:
         """Start without errors; control steps last `step_s`."""
@@ -113,10 +92,7 @@ class BallSight:
         self._error[rows] = 0.0
 
     def update(self, ball: Floats, pose: Floats, estimated: Floats, rng: np.random.Generator, active: Bools) -> None:
-        """Update the estimates of the robots in `active` (B,) after a step to the true `ball` (B, 2).
-
-        Their true poses are `pose` (B, 3), their `estimated` ones (B, 3).
-        """
+        """Update the robots in `active` (B,) after a step to the true `ball` (B, 2); `pose` is true, (B, 3)."""
         errors = self.errors
         apart = ball - pose[:, :2]
         distance = np.linalg.norm(apart, axis=1)

@@ -1,8 +1,4 @@
-"""The NAO's body as a MuJoCo model, and B of them: physics, servos, ankle reflex, 16 ticks per control step.
-
-A robot's whole control step runs in one thread, so that results do not depend on the number of threads. The
-robot's own friction and stiffness are first written into the thread's copy of the model.
-"""
+"""The NAO's body as a MuJoCo model, and B of them: physics, servos, ankle reflex, 16 ticks per control step."""
 
 import copy
 import xml.etree.ElementTree as ElementTree
@@ -41,17 +37,12 @@ from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.simulators import add_walls, share_out, views, wall_geoms
 
-SUBSTEPS = 3
-"""Physics steps per tick: 4 ms each."""
+SUBSTEPS = 3  # physics steps per tick: 4 ms each
 WALL_HEIGHT_M = 0.5
 
 
 def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel:
-    """Build a NAO on a floor, in `maze` or without walls, with or without a ball: see nao.xml.
-
-    qpos: torso x, y, z, quaternion (7), left leg's six joints, right leg's six, the ball's pose (7).
-    Controls: twelve joint angles in rad in the same order; both hip yaw-pitch joints are coupled.
-    """
+    """Build a NAO, see nao.xml; qpos: torso (7), left leg (6), right leg (6), ball (7); controls: the legs' angles."""
     root = ElementTree.parse(Path(str(files("astra_data.robots.nao") / "nao.xml"))).getroot()
     (world,) = root.findall("worldbody")
     for body in [] if ball else world.findall("body[@name='ball']"):
@@ -61,10 +52,8 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
 
 
-TICKS = 16
-"""Per control step."""
-FALLEN_COSINE = 0.7
-"""A robot has fallen when the cosine between its up axis and the vertical is below this (45°)."""
+TICKS = 16  # per control step
+FALLEN_COSINE = 0.7  # a robot has fallen when the cosine between its up axis and the vertical is below this (45°)
 MOTORS = len(TO_MOTORS)
 
 _STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
@@ -73,17 +62,7 @@ _ANKLES = ((4, 5), (10, 11))
 
 
 class BatchedBodies:
-    """B bodies of one model.
-
-    Attributes:
-        state: MuJoCo's full states, (B, N). qpos, qvel: views of it, (B, nq), (B, nv). sent: angles sent to
-        the servos, (B, delay + 16, 12) in rad: the last ticks of the previous control step, which may not
-        have arrived, then this one's. tilting: low-passed measured rates about x and y, (B, 2) in rad/s.
-        held: angles planned for the last tick, (B, 12) in rad. waited: ticks for which the present lift of a
-        foot has been delayed, (B,) int. gyro: last measured rates, (B, 3) in rad/s. pressure: on the points
-        of the soles, left foot's then right foot's, (B, 8) in N. fallen: (B,) bool; a fallen robot stays as
-        it is until its reset. touching: whether the robot touched a wall in its last control step, (B,) bool.
-    """
+    """B bodies of one model; one that has fallen stays as it is until its reset."""
 
     def __init__(
         self, model: mujoco.MjModel, traits: Traits, *, longest_delay_ticks: int, style: WalkStyle, num_threads: int
@@ -124,11 +103,7 @@ class BatchedBodies:
             part[rows] = 0
 
     def step(self, rows: NDArray[np.intp], targets: Targets, noise: Floats) -> NDArray[np.intp]:
-        """Run the bodies `rows` (n,) through one control step; fallen ones are left as they are.
-
-        `noise` (B, 16, 3) is that of the gyroscope in rad/s. Return how many ticks of the targets were
-        followed, (B,) int; in the others a lift was delayed.
-        """
+        """Run `rows` (n,) through one control step; return how many ticks of the targets were followed, (B,) int."""
         self.touching[rows] = False
         rows = rows[~self.fallen[rows]]
         before = self.sent.shape[1] - TICKS
@@ -202,17 +177,11 @@ class BatchedBodies:
 
 CONTROL_STEP_S = TICKS * TICK_S
 _BALL = 7 + MOTORS
-_MIDDLE_M = 0.03
-"""Either foot may kick a ball that is less far to the side: the torso sways as far from step to step."""
+_MIDDLE_M = 0.03  # either foot may kick a ball that is less far to the side: the torso sways as far from step to step
 
 
 class BatchedNao:
-    """B NAOs, each on a floor of its own.
-
-    Attributes:
-        gait: the robots' phases in their steps. traits: individual differences of the robots. bodies: their
-        physics.
-    """
+    """B NAOs, each on a floor of its own."""
 
     def __init__(
         self,
@@ -224,10 +193,7 @@ class BatchedNao:
         spread: TraitSpread | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Build B robots standing at the origin.
-
-        ball: give each robot a ball. spread: ranges of the traits.
-        """
+        """Build B robots standing at the origin, with traits of `spread`, each with a ball if asked."""
         self.num_robots = num_robots
         self.spread = spread or TraitSpread()
         self.has_ball = ball
@@ -249,10 +215,7 @@ class BatchedNao:
     def reset(
         self, rows: NDArray[np.intp], poses: Floats, rng: np.random.Generator, ball: Floats | None = None
     ) -> None:
-        """Set the robots `rows` (n,) upright at `poses` (n, 3), x, y in m and heading, with new traits.
-
-        Their balls are put at `ball` (n, 2) in m, by default 1 m ahead of them.
-        """
+        """Set robots upright at `poses` (n, 3), with new traits, and balls at `ball` (n, 2), by default 1 m ahead."""
         put_rows(self.traits, rows, Traits.draw(self.spread, len(rows), rng))
         standing = Gait.standing(len(rows), self._limits)
         put_rows(self.gait, rows, standing)
@@ -270,11 +233,7 @@ class BatchedNao:
         self.bodies.reset(rows, qpos, (angles + self.traits.joint_offset_rad[rows])[:, TO_MOTORS])
 
     def step(self, command: Floats, active: Bools | None = None, kick: Bools | None = None) -> None:
-        """Walk for 0.192 s at `command` (B, 3), m/s forward and to the left, rad/s.
-
-        Robots that are not `active` (B,), and fallen ones, stay as they are. Those that `kick` (B,) do so
-        with the foot on the ball's side when it next swings.
-        """
+        """Walk for 0.192 s at `command` (B, 3), m/s ahead and left, rad/s; who is to `kick` does in its next swing."""
         rows = np.flatnonzero(~self.fallen if active is None else active & ~self.fallen)
         targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))
         noise = np.random.default_rng([self._seed, self._steps]).normal(

@@ -1,7 +1,4 @@
-"""NAOs, simulated stand-ins, that follow planar velocity commands in a maze or with a ball; their φ.
-
-φ maps target states (..., S) to abstract states (..., X), numpy in, numpy out, torch in, torch out.
-"""
+"""NAOs, simulated stand-ins, that follow planar velocity commands in a maze or with a ball; their φ."""
 
 import json
 
@@ -27,20 +24,12 @@ _BALL = [STATE_SIZE + entry for entry in range(4)]
 
 
 def nao_to_point_mass[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
-    """Keep a NAO's estimated position and its planned velocity: (..., S) to [x, y, vx, vy] (..., 4).
-
-    In m and m/s, in the world frame. Dropped: the heading, the legs' joints, how the torso sways, the feet's
-    load, the phase of the step. The error of the estimates is not part of the state.
-    """
+    """Keep a NAO's estimated position in m and planned velocity in m/s: (..., S) to [x, y, vx, vy] (..., 4)."""
     return state[..., _PLANAR]
 
 
 def nao_to_ball_agent[Array: (NDArray[np.float32], NDArray[np.float64], Tensor)](state: Array) -> Array:
-    """Keep what `nao_to_point_mass` does, and the estimate of the ball: (..., 34) to (..., 8).
-
-    The ball's position in m and velocity in m/s in the world frame. Dropped besides: the time since the ball
-    was last seen.
-    """
+    """Keep what `nao_to_point_mass` does, and the ball's estimated position and velocity: (..., 34) to (..., 8)."""
     return state[..., _PLANAR + _BALL]
 
 
@@ -50,32 +39,21 @@ def nao_beyond(state: Tensor) -> Tensor:
     return state[..., rest]
 
 
-SPEED_M_S = 0.25
-"""Of a command of 1, along each axis: the largest forward speed of B-Human's walk."""
-TURN_GAIN_PER_S = 2.0
-"""Turning rate per rad between heading and direction of motion."""
+SPEED_M_S = 0.25  # of a command of 1, along each axis: the largest forward speed of B-Human's walk
+TURN_GAIN_PER_S = 2.0  # turning rate per rad between heading and direction of motion
 TURN_LIMIT_RAD_S = 1.0
-SEARCH_AFTER_S = 1.5
-"""A robot that has not seen its ball for longer turns to search for it."""
-_STANDING = 0.05
-"""Robots do not turn at shorter commands."""
-_FOOT_LOAD_N = 50.0
-"""Scale of the pressures on the soles."""
-BALL_SIZE = 5
-"""With a ball there follow its estimated position (2) and velocity (2), and the time since it was seen."""
+SEARCH_AFTER_S = 1.5  # a robot that has not seen its ball for longer turns to search for it
+_STANDING = 0.05  # robots do not turn at shorter commands
+_FOOT_LOAD_N = 50.0  # scale of the pressures on the soles
+BALL_SIZE = 5  # with a ball there follow its estimated position (2) and velocity (2), and the time since it was seen
 
 
 class NaoEnv(PlanarTarget):
     """B NAOs; action: world-frame velocity command, (B, 2), in units of 0.25 m/s and clipped to ±1 per axis.
 
-    With a ball, actions are (B, 3), and a third entry above 0.5 asks for a kick, however far the ball is: the
-    robot steps on the spot and swings forward the foot on the ball's side, or either foot if the ball is
-    straight ahead. A control step lasts 0.192 s. The robots turn by themselves to where they go, or to their
-    ball. They act on estimates, which are also all that their state (B, S) holds; rewards, success and
-    failure depend on true positions. Success, falling, and the task's own failures end an episode.
-
-    Attributes:
-        goal: (B, 2) float32. failed: (B,) bool, failed in the last step. robots: the robots.
+    With a ball, (B, 3), a third entry above 0.5 asks for a kick. A control step lasts 0.192 s. Robots turn by
+    themselves to where they go, or to their ball. They act on estimates, which their state (B, S) holds; rewards are of
+    true positions.
     """
 
     def __init__(
@@ -89,10 +67,7 @@ class NaoEnv(PlanarTarget):
         errors: PerceptionErrors | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Build B robots.
-
-        ball: whether there is a ball. errors: of the estimates.
-        """
+        """Build B robots, with a `ball` or without; `errors` are those of the estimates."""
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.has_ball, self.action_size = ball, objective.action_size
         self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)
@@ -180,11 +155,7 @@ class NaoEnv(PlanarTarget):
         return self._judged(before, self.truth, self.robots.fallen)
 
     def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
-        """Turn commands (B, 2) in the world frame into forward, left and turning speed (B, 3).
-
-        Robots turn to where they go. With a ball they turn to it and walk more slowly the farther it is to
-        the side, and not at all while they `kick` (B,); robots that have lost it turn to search.
-        """
+        """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3): see `NaoEnv`."""
         command = velocity.clamp(-1.0, 1.0).double().numpy()
         x, y = (SPEED_M_S * command).T
         heading = self.localisation.pose[:, 2]

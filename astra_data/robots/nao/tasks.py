@@ -14,8 +14,7 @@ from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, ColumnEntry, Plane, Task, Varied, column, entries
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES, BallVariation
 
-_RADIUS_M = 0.1
-"""Radius of the mass at walls in the simulators: as in AntMaze, and less than the robot's 0.14 m."""
+_RADIUS_M = 0.1  # radius of the mass at walls in the simulators: as in AntMaze, and less than the robot's 0.14 m
 _BODY: dict[str, Any] = {"timestep_s": CONTROL_STEP_S, "radius_m": _RADIUS_M, "speed_m_s": SPEED_M_S}
 _CONTACT: dict[str, Any] = {"kick_reach_m": 0.35, "kick_m_s": 1.0, "reach_m": 0.22, "knock_m_s": 0.7}
 """Of the robot with its ball. The reach of a kick is that of the paper's group's published simulator of an

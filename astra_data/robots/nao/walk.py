@@ -1,10 +1,8 @@
-"""The NAO's legs: their angles in closed form, and how robots differ; links and joints are in nao.xml.
+"""The NAO's legs: their angles in closed form, how robots differ, how they walk; links and joints are in nao.xml.
 
 A foot's pose is that of its sole below the ankle, in the torso's frame: x, y, z in m, roll, pitch, yaw in rad
-(rotation Rz(yaw) Ry(pitch) Rx(roll)). Both legs share one motor that turns the hips about axes tilted by 45°
-(yaw and pitch at once), so there are eleven angles for twelve joints, and the feet's yaws depend on each
-other: the motor takes the mean of the angles that each foot alone would need; the other joints then keep the
-soles' positions and planes exact.
+(Rz(yaw) Ry(pitch) Rx(roll)). One motor turns both hips about axes tilted by 45°: it takes the mean of the angles that
+each foot alone would need; the other joints then keep the soles' positions and planes exact.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -14,8 +12,7 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
 
-TICK_S = 0.012
-"""The robot's own motion cycle (83 Hz), as B-Human's code states it."""
+TICK_S = 0.012  # the robot's own motion cycle (83 Hz), as B-Human's code states it
 GRAVITY = 9.81
 HIP_OFFSET_Y_M = 0.050
 HIP_OFFSET_Z_M = 0.085
@@ -23,8 +20,7 @@ THIGH_M = 0.100
 TIBIA_M = 0.1029
 FOOT_HEIGHT_M = 0.04519
 _LEG = ("HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
-JOINTS = ("HipYawPitch", *(f"{side}{name}" for side in "LR" for name in _LEG))
-"""The eleven angles, in order."""
+JOINTS = ("HipYawPitch", *(f"{side}{name}" for side in "LR" for name in _LEG))  # the eleven angles, in order
 TO_MOTORS = np.array([0, 1, 2, 3, 4, 5, 0, 6, 7, 8, 9, 10])
 """Which of the eleven angles each of the model's twelve controls follows."""
 
@@ -60,10 +56,7 @@ def _rotation(angle: Floats, first: int, second: int) -> Floats:
 
 
 def leg_angles(poses: Floats) -> Floats:
-    """Return the eleven joint angles (..., 11) in rad that bring the feet to `poses` (..., 2, 6), left first.
-
-    Positions beyond a leg's reach are approached with a straight leg. Joint limits are not applied.
-    """
+    """Return angles (..., 11) in rad, limits not applied, that bring the feet to `poses` (..., 2, 6), left first."""
     mirrored = poses.copy()
     mirrored[..., 1, :] *= _MIRRORED_POSE
     roll, pitch, yaw = np.moveaxis(mirrored[..., 3:], -1, 0)
@@ -103,12 +96,7 @@ def _triangle(distance: Floats) -> tuple[Floats, Floats]:
 
 
 def _wanted_hip_yaw_pitch(foot: Floats, ankle: Floats, knee: Floats, thigh_lead: Floats) -> Floats:
-    """Return the tilted joint's angle at which a (left) leg alone has no error of yaw.
-
-    In the foot's frame, the position of the hip determines the ankle's two angles. The rest of the foot's
-    rotation is the hip's, Ry(shared) Rx(roll + 45°) Ry(pitch) in a frame turned by 45°, whose angles can be
-    read off.
-    """
+    """Return the tilted joint's angle at which a (left) leg alone has no error of yaw."""
     x, y, z = np.moveaxis((np.swapaxes(foot, -1, -2) @ -ankle[..., None])[..., 0], -1, 0)
     ankle_roll = np.arctan2(y, z)
     # In the foot's plane of pitch the hip lies behind the tibia by the rest of the triangle.
@@ -124,37 +112,26 @@ class TraitSpread:
 
     joint_offset_deg: float = 0.35
     """Standard deviation of each joint's zero, which makes a robot veer; with 0.7 some turn the wrong way."""
-    stiffness_loss: float = 0.3
-    """Largest share of the servos' stiffness that is missing."""
-    delay_ticks: tuple[int, int] = (2, 3)
-    """Range of the delay from command to servo."""
-    friction: tuple[float, float] = (0.4, 0.8)
-    """Range of the floor's friction."""
-    gyro_noise_rad_s: float = 0.05
-    """Standard deviation per tick and axis: the same for all robots."""
+    stiffness_loss: float = 0.3  # largest share of the servos' stiffness that is missing
+    delay_ticks: tuple[int, int] = (2, 3)  # range of the delay from command to servo
+    friction: tuple[float, float] = (0.4, 0.8)  # range of the floor's friction
+    gyro_noise_rad_s: float = 0.05  # standard deviation per tick and axis: the same for all robots
     quality: tuple[float, float] = (0.83, 1.0)
     """Range of the factor on the top speeds: B-Human's limits of a worn and of a new robot."""
 
 
-IDENTICAL = TraitSpread(0.0, 0.0, (2, 2), (0.6, 0.6), 0.0, (1.0, 1.0))
-"""All robots alike, without noise."""
+IDENTICAL = TraitSpread(0.0, 0.0, (2, 2), (0.6, 0.6), 0.0, (1.0, 1.0))  # all robots alike, without noise
 
 
 @dataclass(frozen=True)
 class Traits:
-    """The traits of B robots.
+    """The traits of B robots."""
 
-    Attributes:
-        joint_offset_rad: true minus measured joint angles, (B, 11). stiffness: share of the servos'
-        stiffness, (B,). delay_ticks: from command to servo, (B,) int. friction: of the floor, (B,). quality:
-        factor on the top speeds, (B,).
-    """
-
-    joint_offset_rad: Floats
-    stiffness: Floats
-    delay_ticks: NDArray[np.intp]
-    friction: Floats
-    quality: Floats
+    joint_offset_rad: Floats  # true minus measured joint angles, (B, 11)
+    stiffness: Floats  # share of the servos' stiffness, (B,)
+    delay_ticks: NDArray[np.intp]  # from command to servo, (B,)
+    friction: Floats  # of the floor, (B,)
+    quality: Floats  # factor on the top speeds, (B,)
 
     @classmethod
     def draw(cls, spread: TraitSpread, count: int, rng: np.random.Generator) -> "Traits":
@@ -182,45 +159,32 @@ class WalkLimits:
     backward_m_s: float = 0.150
     sideways_m_s: float = 0.200
     turn_rad_s: float = float(np.radians(120.0))
-    speed_up_m_s: float = 0.075
-    """Forward speed that may be gained per step."""
-    slow_down_m_s: float = 0.300
-    """Forward speed that may be lost per step."""
+    speed_up_m_s: float = 0.075  # forward speed that may be gained per step
+    slow_down_m_s: float = 0.300  # forward speed that may be lost per step
     step_s: float = 0.250
-    step_s_per_sideways_m_s: float = 0.150
-    """How much longer a step lasts per m/s sideways."""
-    wide_turn: float = 0.67
-    """Share of two steps' turn in the one that opens the feet; the rest closes them."""
+    step_s_per_sideways_m_s: float = 0.150  # how much longer a step lasts per m/s sideways
+    wide_turn: float = 0.67  # share of two steps' turn in the one that opens the feet; the rest closes them
     forward_stops_at_turn_rad: float = float(np.radians(24.0))
     """Turn in the wider step at which nothing is left of the forward speed, which falls with its square."""
     sideways_stops_at_turn_rad: float = float(np.radians(45.4))
 
 
-STRIDE, START, STOP = 0, 1, 2
-"""Kinds of steps: the first and the last step of a walk only shift the weight."""
+STRIDE, START, STOP = 0, 1, 2  # kinds of steps: the first and the last step of a walk only shift the weight
 
 
 @dataclass
 class Gait:
-    """Phases of B walking robots in their steps.
+    """Phases of B walking robots in their steps."""
 
-    Attributes:
-        phase: fraction of the step done, (B,). duration_s: of the step, (B,). left_swings: which foot is in
-        the air, (B,) bool. walking: False for robots that stand, (B,) bool. kind: of step: `STRIDE`, `START`
-        or `STOP`, (B,) int. before, after: spread at the step's start and end, (B, 3). forward_m_s: forward
-        speed of the previous step, from which the next may differ by a limit, (B,). kicking: whether the
-        swinging foot kicks, (B,) bool.
-    """
-
-    phase: Floats
-    duration_s: Floats
-    left_swings: Bools
-    walking: Bools
-    kind: NDArray[np.intp]
-    before: Floats
-    after: Floats
-    forward_m_s: Floats
-    kicking: Bools
+    phase: Floats  # fraction of the step done, (B,)
+    duration_s: Floats  # of the step, (B,)
+    left_swings: Bools  # which foot is in the air, (B,)
+    walking: Bools  # False for robots that stand, (B,)
+    kind: NDArray[np.intp]  # of step: `STRIDE`, `START` or `STOP`, (B,)
+    before: Floats  # spread at the step's start, (B, 3)
+    after: Floats  # spread at the step's end, (B, 3)
+    forward_m_s: Floats  # of the previous step, from which the next may differ by a limit, (B,)
+    kicking: Bools  # whether the swinging foot kicks, (B,)
 
     @classmethod
     def standing(cls, count: int, limits: WalkLimits) -> "Gait":
@@ -244,14 +208,9 @@ class Gait:
 
 @dataclass(frozen=True)
 class StepPlanner:
-    """Plans the steps of B robots.
+    """Plans the steps of B robots."""
 
-    Attributes:
-        quality: factor on a robot's top speeds, (B,): 1 new, 0.83 worn (B-Human's two sets of limits).
-        limits: top speeds and the rest.
-    """
-
-    quality: Floats
+    quality: Floats  # factor on a robot's top speeds, (B,): 1 new, 0.83 worn (B-Human's two sets of limits)
     limits: WalkLimits = field(default_factory=WalkLimits)
 
     def attainable(self, command: Floats) -> Floats:
@@ -272,10 +231,9 @@ class StepPlanner:
         return np.stack([x, y, turn], axis=1)
 
     def advance(self, gait: Gait, command: Floats, seconds: float, on_the_spot: Bools | None = None) -> Bools:
-        """Advance `gait` by `seconds`, in place; where a step ends, plan the next one by `command` (B, 3).
+        """Advance `gait` in place; where a step ends, plan the next by `command` (B, 3); return which began one, (B,).
 
-        With a command of zero robots come to rest, except those that walk `on_the_spot` (B,). Return which
-        robots began a step, (B,) bool.
+        With a command of zero robots come to rest, except those that walk `on_the_spot` (B,).
         """
         gait.phase = np.where(gait.walking, gait.phase + seconds / gait.duration_s, 0.0)
         called = (command != 0).any(axis=1)
@@ -324,45 +282,30 @@ def _nearer_zero_or_up_to(speed: Floats, wanted: Floats, loss: float, gain: floa
 class WalkStyle:
     """Parameters of the motion; ours where no source is named."""
 
-    hip_height_m: float = 0.230
-    """B-Human and HULKs."""
-    lift_m: float = 0.022
-    """13 mm at B-Human, 8 mm at HULKs; the servos here give way more."""
-    torso_ahead_m: float = 0.012
-    """Distance of the torso ahead of the middle of the ankles: B-Human."""
-    sway_foot_m: float = 0.05
-    """Distance of the foot of the sway's pendulum from the middle."""
-    pendulum_m: float = 0.26
-    """Length of the sway's pendulum, about the height of the center of mass."""
+    hip_height_m: float = 0.230  # B-Human and HULKs
+    lift_m: float = 0.022  # 13 mm at B-Human, 8 mm at HULKs; the servos here give way more
+    torso_ahead_m: float = 0.012  # distance of the torso ahead of the middle of the ankles: B-Human
+    sway_foot_m: float = 0.05  # distance of the foot of the sway's pendulum from the middle
+    pendulum_m: float = 0.26  # length of the sway's pendulum, about the height of the center of mass
     step_scale: tuple[float, float, float] = (1.05, 1.3, 1.05)
     """Factors on steps (x, y, yaw) that make up for servos and slip; fitted to reach commands."""
     gyro_gain: tuple[float, float] = (0.08, 0.04)
     """Rad of ankle per rad/s of the torso, pitch and roll; 0.05 at B-Human and HULKs."""
-    gyro_keep: float = 0.6
-    """Decay of the low-pass filter on the rates per tick: B-Human."""
-    lean_rad: float = 0.02
-    """The lift of a foot is delayed while the torso is about to lean farther over it than this."""
-    lean_ahead_s: float = 0.06
-    """Prediction horizon of the lean: about the delay of commands and servos."""
+    gyro_keep: float = 0.6  # decay of the low-pass filter on the rates per tick: B-Human
+    lean_rad: float = 0.02  # the lift of a foot is delayed while the torso is about to lean farther over it than this
+    lean_ahead_s: float = 0.06  # prediction horizon of the lean: about the delay of commands and servos
     longest_wait_ticks: int = 25
-    kick_reach_m: float = 0.08
-    """Distance that a kicking foot swings beyond its step."""
+    kick_reach_m: float = 0.08  # distance that a kicking foot swings beyond its step
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Targets of the legs for the next ticks.
+    """Targets of the legs for the next ticks."""
 
-    Attributes:
-        angles: the eleven angles, (B, ticks, 11) in rad. supports: feet that a walking robot stands on, left
-        and right, (B, ticks, 2) bool. lifts_off: foot that leaves the floor at the tick: 1 left, -1 right, 0
-        none, (B, ticks). gaits: the gait before the first tick and after each, ticks + 1.
-    """
-
-    angles: Floats
-    supports: Bools
-    lifts_off: NDArray[np.intp]
-    gaits: list[Gait]
+    angles: Floats  # in rad, (B, ticks, 11)
+    supports: Bools  # feet that a walking robot stands on, left and right, (B, ticks, 2)
+    lifts_off: NDArray[np.intp]  # foot that leaves the floor at the tick: 1 left, -1 right, 0 none, (B, ticks)
+    gaits: list[Gait]  # before the first tick and after each, ticks + 1
 
     def reached(self, ticks: NDArray[np.intp]) -> Gait:
         """Return the gait of robots that followed `ticks` (B,) of them."""
@@ -375,20 +318,13 @@ class Targets:
 
 @dataclass(frozen=True)
 class WalkEngine:
-    """Walks B robots.
-
-    Attributes:
-        planner: plans their steps. style: how their feet move.
-    """
+    """Walks B robots."""
 
     planner: StepPlanner
     style: WalkStyle
 
     def advance(self, gait: Gait, command: Floats, ticks: int, kick: Bools | None = None) -> Targets:
-        """Walk on at `command` (B, 3) for `ticks` of 12 ms, changing `gait` in place.
-
-        Feet, left and right, that are to `kick` (B, 2) do so when they swing next; until then robots step on.
-        """
+        """Walk on at `command` (B, 3) for `ticks`, changing `gait`; feet that are to `kick` (B, 2) do in a swing."""
         feet, supports, lifts_off, gaits = [], [], [], [replace(gait)]
         if kick is None:
             kick = np.zeros((len(command), 2), dtype=bool)
@@ -430,11 +366,7 @@ class WalkEngine:
         return pose
 
     def _sway(self, gait: Gait) -> Floats:
-        """Return the sway of the torso to the left of a straight line from start to end, (B,) in m.
-
-        It moves like an inverted pendulum on the supporting foot, with the speed that takes it from start to
-        end within the step.
-        """
+        """Return the torso's sway to the left, (B,) in m: an inverted pendulum on the supporting foot."""
         rate = np.sqrt(GRAVITY / self.style.pendulum_m)
         done, left = gait.phase * gait.duration_s, (1 - gait.phase) * gait.duration_s
         foot = np.where(gait.left_swings, -1.0, 1.0) * self.style.sway_foot_m

@@ -1,8 +1,7 @@
 """Mazes: walls, free space, distances along the corridors; shared by targets and abstract simulators.
 
-Cells are indexed (row, column) from the top left; x grows with the column, y falls with the row, and the
-maze is centered on the origin, as in gymnasium-robotics. Fine grids have square cells of the maze's `fine_m`
-and are indexed [y, x] from the lower left corner.
+Cells are (row, column) from the top left; x grows with the column, y falls with the row, the origin is the middle.
+Fine grids have square cells of the maze's `fine_m` and are indexed [y, x] from the lower left corner.
 """
 
 from copy import copy
@@ -21,19 +20,13 @@ from astra_data.core.errors import BadInputError
 
 @dataclass(frozen=True)
 class Maze:
-    """A maze of square cells.
+    """A maze of square cells."""
 
-    Attributes:
-        rows: one string per row; "1" is wall, "0" is free. scale: side of a cell in m. start: (row, column)
-        of the usual start cell. goal: (row, column) of the usual goal cell. fine_m: cell size of the fine
-        grid for clearances and distances; divides the scale.
-    """
-
-    rows: tuple[str, ...]
-    scale: float
-    start: tuple[int, int]
+    rows: tuple[str, ...]  # "1" is wall, "0" is free
+    scale: float  # side of a cell in m
+    start: tuple[int, int]  # (row, column) of the usual start cell
     goal: tuple[int, int]
-    fine_m: float = 0.1
+    fine_m: float = 0.1  # cell size of the fine grid for clearances and distances; divides the scale
 
     def __post_init__(self) -> None:
         """Check the maze."""
@@ -90,10 +83,7 @@ class Maze:
 
     @cached_property
     def clearance_field(self) -> Floats:
-        """Distance in m from each fine grid cell to the center of the nearest wall cell, indexed [y, x].
-
-        All around the grid there is wall.
-        """
+        """Distance in m from each fine cell to the center of the nearest wall cell, [y, x]; around it there is wall."""
         free = np.pad(~self.fine_walls, 1)
         return np.asarray(scipy.ndimage.distance_transform_edt(free))[1:-1, 1:-1] * self.fine_m
 
@@ -110,9 +100,8 @@ class Maze:
     def distance_field(self, goal: Floats, *, radius: float = 0.0, margin: float = 0.0) -> Floats:
         """Return the length in m of the shortest free path from each fine cell to `goal` (2,), [y, x].
 
-        Cells within `radius` m of a wall are not free. Paths keep `margin` m from walls where they can:
-        within it, cells cost more the closer they are to a wall. Cells that are not free, or closed off,
-        take the value of the nearest one with a path plus the distance to it.
+        Cells within `radius` m of a wall are not free; within `margin` m they cost more. Cells that are not free, or
+        closed off, take the value of the nearest one with a path plus the distance to it.
         """
         free = self.clearance_field > radius
         goal_cell = self.fine_index(goal)
@@ -175,17 +164,11 @@ FIELD = Maze(
 """A room of 5 m by 5 m for playing with a ball."""
 
 
-_EDGE_M = 1e-4
-"""Distance from the face of a blocked cell at which a sliding point is stopped."""
+_EDGE_M = 1e-4  # distance from the face of a blocked cell at which a sliding point is stopped
 
 
 class FreeSpace:
-    """The cells in which the center of a disc may be.
-
-    Attributes:
-        blocked: (height, width) bool, True where the disc would overlap a wall. half_extent: half of the
-        maze's width and height in m, (2,). cell_m: side of a cell.
-    """
+    """The cells in which the center of a disc may be: not those of `blocked` (height, width)."""
 
     def __init__(self, blocked: Tensor, half_extent: Tensor, cell_m: float) -> None:
         self.blocked = blocked
@@ -207,11 +190,9 @@ class FreeSpace:
         return row, column
 
     def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Move points from `start` to `end`, both (B, 2) in m, stopping each axis at blocked cells.
+        """Move points from `start` to `end` (B, 2), each axis up to blocked cells; return where, and who was stopped.
 
-        Only the cells where a move begins and ends are looked at; one that is stopped ends where its own
-        cell does. A point that starts in a blocked cell may move in it and out of it, but not deeper into it.
-        Return the points' new positions (B, 2), and which were stopped (B,).
+        Only the cells where a move begins and ends are looked at. From a blocked cell a point may not go deeper.
         """
         here, there = self._cells(torch.stack([start, end]))
         (from_x, from_y), (to_x, to_y) = here.unbind(-1), there.unbind(-1)
@@ -247,10 +228,7 @@ def _free_space(maze: Maze, reach: int, device: str) -> FreeSpace:
 
 @dataclass(frozen=True)
 class GoalDistance:
-    """Length of the shortest free path to a goal near the maze's goal cell.
-
-    There is one distance field per point of a lattice around the cell's middle; a goal uses the nearest.
-    """
+    """Length of the shortest free path to a goal near the maze's goal cell: a field for each point of a lattice."""
 
     fields: Tensor  # (goals, height, width) in m
     lattice: Tensor  # the goal of each field, (goals, 2) in m
@@ -277,10 +255,7 @@ class GoalDistance:
         return GoalDistance(*tensors, self.cell_m)
 
     def __call__(self, position: Tensor, goal: Tensor) -> Tensor:
-        """Return the distance in m (..., B) from `position` (..., B, 2) to `goal` (B, 2).
-
-        It is bilinear in the position.
-        """
+        """Return the distance in m (..., B), bilinear, from `position` (..., B, 2) to `goal` (B, 2)."""
         # Axis by axis, since a sum over a last dimension of two is slow.
         away_x, away_y = goal[:, :1] - self.lattice[:, 0], goal[:, 1:] - self.lattice[:, 1]
         field = (away_x.square() + away_y.square()).argmin(dim=1)

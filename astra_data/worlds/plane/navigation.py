@@ -1,8 +1,4 @@
-"""Objectives and simulated targets in a maze; navigation: reach a goal.
-
-The paper prints no reward. Ours: progress along the shortest free path to the goal, +10 for reaching it, and
-a negative reward for a failure.
-"""
+"""Objectives and simulated targets in a maze; navigation: reach a goal. The paper prints no reward, so it is ours."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -22,11 +18,7 @@ from astra_data.worlds.protocols import Step
 
 @dataclass(frozen=True)
 class PlanarObjective(Objective):
-    """An objective in a maze; states begin with x and y of the robot in m, actions with its velocity.
-
-    Attributes:
-        maze: where it happens.
-    """
+    """An objective in `maze`; states begin with x and y of the robot in m, actions with its velocity."""
 
     action_size = 2
     goal_size = 2
@@ -56,25 +48,15 @@ class PlanarObjective(Objective):
 
 @dataclass(frozen=True)
 class Navigation(PlanarObjective):
-    """Reach the goal of `maze` within `horizon` steps.
+    """Reach the goal of `maze` within `horizon` steps, paid for progress along the shortest free path."""
 
-    Attributes:
-        meter_reward: for a meter of progress. path_clearance_m: clearance from walls of the shortest free
-        path. success_radius_m: distance from the goal within which the episode ends in success.
-        position_waves: number of waves of which policies see sine and cosine of the position along each axis;
-        the first is as long as the maze is wide, each other half as long as the one before. spread_m:
-        standard deviation of start and goal around their cells' centers, per axis. start_clearance_m:
-        clearance from walls of starts that are drawn anywhere. start_offsets_m: offsets of the usual starts
-        from the center of the start cell, drawn uniformly.
-    """
-
-    meter_reward: float = 1.0
-    path_clearance_m: float = 0.0
-    position_waves: int = 0
+    meter_reward: float = 1.0  # for a meter of progress
+    path_clearance_m: float = 0.0  # from walls, of the shortest free path
+    position_waves: int = 0  # of which policies see sine and cosine; each is half as long as the one before
     success_radius_m: float = 0.45
-    spread_m: float = 0.2
-    start_clearance_m: float = 0.8
-    start_offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    spread_m: float = 0.2  # standard deviation of start and goal around their cells' centers, per axis
+    start_clearance_m: float = 0.8  # from walls, of starts that are drawn anywhere
+    start_offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0),)  # from the center of the start cell
 
     def __post_init__(self) -> None:
         """Check that starts and goals are in free space."""
@@ -156,13 +138,7 @@ def _at_rest(position: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class PlanarTarget(ABC):
-    """B robots in a maze. An observation (B, O) is the state, then the goal.
-
-    Success, falls, misses and, where the objective says so, walls end an episode.
-
-    Attributes:
-        objective: maze, goal and reward. goal: (B, 2) float32. failed: (B,) bool, failed in the last step.
-    """
+    """B robots in a maze; an observation (B, O) is the state, then the goal."""
 
     def __init__(self, objective: PlanarObjective, num_envs: int, *, start_anywhere: bool = False) -> None:
         self.objective, self.num_envs, self.start_anywhere = objective, num_envs, start_anywhere
@@ -194,10 +170,7 @@ class PlanarTarget(ABC):
         self.goal[rows] = torch.from_numpy(self.objective.draw_goals(self._rng, len(rows))).float()
 
     def _judged(self, before: Tensor, after: Tensor, fallen: Bools) -> Step:
-        """Return the outcome of a step between states (B, 2 or more) that begin with true positions.
-
-        Who reaches the goal has not failed, `fallen` (B,) or not.
-        """
+        """Return the outcome of a step between states with true positions; who reaches the goal has not failed."""
         success = self.objective.reached(after, self.goal)
         failed = torch.from_numpy(fallen) | self.objective.missed(after, self.goal)
         if self.objective.ends_at_walls:

@@ -11,18 +11,11 @@ from astra_data.worlds.plane.mazes import FreeSpace, Maze
 from astra_data.worlds.protocols import TaskSimulator
 from astra_data.worlds.variation import Variation, VariedSimulator, noisy_command
 
-_CELLS_APART = 1e-6
-"""How far a radius may be from a whole number of cells, by rounding."""
+_CELLS_APART = 1e-6  # how far a radius may be from a whole number of cells, by rounding
 
 
 class PlanarStates:
-    """B planar states (B, X) that begin with x, y, vx, vy of a disc among the walls of a maze, in m and m/s.
-
-    Attributes:
-        parameters: what a dataset paired with this simulator records about it. state: (B, X) float32. free:
-        where the disc's center may be. blocked: (B,) bool, a wall stopped the disc in the last step, or in
-        its correction. period_s: control period, one for all or (B, 1).
-    """
+    """B planar states (B, X) that begin with x, y, vx, vy of a disc among the walls of a maze, in m and m/s."""
 
     state_size: int
 
@@ -36,11 +29,7 @@ class PlanarStates:
         speed_m_s: float = 1.0,
         device: str = "cpu",
     ) -> None:
-        """Put B of them at rest at the origin.
-
-        radius_m: distance that the disc's center keeps from walls, a multiple of the maze's `fine_m`.
-        speed_m_s: top speed along each axis.
-        """
+        """Put B of them at rest at the origin, `radius_m` from walls, `speed_m_s` fast along each axis."""
         cells = radius_m / maze.fine_m
         if abs(cells - round(cells)) > _CELLS_APART:
             raise BadInputError(
@@ -78,10 +67,7 @@ class PlanarStates:
             self.blocked = self.blocked.index_fill(0, rows, False)
 
     def keep_clear(self, distance_m: float) -> None:
-        """Let corrections end no closer to walls than `distance_m`, to the nearest cell of the fine grid.
-
-        Steps come as close as the disc can.
-        """
+        """Let corrections end no closer to walls than `distance_m`, to the nearest fine cell; steps come closer."""
         widest = max(distance_m, self.parameters["radius_m"])
         device = str(self.state.device)
         self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=device)
@@ -89,9 +75,7 @@ class PlanarStates:
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Slide the discs from `before` toward `landed`, both (B, X); all else is that of `landed`.
 
-        A wall that stopped the step itself still counts as touched: otherwise policies lean on walls that the
-        correction draws them away from. Who is kept clear of one stands there: otherwise policies lean on a
-        wall with the velocity of progress, and are paid for it.
+        Walls that stopped the step count, and who is kept clear of one stands there: policies would else lean on it.
         """
         position, stopped = self._settles_in.slide(before[:, :2], landed[:, :2])
         self.blocked = self.blocked | stopped
@@ -104,11 +88,7 @@ class PlanarStates:
 
 
 class VariedPlanar(VariedSimulator):
-    """B point masses, with balls or without, each with the parameters of a `PlanarVariation`.
-
-    Commanded velocities get Gaussian noise, observed positions and velocities uniform noise. A state is
-    observed without noise when it was set or corrected.
-    """
+    """B point masses, each with a `PlanarVariation`; states that were set or corrected are observed without noise."""
 
     def __init__(self, simulator: TaskSimulator, variation: Variation) -> None:
         super().__init__(simulator, variation)
@@ -146,12 +126,7 @@ class VariedPlanar(VariedSimulator):
 
 
 class PointMass(PlanarStates):
-    """B point masses [x, y, vx, vy] in a maze, in m and m/s.
-
-    A command is the velocity of the next step, in units of the top speed along each axis; walls stop each
-    axis by itself. The velocity in the state is the displacement in the last step over its duration. Left
-    out: the legs and all their dynamics.
-    """
+    """B point masses [x, y, vx, vy] in a maze, in m and m/s; a command is the velocity of the next step."""
 
     state_size = 4
     action_size = 2

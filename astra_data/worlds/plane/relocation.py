@@ -27,10 +27,8 @@ from astra_data.worlds.task import Task
 
 Rotations = Literal["quarter", "any", "none"]
 
-_SHIFTS = 64
-"""Shifts that are tried for each rotation."""
-_ROUNDING = 1e-6
-"""How far a rotated command may exceed the limit."""
+_SHIFTS = 64  # shifts that are tried for each rotation
+_ROUNDING = 1e-6  # how far a rotated command may exceed the limit
 
 
 def positions(task: Task, states: Array) -> Array:
@@ -49,21 +47,14 @@ class Copy(NamedTuple):
 
 @dataclass(frozen=True)
 class Relocation:
-    """How segments of episodes may be moved within the maze of `task`.
-
-    Attributes:
-        rotations: by multiples of 90 degrees, by any angle, or none. translations: to anywhere; otherwise a
-        segment starts where it did. margin_m: clearance from walls that every step keeps before and after it
-        is moved. min_steps: length of the shortest segment. tries: rotations that are drawn, with 64 shifts
-        for each, before a segment is given up.
-    """
+    """How segments of episodes of `min_steps` or more may be moved within the maze of `task`, `margin_m` from walls."""
 
     task: Task
     rotations: Rotations
-    translations: bool
+    translations: bool  # to anywhere; otherwise a segment starts where it did
     margin_m: float
     min_steps: int
-    tries: int
+    tries: int  # rotations that are drawn, with 64 shifts for each, before a segment is given up
 
     def stretches(self, episode: Episode) -> list[tuple[int, int]]:
         """Return first step and end of each segment of `episode` that may be moved."""
@@ -74,10 +65,7 @@ class Relocation:
         return [(int(first), int(end)) for first, end in edges if end - first >= self.min_steps]
 
     def placements(self, episode: Episode, rng: np.random.Generator) -> Iterator[tuple[PlanarMap, slice]]:
-        """Draw segments of `episode`, in proportion to their lengths, and a placement for each.
-
-        There is one for each of `tries` rotations that has one, and none if it has no segment.
-        """
+        """Draw segments of `episode`, in proportion to their lengths, and a placement for each, `tries` times."""
         stretches = self.stretches(episode)
         lengths = np.array([end - first for first, end in stretches])
         for _ in range(self.tries if stretches else 0):
@@ -97,8 +85,7 @@ class Relocation:
     def copied(self, episode: Episode, moving: Sequence[Column], rng: np.random.Generator) -> Copy | None:
         """Move a part of `episode`, with a goal of its own, judged by the task; None where there is no room.
 
-        With a ball, the step that ended the episode is left out, for where the ball was may have ended it,
-        and the copy begins with the ball neither in the goal nor out of the field. `moving` columns move.
+        The step that ended an episode with a ball is left out, and the copy does not begin with it in the goal or out.
         """
         world, movable = self.task, episode
         if world.ball_index is not None and episode.columns[TERMINATED][-1]:
@@ -140,10 +127,7 @@ class Relocation:
 
 
 def outcomes(objective: Objective, before: Array, after: Array, goal: Array, toppled: Array) -> dict[str, Array]:
-    """Return the outcome columns of an episode as the task pays them, up to the step that ends it, (T',).
-
-    Steps lead from abstract states `before` to `after`, (T, X); in `toppled` (T,) ones the robot toppled.
-    """
+    """Return the outcome columns (T',) of steps between abstract states (T, X), up to the one that ends the episode."""
     start, end = torch.from_numpy(before), torch.from_numpy(after)
     goals = torch.from_numpy(goal).expand(len(start), 2)
     success = objective.reached(end, goals)
