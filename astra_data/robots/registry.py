@@ -9,6 +9,9 @@ import numpy as np
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ABSTRACT_STATE, Array, Column
+from astra_data.robots.ant.tasks import LONG, UMAZE
+from astra_data.robots.humanoid.tasks import EXTENDED, KINEMATICS, WALKER2D
+from astra_data.robots.nao.tasks import KICK, NAVIGATION
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.protocols import AbstractSimulator
@@ -17,26 +20,7 @@ from astra_data.worlds.user_code import expect_tensor, explained, file_of, is_us
 
 TASK_GROUP = "astra_data.tasks"  # the group of entry points under which installed packages offer tasks
 SIMULATOR_GROUP = "astra_data.simulators"  # likewise, of abstract simulators
-
-
-def _task_at(name: str, place: str) -> Task:
-    found = user_object(place)
-    if not isinstance(found, Task):
-        raise BadInputError(f"{name} is a {type(found).__name__}, expected a Task")
-    return found
-
-
-_PLACES = {
-    "antmaze-umaze": "astra_data.robots.ant.tasks:UMAZE",
-    "antmaze-long": "astra_data.robots.ant.tasks:LONG",
-    "nao-navigation": "astra_data.robots.nao.tasks:NAVIGATION",
-    "nao-kick": "astra_data.robots.nao.tasks:KICK",
-    "humanoid-walker2d": "astra_data.robots.humanoid.tasks:WALKER2D",
-    "humanoid-kinematics": "astra_data.robots.humanoid.tasks:KINEMATICS",
-    "humanoid-extended": "astra_data.robots.humanoid.tasks:EXTENDED",
-}
-"""As the entry points of an installed package name them."""
-TASKS: dict[str, Task] = {name: _task_at(name, place) for name, place in _PLACES.items()}
+TASKS: dict[str, Task] = {task.name: task for task in (UMAZE, LONG, NAVIGATION, KICK, WALKER2D, KINEMATICS, EXTENDED)}
 """The tasks of the package."""
 
 
@@ -50,7 +34,10 @@ def task_named(name: str, besides: tuple[str, ...] = ()) -> Task:
     if name in TASKS:
         return TASKS[name]
     if place := name if is_user_code(name) else offered(TASK_GROUP).get(name):
-        return _task_at(name, place)
+        found = user_object(place)
+        if not isinstance(found, Task):
+            raise BadInputError(f"{name} is a {type(found).__name__}, expected a Task")
+        return found
     known = (*known_names(), *besides)
     raise BadInputError(f"unknown task '{name}'{did_you_mean(name, known)}; name your own task like cart.py:TASK")
 
@@ -84,14 +71,19 @@ def pairing_named(name: str) -> Pairing:
     """Return the simulator of a task, of an installed package, or a class at `path.py:MySim`; a task comes first."""
     if name not in TASKS and name.endswith(".py"):
         raise BadInputError(f"{name}: expected the class after a colon, as in {name}:MySimulator")
-    made = _made_by(name)
+    installed = offered(SIMULATOR_GROUP)
+    made: Any
+    if is_user_code(name):
+        made = user_object(name)
+    elif name in installed and name not in known_names():
+        made = user_object(installed[name])
+    else:
+        made = task_named(name, besides=tuple(installed))
     if isinstance(made, Task):
-        maze = None if made.plane is None else made.maze
-        origin = {"task": made.name, **file_of(name)}
         return Pairing(
             id=made.simulator_id,
-            origin=origin,
-            maze=maze,
+            origin={"task": made.name, **file_of(name)},
+            maze=None if made.plane is None else made.maze,
             abstract_state=made.abstract_state,
             abstraction=made.abstraction,
             simulator=made.own_simulator,
@@ -112,15 +104,6 @@ def pairing_named(name: str) -> Pairing:
     column = replace(column, name=ABSTRACT_STATE)
     origin = file_of(name) if is_user_code(name) else {"package": offered(SIMULATOR_GROUP)[name]}
     return Pairing(kind, origin, None, column, made.abstraction, made)
-
-
-def _made_by(name: str) -> Any:  # noqa: ANN401 - a task or a class of the user's
-    if is_user_code(name):
-        return user_object(name)
-    installed = offered(SIMULATOR_GROUP)
-    if name in installed and name not in known_names():
-        return user_object(installed[name])
-    return task_named(name, besides=tuple(installed))
 
 
 def built(pairing: Pairing, count: int) -> AbstractSimulator:

@@ -154,16 +154,15 @@ class GymnasiumSimulator(NumpySimulator):
                 if not is_checked:
                     env.reset(seed=0)
                     write(inner, landed[row])
-                    _check_written(env_id, landed[row], np.asarray(read(inner)))
+                    written, shown = landed[row], np.asarray(read(inner))
+                    if shown.shape != written.shape or not np.allclose(
+                        shown, written, rtol=_TOLERANCE, atol=_TOLERANCE
+                    ):
+                        raise BadInputError(
+                            f"{env_id}: after write(env, {written.tolist()}) expected the same of read(env), "
+                            f"got {shown.tolist()}: write has to set what read returns"
+                        )
                     is_checked = True
             return landed
 
         super().__init__(num_envs, function=step_each, size=size, parameters=parameters)
-
-
-def _check_written(env_id: str, state: Floats, shown: Floats) -> None:
-    if shown.shape != state.shape or not np.allclose(shown, state, rtol=_TOLERANCE, atol=_TOLERANCE):
-        raise BadInputError(
-            f"{env_id}: after write(env, {state.tolist()}) expected the same of read(env), "
-            f"got {shown.tolist()}: write has to set what read returns"
-        )

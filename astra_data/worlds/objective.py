@@ -28,11 +28,8 @@ class Score:
 
 
 SUCCESS = Score("success", "success", "success rate", 2, limit=1.0)
-
 SURVIVED_STEPS = Score("steps", "survived steps", "number of survived steps", 0)
-
 RETURN = Score("return", "return", "return", 1)
-
 
 NO_LIMIT = 2.0  # of the length of velocity commands: longer than any of ±1 on two axes
 
@@ -43,7 +40,6 @@ class Objective(ABC):
 
     Attributes:
         horizon: steps until an episode is cut off.
-        success_reward: for reaching the goal. failure_reward: for a failure.
         ends_at_walls: whether touching a wall is a failure, which ends an episode.
         is_lasting: whether success is to last to the horizon, not to reach something before.
         action_size: A. goal_size: G, 0 where all episodes have the same goal.

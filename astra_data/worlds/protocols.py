@@ -100,9 +100,7 @@ class TaskSimulator(PlacedSimulator, AbstractSimulator, Protocol):
 class RememberingSimulator(Protocol):
     """A simulator whose next steps depend on more than its states."""
 
-    memory: Tensor
-    """The memory that they, and corrections, depend on besides states, (B, M); `reset_to` of given rows
-    begins theirs anew."""
+    memory: Tensor  # that they, and corrections, depend on, (B, M); `reset_to` of given rows begins theirs anew
 
 
 @dataclass(frozen=True)

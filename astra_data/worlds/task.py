@@ -60,12 +60,6 @@ def names_with_units(column: Column) -> list[str]:
     ]
 
 
-def repeated_names(column: Column | None) -> list[str]:
-    """Return the names that several values of a column have, each once; none of no column."""
-    names = (column.names if column else None) or ()
-    return sorted({name for name in names if names.count(name) > 1})
-
-
 def free_body(joints: Sequence[str]) -> list[ColumnEntry]:
     """Return the entries of MuJoCo's qpos, then qvel, of a free body with hinge `joints`, in their order."""
     rates = " ".join(f"{joint}_rate" for joint in joints)
@@ -90,11 +84,9 @@ def whole(state: Tensor) -> Tensor:
 class Varied:
     """How the parameters of an abstract simulator vary from episode to episode."""
 
-    kind: Callable[[TaskSimulator, Variation], VariedSimulator]
-    """Builds the varied simulator from a plain one and the ranges."""
+    kind: Callable[[TaskSimulator, Variation], VariedSimulator]  # builds it from a plain one and the ranges
     randomized: Variation  # what domain randomization varies, in which ranges
-    wide: Variation
-    """What COMPASS varies or identifies, and RMA adapts to; of the kind of all parameters that there are."""
+    wide: Variation  # what COMPASS varies or identifies, and RMA adapts to, of the kind of all parameters
 
 
 @dataclass(frozen=True)
@@ -104,8 +96,7 @@ class Plane:
     wall_reach_m: float  # a robot whose clearance in the maze is larger than this touches no wall
 
 
-_FROM_SIMULATOR: Any = None
-_EACH_ENTRY: Any = None
+_DERIVED: Any = None  # from other fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,28 +105,22 @@ class Task:
 
     Attributes:
         name: in datasets, results and, of tasks of the package, in recipes.
-        timestep_s: the control period.
         state: the column of target states, with names, units, frames and roles.
-        commands: the least and the largest command along each axis of the action, by the axes' names; or a
-            dataset, whose range they are then.
+        commands: (least, largest) command by name of each axis of the action; or a dataset, whose range they are.
         make_simulator: the class of the abstract simulator, a `Simulator`, or what builds B of them.
         objective: horizon, starts, goals, reward and success; the maze, if there is one.
-        robot: builds one robot, which makes a target to collect in and to test in; or
-        make_target: builds B target environments. A task may have neither.
+        robot: builds one robot; or make_target: builds B target environments. A task may have neither.
         instruction: LeRobot's task description, by default the name.
         action, goal: their columns, by default with the names of `commands`, and without names.
         abstraction: φ, target states (..., S) to abstract states (..., X), by default the simulator's.
         abstract_state: the column of abstract states, by default the simulator's.
-        beyond: the part of target states that φ drops, scaled to about 1, (..., S) to (..., R); by default
-            the whole state.
-        quantities: indices in abstract states of what the gap report lists, by name with unit; by default
-            each entry for itself.
+        beyond: what φ drops, scaled to about 1, (..., S) to (..., R); by default the whole state.
+        quantities: indices in abstract states of what the gap report lists, by name with unit; by default each.
         facts: what datasets record about the target environment.
         simulator_id: names the abstract simulator in datasets, by default after its class.
         varied: the same simulator with parameters that vary, by default what reaches it of the commands.
         plane: properties of a task in a maze; None for others.
-        photograph: renders target states (K, S) as pictures (K, height, width, 3); None where reports show
-            none.
+        photograph: renders target states (K, S) as pictures (K, height, width, 3).
         target_id: name of a target that several tasks share, so that episodes of one serve all.
         derived: the defaults that were filled in, by field: `dataclasses.replace` fills them in anew.
 
@@ -157,12 +142,12 @@ class Task:
     robot: Callable[[], Robot] | None = None
     make_target: Callable[..., TargetEnv] | None = None
     instruction: str = ""
-    action: Column = _FROM_SIMULATOR
+    action: Column = _DERIVED
     goal: Column | None = None
-    abstraction: Callable[[Any], Any] = _FROM_SIMULATOR
-    abstract_state: Column = _FROM_SIMULATOR
+    abstraction: Callable[[Any], Any] = _DERIVED
+    abstract_state: Column = _DERIVED
     beyond: Callable[[Tensor], Tensor] = whole
-    quantities: Mapping[str, tuple[int, ...]] = _EACH_ENTRY
+    quantities: Mapping[str, tuple[int, ...]] = _DERIVED
     facts: Mapping[str, str | float] = field(default_factory=dict)
     simulator_id: str = ""
     varied: Varied = Varied(VariedCommands, RANDOMIZED_COMMANDS, RANDOMIZED_COMMANDS)
@@ -189,11 +174,10 @@ class Task:
             faults.append(f"action: names {', '.join(self.action.labels)}, expected {', '.join(commands)}")
         simulated = self.abstract_state or getattr(self.make_simulator, "abstract_state", None)
         named = {"state": self.state, "action": self.action, "goal": self.goal, "abstract_state": simulated}
-        faults += [
-            f"{name}: names has {', '.join(repeated)} more than once"
-            for name, column in named.items()
-            if (repeated := repeated_names(column))
-        ]
+        for name, column in named.items():
+            names = (column and column.names) or ()
+            if repeated := sorted({entry for entry in names if names.count(entry) > 1}):
+                faults.append(f"{name}: names has {', '.join(repeated)} more than once")
         for name, size in (("action", len(commands)), ("goal", self.objective.goal_size)):
             if (column := getattr(self, name)) and column.size != size:
                 faults.append(f"{name}: {column.size} values, expected {size}")
@@ -248,23 +232,20 @@ class Task:
     @property
     def planar(self) -> Plane:
         """The properties of a task in a maze; BadInputError for others."""
-        if self.plane is None:
-            raise self.without_maze()
-        return self.plane
+        return self._in_maze(self.plane)
 
     @property
     def maze(self) -> Maze:
         """The maze; BadInputError where there is none."""
-        if self.objective.layout is None:
-            raise self.without_maze()
-        return self.objective.layout
+        return self._in_maze(self.objective.layout)
 
-    def without_maze(self) -> BadInputError:
-        """Return the error for settings that need a maze."""
-        return BadInputError(
-            f"expected a task in a maze, got '{self.name}', which has none: leave out what needs a maze "
-            "(augment, follower, support_penalty, command_limit, clearance_m, start 'anywhere')"
-        )
+    def _in_maze[Found](self, found: Found | None) -> Found:
+        if found is None:
+            raise BadInputError(
+                f"expected a task in a maze, got '{self.name}', which has none: leave out what needs a maze "
+                "(augment, follower, support_penalty, command_limit, clearance_m, start 'anywhere')"
+            )
+        return found
 
     @property
     def ball_index(self) -> int | None:
@@ -286,15 +267,8 @@ class Task:
                 f"task '{self.name}' has no target: give it a `robot`, or leave out what needs one (collect, "
                 "rows trained in the target)"
             )
-        return RobotEnv(
-            self.objective,
-            num_envs,
-            robot=self.robot,
-            state=self.state,
-            commands=self.limits,
-            abstraction=self.abstraction,
-            **options,
-        )
+        parts: dict[str, Any] = {"state": self.state, "commands": self.limits, "abstraction": self.abstraction}
+        return RobotEnv(self.objective, num_envs, robot=self.robot, **parts, **options)
 
     def own_simulator(self, num_envs: int, device: str = "cpu") -> AbstractSimulator:
         """Build `num_envs` abstract simulators, driven by commands in their units."""

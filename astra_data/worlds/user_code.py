@@ -25,12 +25,10 @@ from astra_data.worlds.protocols import AbstractSimulator
 
 _PREFIX = "astra_data_user_"  # of the names of modules that are files of the user's
 _PACKAGE = Path(__file__).parents[1]
-_NOT_READ = (".log", ".py", ".pyc")
-"""Endings of files that code names and does not read as data: what it writes, and code, which it imports."""
+_NOT_READ = (".log", ".py", ".pyc")  # files that code names and does not read as data: it writes or imports them
+# So that `ast.dump` writes the same in each version of Python, for digests.
 _WHOLE: dict[str, bool] = {"show_empty": True} if sys.version_info >= (3, 13) else {}
-"""What makes `ast.dump` write the same in each version of Python, for digests."""
-_INSTALLED = ("site-packages", "dist-packages")
-"""Names of folders in which what lies side by side need not belong together."""
+_INSTALLED = ("site-packages", "dist-packages")  # in which what lies side by side need not belong together
 
 
 def is_user_code(name: str) -> bool:
@@ -67,7 +65,10 @@ def file_of(name: str) -> dict[str, str]:
 def user_object(name: str) -> Any:  # noqa: ANN401 - any object
     """Run the file or module that `name` begins with, and return the object that it ends with."""
     place, _, attribute = name.rpartition(":")
-    module = _of_file(Path(place)) if place.endswith(".py") else _of_package(place)
+    if not place.endswith(".py") and not all(part.isidentifier() for part in place.split(".")):
+        raise BadInputError(f"{place}: expected a Python file, such as cart.py, or a module, package.module")
+    with explained(f"importing {place}"):
+        module = _of_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
     if not hasattr(module, attribute):
         raise BadInputError(f"{place} has no '{attribute}'; it has {', '.join(_public_names(module)) or 'nothing'}")
     return getattr(module, attribute)
@@ -77,29 +78,20 @@ def _of_file(path: Path) -> ModuleType:
     if not path.is_file():
         where = "" if path.is_absolute() else f" in {Path.cwd()}"
         raise BadInputError(f"{path} does not exist{where}: expected a Python file")
-    key = hashlib.sha256(f"{path.resolve()}".encode()).hexdigest()[:12]
-    name = f"{_PREFIX}{path.stem}_{key}"
+    name = f"{_PREFIX}{path.stem}_{hashlib.sha256(f'{path.resolve()}'.encode()).hexdigest()[:12]}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
+    assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
     try:
-        with explained(f"importing {path}"), _among_neighbors(str(path.resolve().parent)):
+        with _among_neighbors(str(path.resolve().parent)):
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
     return module
-
-
-def _of_package(name: str) -> ModuleType:
-    if not all(part.isidentifier() for part in name.split(".")):
-        raise BadInputError(f"{name}: expected a Python file, such as cart.py, or a module, package.module")
-    with explained(f"importing {name}"):
-        return importlib.import_module(name)
 
 
 @contextmanager
@@ -231,12 +223,9 @@ def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
 
 def _imported(tree: ast.Module) -> set[str]:
     """Return the names of the top modules that a file imports."""
-    names: list[str] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.append(node.module)
+    nodes = [*ast.walk(tree)]
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
     return {name.partition(".")[0] for name in names}
 
 
@@ -244,16 +233,15 @@ def parts_of(learned: object) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
     """Return the tensors and the metadata (JSON values) that `to_file` of something learned returns."""
     what = f"{type(learned).__name__}.to_file"
     returned = answered(what, learned.to_file)  # type: ignore[attr-defined]
-    is_pair = isinstance(returned, tuple | list) and len(returned) == 2
-    if not (is_pair and all(isinstance(values, Mapping) for values in returned)):
+    if not isinstance(returned, tuple | list) or [isinstance(part, Mapping) for part in returned] != [True, True]:
         kind = type(returned).__name__
         raise BadInputError(f"{what}: expected a pair, a dict of tensors and one of JSON values, got a {kind}")
     tensors, metadata = returned
-    faults = [
-        f"{name!r} is a {type(value).__name__}, expected a torch tensor, as torch.as_tensor(value) is"
-        for name, value in tensors.items()
-        if not isinstance(value, Tensor)
-    ]
+    faults = []
+    for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            kind = type(value).__name__
+            faults.append(f"{name!r} is a {kind}, expected a torch tensor, as torch.as_tensor(value) is")
     for name, value in metadata.items():
         try:
             json.dumps(value)
@@ -291,9 +279,7 @@ def expect(
 ) -> Tensor:
     """Return `found`, a finite tensor of `shape`, where -1 stands for any length; refuse what is none."""
     found = expect_tensor(what, found)
-    if len(shape) != found.dim() or any(
-        size not in (-1, length) for size, length in zip(shape, found.shape, strict=True)
-    ):
+    if len(shape) != found.dim() or any(size not in (-1, got) for size, got in zip(shape, found.shape, strict=True)):
         expected = str(shape).replace("-1", "any")
         raise BadInputError(f"{what}: expected shape {expected}, got {tuple(found.shape)}")
     if dtype is not None and found.dtype != dtype:

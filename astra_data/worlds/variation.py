@@ -1,7 +1,7 @@
 """Variation: how the parameters of simulators differ from episode to episode."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, ClassVar, Self
 
 import torch
@@ -12,21 +12,18 @@ from astra_data.core.config import Config, in_order
 from astra_data.worlds.protocols import TaskSimulator, keep_clear
 
 
-def _above_zero(ends: tuple[float, float]) -> tuple[float, float]:
-    if ends[0] <= 0:
-        raise ValueError(f"expected a range above 0, got {list(ends)}")
-    return ends
+def _range(where: str, fits: Callable[[float], bool]) -> AfterValidator:
+    def check(ends: tuple[float, float]) -> tuple[float, float]:
+        if not fits(ends[0]):
+            raise ValueError(f"expected a range {where}, got {list(ends)}")
+        return ends
 
-
-def _not_below_zero(ends: tuple[float, float]) -> tuple[float, float]:
-    if ends[0] < 0:
-        raise ValueError(f"expected a range from 0 up, got {list(ends)}")
-    return ends
+    return AfterValidator(check)
 
 
 Range = Annotated[tuple[float, float], AfterValidator(in_order)]
-FactorRange = Annotated[Range, AfterValidator(_above_zero)]
-NoiseRange = Annotated[Range, AfterValidator(_not_below_zero)]
+FactorRange = Annotated[Range, _range("above 0", lambda least: least > 0)]
+NoiseRange = Annotated[Range, _range("from 0 up", lambda least: least >= 0)]
 
 
 class Variation(Config):

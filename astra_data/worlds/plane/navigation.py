@@ -76,12 +76,6 @@ class Navigation(PlanarObjective):
     def _goal_distances(self) -> dict[torch.device, GoalDistance]:
         return {}
 
-    def _goal_distance_on(self, device: torch.device) -> GoalDistance:
-        # Cached: the fields are too large to move to an accelerator in every step.
-        if device not in self._goal_distances:
-            self._goal_distances[device] = self.goal_distance.to(device)
-        return self._goal_distances[device]
-
     def draw_starts(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw states [x, y, vx, vy] (count, 4) at rest around the usual starts."""
         position = self._around(self.maze.start, rng, count)
@@ -124,7 +118,10 @@ class Navigation(PlanarObjective):
 
     def progress(self, before: Tensor, after: Tensor, goal: Tensor) -> Tensor:
         """Return the progress in m (B,) toward `goal` (B, 2) from `before` to `after`, (B, 2 or more)."""
-        distance = self._goal_distance_on(goal.device)(torch.stack([before[:, :2], after[:, :2]]), goal)
+        fields = self._goal_distances
+        if goal.device not in fields:  # they are too large to move to an accelerator in every step
+            fields[goal.device] = self.goal_distance.to(goal.device)
+        distance = fields[goal.device](torch.stack([before[:, :2], after[:, :2]]), goal)
         return distance[0] - distance[1]
 
     def reward(self, before: Tensor, after: Tensor, goal: Tensor, failed: Tensor) -> Tensor:

@@ -68,10 +68,13 @@ class Relocation:
         """Draw segments of `episode`, in proportion to their lengths, and a placement for each, `tries` times."""
         stretches = self.stretches(episode)
         lengths = np.array([end - first for first, end in stretches])
+        least, largest = np.array(list(self.task.limits.values())).T
         for _ in range(self.tries if stretches else 0):
             steps = slice(*stretches[rng.choice(len(stretches), p=lengths / lengths.sum())])
-            turn = self._draw_turn(rng)
-            if not self._is_commanded(turn, episode.columns[ACTION][steps]):
+            angle = {"quarter": rng.integers(4) * np.pi / 2, "any": rng.uniform(-np.pi, np.pi), "none": 0.0}
+            turn = PlanarMap(float(angle[self.rotations]))
+            action = turn.of_column(self.task.action, episode.columns[ACTION][steps])
+            if not ((action >= least - _ROUNDING) & (action <= largest + _ROUNDING)).all():
                 continue
             ends = [positions(self.task, episode.columns[name][steps]) for name in (STATE, NEXT_STATE)]
             path = turn.positions(np.concatenate(ends).astype(np.float64))
@@ -87,8 +90,8 @@ class Relocation:
 
         The step that ended an episode with a ball is left out, and the copy does not begin with it in the goal or out.
         """
-        world, movable = self.task, episode
-        if world.ball_index is not None and episode.columns[TERMINATED][-1]:
+        world, movable, has_ball = self.task, episode, self.task.ball_index is not None
+        if has_ball and episode.columns[TERMINATED][-1]:
             movable = replace(episode, columns={name: each[:-1] for name, each in episode.columns.items()})
         for change, steps in self.placements(movable, rng):
             cut = {name: values[steps] for name, values in movable.columns.items()}
@@ -96,26 +99,15 @@ class Relocation:
             goal = world.objective.draw_goals(rng, 1)[0].astype(np.float32)
             columns = cut | moved | {GOAL: np.tile(goal, (len(cut[GOAL]), 1))}
             before, after = (np.asarray(world.abstraction(columns[name])) for name in (STATE, NEXT_STATE))
-            if world.ball_index is None or not self._begins_decided(before[0], goal):
+            first = (torch.from_numpy(before[:1]), torch.from_numpy(goal[None]))
+            if not has_ball or not world.objective.decided(*first):
                 judged = outcomes(world.objective, before, after, goal, cut[TERMINATED] & ~cut[SUCCESS])
                 length = len(judged[DONE])
                 return Copy({name: values[:length] for name, values in columns.items()} | judged, change, steps)
         return None
 
-    def _begins_decided(self, state: Array, goal: Array) -> bool:
-        return bool(self.task.objective.decided(torch.from_numpy(state[None]), torch.from_numpy(goal[None])))
-
     def _is_free(self, points: Array) -> Array:
         return self.task.maze.clearance(points) > self.margin_m
-
-    def _is_commanded(self, turn: PlanarMap, action: Array) -> bool:
-        turned = turn.of_column(self.task.action, action)
-        least, largest = np.array(list(self.task.limits.values())).T
-        return bool(((turned >= least - _ROUNDING) & (turned <= largest + _ROUNDING)).all())
-
-    def _draw_turn(self, rng: np.random.Generator) -> PlanarMap:
-        angle = {"quarter": rng.integers(4) * np.pi / 2, "any": rng.uniform(-np.pi, np.pi), "none": 0.0}
-        return PlanarMap(float(angle[self.rotations]))
 
     def _draw_shifts(self, start: Array, path: Array, rng: np.random.Generator) -> Array:
         """Draw shifts (n, 2) that keep `path` (T, 2) inside the maze where it fits."""
