@@ -217,7 +217,7 @@ class Dataset(Contents):
         return opened
 
     @cached_property
-    def _digests(self) -> Digests:
+    def digests(self) -> Digests:
         """Those of the values as they were written, or as they were when a recording was opened."""
         return self.recorded.digests if self.recorded else read_digests(self.root, self.features)
 
@@ -240,7 +240,7 @@ class Dataset(Contents):
     def alterations(self, block: Mapping[str, Array], indices: Ints) -> Iterator[str]:
         """Yield a sentence for each episode of a block that has other values than were written."""
         for episode, values in self._split(block, indices):
-            if altered := altered_columns(values, episode, self._digests):
+            if altered := altered_columns(values, episode, self.digests):
                 start = int(self.starts[episode])
                 file = int(np.searchsorted(self.file_starts, start, side="right")) - 1
                 row = start - int(self.file_starts[file])

@@ -2,12 +2,11 @@
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats, as_rows
 from astra_data.core.naming import first_few
@@ -36,18 +35,13 @@ class Finding:
 
     def __str__(self) -> str:
         """Say it in a line."""
-        where = f" ({listed(self.episodes)})" if self.episodes else ""
+        word = "episode" if len(self.episodes) == 1 else "episodes"
+        where = f" ({word} {first_few(self.episodes, SHOWN)})" if self.episodes else ""
         return f"{self.severity}: {self.what}{where}: {self.advice}"
 
     def record(self) -> dict[str, Any]:
         """Return it for JSON, with all its episodes."""
         return asdict(self) | {"episodes": list(self.episodes)}
-
-
-def listed(uids: Sequence[int]) -> str:
-    """Name the first `SHOWN` of the episodes `uids` and count the others."""
-    words = "episode " if len(uids) == 1 else "episodes "
-    return words + first_few(uids, SHOWN)
 
 
 def deletion(called: str, uids: Sequence[int]) -> str:
@@ -75,75 +69,33 @@ def is_angle(name: str) -> bool:
     return ANGLE.fullmatch(re.sub(r"_(pos|position|rad|deg)$", "", short)) is not None
 
 
-class Angles:
-    """The values in radians of a column."""
-
-    def __init__(self, column: Column) -> None:
-        self._column = column
-        self._angles = [index for index, unit in enumerate(column.units) if unit == "rad"]
-        self._farthest: NDArray[np.float64] = np.zeros(len(self._angles))
-
-    def add(self, episode: Episode) -> None:
-        """Look at the next episode."""
-        values = as_rows(episode.columns[self._column.name])[:, self._angles]
-        self._farthest = np.maximum(self._farthest, np.abs(values).max(axis=0))
-
-    def findings(self, called: str = "") -> list[Finding]:
-        """Tell which angles are larger than `LARGEST`."""
-        found = np.flatnonzero(self._farthest > LARGEST).tolist()
-        if not found:
-            return []
-        named = channels(self._column, [self._angles[index] for index in found])
-        what = f"{named}: up to {self._farthest[found].max():.4g} rad, which is more than two full turns"
-        advice = "if these are degrees, set `scale` to 0.0174533 in the mapping and import again"
-        return [Finding("warning", what, advice)]
-
-
 def full_turns(column: Column) -> Floats:
     """Return what a full turn adds to each value of a column, (size,); 0 for values that are no angles."""
     roles = (column.astra or {}).get("role", [""] * column.size)
-    turns = [
-        TURNS.get(unit, 2 * np.pi if role == "heading" else 0.0) for unit, role in zip(column.units, roles, strict=True)
-    ]
-    return np.array(turns)
+    radians = [2 * np.pi if role == "heading" else 0.0 for role in roles]
+    return np.array([TURNS.get(unit, turn) for unit, turn in zip(column.units, radians, strict=True)])
 
 
 def shortest(steps: Floats, turns: Floats) -> Floats:
     """Return `steps` (T, S) less whole `turns` (S,), where these are not 0."""
-    angles = turns > 0
-    whole = np.rint(np.divide(steps, turns, out=np.zeros_like(steps), where=angles))
-    left: Floats = steps - turns * whole
+    left: Floats = steps - turns * np.rint(np.divide(steps, turns, out=np.zeros_like(steps), where=turns > 0))
     return left
 
 
-class Continuity:
-    """Compares each step's next state with the state of the row after it, to the bit."""
-
-    def __init__(self) -> None:
-        self._steps = self._broken = 0
-        self._uids: list[int] = []
-
-    def add(self, episode: Episode) -> None:
-        """Compare the steps of the next episode."""
-        if NEXT_STATE not in episode.columns or STATE not in episode.columns:
-            return
+def continuity(episodes: Iterable[Episode]) -> list[Finding]:
+    """Tell of how many steps the next state is not the state of the row after it, to the bit."""
+    steps, broken = 0, dict[int, int]()
+    for episode in episodes:
         state, arrived = as_rows(episode.columns[STATE]), as_rows(episode.columns[NEXT_STATE])
-        broken = int((arrived[:-1] != state[1:]).any(axis=1).sum())
-        self._steps += len(state) - 1
-        self._broken += broken
-        if broken:
-            self._uids.append(episode.uid)
-
-    def findings(self, called: str = "") -> list[Finding]:
-        """Tell how many steps do not lead to the row after them."""
-        if not self._broken:
-            return []
-        what = f"steps whose {NEXT_STATE} is not the state of the next row: {self._broken} of {self._steps}"
-        advice = (
-            "rows are missing, or the columns come from different logs: import again, without "
-            f"{NEXT_STATE} in the mapping if each row is the state after the one before"
-        )
-        return [Finding("warning", what, advice, tuple(self._uids))]
+        steps += len(state) - 1
+        broken[episode.uid] = int((arrived[:-1] != state[1:]).any(axis=1).sum())
+    uids = tuple(uid for uid, count in broken.items() if count)
+    what = f"steps whose {NEXT_STATE} is not the state of the next row: {sum(broken.values())} of {steps}"
+    advice = (
+        "rows are missing, or the columns come from different logs: import again, without "
+        f"{NEXT_STATE} in the mapping if each row is the state after the one before"
+    )
+    return [Finding("warning", what, advice, uids)] if uids else []
 
 
 GAP = 1.5
@@ -170,117 +122,106 @@ def is_clock(column: Column) -> bool:
     return column.size == 1 and column.dtype != "bool" and column.name not in RESERVED and named is not None
 
 
+@dataclass
 class Clock:
     """The times that are called `name`, in `scale` s, of a recording of `fps` declared steps per second."""
 
-    def __init__(self, name: str, fps: int, scale: float = 1.0, *, whole: bool = False) -> None:
-        self._name, self._fps, self._scale, self._whole = name, fps, scale, whole
-        self._steps_s: list[Floats] = []
-        self._uids: list[int] = []
+    name: str
+    fps: int
+    scale: float = 1.0
+    is_whole: bool = False
+    """Whether the times are integers."""
+    steps_s: list[Floats] = field(default_factory=list)
+    """Of each episode, (n,)."""
+    uids: list[int] = field(default_factory=list)
 
     @classmethod
     def of(cls, column: Column, fps: int) -> Self:
         """Return a clock of the times in `column` (T,), in its unit, by default s."""
         unit = column.units[0] or column.name.lower().rpartition("_")[2]
-        return cls(column.name, fps, _SECONDS.get(unit, 1.0), whole=column.dtype == "int64")
+        return cls(column.name, fps, _SECONDS.get(unit, 1.0), column.dtype == "int64")
 
     def add(self, episode: Episode) -> None:
         """Count the steps between the times of the next episode."""
-        self.count(np.diff(episode.columns[self._name].astype(np.float64)) * self._scale, episode.uid)
+        self.count(np.diff(episode.columns[self.name].astype(np.float64)) * self.scale, episode.uid)
 
     def count(self, steps_s: Floats, uid: int = 0) -> None:
         """Count steps of the episode `uid`, (n,) in s."""
-        self._steps_s.append(steps_s)
-        self._uids.append(uid)
+        self.steps_s.append(steps_s)
+        self.uids.append(uid)
 
-    def _sorted_steps(self) -> Floats:
-        """Return the steps in which time goes on, in s, the shortest first."""
-        steps_s = np.concatenate([*self._steps_s, np.zeros(0)])
-        return np.sort(steps_s[steps_s > 0])
+    def rates(self) -> tuple[float, int, float, float]:
+        """Return period in s, number of gaps, their share of the steps, and jitter in periods; 0 without a rate.
 
-    @property
-    def period_s(self) -> float:
-        """The mean in s of the `INNER` share of steps around the median; 0 without steps."""
-        steps_s = self._sorted_steps()
+        The period is the mean of the `INNER` share of steps around the median; by the jitter, 5 % of the steps
+        are off at least, gaps aside. Time goes on in most steps, or there is no rate: float32 cannot hold the
+        seconds since 1970, for one.
+        """
+        every = np.concatenate([*self.steps_s, np.zeros(0)])
+        steps_s = np.sort(every[every > 0])
+        if 2 * len(steps_s) <= len(every):
+            return 0.0, 0, 0.0, 0.0
         first, last = (int(len(steps_s) * share) for share in ((1 - INNER) / 2, (1 + INNER) / 2))
-        return float(steps_s[first : max(last, first + 1)].mean()) if len(steps_s) else 0.0
-
-    @property
-    def gaps(self) -> int:
-        """Steps that took over `GAP` periods."""
-        return int((self._sorted_steps() > GAP * self.period_s).sum())
-
-    @property
-    def jitter(self) -> float:
-        """Periods by which 5 % of the steps are off at least, gaps aside."""
-        steps_s, period_s = self._sorted_steps(), self.period_s
-        offsets = np.abs(steps_s[steps_s <= GAP * period_s] - period_s)
-        return float(np.quantile(offsets, INNER) / period_s) if len(offsets) else 0.0
+        period_s = float(steps_s[first : max(last, first + 1)].mean())
+        regular = steps_s[steps_s <= GAP * period_s]
+        gaps = len(steps_s) - len(regular)
+        jitter = float(np.quantile(np.abs(regular - period_s), INNER) / period_s) if len(regular) else 0.0
+        return period_s, gaps, gaps / len(steps_s), jitter
 
     def __str__(self) -> str:
         """Compare the rates."""
-        declared, period_s = f"{self._fps} Hz declared", self.period_s
-        if not self._has_rate:
-            return f"{declared}; {self._name} does not increase in most steps"
-        if off := self._off:
-            return f"{declared}, and {off} by {self._name}"
-        share = self.gaps / len(self._sorted_steps())
+        declared, (period_s, gaps, share, jitter) = f"{self.fps} Hz declared", self.rates()
+        if not period_s:
+            return f"{declared}; {self.name} does not increase in most steps"
+        if off := self._off(period_s):
+            return f"{declared}, and {off} by {self.name}"
         missing = f" ({100 * share:.0f} % of the steps: rows are missing)" if share >= MANY_GAPS else ""
         return (
-            f"{declared}, {1 / period_s:.4g} Hz by {self._name}; gaps within episodes: {self.gaps}{missing}, "
-            f"jitter {100 * self.jitter:.1f} % of a period"
+            f"{declared}, {1 / period_s:.4g} Hz by {self.name}; gaps within episodes: {gaps}{missing}, "
+            f"jitter {100 * jitter:.1f} % of a period"
         )
 
     def findings(self, called: str) -> list[Finding]:
         """Tell a wrong rate, gaps, jitter, and where time stands still or goes back."""
-        found, period_s = [], self.period_s
-        if standing := [u for u, steps_s in zip(self._uids, self._steps_s, strict=True) if (steps_s <= 0).any()]:
-            what = f"{self._name} stands still or goes back between steps"
+        found, (period_s, gaps, share, jitter) = [], self.rates()
+        if standing := [u for u, steps_s in zip(self.uids, self.steps_s, strict=True) if (steps_s <= 0).any()]:
             remedy = "store it as seconds since the start (`offset`) or as int64"
-            if self._whole:
+            if self.is_whole:
                 remedy = (
                     "look for duplicate rows in the log or a clock that was set back, and in MCAP for an "
                     "`fps` that is too high or a topic that drops out (`gap_s`)"
                 )
+            what = f"{self.name} stands still or goes back between steps"
             advice = f"{remedy}, or leave the episodes out: {deletion(called, standing)}"
             found.append(Finding("warning", what, advice, tuple(standing)))
-        if not self._has_rate:
+        if not period_s:
             return found
-        if off := self._off:
+        if off := self._off(period_s):
             advice = "give its `unit` (s, ms, us or ns) or correct `fps` in the mapping, and import again"
-            return [*found, Finding("warning", f"{off}, by {self._name}", advice)]
-        if abs(1 / period_s / self._fps - 1) > WRONG_RATE:
-            what = f"{self._name} runs at {1 / period_s:.4g} Hz, but {self._fps} Hz is declared"
-            advice = "correct `fps` in the mapping, or resample, and import again"
-            found.append(Finding("warning", what, advice))
-        if self.gaps:
-            longest = [float(steps_s.max(initial=0.0)) for steps_s in self._steps_s]
-            uids = [uid for uid, s in zip(self._uids, longest, strict=True) if s > GAP * period_s]
-            what = f"steps of over {GAP:g} periods: {self.gaps}, the longest {max(longest):.3g} s"
+            return [*found, Finding("warning", f"{off}, by {self.name}", advice)]
+        if abs(1 / period_s / self.fps - 1) > WRONG_RATE:
+            what = f"{self.name} runs at {1 / period_s:.4g} Hz, but {self.fps} Hz is declared"
+            found.append(Finding("warning", what, "correct `fps` in the mapping, or resample, and import again"))
+        if gaps:
+            longest = [float(steps_s.max(initial=0.0)) for steps_s in self.steps_s]
+            uids = [uid for uid, s in zip(self.uids, longest, strict=True) if s > GAP * period_s]
             remedy = (
                 f"begin new episodes there (`time`, and `gap_s = {GAP * period_s:.3g}` in [split], of the "
-                f'mapping; for MCAP, `gap_s = {HELD * period_s:.3g}` in [columns."{self._name}"])'
+                f'mapping; for MCAP, `gap_s = {HELD * period_s:.3g}` in [columns."{self.name}"])'
             )
             # Many gaps are a recording of another rate, of which splits would leave crumbs.
-            if self.gaps >= MANY_GAPS * len(self._sorted_steps()):
+            if share >= MANY_GAPS:
                 remedy = f"resample the recording (of MCAP, take an `fps` that divides its rate), or {remedy}"
+            what = f"steps of over {GAP:g} periods: {gaps}, the longest {max(longest):.3g} s"
             found.append(Finding("warning", what, f"{remedy} and import again", tuple(uids)))
-        if self.jitter > JITTERY:
-            off = f"{100 * self.jitter:.0f} %"
-            what = f"5 % of the steps are off by {off} of a period or more, by {self._name}"
-            advice = f"resample the recording to {self._fps} Hz and import again"
-            found.append(Finding("note", what, advice))
+        if jitter > JITTERY:
+            what = f"5 % of the steps are off by {100 * jitter:.0f} % of a period or more, by {self.name}"
+            found.append(Finding("note", what, f"resample the recording to {self.fps} Hz and import again"))
         return found
 
-    @property
-    def _has_rate(self) -> bool:
-        """Whether time goes on in most steps: float32 cannot hold the seconds since 1970, for one."""
-        return 2 * len(self._sorted_steps()) > sum(map(len, self._steps_s))
-
-    @property
-    def _off(self) -> str:
-        """How long a step is, if it is so long or short that the unit is another than is thought."""
-        periods = self.period_s * self._fps
+    def _off(self, period_s: float) -> str:
+        """Say how long a step is, if it is so long or short that the unit is another than is thought."""
+        periods = period_s * self.fps
         if 1 / FINE <= periods < MOST_PERIODS:
             return ""
         return "a step takes " + (f"1/{FINE} of a period or less" if periods < 1 else f"{MOST_PERIODS} periods or more")

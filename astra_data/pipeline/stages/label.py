@@ -12,7 +12,7 @@ from astra_data.core.durable import make_folder, refuse_existing
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
-from astra_data.dataset.checkup.findings import Continuity
+from astra_data.dataset.checkup.findings import continuity
 from astra_data.dataset.columns import (
     DONE,
     GOAL,
@@ -117,10 +117,8 @@ def label(
 
 def remarks(source: Dataset, task: Task) -> list[str]:
     """Say what is to be checked of a dataset that fits a task."""
-    continuity = Continuity()
-    for episode in source.episodes([STATE, NEXT_STATE]):
-        continuity.add(episode)
-    found = [f"{finding.what}: {finding.advice}" for finding in continuity.findings()]
+    torn = continuity(source.episodes([STATE, NEXT_STATE]))
+    found = [f"{finding.what}: {finding.advice}" for finding in torn]
     if named := names_apart(source, (task.state, task.action), task.name):
         found.append(named)
     has_ends = TERMINATED in source.features and SUCCESS not in source.features

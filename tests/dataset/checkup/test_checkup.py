@@ -10,21 +10,17 @@ from toy_logs import Columns, toy_columns, write_logs
 from astra_data.core.arrays import Floats
 from astra_data.dataset.checkup.checkup import (
     Checkup,
-    Duplicates,
-    EpisodeEnds,
-    GivenCommands,
-    Repeats,
-    Shift,
     check_up,
+    commands,
+    edge_shares,
+    endings,
     held_steps,
     longest_rests,
+    repeats,
+    shift,
 )
-from astra_data.dataset.checkup.findings import (
-    Continuity,
-    Finding,
-    is_angle,
-)
-from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED, Array, Column, Episode
+from astra_data.dataset.checkup.findings import Finding, continuity, is_angle
+from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, Array, Column, Episode
 
 
 def test_good_logs_have_no_findings(tmp_path: Path) -> None:
@@ -147,30 +143,13 @@ def test_a_step_leads_to_the_row_after_it(shape: tuple[int, ...]) -> None:
     walk = np.random.default_rng(0).normal(size=(7, *shape[1:])).astype(np.float32)
     state, arrived = walk[:-1], walk[1:].copy()
     arrived[-1] = 9.0  # whatever is after the last row
-    continuity = Continuity()
-    continuity.add(Episode(0, {STATE: state, NEXT_STATE: arrived}))
-    continuity.add(Episode(1, {STATE: state[:1], NEXT_STATE: arrived[:1]}))
-    continuity.add(Episode(2, {STATE: state}))
-    assert not continuity.findings()
     off = arrived.copy()
     off[1] = np.nextafter(off[1], np.float32(100))
-    continuity.add(Episode(4, {STATE: state, NEXT_STATE: off}))
-    (found,) = continuity.findings()
+    episodes = [Episode(uid, {STATE: state[:n], NEXT_STATE: arrived[:n]}) for uid, n in ((0, 6), (1, 1))]
+    assert not continuity(episodes)
+    (found,) = continuity([*episodes, Episode(4, {STATE: state, NEXT_STATE: off})])
     assert found.severity == "warning" and found.episodes == (4,)
     assert found.what == "steps whose next.observation.state is not the state of the next row: 1 of 10"
-
-
-def test_the_same_states_and_actions_are_a_copy() -> None:
-    state, action = np.arange(12, dtype=np.float32).reshape(6, 2), np.ones(6, np.float32)
-    other = state.copy()
-    other[5, 1] = np.nextafter(other[5, 1], 100, dtype=np.float32)
-    pairs = [(state, action), (other, action), (state, 2 * action), (state[:5], action[:5]), (other, action)]
-    duplicates = Duplicates()
-    for uid, (states, actions) in enumerate(pairs):
-        assert not duplicates.findings("walks")
-        duplicates.add(Episode(uid, {STATE: states, ACTION: actions}))
-    (found,) = duplicates.findings("walks")
-    assert found.episodes == (4,)
 
 
 WALK = np.cumsum(np.random.default_rng(0).normal(size=(400, 2)), axis=0)
@@ -186,18 +165,12 @@ WALK = np.cumsum(np.random.default_rng(0).normal(size=(400, 2)), axis=0)
     ],
 )
 def test_rows_that_were_written_twice_are_found(state: Array, found: bool) -> None:
-    repeats = Repeats()
-    repeats.add(Episode(0, {STATE: state[:200].astype(np.float32)}))
-    repeats.add(Episode(1, {STATE: state[200:].astype(np.float32)}))
-    assert bool(repeats.findings()) is found
+    assert bool(repeats([state[:200], state[200:]])) is found
 
 
 def shifted(state: Floats, action: Floats) -> list[Finding]:
-    part = Shift()
-    for uid, half in enumerate((slice(0, len(state) // 2), slice(len(state) // 2, None))):
-        columns = {STATE: state[half].astype(np.float32), ACTION: action[half].astype(np.float32)}
-        part.add(Episode(uid, columns))
-    return part.findings()
+    halves = (slice(0, len(state) // 2), slice(len(state) // 2, None))
+    return shift([(state[half].astype(np.float32), action[half].astype(np.float32)) for half in halves])
 
 
 def walk(actions: Floats, delay: int = 0) -> Floats:
@@ -245,53 +218,29 @@ def test_actions_of_their_own_rows_are_not(state: Floats, action: Floats) -> Non
     assert shifted(state, action) == []
 
 
-def counted(ends: list[tuple[int, bool | None]], successes: list[bool | None] | None) -> EpisodeEnds:
-    outcomes = EpisodeEnds(successes)
-    for uid, (steps, terminated) in enumerate(ends):
-        columns: Columns = {"x": np.zeros(steps, np.float32)}
-        if terminated is not None:
-            columns[TERMINATED] = (np.arange(steps) == steps - 1) & terminated
-        outcomes.add(Episode(uid, columns))
-    return outcomes
-
-
 def test_every_way_to_end_is_counted() -> None:
-    ends: list[tuple[int, bool | None]] = [
-        (9, True),
-        (8, True),
-        (50, False),
-        (50, False),
-        (30, False),
-        (7, True),
-    ]
-    outcomes = counted(ends, [True, False, False, None, False, None])
-    assert str(outcomes) == (
+    lengths, ended = np.array([9, 8, 50, 50, 30, 7]), np.array([1, 1, 0, 0, 0, 1], bool)
+    line, (found,) = endings(range(6), lengths, ended, [True, False, False, None, False, None])
+    assert line == (
         "1 in success, 1 in failure, 1 terminated, success unknown, 2 after 50 steps, the longest (a time limit), 1 cut"
     )
-    assert outcomes.failures == [1]
-    assert str(counted([(9, False), (12, False)], None)) == "2 cut"
-    unknown = counted([(9, None), (9, None)], None)
-    assert str(unknown).startswith("unknown") and not unknown.findings()
+    assert found.episodes == (1,)
+    assert endings([0, 1], np.array([9, 12]), np.zeros(2, bool), None) == ("2 cut", [])
+    line, findings = endings([0, 1], np.array([9, 9]), None, None)
+    assert line.startswith("unknown") and not findings
 
 
 @pytest.mark.parametrize(("longest", "found"), [(1, True), (2, False)])
 def test_episodes_that_all_end_in_their_first_step_are_told(longest: int, found: bool) -> None:
-    assert bool(counted([(1, False), (longest, False)], [None, None]).findings()) is found
+    assert bool(endings([0, 1], np.array([1, longest]), None, [None, None])[1]) is found
 
 
 @pytest.mark.parametrize(("failures", "found"), [(0, False), (1, True), (9, True), (10, False)])
 def test_few_failures_are_told(failures: int, found: bool) -> None:
-    ends: list[tuple[int, bool | None]] = [(9, uid < failures) for uid in range(30)]
-    findings = counted(ends, [False] * len(ends)).findings()
+    lengths, ended = np.full(30, 9), np.arange(30) < failures
+    findings = endings(range(30), lengths, ended, [False] * 30)[1]
     assert [finding.episodes for finding in findings] == ([tuple(range(failures))] if found else [])
-    assert not counted(ends, None).findings()  # where success is unknown, failure is
-
-
-def given(*actions: Array, size: int = 1) -> GivenCommands:
-    commands = GivenCommands(Column(ACTION, size=size, names=("v", "w")[:size]), fps=10)
-    for uid, action in enumerate(actions):
-        commands.add(Episode(uid, {ACTION: action.astype(np.float32)}))
-    return commands
+    assert not endings(range(30), lengths, ended, None)[1]  # where success is unknown, failure is
 
 
 def test_commands_are_held_as_long_as_all_of_them_stay() -> None:
@@ -301,18 +250,16 @@ def test_commands_are_held_as_long_as_all_of_them_stay() -> None:
     assert held_steps(np.ones((1, 2), np.float32)).tolist() == [1]
 
 
-def test_steps_at_either_edge_of_the_range_of_all_episodes_are_counted() -> None:
-    first = np.linspace(-0.5, 0.5, 10)  # its edges are none of the whole
-    second = np.concatenate([np.linspace(-0.8, 0.8, 8), [-1, 1]])
-    third = np.array([1.0] * 5 + [-1.0] * 2 + [0.0] * 3)
-    for order in ((first, second, third), (third, first, second)):
-        np.testing.assert_allclose(given(*order).edge_shares, [9 / 30])
+def test_steps_at_either_edge_of_the_range_are_counted() -> None:
+    linear = [np.linspace(-0.5, 0.5, 10), np.linspace(-0.8, 0.8, 8)]
+    actions = np.concatenate([*linear, [-1, 1], [1.0] * 5 + [-1.0] * 2 + [0.0] * 3])
+    np.testing.assert_allclose(edge_shares(actions[:, None]), [9 / 30])
 
 
 @pytest.mark.parametrize(("values", "found"), [(8, False), (9, True)])
 def test_a_choice_of_a_few_commands_has_no_edge(values: int, found: bool) -> None:
     action = np.tile(np.arange(values), 10)
-    assert bool(given(action[:40], action[40:]).findings()) == found
+    assert bool(commands(Column(ACTION), action[:, None], np.array([0, 40]), 10)[1]) == found
 
 
 def test_the_longest_rest_is_counted_in_each_column() -> None:

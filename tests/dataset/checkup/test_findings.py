@@ -48,7 +48,7 @@ def test_clocks_are_known_by_their_name(column: Column, is_one: bool) -> None:
 def test_times_have_units(column: Column, per_second: int) -> None:
     found = Clock.of(column, 2)
     found.add(Episode(0, {column.name: np.arange(50, dtype=np.int64) * per_second}))
-    assert found.period_s == pytest.approx(1.0)
+    assert found.rates()[0] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -63,14 +63,14 @@ def test_a_rate_that_is_off_by_over_a_twentieth_is_wrong(period_s: float, found:
 @pytest.mark.parametrize(("step_s", "found"), [(0.149, False), (0.152, True)])
 def test_a_step_of_over_one_and_a_half_periods_is_a_gap(step_s: float, found: bool) -> None:
     timed = clock(REGULAR, [*REGULAR, step_s], REGULAR)
-    assert timed.gaps == found
+    assert timed.rates()[1] == found
     findings = timed.findings("walks")
     assert [finding.episodes for finding in findings] == [(1,)] * found
 
 
 def test_gaps_are_counted_where_the_declared_rate_is_wrong_too() -> None:
     timed = clock([*REGULAR, 0.3, 0.4], fps=100)
-    assert timed.gaps == 2
+    assert timed.rates()[1] == 2
     wrong, gaps = timed.findings("walks")
     assert "at 10 Hz, but 100 Hz is declared" in wrong.what
     assert "the longest 0.4 s" in gaps.what
