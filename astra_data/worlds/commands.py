@@ -1,6 +1,6 @@
 """Commands in their own units, and as policies give them, ±1 along each axis; simulators driven so."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
@@ -15,7 +15,7 @@ from astra_data.worlds.protocols import SteppedSimulator, keep_clear
 from astra_data.worlds.variation import VariedSimulator, noisy_command
 
 
-class Commands(Mapping[str, tuple[float, float]]):
+class Commands(dict[str, tuple[float, float]]):
     """The least and the largest command along each of A axes, by the axes' names.
 
     Example:
@@ -36,11 +36,10 @@ class Commands(Mapping[str, tuple[float, float]]):
                 faults.append(f"{name}: expected (least, largest), got {ends!r}")
         if faults:
             raise BadInputError(f"commands: {'; '.join(faults)}")
-        self._bounds = {name: (float(low), float(high)) for name, (low, high) in bounds.items()}
-        low, high = torch.tensor(list(self._bounds.values())).unbind(-1)
+        super().__init__({name: (float(low), float(high)) for name, (low, high) in bounds.items()})
+        low, high = torch.tensor(list(self.values())).unbind(-1)
         self._middle, self._half = (low + high) / 2, (high - low) / 2
-        self.are_normal = all(ends == (-1.0, 1.0) for ends in self._bounds.values())
-        """Whether they are ±1 in their own units already."""
+        self.are_normal = {*self.values()} == {(-1.0, 1.0)}  # in their own units already
 
     @classmethod
     def recorded(cls, dataset: str | Path) -> Self:
@@ -51,24 +50,11 @@ class Commands(Mapping[str, tuple[float, float]]):
             raise BadInputError(f"commands: the range of {source.reference} is not known: {statistics}")
         if ACTION not in statistics:
             raise BadInputError(f"commands: {source.reference} has no column {ACTION}: give their bounds")
-        least, largest = (np.asarray(statistics[ACTION][end], float).tolist() for end in ("min", "max"))
-        column = next(column for column in source.schema if column.name == ACTION)
-        names = column.labels
-        if still := [name for name, low, high in zip(names, least, largest, strict=True) if low == high]:
+        ends = np.array([statistics[ACTION][end] for end in ("min", "max")], float).T.tolist()
+        names = next(column for column in source.schema if column.name == ACTION).labels
+        if still := [name for name, (low, high) in zip(names, ends, strict=True) if low == high]:
             raise BadInputError(f"commands: {', '.join(still)} never changes in {source.reference}: give the bounds")
-        return cls(dict(zip(names, zip(least, largest, strict=True), strict=True)))
-
-    def __getitem__(self, name: str) -> tuple[float, float]:
-        """Return the bounds of an axis."""
-        return self._bounds[name]
-
-    def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of the axes."""
-        return iter(self._bounds)
-
-    def __len__(self) -> int:
-        """Return the number of axes, A."""
-        return len(self._bounds)
+        return cls(dict(zip(names, ends, strict=True)))
 
     def in_units(self, action: Tensor) -> Tensor:
         """Return actions of ±1 (..., A), clipped to that first, in the units of the commands."""

@@ -4,7 +4,6 @@ Cells are (row, column) from the top left; x grows with the column, y falls with
 Fine grids have square cells of the maze's `fine_m` and are indexed [y, x] from the lower left corner.
 """
 
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -114,10 +113,11 @@ class Maze:
         cost = np.ones(free.shape)
         if margin > 0:
             cost += 20.0 * np.clip(1.0 - self.clearance_field / margin, 0.0, 1.0)
-        sources, targets, weights = [], [], []
+        (height, width), (sources, targets, weights) = free.shape, ([], [], [])
         # Knight moves beside the eight neighbors keep the error of grid distances below 3 %.
         for dy, dx in [(0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1)]:
-            here, there = _shifted(free.shape, dy, dx)
+            here = np.s_[: height - dy, max(0, -dx) : width - max(0, dx)]
+            there = np.s_[dy:, max(0, dx) : width + min(0, dx)]
             both = free[here] & free[there]
             sources.append(numbers[here][both])
             targets.append(numbers[there][both])
@@ -133,36 +133,15 @@ class Maze:
         return np.asarray(field[tuple(nearest)] + away * self.fine_m)
 
 
-def _shifted(shape: tuple[int, ...], dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    height, width = shape
-    left, right = max(0, -dx), width - max(0, dx)
-    here = (slice(0, height - dy), slice(left, right))
-    there = (slice(dy, height), slice(left + dx, right + dx))
-    return here, there
-
-
-U_MAZE = Maze(rows=("11111", "10001", "11101", "10001", "11111"), scale=4.0, start=(1, 1), goal=(3, 1))
-"""gymnasium-robotics' U_MAZE at its own scale."""
-
-LONG_MAZE = Maze(
-    rows=("11111", "10001", "11101", "10001", "10111", "10001", "11111"), scale=4.0, start=(1, 1), goal=(5, 3)
-)
-"""Two U's in a row, four right-angle turns, 40 m along the center line: ours, the paper prints no layout."""
-
-S_MAZE = Maze(
-    rows=("111111", "100001", "111101", "100001", "101111", "100001", "111111"),
-    scale=1.0,
-    start=(1, 1),
-    goal=(5, 4),
-    fine_m=0.05,
-)
-"""An S with corridors of 1 m on half a field of RoboCup's Standard Platform League. Ours too."""
-
-FIELD = Maze(
-    rows=("1" * 12, *("1" + "0" * 10 + "1",) * 10, "1" * 12), scale=0.5, start=(5, 2), goal=(5, 9), fine_m=0.05
-)
-"""A room of 5 m by 5 m for playing with a ball."""
-
+# gymnasium-robotics' U_MAZE at its own scale.
+U_MAZE = Maze(("11111", "10001", "11101", "10001", "11111"), scale=4.0, start=(1, 1), goal=(3, 1))
+# Two U's in a row, four right-angle turns, 40 m along the center line: ours, the paper prints no layout.
+LONG_MAZE = Maze(("11111", "10001", "11101", "10001", "10111", "10001", "11111"), scale=4.0, start=(1, 1), goal=(5, 3))
+# An S with corridors of 1 m on half a field of RoboCup's Standard Platform League. Ours too.
+_S_ROWS = ("111111", "100001", "111101", "100001", "101111", "100001", "111111")
+S_MAZE = Maze(_S_ROWS, scale=1.0, start=(1, 1), goal=(5, 4), fine_m=0.05)
+# A room of 5 m by 5 m for playing with a ball.
+FIELD = Maze(("1" * 12, *("1" + "0" * 10 + "1",) * 10, "1" * 12), scale=0.5, start=(5, 2), goal=(5, 9), fine_m=0.05)
 
 _EDGE_M = 1e-4  # distance from the face of a blocked cell at which a sliding point is stopped
 
@@ -180,23 +159,25 @@ class FreeSpace:
         self._limits = torch.tensor(blocked.shape[::-1], device=blocked.device) - 1
 
     @classmethod
+    @lru_cache(maxsize=16)  # for who builds simulators often
     def of_maze(cls, maze: Maze, *, radius_m: float, device: str = "cpu") -> "FreeSpace":
         """Return the free space of a disc of `radius_m`, to the nearest cell of the grid."""
-        return copy(_free_space(maze, round(radius_m / maze.fine_m), device))
-
-    def cells(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the row and the column (...) of the fine grid's cell of each `position` (..., 2)."""
-        column, row = self._cells(position).unbind(-1)
-        return row, column
+        reach = round(radius_m / maze.fine_m)
+        square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
+        blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)
+        half_extent = torch.tensor(maze.half_extent, dtype=torch.float32, device=device)
+        return cls(torch.from_numpy(blocked).to(device), half_extent, maze.fine_m)
 
     def slide(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Move points from `start` to `end` (B, 2), each axis up to blocked cells; return where, and who was stopped.
 
         Only the cells where a move begins and ends are looked at. From a blocked cell a point may not go deeper.
         """
-        here, there = self._cells(torch.stack([start, end]))
+        here, there = self.cells(torch.stack([start, end]))
         (from_x, from_y), (to_x, to_y) = here.unbind(-1), there.unbind(-1)
-        face_x, face_y = self._faces(here, there).unbind(-1)
+        onward = there > here
+        face = (here + onward) * self.cell_m - self.half_extent
+        face_x, face_y = torch.where(onward, face - _EDGE_M, face + _EDGE_M).unbind(-1)
         end_x, end_y = end.unbind(-1)
         depth, depth_x = self._depth[from_y, from_x], self._depth[from_y, to_x]
         stop_x = depth_x > depth
@@ -206,24 +187,10 @@ class FreeSpace:
         y = torch.where(stop_y, face_y, end_y)
         return torch.stack([x, y], dim=-1), stop_x | stop_y
 
-    def _cells(self, position: Tensor) -> Tensor:
+    def cells(self, position: Tensor) -> Tensor:
+        """Return the column and the row (..., 2) of the fine grid's cell of each `position` (..., 2)."""
         cells = ((position + self.half_extent) / self.cell_m).floor().long()
         return torch.minimum(cells.clamp_min(0), self._limits)
-
-    def _faces(self, here: Tensor, there: Tensor) -> Tensor:
-        """Return where points that move between the cells (B, 2) are stopped on each axis, (B, 2) in m."""
-        onward = there > here
-        face = (here + onward) * self.cell_m - self.half_extent
-        return torch.where(onward, face - _EDGE_M, face + _EDGE_M)
-
-
-@lru_cache(maxsize=16)
-def _free_space(maze: Maze, reach: int, device: str) -> FreeSpace:
-    """Return the free space of a disc that reaches as many cells; kept, for who builds simulators often."""
-    square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
-    blocked = scipy.ndimage.binary_dilation(maze.fine_walls, square, border_value=1)
-    half_extent = torch.tensor(maze.half_extent, dtype=torch.float32, device=device)
-    return FreeSpace(torch.from_numpy(blocked).to(device), half_extent, maze.fine_m)
 
 
 @dataclass(frozen=True)
@@ -242,12 +209,8 @@ class GoalDistance:
         center = np.array(maze.cell_center(*maze.goal))
         lattice = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2) + center
         fields = np.stack([maze.distance_field(goal, radius=radius_m) for goal in lattice])
-        return cls(
-            torch.from_numpy(fields).float(),
-            torch.from_numpy(lattice).float(),
-            torch.tensor(maze.half_extent, dtype=torch.float32),
-            maze.fine_m,
-        )
+        half_extent = torch.tensor(maze.half_extent, dtype=torch.float32)
+        return cls(torch.from_numpy(fields).float(), torch.from_numpy(lattice).float(), half_extent, maze.fine_m)
 
     def to(self, device: str | torch.device) -> "GoalDistance":
         """Return the same fields on `device`."""

@@ -38,7 +38,8 @@ class PlanarStates:
             )
         self.parameters = {"timestep_s": timestep_s, "radius_m": radius_m, "speed_m_s": speed_m_s}
         self.free = FreeSpace.of_maze(maze, radius_m=radius_m, device=device)
-        self._maze, self._settles_in = maze, self.free
+        self._maze = maze
+        self._settles_in: FreeSpace | None = None  # other than its own
         self.num_envs = num_envs
         self.state = torch.zeros(num_envs, self.state_size, device=device)
         self.blocked = torch.zeros(num_envs, dtype=torch.bool, device=device)
@@ -69,18 +70,17 @@ class PlanarStates:
     def keep_clear(self, distance_m: float) -> None:
         """Let corrections end no closer to walls than `distance_m`, to the nearest fine cell; steps come closer."""
         widest = max(distance_m, self.parameters["radius_m"])
-        device = str(self.state.device)
-        self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=device)
+        self._settles_in = FreeSpace.of_maze(self._maze, radius_m=widest, device=str(self.state.device))
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Slide the discs from `before` toward `landed`, both (B, X); all else is that of `landed`.
 
         Walls that stopped the step count, and who is kept clear of one stands there: policies would else lean on it.
         """
-        position, stopped = self._settles_in.slide(before[:, :2], landed[:, :2])
+        position, stopped = (self._settles_in or self.free).slide(before[:, :2], landed[:, :2])
         self.blocked = self.blocked | stopped
         velocity = landed[:, 2:4]
-        if self._settles_in is not self.free:
+        if self._settles_in:
             moved = (position - before[:, :2]) / self.period_s
             velocity = torch.where(position == landed[:, :2], velocity, moved)
         self.reset_to(torch.cat([position, velocity, landed[:, 4:]], dim=-1))
@@ -116,11 +116,8 @@ class VariedPlanar(VariedSimulator):
         command = torch.cat([noisy_command(velocity, parameters["action_noise"]), rest], dim=-1)
         self.simulator.vary(parameters)
         true = self.simulator.step(command)
-        half_widths = [
-            parameters[name].expand(-1, 2)
-            for name in ("position_noise_m", "velocity_noise_m_s", "ball_position_noise_m", "ball_velocity_noise_m_s")
-            if name in parameters
-        ]
+        noises = ("position_noise_m", "velocity_noise_m_s", "ball_position_noise_m", "ball_velocity_noise_m_s")
+        half_widths = [parameters[name].expand(-1, 2) for name in noises if name in parameters]
         self._observed = true + (torch.rand_like(true) * 2.0 - 1.0) * torch.cat(half_widths, dim=-1)
         return self._observed
 

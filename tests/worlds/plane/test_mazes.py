@@ -106,7 +106,8 @@ def test_walls_stop_each_axis_by_itself(end: list[float], rest: list[float]) -> 
     assert reached == pytest.approx(rest, abs=2e-4)
     assert stopped
     free = FreeSpace.of_maze(ROOM, radius_m=0.1)
-    assert not free.blocked[free.cells(torch.tensor(reached))]
+    column, row = free.cells(torch.tensor(reached))
+    assert not free.blocked[row, column]
 
 
 @pytest.mark.parametrize(("fine_m", "radius_m"), [(0.1, 0.3), (0.1, 0.6), (0.05, 0.35), (0.25, 0.75)])
@@ -115,7 +116,8 @@ def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float
     free = FreeSpace.of_maze(replace(ROOM, fine_m=fine_m), radius_m=radius_m)
     inside, outside = 2.0 - radius_m - fine_m / 2, 2.0 - radius_m + fine_m / 2
     points = torch.tensor([[inside, 0.0], [0.0, -inside], [outside, 0.0], [0.0, -outside]])
-    assert free.blocked[free.cells(points)].tolist() == [False, False, True, True]
+    column, row = free.cells(points).unbind(-1)
+    assert free.blocked[row, column].tolist() == [False, False, True, True]
 
 
 def test_a_start_in_a_blocked_cell_may_leave_but_not_go_deeper() -> None:
