@@ -77,19 +77,19 @@ def fake_episodes() -> list[Episode]:
     return [fake_episode(uid, length) for uid, length in zip((13, 4, 2**53 + 1, 6, 0), LENGTHS, strict=True)]
 
 
-def writer(root: Path, **changes: Any) -> DatasetWriter:  # noqa: ANN401
+def writer(root: Path, **changes: Any) -> DatasetWriter:
     settings: dict[str, Any] = {"columns": COLUMNS, "fps": 20, "task": "run", "description": DESCRIPTION}
     return DatasetWriter(root, **settings | changes)
 
 
-def write_fake(root: Path, **changes: Any) -> Dataset:  # noqa: ANN401
+def write_fake(root: Path, **changes: Any) -> Dataset:
     with writer(root, **changes) as open_writer:
         for episode in fake_episodes():
             open_writer.add(episode)
     return Dataset.open(root)
 
 
-def staged_writer(root: Path, **changes: Any) -> StagedWriter:  # noqa: ANN401
+def staged_writer(root: Path, **changes: Any) -> StagedWriter:
     settings: dict[str, Any] = {"columns": COLUMNS, "fps": 20, "task": "run", "description": DESCRIPTION}
     return StagedWriter(root, **settings | changes)
 

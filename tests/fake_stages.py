@@ -50,7 +50,7 @@ class _Fake:
         self.stage, self.runs = stage, runs
         self.__signature__ = inspect.signature(stage.run)
 
-    def __call__(self, *first: Any, progress: Callable[[float, str], object], **given: Any) -> None:  # noqa: ANN401
+    def __call__(self, *first: Any, progress: Callable[[float, str], object], **given: Any) -> None:
         out: Path = given.get("out") or given["root"] / self.stage.name
         root = next((place for place in out.parents if place.name == self.stage.name), out).parent
         key = out.relative_to(root).as_posix()

@@ -47,14 +47,14 @@ def values(episode: int) -> dict[str, Any]:
     }
 
 
-def add_frames(dataset: Any, episode: int) -> None:  # noqa: ANN401 - lerobot's dataset
+def add_frames(dataset: Any, episode: int) -> None:
     columns = values(episode)
     for frame in range(length(episode)):
         row = {name: np.atleast_1d(column[frame]) for name, column in columns.items()}
         dataset.add_frame({**row, "task": task(episode)})
 
 
-def save(dataset: Any, episodes: range) -> None:  # noqa: ANN401 - lerobot's dataset
+def save(dataset: Any, episodes: range) -> None:
     for episode in episodes:
         add_frames(dataset, episode)
         dataset.save_episode()
@@ -63,27 +63,27 @@ def save(dataset: Any, episodes: range) -> None:  # noqa: ANN401 - lerobot's dat
 def main(folder: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415 - takes seconds
 
-    def create(name: str) -> Any:  # noqa: ANN401 - lerobot's dataset
+    def create(name: str) -> Any:
         return LeRobotDataset.create("a/b", FPS, FEATURES, root=folder / name, use_videos=False)
 
-    def whole() -> Any:  # noqa: ANN401 - lerobot's dataset
+    def whole() -> Any:
         dataset = create("whole")
         save(dataset, range(8))
         dataset.finalize()
         return dataset
 
-    def saved() -> Any:  # noqa: ANN401 - lerobot's dataset
+    def saved() -> Any:
         dataset = create("saved")
         save(dataset, range(25))
         return dataset
 
-    def buffered() -> Any:  # noqa: ANN401 - lerobot's dataset
+    def buffered() -> Any:
         dataset = create("buffered")
         save(dataset, range(3))
         add_frames(dataset, 3)
         return dataset
 
-    def resumed() -> Any:  # noqa: ANN401 - lerobot's dataset
+    def resumed() -> Any:
         dataset = create("resumed")
         save(dataset, range(5))
         dataset.finalize()

@@ -18,7 +18,7 @@ class Rail:
         self.state = torch.zeros(num_envs, 1)
 
     @staticmethod
-    def abstraction(state: Any) -> Any:  # noqa: ANN401
+    def abstraction(state: Any) -> Any:
         return state[..., :1]
 
     def reset_to(self, state: torch.Tensor, rows: torch.Tensor | None = None) -> None:
@@ -34,10 +34,10 @@ class Reach(Objective):
 
     action_size, goal_size = 1, 1
 
-    def draw_starts(self, rng: np.random.Generator, count: int) -> Any:  # noqa: ANN401
+    def draw_starts(self, rng: np.random.Generator, count: int) -> Any:
         return np.zeros((count, 1))
 
-    def draw_goals(self, rng: np.random.Generator, count: int) -> Any:  # noqa: ANN401
+    def draw_goals(self, rng: np.random.Generator, count: int) -> Any:
         return rng.uniform(1.0, 2.0, (count, 1))
 
     def reached(self, state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:

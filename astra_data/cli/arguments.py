@@ -139,7 +139,7 @@ def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., N
         options = [_option(field, about) for field, about in fields_of(place)]
 
         @wraps(command)
-        def run(**given: Any) -> None:  # noqa: ANN401 - of any option
+        def run(**given: Any) -> None:
             typed = {one.name: value for one in options if (value := given.pop(one.name)) is not None}
             command(settings=typed, **given)
 
@@ -223,7 +223,7 @@ def resumable(how: str = "run the same command again to continue") -> Iterator[N
         raise typer.Exit(130) from None
 
 
-def run_stage(recipe: Path, stage: str, **options: Any) -> Path:  # noqa: ANN401 - as `run.run_stage`
+def run_stage(recipe: Path, stage: str, **options: Any) -> Path:
     """Run one stage of a recipe, and print the folder of its artifacts.
 
     Options that are given None are left out.

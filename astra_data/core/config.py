@@ -67,7 +67,7 @@ def own_settings[C: Config](given: Config | None, usual: C) -> C:
     return given
 
 
-def only_given(**options: Any) -> dict[str, Any]:  # noqa: ANN401 - of any type
+def only_given(**options: Any) -> dict[str, Any]:
     """Return the options that are not None: those to be set, where None stands for the usual value."""
     return {key: value for key, value in options.items() if value is not None}
 

@@ -17,14 +17,7 @@ from astra_data.core.naming import RECORD, first_few
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents, read_values
-from astra_data.dataset.description import (
-    Digests,
-    alteration,
-    altered_columns,
-    full_name,
-    identity_of,
-    read_digests,
-)
+from astra_data.dataset.description import Digests, alteration, altered_columns, full_name, identity_of, read_digests
 from astra_data.dataset.format import CODEBASE_VERSION, INFO_PATH, OUR_FOLDER, STATS_PATH
 from astra_data.dataset.lerobot_recording import open_recording
 from astra_data.dataset.lerobot_rows import declared_columns
@@ -206,7 +199,7 @@ class Dataset(Contents):
         rows: datasets.Dataset = library.Dataset(pa.concat_tables(map(pq.read_table, data_files(self.root))))
         return rows
 
-    def to_lerobot(self, **options: Any) -> "LeRobotDataset":  # noqa: ANN401 - lerobot's own
+    def to_lerobot(self, **options: Any) -> "LeRobotDataset":
         """Return a `LeRobotDataset` of the same files, once all values are verified.
 
         It takes `options` such as `delta_timestamps`; lerobot keeps a copy of the rows in its cache.

@@ -137,7 +137,7 @@ def successor(
     name: str | None = None,
     out: Path | None = None,
     parents: Iterable[Mapping[str, str]] = (),
-    **more: Any,  # noqa: ANN401 - JSON
+    **more: Any,
 ) -> tuple[dict[str, Any], Path]:
     """Return the description of the version that follows `source`, for `DatasetWriter`, and its folder.
 
@@ -173,7 +173,7 @@ def next_version(
     subset_seed: int | None = None,
     others: Iterable[Dataset] = (),
     task: str | None = None,
-    **described: Any,  # noqa: ANN401 - as `successor` takes it
+    **described: Any,
 ) -> DatasetWriter:
     """Prepare to write the version that follows `source`; its folder is the writer's `root`.
 

@@ -29,13 +29,7 @@ OPTIONS = ("data_start_share", "episode_steps")
 """The keywords of an environment, keys of `[train]`."""
 
 
-def grounded(
-    run: str | Path,
-    row: str,
-    seed: int = 0,
-    percent: int | None = None,
-    **options: Any,  # noqa: ANN401 - checked as a recipe's are
-) -> SingleEnv:
+def grounded(run: str | Path, row: str, seed: int = 0, percent: int | None = None, **options: Any) -> SingleEnv:
     """Build the environment of one robot in which a row of a run is trained.
 
     Args:
@@ -56,7 +50,7 @@ def grounded_vector(
     seed: int = 0,
     percent: int | None = None,
     max_episode_steps: int | None = None,
-    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+    **options: Any,
 ) -> BatchedVectorEnv:
     """Build `num_envs` of the environments that `grounded` builds, stepped at once."""
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=num_envs, **options)
@@ -101,12 +95,7 @@ def evaluate_policy(
 
 
 def _world(
-    run: str | Path,
-    settings: dict[str, Any],
-    row: str,
-    seed: int,
-    percent: int | None,
-    **options: Any,  # noqa: ANN401 - checked as a recipe's are
+    run: str | Path, settings: dict[str, Any], row: str, seed: int, percent: int | None, **options: Any
 ) -> tuple[SimulatorEnv, Simulation, Training]:
     """Return the environment that `train` builds for a row, and what it builds it from."""
     add_all(settings.get("own_methods", {}))

@@ -186,17 +186,12 @@ def _spaces(env: SeededEnv) -> tuple[Box, Box]:
     return observation, Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
-def ant_maze(task: str, **options: Any) -> SingleEnv:  # noqa: ANN401 - handed on
+def ant_maze(task: str, **options: Any) -> SingleEnv:
     """Build one target environment of `task`; `options` as for `AntMazeEnv`."""
     return SingleEnv(task_named(task).target(1, seed=fresh_seed(), **options))
 
 
-def ant_maze_vector(
-    num_envs: int,
-    task: str,
-    max_episode_steps: int,
-    **options: Any,  # noqa: ANN401 - handed on
-) -> BatchedVectorEnv:
+def ant_maze_vector(num_envs: int, task: str, max_episode_steps: int, **options: Any) -> BatchedVectorEnv:
     """Build `num_envs` target environments of `task`; `options` as for `AntMazeEnv`."""
     env = task_named(task).target(num_envs, seed=fresh_seed(), **options)
     return BatchedVectorEnv(env, max_episode_steps)

@@ -36,7 +36,7 @@ def as_given(command: NDArray[np.float64], state: State) -> NDArray[np.float64]:
     return command
 
 
-def made(env_id: str | Callable[..., Env], **options: Any) -> Env:  # noqa: ANN401 - handed on
+def made(env_id: str | Callable[..., Env], **options: Any) -> Env:
     """Return the environment `env_id`, or of that class, with its `options`."""
     if callable(env_id):
         return answered(f"making {_name(env_id)}", partial(env_id, **options))
@@ -69,7 +69,7 @@ class GymnasiumRobot:
         read_state: Callable[[Env, Any], State] = observed,
         command: Callable[[NDArray[np.float64], State], Any] = as_given,
         failed: Callable[[State, bool], bool] | None = None,
-        **options: Any,  # noqa: ANN401 - handed on
+        **options: Any,
     ) -> None:
         """Make the environment.
 
@@ -134,7 +134,7 @@ class GymnasiumSimulator(NumpySimulator):
         read: Callable[[Env], State],
         write: Callable[[Env, State], object],
         parameters: Mapping[str, float] | None = None,
-        **options: Any,  # noqa: ANN401 - handed on
+        **options: Any,
     ) -> None:
         """Make the environment, and begin with B states of zeros, each of `size`.
 

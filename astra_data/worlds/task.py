@@ -258,7 +258,7 @@ class Task:
         """Control steps per second, rounded, for LeRobot takes whole numbers."""
         return round(1.0 / self.timestep_s)
 
-    def target(self, num_envs: int, **options: Any) -> TargetEnv:  # noqa: ANN401 - handed on
+    def target(self, num_envs: int, **options: Any) -> TargetEnv:
         """Build `num_envs` target environments, driven by actions of ±1; `options` are their own."""
         if self.make_target is not None:
             return self.make_target(self.objective, num_envs, **options)

@@ -58,7 +58,7 @@ def test_a_run_passes_its_options_on(recipe: Path, tmp_path: Path, monkeypatch: 
     recipe.write_text('task = "antmaze-umaze"\nmethods = ["nas"]\nseeds = [0, 1]\n[sweep]\npercent = [50]\n')
     asked: list[dict[str, Any]] = []
 
-    def run(_: Path, **given: Any) -> Path:  # noqa: ANN401
+    def run(_: Path, **given: Any) -> Path:
         asked.append(given)
         return tmp_path
 

@@ -98,7 +98,7 @@ def pipe(name: str) -> Callable[[Path], None]:
     return damage
 
 
-def declare(column: str, **feature: Any) -> Callable[[Path], object]:  # noqa: ANN401 - JSON
+def declare(column: str, **feature: Any) -> Callable[[Path], object]:
     def damage(root: Path) -> object:
         info = json.loads((root / INFO).read_text())
         info["features"][column] = info["features"].get(column, {"dtype": "float32", "shape": [1]}) | feature

@@ -124,7 +124,7 @@ LACKING = "lacks the columns episode_index, frame_index, index, task_index, time
 OWN = {column.name: column.feature() for column in DEFAULT_COLUMNS}
 
 
-def declared(**features: Any) -> list[Column]:  # noqa: ANN401 - JSON
+def declared(**features: Any) -> list[Column]:
     return declared_columns(Path("set"), {"fps": 10.0, "features": OWN | features})[1]
 
 
@@ -175,8 +175,4 @@ def test_without_lerobots_own_columns_or_a_whole_rate_nothing_is_known(info: dic
 
 
 def test_a_folder_gives_a_valid_name() -> None:
-    assert [name_of(Path(name)) for name in ("walks", "my set (2)", "-._")] == [
-        "walks",
-        "my-set-2-",
-        "repaired",
-    ]
+    assert [name_of(Path(name)) for name in ("walks", "my set (2)", "-._")] == ["walks", "my-set-2-", "repaired"]

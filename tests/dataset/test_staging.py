@@ -124,18 +124,12 @@ def test_what_was_prepared_is_kept_after_an_error_and_lost_to_no_other_dataset(t
     with pytest.raises(RuntimeError), staged_writer(tmp_path / "set") as writer:
         (writer.folder / "training.safetensors").write_text("half")
         raise RuntimeError
-    with (
-        pytest.raises(BadInputError, match="left an unfinished recording; resume it"),
-        staged_writer(tmp_path / "set"),
-    ):
+    with pytest.raises(BadInputError, match="left an unfinished recording; resume it"), staged_writer(tmp_path / "set"):
         pass
     write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
     (tmp_path / "other").rename(tmp_path / "set")
     again = staged_writer(tmp_path / "set", resume=True)
-    with (
-        pytest.raises(BadInputError, match=r"another dataset .* which left an unfinished recording in"),
-        again,
-    ):
+    with pytest.raises(BadInputError, match=r"another dataset .* which left an unfinished recording in"), again:
         pass
     assert (tmp_path / ".set.staged" / "training.safetensors").read_text() == "half"
 
@@ -195,10 +189,7 @@ def test_staged_episodes_of_an_unknown_recording_are_refused(tmp_path: Path, pla
     if plan is not None:
         path.write_text(plan)
     again = staged_writer(tmp_path / "set", resume=True)
-    with (
-        pytest.raises(BadInputError, match=r"holds 2 episodes, but plan\.json is .*delete the folder"),
-        again,
-    ):
+    with pytest.raises(BadInputError, match=r"holds 2 episodes, but plan\.json is .*delete the folder"), again:
         pass
     assert len(list((tmp_path / ".set.staged").glob("*.arrow"))) == 2
 
@@ -247,7 +238,7 @@ def test_a_disk_that_fails_at_any_operation_loses_no_episode(tmp_path: Path, mon
         at += 1 if calls[at] != "fsync" else 3  # most are the finished dataset's files, one after another
 
 
-def write_episodes(root: Path, episodes: list[Episode], **changes: Any) -> Path:  # noqa: ANN401
+def write_episodes(root: Path, episodes: list[Episode], **changes: Any) -> Path:
     """Record `episodes`, or go on with it."""
     with staged_writer(root, resume=True, **changes) as writer:
         for position, episode in enumerate(episodes):

@@ -11,23 +11,10 @@ from small_cart import TASK as CART
 from torch import Tensor
 
 from astra_data.core.errors import BadInputError
-from astra_data.deployment.graph import (
-    ONNX,
-    PolicyGraph,
-    _apart,
-    load_onnx,
-    write_graph,
-)
+from astra_data.deployment.graph import ONNX, PolicyGraph, _apart, load_onnx, write_graph
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.policies.networks import (
-    ActorCritic,
-    ActorCriticShape,
-    AdaptiveShape,
-    PolicyShape,
-    SoftActor,
-    Student,
-)
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, PolicyShape, SoftActor, Student
 from astra_data.policies.running_policy import RunningPolicy
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
@@ -57,7 +44,7 @@ def lively[P: ActorCritic](policy: P) -> P:
     return policy
 
 
-def actor(observation_size: int, action_size: int = 2, **sizes: Any) -> ActorCritic:  # noqa: ANN401
+def actor(observation_size: int, action_size: int = 2, **sizes: Any) -> ActorCritic:
     return lively(ActorCritic(ActorCriticShape(observation_size, action_size, hidden_sizes=(8,), **sizes)))
 
 
@@ -147,7 +134,7 @@ class Forgetful:
         (Forgetful(), r"in step 0 policy.onnx gives the command \[.*\], the policy \[.*\]: does φ"),
     ],
 )
-def test_code_that_is_no_graph_is_named_in_one_line(abstraction: Any, told: str, tmp_path: Path) -> None:  # noqa: ANN401
+def test_code_that_is_no_graph_is_named_in_one_line(abstraction: Any, told: str, tmp_path: Path) -> None:
     task = replace(CART, abstraction=abstraction)
     with pytest.raises(BadInputError, match=f"rail-cart: {told}") as raised:
         write_graph(RunningPolicy(task, actor(2, 1)), tmp_path)

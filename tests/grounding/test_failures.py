@@ -164,7 +164,7 @@ def test_the_likelihood_is_that_of_the_moments_over_a_constant_rate(monkeypatch:
     soon, now = is_failing & (steps_left <= 2), is_failing & (steps_left == 1)
     assert now.sum() == 6 and soon.sum() == 12
 
-    def surprise(of: Any) -> float:  # noqa: ANN401 - an array
+    def surprise(of: Any) -> float:
         said = np.exp(of[0]) * odds + of[1]
         return float(np.mean(np.logaddexp(0, said) - soon * said) + 0.5 * of[0] ** 2 * 2 / odds.shape[1])
 
@@ -199,9 +199,7 @@ def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
     assert has_failures(kick, made) and not has_failures(kick, made.select(torch.tensor([0])))
 
 
-def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_seen_of_a_step_is_simulated_from_two_to_three_seconds_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each step by itself: from the moment 40 to 59 steps before it, with the history until then."""
     episodes = hurried(3, 0)
     windows, failures = episodes.windows, untrained(episodes, latent_size=8)

@@ -77,12 +77,7 @@ def episodes(seed: int, count: int = 4, failing: int = 1) -> PairedEpisodes:
 
 
 def fit(
-    folder: Path,
-    of: HistoryFit | None = None,
-    *,
-    failing: int = 1,
-    seed: int = 0,
-    **settings: Any,  # noqa: ANN401
+    folder: Path, of: HistoryFit | None = None, *, failing: int = 1, seed: int = 0, **settings: Any
 ) -> tuple[HistoryGrounding, dict[str, Any], Fitting]:
     config = GroundConfig(updates=3, batch_windows=4, window=5, latent_size=8).model_copy(update=settings)
     training, held_out = episodes(0, failing=failing), episodes(1, 3, failing=min(failing, 2))

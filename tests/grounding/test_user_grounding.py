@@ -51,7 +51,7 @@ def test_what_is_no_such_pair_is_refused(returned: object, told: str, known: Non
         fitted(returned)
 
 
-def windows_of(count: int) -> Any:  # noqa: ANN401 - what is read of episodes
+def windows_of(count: int) -> Any:
     """Return episodes that begin on the rail of small_cart.py."""
 
     class Windows:
@@ -69,14 +69,8 @@ RAIL = f"{Path(__file__).parents[1] / 'small_cart.py'}:TASK"
 @pytest.mark.parametrize(
     ("landed", "told"),
     [
-        (
-            lambda self, action: self.simulator.step(action)[:, :0],
-            r"expected states of shape \(2, 1\), got \(2, 0\)",
-        ),
-        (
-            lambda self, action: self.simulator.step(action)[:1],
-            r"expected states of shape \(2, 1\), got \(1, 1\)",
-        ),
+        (lambda self, action: self.simulator.step(action)[:, :0], r"expected states of shape \(2, 1\), got \(2, 0\)"),
+        (lambda self, action: self.simulator.step(action)[:1], r"expected states of shape \(2, 1\), got \(1, 1\)"),
         (lambda self, action: None, r"expected states of shape \(2, 1\), got a NoneType"),
     ],
 )

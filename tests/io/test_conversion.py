@@ -14,7 +14,7 @@ from astra_data.io.recording import Block
 NAN = np.nan
 
 
-def converter(columns: dict[str, dict[str, Any]], **more: Any) -> Cutter:  # noqa: ANN401 - keys of a mapping
+def converter(columns: dict[str, dict[str, Any]], **more: Any) -> Cutter:
     specs = {name: ColumnMapping.model_validate(spec) for name, spec in columns.items()}
     return Cutter(ImportMapping(name="n", task="t", fps=10, columns=specs, **more))
 
@@ -73,15 +73,11 @@ def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
         ({"scale": (1.0, 2.0, 3.0)}, [[1, 2]], "columns.c: scale has 3 numbers for 2 values"),
         ({"offset": (1.0, 2.0)}, [1], "columns.c: offset has 2 numbers for 1 values"),
         ({}, ["a"], "field 'f': expected numbers, got text$"),
-        (
-            {},
-            np.array([1, None]),
-            "field 'f': expected numbers, got values that are not numbers, such as missing ones",
-        ),
+        ({}, np.array([1, None]), "field 'f': expected numbers, got values that are not numbers, such as missing ones"),
         ({}, np.zeros((2, 0)), r"field 'f' has no values, its shape is \(2, 0\)"),
     ],
 )
-def test_values_that_do_not_fit_are_refused(spec: dict[str, Any], values: Any, told: str) -> None:  # noqa: ANN401
+def test_values_that_do_not_fit_are_refused(spec: dict[str, Any], values: Any, told: str) -> None:
     with pytest.raises(BadInputError, match=f"^log: {told}"):
         convert(spec, values)
 

@@ -11,24 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from astra_data.dataset.columns import (
-    ACTION,
-    DONE,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    Array,
-)
+from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED, Array
 from astra_data.dataset.inspection import Endings
 from astra_data.io.cutting import Cutter
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block
 
 
-def cutter(**changes: Any) -> Cutter:  # noqa: ANN401
+def cutter(**changes: Any) -> Cutter:
     settings: dict[str, Any] = {
         "name": "log",
         "task": "walk",
@@ -81,11 +71,7 @@ def test_columns_that_are_flags_end_episodes_too() -> None:
     # Of row 2 the next state is its own, since it is terminal; of rows 5 and 7 nobody recorded one.
     assert rows(episodes) == [[0, 1, 2], [3, 4], [6]]
     assert [episode[NEXT_STATE].tolist() for episode in episodes] == [[2, 4, 4], [8, 10], [14]]
-    assert [episode[TERMINATED].tolist() for episode in episodes] == [
-        [False, False, True],
-        [False] * 2,
-        [False],
-    ]
+    assert [episode[TERMINATED].tolist() for episode in episodes] == [[False, False, True], [False] * 2, [False]]
     assert [episode[TRUNCATED].tolist() for episode in episodes] == [[False] * 3, [False, True], [True]]
     assert cutting.tally.split_points == {"end": 2}
     assert (cutting.tally.last_rows, cutting.tally.last_reward) == (2, 12)
@@ -253,11 +239,7 @@ def test_a_success_in_the_last_row_is_that_of_the_step_that_leads_to_it() -> Non
     cutting = cutter(columns=columns, split={"field": "k"})
     there = [0, 1, 0, 0, 0, 1, 1, 0, 0]
     episodes = cut(cutting, x=np.arange(9.0), there=there, k=[0, 0, 0, 1, 1, 1, 2, 2, 2])
-    assert [episode[SUCCESS].tolist() for episode in episodes] == [
-        [False, True],
-        [False, True],
-        [True, False],
-    ]
+    assert [episode[SUCCESS].tolist() for episode in episodes] == [[False, True], [False, True], [True, False]]
 
 
 @pytest.mark.parametrize("not_finite", ["drop", "split"])
@@ -306,11 +288,7 @@ lines = st.tuples(cells, steps, cells, cells, cells, st.sampled_from([0, 0, 0, 5
 )
 @settings(max_examples=60, deadline=None, derandomize=True, database=None)
 def test_where_blocks_end_changes_nothing(
-    table: list[tuple[float, ...]],
-    bounds: list[int],
-    not_finite: str,
-    terminal: str,
-    skip_bad: bool,
+    table: list[tuple[float, ...]], bounds: list[int], not_finite: str, terminal: str, skip_bad: bool
 ) -> None:
     columns = {name: {"fields": (field,)} for name, field in ((STATE, "x"), (ACTION, "a"), (REWARD, "a"))}
     columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("won",)}}

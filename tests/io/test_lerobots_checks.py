@@ -46,7 +46,7 @@ def paired(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset.open(folder / "pair")
 
 
-def opened(lerobot: SimpleNamespace, root: Path) -> Any:  # noqa: ANN401 - lerobot has no types
+def opened(lerobot: SimpleNamespace, root: Path) -> Any:
     return lerobot.lerobot_dataset.LeRobotDataset("a/b", root=root, video_backend="pyav")
 
 

@@ -18,7 +18,7 @@ CHUNK = 2000
 LENGTH = 300
 
 
-def write(path: Path, *, is_finished: bool = True, **options: Any) -> Path:  # noqa: ANN401
+def write(path: Path, *, is_finished: bool = True, **options: Any) -> Path:
     """Write messages of one topic, and some of another, whose contents end in zeros."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=CHUNK, **options)
@@ -42,10 +42,7 @@ def numbers(path: Path, *, checked: bool = True) -> tuple[list[int], bool]:
 
 
 WANTED = [number for number in range(LENGTH) if number % 5 and not 100 < number < 200]
-FORMS: dict[str, dict[str, Any]] = {
-    "usual": {},
-    "without chunks": {"use_chunking": False},
-}
+FORMS: dict[str, dict[str, Any]] = {"usual": {}, "without chunks": {"use_chunking": False}}
 
 
 PACKED = [CompressionType.ZSTD, CompressionType.LZ4]

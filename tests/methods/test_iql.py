@@ -89,7 +89,7 @@ def test_fine_tuning_takes_fewer_and_smaller_updates_of_the_given_policy(
     configs = list[IqlConfig]()
 
     class Noted(Iql):
-        def __init__(self, policy: Any, experience: Any, config: IqlConfig, *, seed: int) -> None:  # noqa: ANN401
+        def __init__(self, policy: Any, experience: Any, config: IqlConfig, *, seed: int) -> None:
             configs.append(config)
             super().__init__(policy, experience, config, seed=seed)
 

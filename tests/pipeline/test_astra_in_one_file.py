@@ -27,7 +27,7 @@ RAIL = f"{ROOT}/tests/small_cart.py:TASK"
 NEAR: dict[str, Any] = {"atol": 1e-6, "rtol": 1e-5}
 
 
-def of_the_file(name: str) -> Any:  # noqa: ANN401 - a class or a function
+def of_the_file(name: str) -> Any:
     return user_object(f"{ROOT}/recipes/examples/astra_in_one_file.py:{name}")
 
 

@@ -46,7 +46,7 @@ def run(cart: Path) -> Path:
     return experiment.folder
 
 
-def world_of(run: Path, row: str, **options: Any) -> SimulatorEnv:  # noqa: ANN401
+def world_of(run: Path, row: str, **options: Any) -> SimulatorEnv:
     """Return what Grounded-v0 wraps, as `train` builds it."""
     env = gymnasium.make(ID, run=run, row=row, **options).unwrapped
     assert isinstance(env, SingleEnv)
@@ -90,7 +90,7 @@ def test_it_is_the_environment_that_the_row_was_trained_in(run: Path, monkeypatc
     built: list[SimulatorEnv] = []
     build = InSimulator.world
 
-    def kept(self: InSimulator, training: Any, **more: Any) -> Any:  # noqa: ANN401
+    def kept(self: InSimulator, training: Any, **more: Any) -> Any:
         made = build(self, training, **more)
         built.append(made[0])
         return made
@@ -123,7 +123,7 @@ def test_methods_of_the_run_s_own_are_added_when_it_is_opened(
 
 
 def test_episodes_end_at_the_horizon_or_where_an_option_says(run: Path) -> None:
-    def steps(**options: Any) -> int:  # noqa: ANN401
+    def steps(**options: Any) -> int:
         env = gymnasium.make(ID, run=run, row="nas", **options)
         env.reset(seed=0)
         back = np.array([-1.0, 0.0], dtype=np.float32)
@@ -151,7 +151,7 @@ def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: P
     assert simulator.scatter_model is not None
     action = np.array([0.5, 0.2], dtype=np.float32)
 
-    def seen(env: Any, actions: Array) -> Array:  # noqa: ANN401
+    def seen(env: Any, actions: Array) -> Array:
         return np.stack([env.reset(seed=5)[0], *(env.step(actions)[0] for _ in range(5))])
 
     single = seen(one, action)
@@ -163,7 +163,7 @@ def test_a_vector_and_a_single_environment_are_the_same_and_noise_repeats(run: P
 def test_what_does_not_fit_is_answered_by_a_line(run: Path, tmp_path: Path) -> None:
     make: Callable[..., Any] = gymnasium.make
 
-    def refused(message: str, **options: Any) -> None:  # noqa: ANN401
+    def refused(message: str, **options: Any) -> None:
         with pytest.raises(AstraDataError, match=message) as raised:
             make(ID, **{"run": run, "row": "nas"} | options)
         assert "\n" not in str(raised.value)

@@ -17,7 +17,7 @@ BASE = {"task": "humanoid-walker2d", "methods": ["direct_transfer"], "seeds": [0
 SAC = {"learner": "sac"}
 
 
-def read(**tables: Any) -> Recipe:  # noqa: ANN401
+def read(**tables: Any) -> Recipe:
     return validated(BASE | tables, Recipe, "r.toml")
 
 

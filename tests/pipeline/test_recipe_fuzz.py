@@ -66,7 +66,7 @@ HOSTILE: st.SearchStrategy[object] = st.one_of(
 )
 
 
-def without_none(value: object) -> Any:  # noqa: ANN401 - JSON
+def without_none(value: object) -> Any:
     """Leave out what has no value, as TOML does."""
     if isinstance(value, dict):
         return {key: without_none(item) for key, item in value.items() if item is not None}

@@ -23,7 +23,7 @@ RECORDED = RECIPES / "examples/recorded"
 
 
 @pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Any:  # noqa: ANN401 - modules of a user
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.syspath_prepend(str(RECORDED))
     return {name: importlib.import_module(name) for name in ("joints", "walker", "windows")}
 

@@ -93,12 +93,12 @@ def test_what_is_not_there_is_asked_for(folder: Path) -> None:
         select(folder)
 
 
-def asked(folder: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]) -> Any:  # noqa: ANN401
+def asked(folder: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]) -> Any:
     """What a run whose recipe has these `changes` asks to be judged."""
     recipe, told = folder / "recipe.json", list[Any]()
     recipe.write_text(json.dumps(json.loads(recipe.read_text()) | changes))
 
-    def noted(asked: Any, *_: object, **more: object) -> None:  # noqa: ANN401
+    def noted(asked: Any, *_: object, **more: object) -> None:
         told.append(asked)
         raise StopIteration
 

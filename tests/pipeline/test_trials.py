@@ -45,7 +45,7 @@ class Tries:
         self.made: list[tuple[RunningPolicy, int, int, dict[str, Any]]] = []
         self.breaks_at, self.success = breaks_at, success
 
-    def __call__(self, task: object, begin: Any, episodes: int, seed: int, **more: Any) -> Any:  # noqa: ANN401
+    def __call__(self, task: object, begin: Any, episodes: int, seed: int, **more: Any) -> Any:
         if len(self.made) + 1 == self.breaks_at:
             raise KeyboardInterrupt
         self.made.append((begin.args[0], episodes, seed, more))

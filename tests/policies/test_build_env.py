@@ -10,14 +10,7 @@ from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
-from astra_data.policies.simulator_env import (
-    Simulation,
-    SimulatorEnv,
-    WorldConfig,
-    data_starts,
-    plus,
-    training_env,
-)
+from astra_data.policies.simulator_env import Simulation, SimulatorEnv, WorldConfig, data_starts, plus, training_env
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.point_mass import PointMass
 
@@ -34,11 +27,7 @@ def episodes() -> PairedEpisodes:
     mask = torch.ones(2, 400)
     mask[1, 300:] = 0.0
     return toy_episodes(
-        state[:, :-1],
-        torch.rand(2, 400, 2) * 2 - 1,
-        next_state=state[:, 1:],
-        goal=torch.randn(2, 400, 2),
-        mask=mask,
+        state[:, :-1], torch.rand(2, 400, 2) * 2 - 1, next_state=state[:, 1:], goal=torch.randn(2, 400, 2), mask=mask
     )
 
 
@@ -48,16 +37,13 @@ def grounding() -> HistoryGrounding:
     return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)))
 
 
-def built(world: WorldConfig, grounding: Grounding, **given: Any) -> SimulatorEnv:  # noqa: ANN401
+def built(world: WorldConfig, grounding: Grounding, **given: Any) -> SimulatorEnv:
     options: dict[str, Any] = {"num_envs": 4, "device": "cpu"} | given
     return training_env(TASK, Simulation(world), grounding, **options)
 
 
 def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, grounding: HistoryGrounding) -> None:
-    kinds: dict[type[EpisodeSimulator], Grounding] = {
-        EpisodeSimulator: NO_GROUNDING,
-        GroundedSimulator: grounding,
-    }
+    kinds: dict[type[EpisodeSimulator], Grounding] = {EpisodeSimulator: NO_GROUNDING, GroundedSimulator: grounding}
     for kind, used in kinds.items():
         assert data_starts(TASK, WorldConfig(), episodes, used) is None
         world = built(WorldConfig(), used)
@@ -82,10 +68,7 @@ def test_plus_settings_reach_the_environment_and_leave_the_rest(episodes: Paired
 
 @pytest.mark.parametrize(("reward", "prices"), [("abstract", False), ("predicted", True), ("priced", True)])
 def test_a_failure_model_is_used_and_starts_know_what_it_remembers_where_failures_have_a_price(
-    reward: Any,  # noqa: ANN401
-    prices: bool,
-    episodes: PairedEpisodes,
-    grounding: HistoryGrounding,
+    reward: Any, prices: bool, episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
     foresees = replace(grounding, failures=failures)

@@ -34,7 +34,7 @@ def _quick_critics(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, name, value)
 
 
-def config(**settings: Any) -> IqlConfig:  # noqa: ANN401
+def config(**settings: Any) -> IqlConfig:
     return QUICK.model_copy(update=settings)
 
 

@@ -21,17 +21,9 @@ def _two_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MINIBATCHES", 2)
 
 
-def ppo(
-    env: BatchedEnv,
-    iterations: int,
-    *,
-    horizon: int,
-    memory: int = 0,
-    **settings: Any,  # noqa: ANN401
-) -> Ppo:
+def ppo(env: BatchedEnv, iterations: int, *, horizon: int, memory: int = 0, **settings: Any) -> Ppo:
     config = PpoConfig(
-        total_steps=iterations * env.num_envs * 16,
-        **{"rollout_steps": 16, "learning_rate": 3e-3, **settings},
+        total_steps=iterations * env.num_envs * 16, **{"rollout_steps": 16, "learning_rate": 3e-3, **settings}
     )
     torch.manual_seed(0)
     shape = ActorCriticShape(env.observation_size, env.action_size, memory, 16, (32,))

@@ -25,16 +25,12 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def restarted(
-    folder: Path,
-    commands: Iterable[float],
-    progress: Progress = silent,
-    clocks: bool = False,
-    **settings: Any,  # noqa: ANN401
+    folder: Path, commands: Iterable[float], progress: Progress = silent, clocks: bool = False, **settings: Any
 ) -> tuple[float, dict[str, Any], list[int]]:
     """Train policies that give these commands, one a try; return what is kept, the curve and the seeds."""
     rest, seeds, one = iter(commands), [], torch.zeros(1, 3, 1)
 
-    def learn(env: Any, given: Training) -> Constant:  # noqa: ANN401
+    def learn(env: Any, given: Training) -> Constant:
         seeds.append(given.seed)
         given.progress(1.0, "")
         assert given.folder.is_dir()

@@ -13,14 +13,7 @@ from astra_data.policies.sac import Sac, SacConfig
 from astra_data.worlds.protocols import BatchedEnv
 
 
-def sac(
-    env: BatchedEnv,
-    steps: int,
-    *,
-    horizon: int,
-    memory: int = 0,
-    **settings: Any,  # noqa: ANN401
-) -> Sac:
+def sac(env: BatchedEnv, steps: int, *, horizon: int, memory: int = 0, **settings: Any) -> Sac:
     usual = {"rollout_steps": 10, "updates_per_step": 2, "batch_size": 64, "discount": 0.9}
     config = SacConfig(total_steps=steps * env.num_envs, **{**usual, **settings})
     torch.manual_seed(0)
@@ -121,7 +114,7 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
     losses: list[torch.Tensor] = []
     gradients: list[torch.Tensor] = []
 
-    def computed(*given: Any) -> tuple[torch.Tensor, ...]:  # noqa: ANN401
+    def computed(*given: Any) -> tuple[torch.Tensor, ...]:
         found = compute(*given)
         losses.extend(loss.detach() for loss in found)
         gradients.extend(torch.autograd.grad(found[0], [*critics.parameters()], retain_graph=True))
@@ -142,7 +135,7 @@ def test_an_update_is_that_of_the_printed_losses(memory: int, monkeypatch: pytes
     seen = steps["observation"], steps["previous_action"]
     first, nothing = steps["first"].float(), actor.initial_hidden(len(learned))
 
-    def action_values(critics: Any, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:  # noqa: ANN401
+    def action_values(critics: Any, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         values = []
         for network in critics.networks:
             hidden = torch.cat([features, action], dim=-1)

@@ -17,7 +17,7 @@ from astra_data.worlds.variation import PlanarVariation
 TASK = Navigation(U_MAZE, horizon=700)
 
 
-def world(num_envs: int = 4, **options: Any) -> SimulatorEnv:  # noqa: ANN401
+def world(num_envs: int = 4, **options: Any) -> SimulatorEnv:
     simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
     return SimulatorEnv(TASK, simulator, **options)
 
@@ -31,7 +31,7 @@ class Risky(GroundedSimulator):
         return torch.full((len(self.state),), self.risk)
 
 
-def risky(count: int, risk: float, **options: Any) -> SimulatorEnv:  # noqa: ANN401
+def risky(count: int, risk: float, **options: Any) -> SimulatorEnv:
     """Return episodes of which every second one reaches the goal in the first step."""
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)

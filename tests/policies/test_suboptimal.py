@@ -27,7 +27,7 @@ class Counting:
 
     made: list["Counting"] = []  # noqa: RUF012 - of all tests, emptied by the fixture
 
-    def __init__(self, env: Any, policy: Any, config: Any, *, horizon: int, seed: int) -> None:  # noqa: ANN401
+    def __init__(self, env: Any, policy: Any, config: Any, *, horizon: int, seed: int) -> None:
         self.env, self.policy, self.config, self.horizon, self.seed = env, policy, config, horizon, seed
         self.steps, self.went_on_from, self.goes_on = 0, 0, True
         self.made.append(self)
@@ -101,7 +101,7 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
 ) -> None:
     seeds: list[int] = []
 
-    def lasts(deployed: Any, seed: int, num_threads: int | None) -> float:  # noqa: ANN401
+    def lasts(deployed: Any, seed: int, num_threads: int | None) -> float:
         seeds.append(seed)
         return float(lasting[len(seeds) - 1])
 

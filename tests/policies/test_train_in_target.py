@@ -44,9 +44,7 @@ def training(folder: Path, settings: TargetConfig | None) -> Training:
 
 @pytest.mark.parametrize("observed", ["abstract", "full"])
 def test_settings_for_the_target_are_laid_over_those_of_the_training(
-    observed: Any,  # noqa: ANN401
-    asked: dict[str, Any],
-    tmp_path: Path,
+    observed: Any, asked: dict[str, Any], tmp_path: Path
 ) -> None:
     given = training(tmp_path, TargetConfig(num_envs=2, memory_size=0))
     trained, curve = InTarget(observed)(given)

@@ -38,7 +38,7 @@ def test_it_acts_in_batches_within_the_bounds_and_remembers_nothing() -> None:
         (None, r"Mine is no policy: expected act\(observation\) -> action"),
     ],
 )
-def test_what_is_no_policy_is_answered_by_a_line(act: Any, message: str) -> None:  # noqa: ANN401
+def test_what_is_no_policy_is_answered_by_a_line(act: Any, message: str) -> None:
     class Mine:
         def __init__(self) -> None:
             self.act = act

@@ -15,7 +15,7 @@ from astra_data.reports.held_out import write_held_out
 Rates = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
-def write(root: Path, percent: int, seed: int, error: float, **more: Any) -> None:  # noqa: ANN401
+def write(root: Path, percent: int, seed: int, error: float, **more: Any) -> None:
     """Write errors of NAS: `error` a step ahead, half of that without it; `more` bands replace these."""
     folder = root / f"ground/nas/percent_{percent:03d}/seed_{seed}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,8 +81,7 @@ def test_a_correction_that_makes_the_simulator_worse_is_named(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("still", "percent", "is_named"),
-    [(1.0, 100, True), (2.0, 100, True), (2.1, 100, False), (1.0, 25, False)],
+    ("still", "percent", "is_named"), [(1.0, 100, True), (2.0, 100, True), (2.1, 100, False), (1.0, 25, False)]
 )
 def test_a_simulator_no_better_than_the_persistence_baseline_is_named(
     tmp_path: Path, still: float, percent: int, is_named: bool

@@ -59,7 +59,7 @@ def test_an_environment_may_be_given_by_its_class() -> None:
 
 
 class Mirrored(gymnasium.ActionWrapper[Any, Any, Any]):
-    def action(self, action: Any) -> Any:  # noqa: ANN401
+    def action(self, action: Any) -> Any:
         return -action
 
 
@@ -92,11 +92,11 @@ class Corridor(gymnasium.Env[Any, Any]):
 
     action_space = gymnasium.spaces.Box(-1.0, 4.0, (1,))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:  # noqa: ANN401
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         self.x = 0.0
         return [self.x, 0.0], {}
 
-    def step(self, action: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    def step(self, action: NDArray[np.float64]) -> Any:
         self.x += 0.1 * float(action[0])
         return [self.x, float(action[0])], 0.0, abs(self.x) >= 0.4, False, {}
 
@@ -108,7 +108,7 @@ class Near(Reach):
         return np.full((count, 1), 0.3)
 
 
-def corridor(**functions: Any) -> RobotEnv:  # noqa: ANN401
+def corridor(**functions: Any) -> RobotEnv:
     gymnasium.registry.pop("Corridor-v0", None)
     gymnasium.register("Corridor-v0", Corridor)  # type: ignore[arg-type]
     robot = partial(GymnasiumRobot, "Corridor-v0", **functions)

@@ -72,7 +72,7 @@ class Noted(Cart):
 
 
 class NotedAmongOptions(Noted):
-    def reset(self, **options: Any) -> list[float]:  # type: ignore[override] # noqa: ANN401
+    def reset(self, **options: Any) -> list[float]:  # type: ignore[override]
         return super().reset(**options)
 
 
@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_goals_and_seeds(robot: type[Noted]) -> Non
 
 
 @pytest.mark.parametrize("state", [[0.0], [0.0, float("nan")], [0.0, 0.0, 0.0], None])
-def test_a_state_of_another_kind_is_refused(state: Any) -> None:  # noqa: ANN401
+def test_a_state_of_another_kind_is_refused(state: Any) -> None:
     class Broken(Cart):
         def step(self, command: np.ndarray[Any, Any]) -> tuple[Any, bool]:
             return state, False
@@ -108,7 +108,7 @@ def test_the_step_in_which_a_state_is_lost_is_told() -> None:
     class Lost(Cart):
         steps = 0
 
-        def step(self, command: np.ndarray[Any, Any]) -> Any:  # noqa: ANN401
+        def step(self, command: np.ndarray[Any, Any]) -> Any:
             self.steps += 1
             (x, speed), tips = super().step(command)
             return np.array([[x, np.inf if self.steps > 3 and speed > 0 else speed]])[0], tips

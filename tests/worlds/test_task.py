@@ -76,7 +76,7 @@ class HalfRail(Rail):
     abstract_state = Column("abstract.state", size=1, names=("half",))
 
     @staticmethod
-    def abstraction(state: Any) -> Any:  # noqa: ANN401
+    def abstraction(state: Any) -> Any:
         return 0.5 * state[..., :1]
 
 

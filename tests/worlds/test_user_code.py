@@ -231,7 +231,7 @@ class Linear:
     def __init__(self, returned: object) -> None:
         self.returned = returned
 
-    def to_file(self) -> Any:  # noqa: ANN401 - as a user would write it
+    def to_file(self) -> Any:
         return self.returned() if callable(self.returned) else self.returned
 
 
@@ -267,7 +267,7 @@ class Own:
 TENSORS, METADATA = {"matrix": torch.ones(2), "factor": torch.ones(1)}, {"sizes": [2], "kind": "mine"}
 
 
-def made_of(body: str, folder: Path) -> Any:  # noqa: ANN401 - a class of a user's
+def made_of(body: str, folder: Path) -> Any:
     (folder / "mine.py").write_text(OWN.format(body=body))
     return user_object(f"{folder / 'mine.py'}:Own")
 

@@ -8,7 +8,7 @@ from griffe import Extension, Object
 class Examples(Extension):
     """Rename the sections while docstrings are collected."""
 
-    def on_object(self, *, obj: Object, **_: Any) -> None:  # noqa: ANN401 - griffe passes more than is needed
+    def on_object(self, *, obj: Object, **_: Any) -> None:
         """Rename that of one object."""
         if obj.docstring is not None:
             obj.docstring.value = obj.docstring.value.replace("Example:\n", "Examples:\n")

@@ -121,7 +121,7 @@ def look(row: str) -> dict[str, Any]:
     return {"color": method_color(row), "ls": "--" if is_plus(row) else "-", "label": method_title(row)}
 
 
-def draw_band(axes: Axes, at: Floats, mean: Floats, low: Floats, high: Floats, **look: Any) -> None:  # noqa: ANN401
+def draw_band(axes: Axes, at: Floats, mean: Floats, low: Floats, high: Floats, **look: Any) -> None:
     """Draw a line over a band between `low` and `high`; all are of the same shape (K,)."""
     axes.fill_between(at, low, high, color=look["color"], alpha=0.15, lw=0)
     axes.plot(at, mean, **look)

@@ -249,7 +249,7 @@ _WALKER_QUANTITIES: Quantities = {
 }
 
 
-def _humanoids(objective: Walking, num_envs: int, **options: Any) -> HumanoidEnv:  # noqa: ANN401 - handed on
+def _humanoids(objective: Walking, num_envs: int, **options: Any) -> HumanoidEnv:
     return HumanoidEnv(objective.locomotion, num_envs, **options)
 
 

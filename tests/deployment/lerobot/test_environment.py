@@ -16,7 +16,7 @@ FIRST_SEED = 7
 
 
 @pytest.fixture(scope="module")
-def environment() -> Any:  # noqa: ANN401
+def environment() -> Any:
     """The module, which imports LeRobot."""
     import astra_data.deployment.lerobot.environment as environment  # noqa: PLC0415 - takes seconds
 
@@ -67,7 +67,7 @@ def episode(run: Path, seed: int) -> tuple[bool, list[float]]:
     return bool(step.success), rewards
 
 
-def test_it_takes_rate_and_sizes_from_the_task(environment: Any, run: Path) -> None:  # noqa: ANN401
+def test_it_takes_rate_and_sizes_from_the_task(environment: Any, run: Path) -> None:
     config = environment.AstraDataEnv(task=task_of(run))
     sizes = {name: feature.shape for name, feature in config.features.items()}
     assert config.fps == 10
@@ -80,7 +80,7 @@ def test_it_takes_rate_and_sizes_from_the_task(environment: Any, run: Path) -> N
         without_goal.create_envs(1)
 
 
-def test_commands_are_in_their_units_and_the_horizon_ends_episodes(environment: Any, run: Path) -> None:  # noqa: ANN401
+def test_commands_are_in_their_units_and_the_horizon_ends_episodes(environment: Any, run: Path) -> None:
     env = environment.AstraDataEnv(task=task_of(run)).create_envs(2)["astra_data"][0]
     robot = env.envs[0].unwrapped
     assert (robot.action_space.low, robot.action_space.high) == (-1.0, 4.0)
@@ -104,7 +104,7 @@ def test_commands_are_in_their_units_and_the_horizon_ends_episodes(environment: 
     assert robot.step(np.zeros(1, np.float32))[3] is False  # it is not cut off again
 
 
-def test_a_push_to_the_goal_is_a_success_and_one_that_tips_is_none(environment: Any, run: Path) -> None:  # noqa: ANN401
+def test_a_push_to_the_goal_is_a_success_and_one_that_tips_is_none(environment: Any, run: Path) -> None:
     env = environment.AstraDataEnv(task=task_of(run)).create_envs(2)["astra_data"][0]
     env.reset(seed=[0, 1])
     _, _, terminated, _, info = env.step(np.array([[2.9], [3.1]], np.float32))

@@ -18,7 +18,7 @@ from astra_data.io.importing import import_dataset
 
 
 @pytest.mark.parametrize("write", [write_json, write_protobuf, write_ros2])
-def test_the_last_value_is_held_at_every_row(tmp_path: Path, write: Any) -> None:  # noqa: ANN401
+def test_the_last_value_is_held_at_every_row(tmp_path: Path, write: Any) -> None:
     messages = log()
     dataset, report = imported(tmp_path, write(tmp_path / "log.mcap", messages), MAPPING)
     poses = [(t, m["position"]["x"]) for topic, t, m in messages if topic == "/pose"]
@@ -58,10 +58,7 @@ def test_time_far_apart_costs_nothing(tmp_path: Path) -> None:
     ("change", "told"),
     [
         (("/command:turn", "/comand:turn"), r"no topic '/comand': did you mean '/command'"),
-        (
-            ("/command:turn", "/command:turns"),
-            "no part 'turns' in /command, which has turn: did you mean 'turn'",
-        ),
+        (("/command:turn", "/command:turns"), "no part 'turns' in /command, which has turn: did you mean 'turn'"),
         (("/pose:joints", "/pose:position"), "'/pose:position' is neither a number"),
         (("/pose:joints", "joints"), "'joints', expected '/topic:path.in.message'"),
         (("gap_s = 0.35", ""), "split.gap_s is missing"),
@@ -304,18 +301,14 @@ STAMPED = {"header": {"stamp": {"sec": 1_764_000_000, "nanosec": 123_456_789}}}
         ("/mode:name", {"name": "walk"}, "walk"),
     ],
 )
-def test_a_path_leads_to_a_value(field: str, content: Any, expected: Any) -> None:  # noqa: ANN401
+def test_a_path_leads_to_a_value(field: str, content: Any, expected: Any) -> None:
     np.testing.assert_array_equal(MessageField(field).value(content), expected)
 
 
 @pytest.mark.parametrize(
     ("field", "content", "fault"),
     [
-        (
-            "/cmd_vel:linear.xx",
-            TWIST,
-            "no part 'xx' in /cmd_vel:linear, which has x, y, z: did you mean 'x'?",
-        ),
+        ("/cmd_vel:linear.xx", TWIST, "no part 'xx' in /cmd_vel:linear, which has x, y, z: did you mean 'x'?"),
         (
             "/clock:secs",
             Timestamp(seconds=1),
@@ -334,7 +327,7 @@ def test_a_path_leads_to_a_value(field: str, content: Any, expected: Any) -> Non
         ("/cmd_vel:linear", TWIST, "'/cmd_vel:linear' is neither a number nor a list of numbers"),
     ],
 )
-def test_what_a_message_lacks_is_told_with_what_it_has(field: str, content: Any, fault: str) -> None:  # noqa: ANN401
+def test_what_a_message_lacks_is_told_with_what_it_has(field: str, content: Any, fault: str) -> None:
     with pytest.raises(BadInputError) as error:
         MessageField(field).value(content)
     assert str(error.value) == fault

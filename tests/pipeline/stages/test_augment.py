@@ -129,7 +129,7 @@ def test_the_target_does_what_copies_say(collected: Path, augmented: Path) -> No
         for side in (0, 1)
     )
 
-    def errors(state: Any, action: Any, next_state: Any) -> Any:  # noqa: ANN401
+    def errors(state: Any, action: Any, next_state: Any) -> Any:
         env = TASKS[TASK].target(len(state), seed=0, num_threads=1)
         env.reset_to(np.arange(len(state)), state.astype(np.float64))
         env.step(torch.from_numpy(action))
@@ -204,7 +204,7 @@ class Ten:
         return [] if episode == 3 else [(0, 9)]
 
 
-def shares(seed: int = 0, **settings: Any) -> tuple[Any, Any]:  # noqa: ANN401
+def shares(seed: int = 0, **settings: Any) -> tuple[Any, Any]:
     """Return who of the ten is held out, and the copies of each."""
     ten: Any = Ten()
     held_out, copies = _shares(ten, ten, AugmentConfig(**settings), seed)

@@ -173,7 +173,7 @@ def test_only_as_many_episodes_are_kept_as_have_the_steps(
     some = CollectConfig(**every.model_dump() | {"least_steps": steps})
     batches: list[range] = []
 
-    def counted(*args: Any, **keywords: Any) -> int:  # noqa: ANN401 - handed on as they are
+    def counted(*args: Any, **keywords: Any) -> int:
         batches.append(args[3])
         return record(*args, **keywords)
 

@@ -43,12 +43,7 @@ def drive(speed: float, steps: int) -> dict[str, np.ndarray[Any, Any]]:
     return {STATE: state[:-1], ACTION: np.full(steps, speed, np.float32), NEXT_STATE: state[1:]}
 
 
-def write(
-    folder: Path,
-    episodes: list[Mapping[str, Any]],
-    more: tuple[Column, ...] = (),
-    **metadata: Any,  # noqa: ANN401
-) -> Path:
+def write(folder: Path, episodes: list[Mapping[str, Any]], more: tuple[Column, ...] = (), **metadata: Any) -> Path:
     with DatasetWriter(
         folder, [*COLUMNS, *more], fps=10, task="drive", description={"name": "logs", "stage": "import"}
     ) as writer:

@@ -30,18 +30,13 @@ def root(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "rail"))
 
 
-def reported(root: Path, **changes: Any) -> Reported:  # noqa: ANN401
+def reported(root: Path, **changes: Any) -> Reported:
     settings = json.loads((root / "recipe.json").read_text()) | changes.pop("settings", {})
     usual = {"name": "rail", "task": settings["task"], "methods": ROWS, "seeds": SEEDS}
     return Reported(**usual | {"settings": settings} | changes)
 
 
-def judged(
-    root: Path,
-    recipe: Reported | None = None,
-    progress: Progress = silent,
-    **settings: Any,  # noqa: ANN401
-) -> Judged:
+def judged(root: Path, recipe: Reported | None = None, progress: Progress = silent, **settings: Any) -> Judged:
     config = SelectConfig(**{"episodes": 5} | settings)
     select(recipe or reported(root), config, root=root, progress=progress)
     found = read_judged(root)
@@ -63,7 +58,7 @@ def test_each_policy_is_judged_by_the_groundings_of_other_seeds(root: Path) -> N
 def test_who_judges_whom_with_what_drawn_where(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def success(self: Judge, policy: Any, episodes: int, seed: int) -> float:  # noqa: ANN401
+    def success(self: Judge, policy: Any, episodes: int, seed: int) -> float:
         asked.append((policy, episodes, seed))
         return len(asked) / 100
 
@@ -99,7 +94,7 @@ def test_an_interrupted_choice_goes_on_with_the_next_policy(root: Path, monkeypa
     whole, original, asked = judged(root), Judge.success, []
     shutil.rmtree(root / "select")
 
-    def success(self: Judge, *given: Any) -> float:  # noqa: ANN401
+    def success(self: Judge, *given: Any) -> float:
         asked.append(given)
         if len(asked) == 6:
             raise KeyboardInterrupt

@@ -254,12 +254,7 @@ def test_trainings_without_a_simulator_are_made_once(
     ],
 )
 def test_what_a_function_of_the_user_s_learns_is_a_policy_file_and_a_curve(
-    task: str,
-    paired: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    returned: Any,  # noqa: ANN401 - whatever it returns
-    told: str,
+    task: str, paired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, returned: Any, told: str
 ) -> None:
     method = "direct_transfer"
     monkeypatch.setitem(METHODS, method, replace(METHODS[method], learn=lambda training: returned))

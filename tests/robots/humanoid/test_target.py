@@ -47,13 +47,13 @@ def test_commands_span_their_ranges_and_are_clipped() -> None:
     torch.testing.assert_close(degrees, expected)
 
 
-def theirs(seed: int) -> Any:  # noqa: ANN401 - Gymnasium's own
+def theirs(seed: int) -> Any:
     env = gymnasium.make("Humanoid-v5").unwrapped
     env.reset(seed=seed)
     return env
 
 
-def make(num_envs: int, locomotion: Locomotion | None = None, **options: Any) -> HumanoidEnv:  # noqa: ANN401
+def make(num_envs: int, locomotion: Locomotion | None = None, **options: Any) -> HumanoidEnv:
     return HumanoidEnv(locomotion or Locomotion(), num_envs, seed=0, **{"num_threads": 1, **options})
 
 

@@ -157,7 +157,7 @@ def varied(kind: Kind, state: Tensor, variation: JointVariation) -> VariedHumano
     return simulator
 
 
-def plain(kind: Kind, state: Tensor) -> Any:  # noqa: ANN401 - whichever kind
+def plain(kind: Kind, state: Tensor) -> Any:
     simulator = kind(len(state))
     simulator.reset_to(state)
     return simulator

@@ -10,7 +10,7 @@ from astra_data.robots.nao.target import NaoEnv
 from astra_data.robots.registry import TASKS
 
 
-def env(task: str = "nao-navigation", count: int = 3, **options: Any) -> NaoEnv:  # noqa: ANN401 - handed on
+def env(task: str = "nao-navigation", count: int = 3, **options: Any) -> NaoEnv:
     made = TASKS[task].target(count, seed=0, num_threads=1, **options)
     assert isinstance(made, NaoEnv)
     made.reset()

@@ -24,7 +24,7 @@ KICKING = TASKS["nao-kick"]
 AIM = np.array(TASK.maze.cell_center(*TASK.maze.goal), np.float32)
 
 
-def relocation(**changes: Any) -> Relocation:  # noqa: ANN401
+def relocation(**changes: Any) -> Relocation:
     settings: dict[str, Any] = {
         "rotations": "quarter",
         "translations": True,
@@ -58,14 +58,14 @@ def test_only_what_keeps_its_distance_may_move() -> None:
     assert relocation(margin_m=0.3).stretches(path) == [(0, 100)]
 
 
-def draws(count: int, episode: Episode, **changes: Any) -> list[Any]:  # noqa: ANN401
+def draws(count: int, episode: Episode, **changes: Any) -> list[Any]:
     rng = np.random.default_rng(0)
     drawn = [next(relocation(**changes).placements(episode, rng), None) for _ in range(count)]
     assert None not in drawn
     return drawn
 
 
-def moved(change: Any, episode: Episode) -> Array:  # noqa: ANN401
+def moved(change: Any, episode: Episode) -> Array:
     return np.asarray(change.positions(positions(TASK, episode.columns[STATE]).astype(np.float64)))
 
 
