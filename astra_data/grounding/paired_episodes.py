@@ -74,44 +74,6 @@ def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:
     return (fails[:, None] & mask.bool() & (left <= steps)).float()
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """E recorded episodes of up to T steps, padded at the end.
-
-    Attributes:
-        observation: (E, T, O). previous_action: (E, T, A), zero at the start. action: (E, T, A).
-        lengths: the number of real steps of each episode, (E,).
-    """
-
-    observation: Tensor
-    previous_action: Tensor
-    action: Tensor
-    lengths: Tensor
-
-    def draw(self, count: int, length: int, burn_in: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """Draw windows of `length` steps from torch's global generator.
-
-        Returns:
-            their places in the columns, episodes (count, 1) and steps (count, length), and which steps to
-            learn from, (count, length) bool: all but the first `burn_in` of a window that begins within its
-            episode.
-        """
-        episodes, steps, learned = draw_steps(self.lengths, count, length)
-        learned &= steps < self.lengths[episodes]
-        learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
-        return (episodes, steps), learned
-
-    def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
-        """Draw windows as `draw` does.
-
-        Returns:
-            the columns by name, (count, length, ...), and which steps to learn from, (count, length) bool.
-        """
-        places, learned = self.draw(count, length, burn_in)
-        names = ("observation", "previous_action", "action")
-        return {name: getattr(self, name)[places] for name in names}, learned
-
-
 def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
     """Draw windows of `length` steps, each step equally likely; from torch's global generator.
 

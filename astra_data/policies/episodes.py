@@ -17,16 +17,9 @@ from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import ACTION
 from astra_data.dataset.reader import Dataset
-from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import Grounding
-from astra_data.policies.running_policy import (
-    Observed,
-    PolicyFile,
-    RunningPolicy,
-    running,
-    target_observation,
-)
-from astra_data.policies.simulator_env import Simulation, SimulatorEnv, training_env
+from astra_data.policies.running_policy import Observed, PolicyFile, RunningPolicy, running, target_observation
+from astra_data.policies.simulator_env import SimulatorEnv, training_env
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.protocols import Step
 from astra_data.worlds.task import Task
@@ -34,47 +27,28 @@ from astra_data.worlds.task import Task
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcomes of N episodes: a list per quantity, and every path.
+    """Outcomes of N episodes."""
 
-    Attributes:
-        success: 1 or 0.
-        failed: 1 or 0.
-        wall_contact: share of the steps.
-        steps: until the end.
-        returns: sum of rewards.
-        position: of what moves, (N, T + 1, 2 K) in m, from the start on, NaN after the end.
-    """
-
-    success: list[float]
-    failed: list[float]
-    wall_contact: list[float]
-    steps: list[int]
-    returns: list[float]
-    position: Tensor
+    success: list[float]  # 1 or 0
+    failed: list[float]  # 1 or 0
+    wall_contact: list[float]  # share of the steps
+    steps: list[int]  # until the end
+    returns: list[float]  # sum of rewards
+    position: Tensor  # of what moves, (N, T + 1, 2 K) in m, from the start on, NaN after the end
 
     def to_json(self) -> dict[str, list[float]]:
         """Return the lists by name."""
-        return {
-            "success": self.success,
-            "failed": self.failed,
-            "wall_contact": self.wall_contact,
-            "steps": [float(steps) for steps in self.steps],
-            "return": self.returns,
-        }
+        lists = (self.success, self.failed, self.wall_contact, [float(steps) for steps in self.steps], self.returns)
+        return dict(zip(("success", "failed", "wall_contact", "steps", "return"), lists, strict=True))
 
 
 class EpisodeRecord:
-    """Record N episodes until each has ended, in success or failure.
-
-    Attributes:
-        active: (N,) bool, not ended yet. total_steps: of all episodes together so far.
-    """
+    """Record N episodes until each has ended: `active`, (N,) bool, have not; `total_steps` are those of all so far."""
 
     def __init__(self, position: Tensor) -> None:
         """Start at `position` (N, 2 K)."""
         count = len(position)
-        self.active = torch.ones(count, dtype=torch.bool)
-        self.total_steps = 0
+        self.active, self.total_steps = torch.ones(count, dtype=torch.bool), 0
         self._success, self._failed, self._contact, self._steps, self._return = torch.zeros(5, count)
         self._positions = [position.clone()]
 
@@ -157,8 +131,7 @@ def in_simulator(
 ) -> tuple[Outcome, dict[str, Tensor]]:
     """Run an episode in each row of `world`; `asked` counts commands beyond what was recorded.
 
-    Returns:
-        the outcome, and the starts and goals, which are the same in every simulator.
+    Returns the outcome, and the starts and goals, which are the same in every simulator.
     """
     torch.manual_seed(seed)
     world.reset()
@@ -171,30 +144,11 @@ def in_simulator(
             asked.count(action, record.active)
         step = world.step(action)
         success = world.objective.succeeded(step.success, world.failed, number + 1)
-        blocked = world.simulator.blocked
         places = world.objective.places(world.simulator.state)
-        record.add(places, step.reward, success, world.failed, blocked)
+        record.add(places, step.reward, success, world.failed, world.simulator.blocked)
         if not record.active.any():
             break
     return record.outcome(), start_goal
-
-
-@dataclass(frozen=True)
-class TargetStarts:
-    """Moments of recorded episodes to start from.
-
-    Attributes:
-        state: s_i, (N, S). goal: (N, G).
-    """
-
-    state: Tensor
-    goal: Tensor
-
-    @classmethod
-    def of(cls, episodes: PairedEpisodes) -> "TargetStarts":
-        """Return every step of `episodes`."""
-        state, goal = episodes.target_state, episodes.windows.goal
-        return cls(episodes.steps(state).cpu(), episodes.steps(goal).cpu())
 
 
 class ObservedTargetEnv:
@@ -202,12 +156,10 @@ class ObservedTargetEnv:
 
     The physics runs on the CPU, whatever the device of observations and actions. All randomness comes from
     torch's global generator.
-
-    Attributes:
-        penalty_scale: without effect, as there are no penalties here.
     """
 
     penalty_scale = 1.0
+    """Without effect, as there are no penalties here."""
 
     def __init__(
         self,
@@ -215,21 +167,15 @@ class ObservedTargetEnv:
         num_envs: int,
         *,
         observed: Observed = "abstract",
-        starts: TargetStarts | None = None,
+        starts: tuple[Tensor, Tensor] | None = None,
         data_start_share: float = 0.0,
         device: str = "cpu",
         num_threads: int | None = None,
     ) -> None:
         """Build B environments.
 
-        Args:
-            task: the task.
-            num_envs: B.
-            observed: whether φ of the state is observed, or the full state.
-            starts: recorded moments to start from.
-            data_start_share: share of the episodes that start from `starts`.
-            device: torch device of observations and actions.
-            num_threads: of the physics, by default one per core.
+        A share of the episodes start from `starts`, N recorded states (N, S) and goals (N, G). The physics has
+        `num_threads`, by default one per core.
         """
         self.num_envs = num_envs
         self.action_size = task.objective.action_size
@@ -246,17 +192,16 @@ class ObservedTargetEnv:
         self._env.reset(anew & ~from_data)
         rows = from_data.nonzero().squeeze(1)
         if self._starts is not None and len(rows):
-            moments = torch.randint(len(self._starts.state), (len(rows),))
-            self._env.goal[rows] = self._starts.goal[moments]
-            self._env.reset_to(rows.numpy(), self._starts.state[moments].numpy().astype(np.float64))
+            states, goals = self._starts
+            moments = torch.randint(len(states), (len(rows),))
+            self._env.goal[rows] = goals[moments]
+            self._env.reset_to(rows.numpy(), states[moments].numpy().astype(np.float64))
         return self._observe()
 
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A), clipped to ±1."""
         step = self._env.step(action.cpu())
-        reward, terminated, success = (
-            values.to(self._device) for values in (step.reward, step.terminated, step.success)
-        )
+        reward, terminated, success = (one.to(self._device) for one in (step.reward, step.terminated, step.success))
         return Step(self._observe(), reward, terminated, success)
 
     def _observe(self) -> Tensor:
@@ -274,17 +219,12 @@ class ObservedTargetEnv:
 
 
 class TargetEpisodes(NamedTuple):
-    """Episodes in the target.
-
-    Attributes:
-        outcome: theirs. filmed: the states (T + 1, S) of the first. rate: target steps/s.
-        start_goal: where they began, "start" (B, 2) or with balls (B, 4), and "goal" (B, G).
-    """
+    """Episodes in the target."""
 
     outcome: Outcome
-    filmed: Tensor
-    rate: float
-    start_goal: dict[str, Tensor]
+    filmed: Tensor  # the states (T + 1, S) of the first
+    rate: float  # target steps/s
+    start_goal: dict[str, Tensor]  # where they began, "start" (B, 2) or with balls (B, 4), and "goal" (B, G)
 
 
 def in_target(
@@ -339,43 +279,25 @@ def in_target(
     return TargetEpisodes(record.outcome(), torch.stack(filmed), rate, start_goal)
 
 
-@dataclass(frozen=True)
-class Judge:
-    """A grounding of other episodes, in whose simulator its failure model, if it has one, ends episodes."""
+def judged_success(task: Task, judge: Grounding, policy: RunningPolicy, episodes: int, seed: int) -> float:
+    """Return the share of so many episodes in which a policy succeeds; starts and goals are of `seed`.
 
-    task: Task
-    grounding: Grounding
-
-    def simulator(self, episodes: int) -> SimulatorEnv:
-        """Return its simulator."""
-        simulator = self.grounding.simulator(self.task, episodes)
-        return SimulatorEnv(self.task.objective, simulator, draws_failures=True)
-
-    def success(self, policy: RunningPolicy, episodes: int, seed: int) -> float:
-        """Return the share of so many episodes in which a policy succeeds; starts and goals are of `seed`."""
-        begin = partial(started, policy, policy.act_in_simulator)
-        outcome, _ = in_simulator(self.simulator(episodes), begin, self.task.objective.horizon, seed)
-        return fmean(outcome.success)
+    They are run in the simulator of a `judge`, a grounding of other episodes, whose failure model, if it has
+    one, ends episodes.
+    """
+    world = SimulatorEnv(task.objective, judge.simulator(task, episodes), draws_failures=True)
+    outcome, _ = in_simulator(world, partial(started, policy, policy.act_in_simulator), task.objective.horizon, seed)
+    return fmean(outcome.success)
 
 
 _EPISODES = 100
 
 
-def own_world(task: Task, simulation: Simulation, grounding: Grounding, num_envs: int) -> SimulatorEnv:
-    """Build the simulator that a policy was trained in; episodes start where the task does."""
-    return training_env(task, simulation, grounding, num_envs=num_envs, device="cpu")
+class Reached(NamedTuple):
+    """What a policy reaches in its own simulator."""
 
-
-@dataclass(frozen=True)
-class Reached:
-    """What a policy reaches in its own simulator.
-
-    Attributes:
-        success: share of the episodes. steps: mean of those that succeed; the horizon without any.
-    """
-
-    success: float
-    steps: float
+    success: float  # share of the episodes
+    steps: float  # mean of those that succeed; the horizon without any
 
 
 def reached_in_own_world(task: Task, trained: PolicyFile, grounding: Grounding, seed: int) -> Reached:
@@ -385,10 +307,9 @@ def reached_in_own_world(task: Task, trained: PolicyFile, grounding: Grounding, 
             "tries: expected a policy that knows its simulator, got one without: give PolicyFile its "
             "simulation, or set tries = 1"
         )
-    policy = running(task, trained, grounding)
-    world = own_world(task, trained.simulation, grounding, _EPISODES)
+    policy, horizon = running(task, trained, grounding), task.objective.horizon
+    world = training_env(task, trained.simulation, grounding, num_envs=_EPISODES)
     begin = partial(started, policy, policy.act_in_simulator)
-    horizon = task.objective.horizon
     outcome, _ = in_simulator(world, begin, horizon, derive(seed, "trial in its own simulator"))
     steps = [steps for steps, success in zip(outcome.steps, outcome.success, strict=True) if success]
     return Reached(fmean(outcome.success), fmean(steps) if steps else float(horizon))

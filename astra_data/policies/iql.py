@@ -13,7 +13,7 @@ uninterrupted one.
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from pydantic import model_validator
@@ -24,7 +24,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence, seed_generators
 from astra_data.grounding.encoder import mlp
-from astra_data.grounding.paired_episodes import Recorded
+from astra_data.grounding.paired_episodes import draw_steps
 from astra_data.policies.networks import Policy
 
 _LARGEST_WEIGHT = 100.0
@@ -79,37 +79,38 @@ class IqlConfig(Config):
 
 
 @dataclass(frozen=True)
-class Experience(Recorded):
-    """Recorded episodes with rewards; observations are what the policy sees, then what only the critics see.
+class Experience:
+    """E recorded episodes of up to T steps, padded; observations are what the policy sees, then what critics do."""
 
-    Attributes:
-        reward: (E, T). next_observation: as `observation`, (E, T, O).
-        terminated: (E, T) bool, the task ended there: no bootstrapping. Not set by time-outs.
-    """
+    observation: Tensor  # (E, T, O)
+    previous_action: Tensor  # (E, T, A), zero at the start
+    action: Tensor  # (E, T, A)
+    lengths: Tensor  # (E,), the number of real steps
+    reward: Tensor  # (E, T)
+    next_observation: Tensor  # (E, T, O)
+    terminated: Tensor  # (E, T) bool, the task ended there: no bootstrapping; not set by time-outs
 
-    reward: Tensor
-    next_observation: Tensor
-    terminated: Tensor
+    def draw(self, count: int, length: int, burn_in: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Draw windows of `length` steps from torch's global generator.
+
+        Returns their places in the columns, episodes (count, 1) and steps (count, length), and which steps to
+        learn from, (count, length) bool: all but the first `burn_in` of a window that begins within its
+        episode.
+        """
+        episodes, steps, learned = draw_steps(self.lengths, count, length)
+        learned &= steps < self.lengths[episodes]
+        learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
+        return (episodes, steps), learned
 
 
-@dataclass(frozen=True)
-class Transitions:
-    """N transitions of n steps, from which the critics learn.
+class Transitions(NamedTuple):
+    """N transitions of n steps, from which the critics learn."""
 
-    Attributes:
-        observation: (N, O). action: (N, A). reward: summed and discounted over the n steps, (N,).
-        next_observation: n steps later, (N, O). terminated: (N,) bool, the task ended there.
-    """
-
-    observation: Tensor
-    action: Tensor
-    reward: Tensor
-    next_observation: Tensor
-    terminated: Tensor
-
-    def __len__(self) -> int:
-        """Return N."""
-        return len(self.reward)
+    observation: Tensor  # (N, O)
+    action: Tensor  # (N, A)
+    reward: Tensor  # (N,), summed and discounted over the n steps
+    next_observation: Tensor  # (N, O), n steps later
+    terminated: Tensor  # (N,) bool, the task ended there
 
 
 class _Critics(nn.Module):
@@ -130,11 +131,7 @@ class _Critics(nn.Module):
 
 
 class Iql:
-    """A training in progress.
-
-    Attributes:
-        policy: the networks being trained. updates: gradient updates done, of critics and policy.
-    """
+    """A training in progress, after so many `updates` of critics and policy."""
 
     def __init__(self, policy: Policy, experience: Experience, config: IqlConfig, *, seed: int) -> None:
         """Prepare to train `policy` in place on `experience`, with all randomness from `seed`."""
@@ -168,11 +165,8 @@ class Iql:
     def iterate(self) -> dict[str, float]:
         """Make one update and return its losses: "value" and "action_value", or the "policy"'s."""
         seed_generators(derive(self.seed, f"update {self.updates}"), self._transitions.reward.device)
-        losses = (
-            self._learn_values()
-            if self.updates < self.config.critic_updates
-            else self._learn_policy(self.updates - self.config.critic_updates)
-        )
+        update = self.updates - self.config.critic_updates
+        losses = self._learn_values() if update < 0 else self._learn_policy(update)
         self.updates += 1
         refuse_divergence(f"in update {self.updates}", losses)
         return losses
@@ -180,7 +174,7 @@ class Iql:
     def _learn_values(self) -> dict[str, float]:
         """Take a step down the losses of V, eq. 5, and Q, eq. 6; let the slow Q follow."""
         config, critics, table = self.config, self._critics, self._transitions
-        rows = torch.randint(len(table), (_CRITIC_BATCH,)).to(table.reward.device)
+        rows = torch.randint(len(table.reward), (_CRITIC_BATCH,)).to(table.reward.device)
         observation, action = table.observation[rows], table.action[rows]
         advantage = critics.advantage(observation, action)
         weight = torch.where(advantage > 0, config.expectile, 1.0 - config.expectile)
@@ -207,10 +201,8 @@ class Iql:
             self._weights = self._weigh()
         steps, is_learned = self._experience.draw(config.batch_windows, config.window, config.burn_in)
         seen = self._experience.observation[..., : policy.shape.observation_size][steps]
-        start = torch.zeros(is_learned.shape, device=is_learned.device)
-        features = policy.remember_sequence(
-            seen, self._experience.previous_action[steps], policy.initial_hidden(len(seen)), start
-        )
+        before, start = self._experience.previous_action[steps], torch.zeros_like(is_learned, dtype=torch.float32)
+        features = policy.remember_sequence(seen, before, policy.initial_hidden(len(seen)), start)
         learned = is_learned.nonzero(as_tuple=True)
         likelihood = policy.log_prob(features[learned], self._experience.action[steps][learned])
         loss = -(self._weights[steps][learned] * likelihood).mean()
@@ -228,11 +220,6 @@ class Iql:
         advantage = torch.cat([self._critics.advantage(*row) for row in rows])
         weights = (self.config.temperature * advantage).exp().clamp_max(_LARGEST_WEIGHT)
         return weights.view(self._experience.reward.shape)
-
-    @torch.no_grad()
-    def values(self, observation: Tensor) -> Tensor:
-        """Return the state values (...) of `observation` (..., O)."""
-        return torch.as_tensor(self._critics.value(observation).squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that `load_state_dict` needs to continue from here."""

@@ -4,9 +4,8 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import fmean
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,72 +15,80 @@ from astra_data.worlds.protocols import BatchedEnv, Step
 
 _ROUNDING = 1e-9
 """Of a sum of shares."""
+_ROWS = ("previous_action", "hidden", "first", "age", "lasted")
+"""What checkpoints hold of the rows."""
 
 
-@dataclass(frozen=True)
-class Taken:
-    """The outcome of one step of all rows.
-
-    Attributes:
-        step: its outcome.
-        action: as applied, (B, A) in ±1.
-        expired: episodes that reached the horizon, (B,) bool.
-        done: episodes that ended, expired or terminated, (B,) bool.
-    """
+class Taken(NamedTuple):
+    """The outcome of one step of all rows."""
 
     step: Step
-    action: Tensor
-    expired: Tensor
-    done: Tensor
+    action: Tensor  # (B, A) in ±1, as applied
+    expired: Tensor  # (B,) bool, the episode reached the horizon
+    done: Tensor  # (B,) bool, it ended, expired or terminated
 
 
-class Acting:
-    """B rows of an environment in which a policy acts.
+class Learner(ABC):
+    """A training in progress, in B rows of an environment.
+
+    Every iteration seeds torch from (seed, iteration): a training that resumes from a checkpoint repeats what
+    an uninterrupted one would have done, where the environment can be restored.
 
     Attributes:
-        observation: (B, O), to act on next.
+        observation: (B, O), to act on next. first: whether an episode begins with it, (B,) bool.
         previous_action: (B, A) in ±1. hidden: the policy's memory, (B, H). Both are zero at the start.
-        first: whether an episode begins with it, (B,) bool.
         world_seconds: the time that the environment's steps took, since the start or since resuming.
+        share: of the training that is done, from 0 to 1, which schedules follow.
+        pace: of the training; at 2 it ends after half of the steps that are left.
     """
 
-    def __init__(self, env: BatchedEnv, hidden: Tensor, *, horizon: int, is_staggered: bool) -> None:
-        """Start all rows.
+    def __init__(
+        self,
+        env: BatchedEnv,
+        hidden: Tensor,
+        parts: Mapping[str, Any],
+        *,
+        horizon: int,
+        total_steps: int,
+        rollout_steps: int,
+        seed: int,
+        is_staggered: bool = True,
+    ) -> None:
+        """Start all rows, with the policy's memory `hidden` (B, H).
 
-        Args:
-            env: the environment.
-            hidden: the policy's memory at the start, (B, H).
-            horizon: steps after which an episode is truncated and its row restarted.
-            is_staggered: begin at random ages, so that rows do not all reach the horizon at once.
+        `parts` are all else that learning changes. Episodes are truncated after `horizon` steps; where it
+        `is_staggered`, they begin at random ages, so that rows do not all reach it at once.
         """
         self.env, self.horizon = env, horizon
-        self.world_seconds = 0.0
+        self.total_steps, self.rollout_steps, self.steps = total_steps, rollout_steps, 0
+        self.share, self.pace, self.world_seconds = 0.0, 1.0, 0.0
+        self._parts, self._seed, self._iteration = parts, seed, 0
         self.observation = env.reset()
         device = self.observation.device
         self.previous_action = torch.zeros(env.num_envs, env.action_size, device=device)
         self.hidden = hidden
         self.first = torch.ones(env.num_envs, dtype=torch.bool, device=device)
-        self._lasted = torch.zeros(env.num_envs, dtype=torch.int64, device=device)
-        self._age = torch.randint_like(self._lasted, horizon) if is_staggered else self._lasted
+        self.lasted = torch.zeros(env.num_envs, dtype=torch.int64, device=device)
+        self.age = torch.randint_like(self.lasted, horizon) if is_staggered else self.lasted
         self._forget()
 
     def _forget(self) -> None:
-        self._steps = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
+        self._taken = self._finished = self._succeeded = self._survived = self._rewarded = 0.0
 
     def take(self, action: Tensor, hidden: Tensor) -> Taken:
         """Apply `action` (B, A), clipped to ±1, keep `hidden` (B, H), and reset the rows that are done."""
         began = time.perf_counter()
         step = self.env.step(action)
         self.world_seconds += time.perf_counter() - began
-        self._age, self._lasted = self._age + 1, self._lasted + 1
-        expired = (self._age >= self.horizon) & ~step.terminated
+        self.age, self.lasted = self.age + 1, self.lasted + 1
+        expired = (self.age >= self.horizon) & ~step.terminated
         done = step.terminated | expired
-        self._steps += 1
+        self._taken += 1
         self._finished += float(done.sum())
         self._succeeded += float(step.success.sum())
-        self._survived += float(self._lasted[done].sum())
+        self._survived += float(self.lasted[done].sum())
         self._rewarded += float(step.reward.mean())
-        self._age, self._lasted = (torch.where(done, 0, steps) for steps in (self._age, self._lasted))
+        self.age, self.lasted = (torch.where(done, 0, steps) for steps in (self.age, self.lasted))
         self.observation = self.env.reset(done) if bool(done.any()) else step.observation
         executed, going = action.clamp(-1.0, 1.0), (~done).float().unsqueeze(-1)
         self.previous_action, self.hidden, self.first = executed * going, hidden * going, done
@@ -90,86 +97,14 @@ class Acting:
     def figures(self) -> dict[str, float]:
         """Return figures on the steps since the last call.
 
-        Returns:
-            the share of "success" among the "episodes" that ended, wherever in the task they began, and their
-            mean "episode_steps", NaN if none ended; the mean "reward" of a step.
+        They are the share of "success" among the "episodes" that ended, wherever in the task they began, and
+        their mean "episode_steps", NaN if none ended; the mean "reward" of a step.
         """
-        figures = {
-            "success": self._succeeded / self._finished if self._finished else math.nan,
-            "episode_steps": self._survived / self._finished if self._finished else math.nan,
-            "episodes": self._finished,
-            "reward": self._rewarded / self._steps,
-        }
+        ended = self._finished or math.nan
+        figures = {"success": self._succeeded / ended, "episode_steps": self._survived / ended}
+        figures |= {"episodes": self._finished, "reward": self._rewarded / self._taken}
         self._forget()
         return figures
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything but the environment's own state, after `figures`; see `load_state_dict`."""
-        return {
-            "previous_action": self.previous_action,
-            "hidden": self.hidden,
-            "first": self.first,
-            "age": self._age,
-            "lasted": self._lasted,
-        }
-
-    def load_state_dict(self, state: dict[str, Any], observation: Tensor) -> None:
-        """Continue from `state`, once the environment is restored and returned `observation` (B, O)."""
-        device = observation.device
-        self.observation = observation
-        self.previous_action, self.hidden = state["previous_action"].to(device), state["hidden"].to(device)
-        self.first = state["first"].to(device)
-        self._age, self._lasted = state["age"].to(device), state["lasted"].to(device)
-
-
-class Resumable(Protocol):
-    """What checkpoints of a training hold, such as a network or an optimizer."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all that `load_state_dict` needs."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any], /) -> object:
-        """Continue from `state`."""
-        ...
-
-
-class Learner(ABC):
-    """A training in progress.
-
-    Every iteration seeds torch from (seed, iteration): a training that resumes from a checkpoint repeats what
-    an uninterrupted one would have done, where the environment can be restored.
-
-    Attributes:
-        env: the environment. acting: how a policy acts in it.
-        total_steps: environment steps at most. steps: those done.
-        share: of the training that is done, from 0 to 1, which schedules follow.
-        pace: of the training; at 2 it ends after half of the steps that are left.
-        rollout_steps: batched steps per iteration.
-    """
-
-    def __init__(
-        self,
-        acting: Acting,
-        parts: Mapping[str, Resumable],
-        *,
-        total_steps: int,
-        rollout_steps: int,
-        seed: int,
-    ) -> None:
-        """Prepare to learn.
-
-        Args:
-            acting: the environment and the policy's memory.
-            parts: all else that learning changes, by name.
-            total_steps: environment steps at most.
-            rollout_steps: batched steps per iteration.
-            seed: of all randomness.
-        """
-        self.env, self.acting = acting.env, acting
-        self.total_steps, self.rollout_steps, self.steps = total_steps, rollout_steps, 0
-        self.share, self.pace = 0.0, 1.0
-        self._parts, self._seed, self._iteration = parts, seed, 0
 
     @property
     def done(self) -> bool:
@@ -182,18 +117,14 @@ class Learner(ABC):
         return 1.0 - self.share
 
     def iterate(self) -> dict[str, float]:
-        """Take `rollout_steps` batched steps and learn.
-
-        Returns:
-            the metrics of `Acting`, and the learner's own.
-        """
+        """Take `rollout_steps` batched steps and learn; return `figures`, and the learner's own."""
         torch.manual_seed(derive(self._seed, f"iteration {self._iteration}"))
         figures = self._iterate()
         taken = self.env.num_envs * self.rollout_steps
         self.steps += taken
         self.share = min(1.0, self.share + self.pace * taken / self.total_steps)
         self._iteration += 1
-        return self.acting.figures() | figures
+        return self.figures() | figures
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
@@ -201,13 +132,9 @@ class Learner(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the environment's own state; see `load_state_dict`."""
-        progress = {
-            "steps": self.steps,
-            "share": self.share,
-            "iteration": self._iteration,
-            "acting": self.acting.state_dict(),
-        }
-        return {name: part.state_dict() for name, part in self._parts.items()} | progress
+        progress = {"steps": self.steps, "share": self.share, "iteration": self._iteration}
+        rows = {name: getattr(self, name) for name in _ROWS}
+        return {name: part.state_dict() for name, part in self._parts.items()} | progress | {"rows": rows}
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor, *, goes_on: bool = True) -> None:
         """Continue from `state`, once the environment is restored and returned `observation` (B, O).
@@ -217,11 +144,12 @@ class Learner(ABC):
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
         self.steps, self.share, self._iteration = state["steps"], state["share"], state["iteration"]
-        if goes_on:
-            self.acting.load_state_dict(state["acting"], observation)
-        else:
-            self.acting.observation = observation
+        self.observation = observation
+        if not goes_on:
             self._cut()
+            return
+        for name in _ROWS:
+            setattr(self, name, state["rows"][name].to(observation.device))
 
     def _cut(self) -> None:  # noqa: B027 - most keep nothing
         """Let what comes next follow no step that was kept."""

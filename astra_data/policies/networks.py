@@ -148,13 +148,6 @@ class ActorCritic(Policy):
                 nn.init.zeros_(layer.bias)
             nn.init.orthogonal_(layers[-1].weight, gain)
 
-    @property
-    def value_layer(self) -> nn.Linear:
-        """The critic's last layer."""
-        layer = self.critic[-1]
-        assert isinstance(layer, nn.Linear)
-        return layer
-
     def policy(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation (..., A) of the action for `features` (..., F)."""
         return self.gaussian(self.actor(features))

@@ -13,7 +13,7 @@ from astra_data.core.config import Config, Count, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
-from astra_data.policies.learner import Acting, Learner, Resumable
+from astra_data.policies.learner import Learner
 from astra_data.policies.networks import ActorCritic, gaussian_log_prob
 from astra_data.worlds.protocols import BatchedEnv
 
@@ -52,39 +52,25 @@ class PpoConfig(Config):
 
 
 class Ppo(Learner):
-    """A training in progress.
-
-    Attributes:
-        policy: the networks being trained.
-    """
+    """A training in progress."""
 
     def __init__(self, env: BatchedEnv, policy: ActorCritic, config: PpoConfig, *, horizon: int, seed: int) -> None:
-        """Prepare to train `policy` in `env`.
-
-        Args:
-            env: the environment.
-            policy: the networks.
-            config: settings.
-            horizon: steps after which episodes are truncated.
-            seed: of all randomness.
-        """
+        """Prepare to train `policy` in `env`, with episodes of at most `horizon` steps."""
         if env.num_envs * config.rollout_steps == 1:
             raise BadInputError("rollout_steps: expected 2 or more in a single environment, got 1")
         self.policy, self.config = policy, config
         with torch.no_grad():
-            policy.value_layer.weight.mul_(_CRITIC_GAIN)
+            list(policy.critic.parameters())[-2].mul_(_CRITIC_GAIN)
         self._first_std = float(policy.log_std.detach().exp().max())
         self._optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
         self._returns = ReturnScale(env.num_envs, config.discount, policy.log_std.device)
-        parts: dict[str, Resumable] = {
-            "policy": policy,
-            "optimizer": self._optimizer,
-            "returns": self._returns,
-        }
+        self._segment_steps = math.gcd(config.rollout_steps, _SEGMENT_STEPS)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
-            Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=True),
-            parts,
+            env,
+            policy.initial_hidden(env.num_envs),
+            {"policy": policy, "optimizer": self._optimizer, "returns": self._returns},
+            horizon=horizon,
             total_steps=config.total_steps,
             rollout_steps=config.rollout_steps,
             seed=seed,
@@ -104,53 +90,45 @@ class Ppo(Learner):
 
     @torch.no_grad()
     def _collect(self) -> dict[str, Tensor]:
-        acting, policy = self.acting, self.policy
-        columns: dict[str, list[Tensor]] = {}
-        for _ in range(self.rollout_steps):
+        policy, columns, memories = self.policy, dict[str, list[Tensor]](), list[Tensor]()
+        for number in range(self.rollout_steps):
+            if number % self._segment_steps == 0:
+                memories.append(self.hidden)
             row = {
-                "observation": acting.observation,
-                "previous_action": acting.previous_action,
-                "hidden": acting.hidden,
-                "start": acting.first.float(),
+                "observation": self.observation,
+                "previous_action": self.previous_action,
+                "start": self.first.float(),
             }
-            features, hidden = policy.remember(acting.observation, acting.previous_action, acting.hidden)
+            features, hidden = policy.remember(self.observation, self.previous_action, self.hidden)
             mean, std = policy.policy(features)
             action = torch.normal(mean, std)
-            taken = acting.take(action, hidden)
-            step, expired = taken.step, taken.expired
-            row |= {
-                "features": features,
-                "mean": mean,
-                "std": std,
-                "action": action,
-                "reward": self._returns.scaled(taken.step.reward, taken.done),
-                "terminated": step.terminated,
-                "done": taken.done,
-                "beyond": torch.zeros_like(step.reward),
-            }
+            step, applied, expired, done = self.take(action, hidden)
+            row |= {"features": features, "mean": mean, "std": std, "action": action}
+            row |= {"reward": self._returns.scaled(step.reward, done), "terminated": step.terminated, "done": done}
+            row["beyond"] = torch.zeros_like(step.reward)
             if bool(expired.any()):
-                beyond, _ = policy.remember(step.observation[expired], taken.action[expired], hidden[expired])
+                beyond, _ = policy.remember(step.observation[expired], applied[expired], hidden[expired])
                 row["beyond"][expired] = policy.value(beyond)
             for name, values in row.items():
                 columns.setdefault(name, []).append(values)
-        rollout = {name: torch.stack(values, dim=1) for name, values in columns.items()}
+        rollout = {name: torch.stack(values, dim=1) for name, values in (columns | {"hidden": memories}).items()}
         rollout["value"] = policy.value(rollout["features"])
         rollout["action_log_prob"] = gaussian_log_prob(rollout["mean"], rollout["std"], rollout["action"])
-        last, _ = policy.remember(acting.observation, acting.previous_action, acting.hidden)
+        last, _ = policy.remember(self.observation, self.previous_action, self.hidden)
         following = torch.cat([rollout["value"][:, 1:], policy.value(last).unsqueeze(1)], dim=1)
         following = torch.where(rollout["done"], rollout["beyond"], following)
         parts = rollout["value"], following, rollout["reward"], rollout["done"], rollout["terminated"]
         advantage = generalized_advantages(*parts, discount=self.config.discount, gae_lambda=GAE_LAMBDA)
-        target = advantage + rollout["value"]
-        return rollout | {"advantage": advantage, "value_target": target}
+        return rollout | {"advantage": advantage, "value_target": advantage + rollout["value"]}
 
     def _learn(self, rollout: dict[str, Tensor]) -> None:
-        policy = self.policy
         advantage = rollout["advantage"]
         rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        steps = math.gcd(self.rollout_steps, _SEGMENT_STEPS)
-        segments = {name: rollout[name].unflatten(1, (-1, steps)).flatten(0, 1) for name in _SEEN + _LEARNED}
-        segments["hidden"] = segments["hidden"][:, 0]
+        segments = {
+            name: rollout[name].unflatten(1, (-1, self._segment_steps)).flatten(0, 1)
+            for name in {*_SEEN, *_LEARNED} - {"hidden"}
+        }
+        segments["hidden"] = rollout["hidden"].flatten(0, 1)
         for _ in range(EPOCHS):
             order = torch.randperm(len(segments["action"]), device=advantage.device)
             for rows in order.chunk(MINIBATCHES):
@@ -159,13 +137,13 @@ class Ppo(Learner):
                     return
                 self._optimizer.zero_grad()
                 loss.backward()
-                nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+                nn.utils.clip_grad_norm_(self.policy.parameters(), GRADIENT_NORM)
                 self._optimizer.step()
 
     def _loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the loss, eq. 9 of Schulman et al. with the clipped objective of eq. 7, and a KL divergence.
+        """Return the loss, eq. 9 of Schulman et al. with the clipped objective of eq. 7, and an estimated KL.
 
-        That is an estimate of the divergence of the policy from the one that collected the rollout.
+        The divergence is that of the policy from the one that collected the rollout.
         """
         policy = self.policy
         remembered = policy.remember_sequence(*(batch[name] for name in _SEEN))
@@ -196,14 +174,8 @@ def generalized_advantages(
 ) -> Tensor:
     """Return the generalized advantage estimates (B, T) of Schulman et al. 2016, eq. 16.
 
-    Args:
-        value: of the observation before each step, (B, T).
-        following: of the one after it, (B, T); without effect where a step terminates.
-        reward: (B, T).
-        done: whether the episode ends with the step, (B, T) bool.
-        terminated: whether nothing follows the step, (B, T) bool.
-        discount: per step.
-        gae_lambda: λ.
+    `value` is of the observation before each step, (B, T), `following` of the one after it; episodes that are
+    `done` end with the step, and where they are `terminated` nothing follows.
     """
     error = reward + discount * following * ~terminated - value
     kept = discount * gae_lambda * (~done).to(value.dtype)

@@ -15,7 +15,7 @@ from torch.nn import functional
 from astra_data.core.config import Config, Count, Positive
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
-from astra_data.policies.learner import Acting, Learner
+from astra_data.policies.learner import Learner
 from astra_data.policies.networks import SHORTEST_HISTORY, Student, Teacher
 from astra_data.worlds.protocols import BatchedEnv
 
@@ -36,39 +36,23 @@ class RmaConfig(Config):
 class Adaptation(Learner):
     """A phase 2 in progress: one update per step, on the current histories of all rows.
 
-    Attributes:
-        student: the networks; only the estimate of the extrinsics is trained.
+    Only the `student`'s estimate of the extrinsics is trained.
     """
 
     def __init__(
-        self,
-        env: BatchedEnv,
-        teacher: Teacher,
-        config: RmaConfig,
-        *,
-        rollout_steps: int,
-        horizon: int,
-        seed: int,
+        self, env: BatchedEnv, teacher: Teacher, config: RmaConfig, *, rollout_steps: int, horizon: int, seed: int
     ) -> None:
-        """Prepare to train a student of `teacher` in `env`.
-
-        Args:
-            env: the environment that the teacher was trained in.
-            teacher: the trained teacher.
-            config: settings.
-            rollout_steps: steps of every environment per iteration.
-            horizon: steps after which episodes are truncated.
-            seed: of all randomness.
-        """
+        """Prepare to train a student of `teacher` in `env`, the environment that it was trained in."""
         self.teacher, self.config = teacher, config
         torch.manual_seed(derive(seed, "student"))
         self.student = Student.of_teacher(teacher)
         learned = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.Adam(learned, lr=config.adaptation_learning_rate)
-        hidden = self.student.initial_hidden(env.num_envs)
         super().__init__(
-            Acting(env, hidden, horizon=horizon, is_staggered=True),
+            env,
+            self.student.initial_hidden(env.num_envs),
             {"student": self.student, "optimizer": self._optimizer},
+            horizon=horizon,
             total_steps=config.adaptation_steps,
             rollout_steps=rollout_steps,
             seed=derive(seed, "adaptation"),
@@ -77,9 +61,8 @@ class Adaptation(Learner):
     def _iterate(self) -> dict[str, float]:
         """Take `rollout_steps` batched steps, learning after each.
 
-        Returns:
-            "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those at
-            the start of episodes, without a history; NaN where nothing varies.
+        Returns "r2_extrinsics", the share of the extrinsics' variance that the estimates explain, with those
+        at the start of episodes, without a history; NaN where nothing varies.
         """
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.adaptation_learning_rate * self.share_left
@@ -89,23 +72,19 @@ class Adaptation(Learner):
             errors.append(features[:, -extrinsics.shape[1] :] - extrinsics)
             true.append(extrinsics)
             with torch.no_grad():
-                self.acting.take(self.student.act(features), hidden)
+                self.take(self.student.act(features), hidden)
         error = float(torch.cat(errors).square().mean(0).sum())
         refuse_divergence(f"after step {self.steps}", {"squared error": error})
         variance = float(torch.cat(true).var(0, correction=0).sum())
         return {"r2_extrinsics": 1.0 - error / variance if variance else math.nan}
 
     def _learn(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Process the current observations and make one update.
-
-        Returns:
-            the true extrinsics (B, E), the features (B, F), and the next hidden (B, H).
-        """
-        acting, shape = self.acting, self.student.shape
+        """Make one update; return the true extrinsics (B, E), the features (B, F) and the next hidden (B, H)."""
+        shape = self.student.shape
         with torch.no_grad():
-            extrinsics = self.teacher.extrinsics(acting.observation)
-        seen = acting.observation[:, : shape.observation_size]
-        features, hidden = self.student.remember(seen, acting.previous_action, acting.hidden)
+            extrinsics = self.teacher.extrinsics(self.observation)
+        seen = self.observation[:, : shape.observation_size]
+        features, hidden = self.student.remember(seen, self.previous_action, self.hidden)
         loss = functional.mse_loss(features[:, -shape.extrinsics_size :], extrinsics)
         self._optimizer.zero_grad()
         loss.backward()

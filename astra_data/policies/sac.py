@@ -19,7 +19,7 @@ from astra_data.core.config import Config, Count, CountFromZero, Positive, Share
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import refuse_divergence
-from astra_data.policies.learner import Acting, Learner
+from astra_data.policies.learner import Learner
 from astra_data.policies.networks import PolicyShape, SoftActor, features_of
 from astra_data.worlds.protocols import BatchedEnv
 
@@ -64,30 +64,10 @@ class SacConfig(Config):
 
 
 class Sac(Learner):
-    """A training in progress.
+    """A training in progress, of the actor `policy`."""
 
-    Attributes:
-        policy: the actor.
-    """
-
-    def __init__(
-        self,
-        env: BatchedEnv,
-        policy: SoftActor,
-        config: SacConfig,
-        *,
-        horizon: int,
-        seed: int,
-    ) -> None:
-        """Prepare to train `policy` in `env`.
-
-        Args:
-            env: the environment.
-            policy: the actor.
-            config: settings.
-            horizon: steps after which episodes are truncated.
-            seed: of all randomness.
-        """
+    def __init__(self, env: BatchedEnv, policy: SoftActor, config: SacConfig, *, horizon: int, seed: int) -> None:
+        """Prepare to train `policy` in `env`, with episodes of at most `horizon` steps."""
         self.policy, self.config = policy, config
         torch.manual_seed(derive(seed, "critics"))
         device = next(policy.parameters()).device
@@ -105,7 +85,8 @@ class Sac(Learner):
         self._replay = Replay(config.buffer_size, env, policy.shape.memory_size, device)
         torch.manual_seed(derive(seed, "first reset"))
         super().__init__(
-            Acting(env, policy.initial_hidden(env.num_envs), horizon=horizon, is_staggered=False),
+            env,
+            policy.initial_hidden(env.num_envs),
             {
                 "policy": policy,
                 "critics": self._critics,
@@ -114,9 +95,11 @@ class Sac(Learner):
                 "optimizer": self._optimizer,
                 "replay": self._replay,
             },
+            horizon=horizon,
             total_steps=config.total_steps,
             rollout_steps=config.rollout_steps,
             seed=seed,
+            is_staggered=False,
         )
 
     def _iterate(self) -> dict[str, float]:
@@ -131,29 +114,18 @@ class Sac(Learner):
         return {"temperature": float(self._log_temperature.detach().exp())}
 
     def _cut(self) -> None:
-        """End the episodes in the replay buffer."""
         self._replay.cut()
 
     @torch.no_grad()
     def _act(self) -> None:
         """Take one step and add it to the buffer."""
-        acting = self.acting
-        seen = {
-            "observation": acting.observation,
-            "previous_action": acting.previous_action,
-            "hidden": acting.hidden,
-            "first": acting.first,
-        }
-        features, hidden = self.policy.remember(acting.observation, acting.previous_action, acting.hidden)
+        names = ("observation", "previous_action", "hidden", "first")
+        seen = {name: getattr(self, name) for name in names}
+        features, hidden = self.policy.remember(self.observation, self.previous_action, self.hidden)
         loc, scale = self.policy.policy(features)
-        taken = acting.take(torch.tanh(torch.normal(loc, scale)), hidden)
-        self._replay.add(
-            **seen,
-            action=taken.action,
-            reward=taken.step.reward * _REWARD_SCALE,
-            terminated=taken.step.terminated,
-            expired=taken.expired,
-        )
+        step, action, expired, _ = self.take(torch.tanh(torch.normal(loc, scale)), hidden)
+        reward = step.reward * _REWARD_SCALE
+        self._replay.add(**seen, action=action, reward=reward, terminated=step.terminated, expired=expired)
 
     def _learn(self) -> None:
         """Update actor, critics and temperature once."""
@@ -229,7 +201,11 @@ class Replay:
     """A ring buffer of the last steps of B environments, in contiguous tensors."""
 
     def __init__(self, size: int, env: BatchedEnv, memory_size: int, device: torch.device) -> None:
-        """Hold the last `size` steps of `env`, the same number per row, with memories of `memory_size`."""
+        """Hold the last `size` steps of `env`, the same number per row, with memories of `memory_size`.
+
+        `previous_action` and `hidden` are from before the step, zero at the start; `first` is where an episode
+        begins, and `expired` where time runs out.
+        """
         self._rows = size // env.num_envs
         self._added = 0
         place = self._rows, env.num_envs
@@ -244,13 +220,7 @@ class Replay:
         return min(self._added, self._rows)
 
     def add(self, **step: Tensor) -> None:
-        """Add a step of every environment.
-
-        Args:
-            step: observation (B, O); previous_action (B, A) and the policy's memory before the step, hidden
-                (B, M), both zero at the start; action (B, A); reward (B,); bool (B,): terminated, expired,
-                where time ran out, and first, where an episode begins.
-        """
+        """Add a step of every environment: the columns of `__init__`, (B, ...) each."""
         row = self._added % self._rows
         for name, column in self._columns.items():
             column[row] = step[name]
@@ -265,10 +235,9 @@ class Replay:
     def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
         """Draw windows of `length` consecutive steps, plus one, by torch's global generator.
 
-        Returns:
-            the columns (count, length + 1, ...), and which steps to learn from, (count, length) bool: not
-            those at the horizon, whose next observation is not kept, nor the first `burn_in` of a window
-            before an episode starts in it, which only warm up the memory.
+        Returns the columns (count, length + 1, ...), and which steps to learn from, (count, length) bool: not
+        those at the horizon, whose next observation is not kept, nor the first `burn_in` of a window before an
+        episode starts in it, which only warm up the memory.
         """
         device = self._columns["reward"].device
         oldest = self._added - len(self)

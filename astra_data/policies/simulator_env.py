@@ -25,19 +25,33 @@ RISK_WEIGHT = 4.0
 episode."""
 
 
+class WorldConfig(Config):
+    """The environment that a policy is trained in, as it is written beside the policy."""
+
+    reward: RewardSource = "abstract"
+    """Source of the reward; see `SimulatorEnv`."""
+    change_penalty: NotNegative = 0.0
+    """Subtracted from the reward of a step, multiplied by the squared change of the command."""
+    command_limit: Positive = NO_LIMIT
+    """Commands longer than this are shortened, in training and in the target; a multiple of the largest along
+    an axis."""
+    data_start_share: Share = 0.0
+    """Fraction of the episodes that start from the middle of a recorded one."""
+
+    @property
+    def limits_commands(self) -> bool:
+        """Whether commands are shortened."""
+        return self.command_limit != NO_LIMIT
+
+
 @dataclass(frozen=True)
 class DataStarts:
-    """Moments of recorded episodes to start from.
+    """N moments of recorded episodes to start from."""
 
-    Attributes:
-        state: φ(s_i), (N, X). goal: (N, G). previous_action: a_{i-1}, (N, A).
-        hidden: the grounding's memory before s_i, and its failure model's, (N, H); None where there is none.
-    """
-
-    state: Tensor
-    goal: Tensor
-    previous_action: Tensor
-    hidden: Tensor | None
+    state: Tensor  # φ(s_i), (N, X)
+    goal: Tensor  # (N, G)
+    previous_action: Tensor  # a_{i-1}, (N, A)
+    hidden: Tensor | None  # what the grounding, and its failure model, remember before s_i, (N, H), if anything
 
 
 def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent: Tensor | None) -> Tensor:
@@ -60,8 +74,6 @@ class SimulatorEnv:
     generator.
 
     Attributes:
-        latent_size: Z, of the latents in the observations; 0 where there are none.
-        parameter_count: P, of the parameters at the end of the observations; 0 where they are not shown.
         failed: which episodes failed in the last step, (B,) bool.
         penalty_scale: factor on the price of failures; 1 but where the training ramps it up.
     """
@@ -70,37 +82,21 @@ class SimulatorEnv:
         self,
         objective: Objective,
         simulator: EpisodeSimulator,
+        world: WorldConfig = WorldConfig(),  # noqa: B008 - frozen
         *,
-        reward: RewardSource = "abstract",
-        draws_failures: bool = False,
-        command_limit: float = NO_LIMIT,
-        change_penalty: float = 0.0,
         starts: DataStarts | None = None,
-        data_start_share: float = 0.0,
+        draws_failures: bool = False,
         shows_parameters: bool = False,
     ) -> None:
-        """Set the task in `simulator`.
+        """Set the task in `simulator`, raw or grounded.
 
-        Args:
-            objective: of the task.
-            simulator: raw or grounded.
-            reward: where the reward comes from.
-            draws_failures: whether episodes fail at random with the predicted probability, as judges' do.
-            command_limit: longer commands, ±1 per axis, are shortened to this.
-            change_penalty: subtracted from the reward, times the squared change of the command.
-            starts: recorded moments to start from.
-            data_start_share: share of the episodes that start from `starts`.
-            shows_parameters: end observations with the normalized parameters of a simulator that varies.
+        With `draws_failures`, episodes fail at random with the predicted probability, as judges' do; with
+        `shows_parameters`, observations end with the normalized parameters of a simulator that varies.
         """
         self.objective = objective
         self.simulator = simulator
-        self.reward = reward
-        self.draws_failures = draws_failures
+        self.world, self.starts, self.draws_failures = world, starts, draws_failures
         self.penalty_scale = 1.0
-        self.command_limit = command_limit
-        self.change_penalty = change_penalty
-        self.starts = starts
-        self.data_start_share = data_start_share
         self.device = simulator.state.device
         self.num_envs = len(simulator.state)
         self.action_size = objective.action_size
@@ -108,16 +104,16 @@ class SimulatorEnv:
         self._command = torch.zeros(self.num_envs, self.action_size, device=self.device)
         self.failed = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._shows_parameters = shows_parameters
-        shown = self._shown_parameters()
+        shown = simulator.parameters if shows_parameters else None
         self.parameter_count = 0 if shown is None else shown.shape[1]
         self.observation_size = self._observe().shape[1]
-        self.latent_size = simulator.latent_size
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Reset the rows in `mask` (B,), by default all; return observations (B, O)."""
         rows = torch.arange(self.num_envs, device=self.device) if mask is None else mask.nonzero().squeeze(1)
         if len(rows):
-            from_data = torch.rand(len(rows), device=self.device) < self.data_start_share
+            share = 0.0 if self.starts is None else self.world.data_start_share
+            from_data = torch.rand(len(rows), device=self.device) < share
             self._start_task(rows[~from_data])
             if self.starts is not None:
                 self._start_from_data(rows[from_data], self.starts)
@@ -148,7 +144,7 @@ class SimulatorEnv:
     def step(self, action: Tensor) -> Step:
         """Apply `action` (B, A), clipped to ±1 and to the command limit."""
         before = self.simulator.state
-        command = self.objective.limit_command(action, self.command_limit)
+        command = self.objective.limit_command(action, self.world.command_limit)
         after = self.simulator.step(command)
         success = self.objective.reached(after, self.goal)
         self.failed = self.objective.missed(after, self.goal)
@@ -158,42 +154,34 @@ class SimulatorEnv:
         if risk is not None and self.draws_failures:
             self.failed = self.failed | ((torch.rand_like(risk) < risk) & ~success)
         reward = self.objective.reward(before, after, self.goal, self.failed)
-        if self.reward == "priced" and risk is not None:
+        if self.world.reward == "priced" and risk is not None:
             reward = reward + self.penalty_scale * RISK_WEIGHT * self.objective.failure_reward * risk
-        if self.reward == "predicted":
+        if self.world.reward == "predicted":
             decided = success | self.failed
             own = self.objective.reward(before, after, self.goal, torch.zeros_like(decided))
             predicted = self.simulator.predicted_reward(own)
             if predicted is not None:
                 reward = torch.where(decided, reward, predicted)
-        if self.change_penalty:
-            reward = reward - self.change_penalty * (command - self._command).square().sum(-1)
+        if self.world.change_penalty:
+            reward = reward - self.world.change_penalty * (command - self._command).square().sum(-1)
             self._command = command
-        return Step(
-            observation=self._observe(),
-            reward=reward,
-            terminated=success | self.failed,
-            success=success,
-        )
+        return Step(self._observe(), reward, terminated=success | self.failed, success=success)
 
     def _observe(self) -> Tensor:
         simulator = self.simulator
         observation = policy_observation(self.objective, simulator.state, self.goal, simulator.latent)
-        shown = self._shown_parameters()
+        shown = simulator.parameters if self._shows_parameters else None
         return observation if shown is None else torch.cat([observation, shown], dim=-1)
-
-    def _shown_parameters(self) -> Tensor | None:
-        return self.simulator.parameters if self._shows_parameters else None
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
-        changes = {"command": self._command} if self.change_penalty else {}
+        changes = {"command": self._command} if self.world.change_penalty else {}
         return {"goal": self.goal} | changes | self.simulator.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
         """Continue from `state`; return the observations (B, O)."""
         self.goal = state["goal"].clone()
-        if self.change_penalty:
+        if self.world.change_penalty:
             self._command = state["command"].clone()
         self.simulator.load_state_dict(state)
         return self._observe()
@@ -230,30 +218,6 @@ _CHANGE_PENALTY = 0.02
 """Of the plus settings; recorded ants fall where commands change."""
 
 
-class WorldConfig(Config):
-    """The environment that a policy is trained in, as it is written beside the policy."""
-
-    reward: RewardSource = "abstract"
-    """Source of the reward; see `SimulatorEnv`."""
-    change_penalty: NotNegative = 0.0
-    """Subtracted from the reward of a step, multiplied by the squared change of the command."""
-    command_limit: Positive = NO_LIMIT
-    """Commands longer than this are shortened, in training and in the target; a multiple of the largest along
-    an axis."""
-    data_start_share: Share = 0.0
-    """Fraction of the episodes that start from the middle of a recorded one."""
-
-    @property
-    def prices_failures(self) -> bool:
-        """Whether it makes a difference how probably the target fails."""
-        return self.reward != "abstract"
-
-    @property
-    def limits_commands(self) -> bool:
-        """Whether commands are shortened."""
-        return self.command_limit != NO_LIMIT
-
-
 def plus(world: WorldConfig, command_limit: float) -> WorldConfig:
     """Return the plus settings of `world`: failures are priced, and changes of the command cost."""
     changes = {"reward": "priced", "change_penalty": _CHANGE_PENALTY, "command_limit": command_limit}
@@ -262,15 +226,11 @@ def plus(world: WorldConfig, command_limit: float) -> WorldConfig:
 
 @dataclass(frozen=True)
 class Simulation:
-    """The abstract simulator that a policy is trained in.
-
-    Attributes:
-        world: the environment's settings.
-        variation: ranges of the simulator's parameters, drawn for each episode.
-    """
+    """The abstract simulator that a policy is trained in."""
 
     world: WorldConfig
     variation: Variation | None = None
+    """Ranges of the simulator's parameters, drawn for each episode."""
 
 
 @torch.no_grad()
@@ -278,31 +238,22 @@ def data_starts(task: Task, world: WorldConfig, episodes: PairedEpisodes, ground
     """Return the recorded moments that episodes may start from; None unless `world` asks for them."""
     if not world.data_start_share:
         return None
-    windows, every = episodes.windows, grounding.start_stride
+    windows, every, used = episodes.windows, grounding.start_stride, _used(grounding, world)
     moments = windows.mask[:, ::every].bool()
-    hidden = _remembered(task, _used(grounding, world), episodes, every)
-    return DataStarts(
-        state=windows.state[:, ::every][moments],
-        goal=windows.goal[:, ::every][moments],
-        previous_action=windows.previous_action[:, ::every][moments],
-        hidden=None if hidden is None else hidden[moments],
-    )
+    hidden = used.hidden_before(windows, every)
+    if hidden is not None and isinstance(used, HistoryGrounding) and used.failures is not None:
+        averages = averages_before(task, used, used.failures, episodes)
+        hidden = torch.cat([hidden, averages[:, ::every]], dim=-1)
+    columns = (windows.state, windows.goal, windows.previous_action)
+    state, goal, action = (values[:, ::every][moments] for values in columns)
+    return DataStarts(state, goal, action, None if hidden is None else hidden[moments])
 
 
 def _used(grounding: Grounding, world: WorldConfig) -> Grounding:
-    """Return what `world` makes use of in a grounding."""
-    if world.prices_failures or not isinstance(grounding, HistoryGrounding):
+    """Return what `world` makes use of in a grounding: its failure model only where failures have a price."""
+    if world.reward != "abstract" or not isinstance(grounding, HistoryGrounding):
         return grounding
     return replace(grounding, failures=None)
-
-
-def _remembered(task: Task, grounding: Grounding, episodes: PairedEpisodes, every: int) -> Tensor | None:
-    """Return what the grounding, and its failure model, remember before each `every`-th recorded step."""
-    hidden = grounding.hidden_before(episodes.windows, every)
-    if hidden is None or not isinstance(grounding, HistoryGrounding) or grounding.failures is None:
-        return hidden
-    averages = averages_before(task, grounding, grounding.failures, episodes)
-    return torch.cat([hidden, averages[:, ::every]], dim=-1)
 
 
 def training_env(
@@ -311,30 +262,13 @@ def training_env(
     grounding: Grounding,
     *,
     num_envs: int,
-    device: str,
+    device: str = "cpu",
     starts: DataStarts | None = None,
     shows_parameters: bool = False,
 ) -> SimulatorEnv:
     """Build the environment: the task in the raw, varied or grounded simulator.
 
-    Args:
-        task: the task.
-        simulation: the environment's settings, and what varies.
-        grounding: that the simulator is corrected by.
-        num_envs: episodes side by side.
-        device: torch device.
-        starts: recorded moments, see `data_starts`; without them, all episodes start where the task does.
-        shows_parameters: end observations with the normalized parameters of a simulator that varies.
+    Without `starts`, see `data_starts`, all episodes start where the task does.
     """
-    world = simulation.world
-    used = _used(grounding, world)
-    return SimulatorEnv(
-        task.objective,
-        used.simulator(task, num_envs, device, variation=simulation.variation),
-        reward=world.reward,
-        command_limit=world.command_limit,
-        change_penalty=world.change_penalty,
-        starts=starts,
-        data_start_share=world.data_start_share if starts else 0.0,
-        shows_parameters=shows_parameters,
-    )
+    simulator = _used(grounding, simulation.world).simulator(task, num_envs, device, variation=simulation.variation)
+    return SimulatorEnv(task.objective, simulator, simulation.world, starts=starts, shows_parameters=shows_parameters)

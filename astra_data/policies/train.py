@@ -24,7 +24,7 @@ from astra_data.core.seeding import derive
 from astra_data.grounding.files import grounding_at
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.simulator import Grounding
-from astra_data.policies.episodes import ObservedTargetEnv, Reached, TargetStarts, reached_in_own_world
+from astra_data.policies.episodes import ObservedTargetEnv, Reached, reached_in_own_world
 from astra_data.policies.learner import FAST, Learner, is_mastered, lately, penalty_scale
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, PolicyShape, SoftActor
 from astra_data.policies.ppo import Ppo, PpoConfig
@@ -186,7 +186,7 @@ class InSimulator:
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
         env, simulation = self.world(training)
-        memory_size = 0 if env.latent_size else training.config.memory_size
+        memory_size = 0 if env.simulator.latent_size else training.config.memory_size
         episodes = training.episodes
         policy, curve = train_in(env, training.config, memory_size, training, training.simulated_steps)
         return PolicyFile(policy, simulation, episodes.reference, episodes.content_hash), curve
@@ -268,7 +268,7 @@ def optimize(
         training.progress(learner.share, note)
         if logbook.is_due or learner.done:
             logbook.keep({"learner": learner.state_dict(), "world": env.state_dict()})
-    taken, seconds = learner.steps - first, learner.acting.world_seconds
+    taken, seconds = learner.steps - first, learner.world_seconds
     return {
         "steps_per_second": learner.steps / stopwatch.seconds,
         "simulator_steps_per_second": taken / seconds if taken else None,
@@ -307,7 +307,7 @@ class InTarget:
             training.task,
             config.num_envs,
             observed=self.observed,
-            starts=TargetStarts.of(episodes),
+            starts=(episodes.steps(episodes.target_state).cpu(), episodes.steps(episodes.windows.goal).cpu()),
             data_start_share=config.data_start_share,
             device=training.device,
             num_threads=training.num_threads,

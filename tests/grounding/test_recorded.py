@@ -1,7 +1,6 @@
-import pytest
 import torch
 
-from astra_data.grounding.paired_episodes import Recorded, draw_steps
+from astra_data.grounding.paired_episodes import draw_steps
 
 LENGTHS = torch.tensor([3, 10, 25])
 
@@ -32,29 +31,3 @@ def test_windows_are_steps_in_a_row_inside_their_episodes() -> None:
     # Of a window that was drawn across an end only the part inside counts: one stretch of at least a step.
     assert drawn.any(dim=1).all()
     assert (drawn.int().diff(dim=1).abs().sum(1) <= 1).all()
-
-
-@pytest.fixture
-def recorded() -> Recorded:
-    """Return episodes whose observation is 100 times the episode plus the step."""
-    step = (torch.arange(25.0) + 100 * torch.arange(3.0)[:, None]).unsqueeze(-1)
-    return Recorded(observation=step, previous_action=-step, action=2 * step, lengths=LENGTHS)
-
-
-@pytest.mark.parametrize("burn_in", [0, 3])
-def test_columns_belong_together_and_first_steps_fill_the_memory(recorded: Recorded, burn_in: int) -> None:
-    torch.manual_seed(1)
-    columns, learned = recorded.windows(3_000, 8, burn_in)
-    torch.manual_seed(1)
-    episodes, steps, drawn = draw_steps(LENGTHS, 3_000, 8)
-    seen = columns["observation"].squeeze(-1)
-    assert torch.equal(seen, 100.0 * episodes + steps)
-    assert torch.equal(columns["previous_action"], -columns["observation"])
-    assert torch.equal(columns["action"], 2 * columns["observation"])
-    for window in range(3_000):
-        episode, begin = int(episodes[window]), int(steps[window, 0])
-        for place in range(8):
-            is_real = begin + place < int(LENGTHS[episode])
-            is_filled = place >= burn_in or begin == 0
-            assert bool(learned[window, place]) == (is_real and is_filled and bool(drawn[window, place]))
-    assert learned.any()

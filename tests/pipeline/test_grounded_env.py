@@ -79,11 +79,11 @@ def test_direct_transfer_is_the_raw_simulator_driven_in_its_units(run: Path) -> 
 
 def test_the_row_and_the_recipe_give_the_defaults_and_keywords_change_them(run: Path) -> None:
     plain, predicted, plus = (world_of(run, row) for row in ("nas", "astra", "astra_plus"))
-    assert (plain.reward, predicted.reward, plus.reward) == ("abstract", "predicted", "priced")
-    assert (plain.change_penalty, plus.change_penalty) == (0.0, 0.02)
-    assert plain.data_start_share == plus.data_start_share == 0.0 and plain.starts is None
+    assert (plain.world.reward, predicted.world.reward, plus.world.reward) == ("abstract", "predicted", "priced")
+    assert (plain.world.change_penalty, plus.world.change_penalty) == (0.0, 0.02)
+    assert plain.world.data_start_share == plus.world.data_start_share == 0.0 and plain.starts is None
     changed = world_of(run, "nas", data_start_share=1.0)
-    assert changed.data_start_share == 1.0 and changed.starts is not None
+    assert changed.world.data_start_share == 1.0 and changed.starts is not None
 
 
 def test_it_is_the_environment_that_the_row_was_trained_in(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

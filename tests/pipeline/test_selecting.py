@@ -12,7 +12,6 @@ from astra_data.core.durable import held
 from astra_data.core.errors import BadInputError
 from astra_data.methods import grounded_as
 from astra_data.pipeline.selecting import select
-from astra_data.policies.episodes import Judge
 
 pytestmark = pytest.mark.usefixtures("quick_failures")
 
@@ -37,7 +36,7 @@ def test_the_command_is_a_door_to_the_stage(folder: Path) -> None:
 
 
 def test_the_recipe_says_how_unless_the_call_does(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
+    monkeypatch.setattr("astra_data.pipeline.stages.select.judged_success", lambda *_: 0.5)
     assert select(folder).episodes == 100
     recipe = folder / "recipe.json"
     recipe.write_text(json.dumps(json.loads(recipe.read_text()) | {"select": {"episodes": 9}}))
@@ -48,11 +47,11 @@ def test_the_recipe_says_how_unless_the_call_does(folder: Path, monkeypatch: pyt
 def test_a_choice_that_is_there_is_kept_and_another_set_aside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
-    def success(self: Judge, policy: object, episodes: int, seed: int) -> float:
+    def success(task: object, judge: object, policy: object, episodes: int, seed: int) -> float:
         asked.append(seed)
         return 0.5
 
-    monkeypatch.setattr(Judge, "success", success)
+    monkeypatch.setattr("astra_data.pipeline.stages.select.judged_success", success)
     first = select(folder, rows=["nas"], episodes=5)
     assert select(folder, rows=["nas"], episodes=5) == first and len(asked) == 6
     select(folder, rows=["nas"], episodes=6)
@@ -64,7 +63,7 @@ def test_a_choice_that_is_there_is_kept_and_another_set_aside(folder: Path, monk
 
 
 def test_a_choice_among_other_policies_is_made_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Judge, "success", lambda *_: 0.5)
+    monkeypatch.setattr("astra_data.pipeline.stages.select.judged_success", lambda *_: 0.5)
     assert len(select(folder, rows=["nas"]).candidates) == 3
     shutil.rmtree(folder / "train/nas/seed_2")
     assert len(select(folder, rows=["nas"]).candidates) == 2

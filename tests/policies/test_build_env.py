@@ -49,7 +49,7 @@ def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, gr
         world = built(WorldConfig(), used)
         assert type(world.simulator) is kind
         assert type(world.simulator.simulator) is PointMass
-        assert (world.reward, world.num_envs, world.data_start_share) == ("abstract", 4, 0.0)
+        assert (world.world, world.num_envs) == (WorldConfig(), 4)
         drawn = torch.get_rng_state()
         world.step(torch.zeros(4, 2))
         assert torch.equal(torch.get_rng_state(), drawn)
@@ -62,8 +62,7 @@ def test_plus_settings_reach_the_environment_and_leave_the_rest(episodes: Paired
     assert settings.model_dump() == plain.model_dump() | changes
     starts = data_starts(TASK, settings, episodes, NO_GROUNDING)
     world = built(settings, NO_GROUNDING, starts=starts)
-    assert {name: getattr(world, name) for name in changes} == changes
-    assert world.data_start_share == 0.3
+    assert world.world == settings
 
 
 @pytest.mark.parametrize(("reward", "prices"), [("abstract", False), ("predicted", True), ("priced", True)])

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import derive
+from astra_data.grounding.paired_episodes import draw_steps
 from astra_data.policies import iql as module
 from astra_data.policies.iql import Experience, Iql, IqlConfig, transitions
 from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy
@@ -133,7 +134,7 @@ def test_a_state_is_worth_the_expectile_of_what_its_actions_pay(
     monkeypatch.setattr(module, "_TARGET_RATE", 0.2)
     settings = config(expectile=expectile, reward_scale=1.0, policy_updates=0, critic_updates=600)
     iql = trained(learner(experience, settings))
-    assert float(iql.values(torch.zeros(1))) == pytest.approx(expectile, abs=0.03)
+    assert float(iql._critics.value(torch.zeros(1)).detach()) == pytest.approx(expectile, abs=0.03)
 
 
 def test_returns_are_those_of_a_plain_loop() -> None:
@@ -153,7 +154,7 @@ def test_returns_are_those_of_a_plain_loop() -> None:
             assert torch.equal(table.next_observation[row], experience.next_observation[episode, end - 1])
             assert bool(table.terminated[row]) == bool(experience.terminated[episode, end - 1])
             row += 1
-    assert row == len(table)
+    assert row == len(table.reward)
 
 
 def test_updates_are_those_of_the_printed_losses(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,21 +169,22 @@ def test_updates_are_those_of_the_printed_losses(monkeypatch: pytest.MonkeyPatch
         pair = torch.cat([observation, action], dim=-1)
         with torch.no_grad():
             first, second = (network(pair).squeeze(-1) for network in iql._critics.slow_action_values)
-        return torch.minimum(first, second) - iql.values(observation)
+        return torch.as_tensor(torch.minimum(first, second) - iql._critics.value(observation).squeeze(-1).detach())
 
     table = transitions(experience, settings)
     torch.manual_seed(derive(2, "update 0"))
-    rows = torch.randint(len(table), (256,))
+    rows = torch.randint(len(table.reward), (256,))
     ahead = advantage(table.observation[rows], table.action[rows])
     assert (ahead > 0).any() and (ahead < 0).any()
     expected = torch.where(ahead > 0, 0.8, 0.2) * ahead.square()
     assert iql.iterate()["value"] == pytest.approx(float(expected.mean()), rel=1e-4)
     torch.manual_seed(derive(2, "update 1"))
-    columns, learned = experience.windows(16, 16, 4)
-    weight = (3.0 * advantage(columns["observation"], columns["action"])).exp().clamp_max(100.0)
+    steps, learned = experience.draw(16, 16, 4)
+    observation, action = experience.observation[steps], experience.action[steps]
+    weight = (3.0 * advantage(observation, action)).exp().clamp_max(100.0)
     with torch.no_grad():
-        normal = torch.distributions.Normal(*iql.policy.policy(columns["observation"]))
-        log_prob = normal.log_prob(columns["action"]).sum(-1)
+        normal = torch.distributions.Normal(*iql.policy.policy(observation))
+        log_prob = normal.log_prob(action).sum(-1)
     expected = -(weight * log_prob)[learned].mean()
     assert iql.iterate()["policy"] == pytest.approx(float(expected), rel=1e-4)
     gradients = [part.grad.flatten() for part in iql.policy.parameters() if part.grad is not None]
@@ -195,7 +197,7 @@ def test_settings_and_episodes_that_leave_nothing_to_learn_from_are_told() -> No
     cut = constant_reward(terminated=False)
     with pytest.raises(BadInputError, match=r"at least 4 steps \(return_steps\).*the longest has 3"):
         transitions(cut, config(return_steps=4))
-    assert len(transitions(constant_reward(terminated=True), config(return_steps=4))) == 24
+    assert len(transitions(constant_reward(terminated=True), config(return_steps=4)).reward) == 24
 
 
 def test_a_training_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,3 +228,16 @@ def test_the_policys_learning_rate_falls_along_a_half_cosine() -> None:
         iql.iterate()
         rates.append(iql._optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-2 * share for share in (1.0, 0.85355, 0.5, 0.14645)], rel=1e-3)
+
+
+@pytest.mark.parametrize("burn_in", [0, 3])
+def test_the_first_steps_of_a_window_fill_the_memory(burn_in: int) -> None:
+    column, lengths = torch.zeros(3, 25, 1), torch.tensor([3, 10, 25])
+    experience = Experience(column, column, column, lengths, column, column, column)
+    torch.manual_seed(1)
+    (episodes, steps), learned = experience.draw(3_000, 8, burn_in)
+    torch.manual_seed(1)
+    expected_episodes, expected_steps, drawn = draw_steps(lengths, 3_000, 8)
+    assert torch.equal(episodes, expected_episodes) and torch.equal(steps, expected_steps)
+    is_filled = (torch.arange(8) >= burn_in) | (steps[:, :1] == 0)
+    assert torch.equal(learned, drawn & (steps < lengths[episodes]) & is_filled) and learned.any()

@@ -6,8 +6,8 @@ from rail_run import make_rail_run
 from small_cart import TASK
 
 from astra_data.grounding.files import load_grounding
+from astra_data.grounding.simulator import FittedGrounding
 from astra_data.policies import episodes as judging
-from astra_data.policies.episodes import Judge
 from astra_data.policies.running_policy import PolicyFile, RunningPolicy, running
 from astra_data.policies.simulator_env import SimulatorEnv
 
@@ -20,18 +20,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def judge(folder: Path) -> Judge:
-    made = load_grounding(folder / "ground/nas/seed_0/grounding.safetensors")
-    return Judge(TASK, made)
+def judge(folder: Path) -> FittedGrounding:
+    return load_grounding(folder / "ground/nas/seed_0/grounding.safetensors")
 
 
 @pytest.fixture
-def policy(folder: Path, judge: Judge) -> RunningPolicy:
-    return running(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge.grounding)
+def policy(folder: Path, judge: FittedGrounding) -> RunningPolicy:
+    return running(TASK, PolicyFile.load(folder / "train/nas/seed_0/policy.safetensors"), judge)
 
 
 def test_failures_are_drawn_in_the_whole_simulator_of_the_grounding(
-    judge: Judge, policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch
+    judge: FittedGrounding, policy: RunningPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = list[tuple[SimulatorEnv, int, int]]()
 
@@ -41,10 +40,10 @@ def test_failures_are_drawn_in_the_whole_simulator_of_the_grounding(
 
     monkeypatch.setattr(judging, "in_simulator", seen)
     with pytest.raises(StopIteration):
-        judge.success(policy, 5, 7)
+        judging.judged_success(TASK, judge, policy, 5, 7)
     world, horizon, seed = made[0]
     assert (world.num_envs, horizon, seed) == (5, TASK.objective.horizon, 7)
     used: Any = world.simulator
-    whole: Any = judge.grounding
+    whole: Any = judge
     assert world.draws_failures and whole.failures is not None and whole.scatter_model is not None
     assert (used.failures, used.scatter_model) == (whole.failures, whole.scatter_model)

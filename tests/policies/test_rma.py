@@ -59,7 +59,7 @@ def test_the_student_acts_and_only_its_estimate_learns() -> None:
     step = world.step
     world.step = lambda action: (acted.append(action.clone()), step(action))[1]  # type: ignore[method-assign, func-returns-value]
     before = {name: value.clone() for name, value in learner.student.state_dict().items()}
-    first_told, first_hidden = learner.acting.observation.clone(), learner.acting.hidden.clone()
+    first_told, first_hidden = learner.observation.clone(), learner.hidden.clone()
     with torch.no_grad():
         features, _ = learner.student.remember(first_told[:, :1], torch.zeros(4, 1), first_hidden)
         expected, _ = learner.student.policy(features)

@@ -9,9 +9,9 @@ from constant_policy import Constant
 from small_cart import TASK, Last
 
 from astra_data.grounding.simulator import NO_GROUNDING
-from astra_data.policies.episodes import RecordedRange, in_simulator, own_world, started
+from astra_data.policies.episodes import RecordedRange, in_simulator, started
 from astra_data.policies.running_policy import PolicyFile, UserPolicy, running
-from astra_data.policies.simulator_env import Simulation, WorldConfig
+from astra_data.policies.simulator_env import Simulation, WorldConfig, training_env
 
 SIMULATION = Simulation(WorldConfig())
 SPEED = 4.0
@@ -23,7 +23,7 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
     begin = partial(started, acting, acting.act_in_simulator)
     asked = RecordedRange(torch.tensor([0.0]), torch.tensor([2.0]), TASK.limits)
     runs = [
-        in_simulator(own_world(TASK, simulation, NO_GROUNDING, 9), begin, 40, seed, asked if not seed else None)
+        in_simulator(training_env(TASK, simulation, NO_GROUNDING, num_envs=9), begin, 40, seed, None if seed else asked)
         for simulation in (SIMULATION, Simulation(WorldConfig(), TASK.varied.randomized))
         for seed in (0, 1)
     ]
@@ -39,6 +39,6 @@ def test_the_goals_are_those_of_the_seed_in_any_simulator() -> None:
 
 
 def test_where_it_is_to_last_an_episode_succeeds_in_its_last_step() -> None:
-    world = own_world(replace(TASK, objective=Last(horizon=6)), SIMULATION, NO_GROUNDING, 3)
+    world = training_env(replace(TASK, objective=Last(horizon=6)), SIMULATION, NO_GROUNDING, num_envs=3)
     found, _ = in_simulator(world, lambda goal: lambda state, goal: torch.full_like(goal, -0.6), 6, seed=0)
     assert found.success == [1.0] * 3 and found.steps == [6] * 3

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.policies.episodes import ObservedTargetEnv, TargetStarts
+from astra_data.policies.episodes import ObservedTargetEnv
 from astra_data.policies.networks import ActorCritic, ActorCriticShape
 from astra_data.policies.running_policy import Observed, RunningPolicy
 from astra_data.robots.registry import TASKS
@@ -10,7 +10,7 @@ from astra_data.robots.registry import TASKS
 TASK = TASKS["antmaze-umaze"]
 
 
-def recorded() -> TargetStarts:
+def recorded() -> tuple[Tensor, Tensor]:
     """Return moments of two episodes that walked, with goals of their own."""
     env = TASK.target(2, seed=4, num_threads=1)
     env.reset()
@@ -18,7 +18,7 @@ def recorded() -> TargetStarts:
     for _ in range(5):
         states.append(env.state)
         env.step(torch.tensor([[1.0, 0.0], [0.0, -1.0]]))
-    return TargetStarts(torch.cat(states), torch.tensor([[3.0, -4.0], [-4.0, 1.0]]).repeat(5, 1))
+    return torch.cat(states), torch.tensor([[3.0, -4.0], [-4.0, 1.0]]).repeat(5, 1)
 
 
 def world(observed: Observed = "full", share: float = 0.0, count: int = 4, threads: int = 1) -> ObservedTargetEnv:
@@ -55,7 +55,7 @@ def test_going_on_from_a_saved_state_is_exact(threads: int) -> None:
 
 
 def test_all_of_the_state_is_observed_in_full_and_the_planar_part_otherwise() -> None:
-    state = recorded().state[7]
+    state = recorded()[0][7]
     goal = torch.tensor([4.0, 0.0])
     shown: dict[Observed, list[int]] = {"abstract": [0, 1, 15, 16], "full": list(range(29))}
     for observed, entries in shown.items():

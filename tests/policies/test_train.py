@@ -79,10 +79,9 @@ class Counting(Ppo):
     """PPO that does nothing but count to ten, and notes the scale of penalties and its pace as it goes."""
 
     def __init__(self, env: ToyWorld, figures: Callable[[int], dict[str, float]]) -> None:
-        self.env, self.figures, self.steps, self.total_steps = env, figures, 0, 10
+        self.env, self.told, self.steps, self.total_steps = env, figures, 0, 10
         self.share, self.pace = 0.0, 1.0
         self.scales, self.paces = list[float](), list[float]()
-        self.acting: Any = self
         self.world_seconds = 0.5
 
     def iterate(self) -> dict[str, float]:
@@ -90,7 +89,7 @@ class Counting(Ppo):
         self.paces.append(self.pace)
         self.steps += 1
         self.share = min(1.0, self.share + self.pace / self.total_steps)
-        return self.figures(self.steps)
+        return self.told(self.steps)
 
     def state_dict(self) -> dict[str, Any]:
         return {"steps": torch.tensor(self.steps), "share": torch.tensor(self.share, dtype=torch.double)}

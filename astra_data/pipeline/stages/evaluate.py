@@ -27,9 +27,16 @@ from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, 
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.policies.episodes import Act, Begin, RecordedRange, in_simulator, in_target, own_world, started
+from astra_data.policies.episodes import (
+    Act,
+    Begin,
+    RecordedRange,
+    in_simulator,
+    in_target,
+    started,
+)
 from astra_data.policies.running_policy import POLICY, EncoderKind, PolicyFile, UserPolicy, running
-from astra_data.policies.simulator_env import SimulatorEnv
+from astra_data.policies.simulator_env import SimulatorEnv, training_env
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES
 from astra_data.robots.registry import task_named
 from astra_data.worlds.task import Task
@@ -189,7 +196,7 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
     identity = {"dataset_version": trained.dataset, "dataset_hash": trained.content_hash}
     simulators = {}
     if trained.simulation is not None:
-        simulators["simulated"] = own_world(task, trained.simulation, grounding, config.episodes)
+        simulators["simulated"] = training_env(task, trained.simulation, grounding, num_envs=config.episodes)
     return _Row(
         partial(started, source, source.act_in_simulator),
         robots,

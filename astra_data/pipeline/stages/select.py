@@ -18,7 +18,7 @@ from astra_data.core.provenance import origin
 from astra_data.core.seeding import derive
 from astra_data.grounding.files import GROUNDING, grounding_at, load_grounding
 from astra_data.methods import grounded_as, method_named
-from astra_data.policies.episodes import Judge
+from astra_data.policies.episodes import judged_success
 from astra_data.policies.running_policy import POLICY, PolicyFile, RunningPolicy, running
 from astra_data.reports.choice import FOLDER, SELECTED, Candidate, Judged, select_page
 from astra_data.reports.runs import Reported
@@ -145,8 +145,7 @@ def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Pat
         begun = folder / _BEGUN
         known: dict[str, float] = json.loads(begun.read_text()) if begun.is_file() else {}
         for bench in contests:
-            groundings = {seed: root / key / GROUNDING for seed, key in bench.judges.items()}
-            judges = {seed: Judge(task_named(recipe.task), load_grounding(file)) for seed, file in groundings.items()}
+            judges = {seed: load_grounding(root / key / GROUNDING) for seed, key in bench.judges.items()}
             for entry in bench.entries:
                 policy, success = entry.load(root, recipe.task), {}
                 for other in bench.judges:
@@ -155,7 +154,7 @@ def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Pat
                     read = f"{made_from[entry.policy]}/{made_from[bench.judges[other]]}"
                     if read not in known:
                         drawn = derive(other, f"judged: {entry.seed}")
-                        known[read] = judges[other].success(policy, config.episodes, drawn)
+                        known[read] = judged_success(policy.task, judges[other], policy, config.episodes, drawn)
                     success[other] = known[read]
                 write_file(begun, json.dumps(known))
                 found.append(Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success))

@@ -11,7 +11,7 @@ from astra_data.core.durable import file_digest
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.pipeline.stages.select import SelectConfig, benches, judge_of, select
-from astra_data.policies.episodes import Judge
+from astra_data.policies.episodes import judged_success
 from astra_data.reports.choice import Judged, read_judged
 from astra_data.reports.runs import Reported
 
@@ -58,11 +58,11 @@ def test_each_policy_is_judged_by_the_groundings_of_other_seeds(root: Path) -> N
 def test_who_judges_whom_with_what_drawn_where(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def success(self: Judge, policy: Any, episodes: int, seed: int) -> float:
+    def success(task: object, judge: object, policy: Any, episodes: int, seed: int) -> float:  # noqa: ANN401
         asked.append((policy, episodes, seed))
         return len(asked) / 100
 
-    monkeypatch.setattr(Judge, "success", success)
+    monkeypatch.setattr("astra_data.pipeline.stages.select.judged_success", success)
     found = judged(root, episodes=7)
     assert {episodes for _, episodes, _ in asked} == {7}
     # In the order of rows, seeds and judges; rows of one seed meet the same starts and goals.
@@ -91,16 +91,16 @@ def test_the_artifact_names_all_that_it_was_made_from(root: Path) -> None:
 
 
 def test_an_interrupted_choice_goes_on_with_the_next_policy(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, original, asked = judged(root), Judge.success, []
+    whole, asked = judged(root), list[object]()
     shutil.rmtree(root / "select")
 
-    def success(self: Judge, *given: Any) -> float:
+    def success(*given: Any) -> float:  # noqa: ANN401
         asked.append(given)
         if len(asked) == 6:
             raise KeyboardInterrupt
-        return original(self, *given)
+        return judged_success(*given)
 
-    monkeypatch.setattr(Judge, "success", success)
+    monkeypatch.setattr("astra_data.pipeline.stages.select.judged_success", success)
     with pytest.raises(KeyboardInterrupt):
         judged(root)
     assert not (root / "select").exists()
@@ -112,13 +112,13 @@ def test_an_interrupted_choice_goes_on_with_the_next_policy(root: Path, monkeypa
 def test_another_policy_is_judged_anew_after_an_interruption(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
-    def success(self: Judge, policy: object, episodes: int, seed: int) -> float:
+    def success(task: object, judge: object, policy: object, episodes: int, seed: int) -> float:
         asked.append(seed)
         if len(asked) == 3:
             raise KeyboardInterrupt
         return 0.5
 
-    monkeypatch.setattr(Judge, "success", success)
+    monkeypatch.setattr("astra_data.pipeline.stages.select.judged_success", success)
     with pytest.raises(KeyboardInterrupt):
         judged(root)
     first, second = (root / f"train/direct_transfer/seed_{seed}" for seed in (0, 1))
