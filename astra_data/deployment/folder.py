@@ -148,9 +148,7 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
 
 
 def describe(
-    deployed: RunningPolicy,
-    parts: Mapping[str, int],
-    recorded: tuple[Sequence[float], Sequence[float]] | None = None,
+    deployed: RunningPolicy, parts: Mapping[str, int], recorded: tuple[Sequence[float], Sequence[float]] | None = None
 ) -> dict[str, Any]:
     """Return what one has to know to run a policy whose hidden state has `parts` of these sizes.
 

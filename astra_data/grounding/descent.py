@@ -85,12 +85,7 @@ class Descent:
     """
 
     def __init__(
-        self,
-        model: nn.Module,
-        config: DescentConfig,
-        *,
-        checkpoint: Path | None = None,
-        weight_decay: float = 0.0,
+        self, model: nn.Module, config: DescentConfig, *, checkpoint: Path | None = None, weight_decay: float = 0.0
     ) -> None:
         """Start, or resume from `checkpoint` if it exists.
 

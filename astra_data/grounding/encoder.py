@@ -206,8 +206,7 @@ class _Recurrence(torch.autograd.Function):
         of_gates, of_state = torch.empty_like(by_gates), torch.empty_like(before)
         later = torch.zeros_like(gradient[0])
         steps = zip(
-            *(values.unbind() for values in (gradient, by_gates, update, keep, of_gates, of_state)),
-            strict=True,
+            *(values.unbind() for values in (gradient, by_gates, update, keep, of_gates, of_state)), strict=True
         )
         for now, by_gate, share, kept, of_gate, of_this in reversed(list(steps)):
             torch.add(later, now, out=of_this)

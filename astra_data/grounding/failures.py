@@ -373,13 +373,7 @@ class _Candidate:
 
     @classmethod
     def of(
-        cls,
-        task: Task,
-        grounding: Grounding,
-        training: PairedEpisodes,
-        inputs: Tensor,
-        *,
-        sees_latent: bool,
+        cls, task: Task, grounding: Grounding, training: PairedEpisodes, inputs: Tensor, *, sees_latent: bool
     ) -> "_Candidate":
         """Return the candidate; `inputs` (E, T, I) end with the latent."""
         untrained = _untrained(task, grounding, training, sees_latent=sees_latent)
@@ -551,11 +545,7 @@ def failure_skill(
         "auc": auc,
         "brier_skill": float(1 - np.square(predicted - happened).mean() / usual) if usual else None,
         "reliability": [
-            [
-                float(predicted[bins == one].mean()),
-                float(happened[bins == one].mean()),
-                int((bins == one).sum()),
-            ]
+            [float(predicted[bins == one].mean()), float(happened[bins == one].mean()), int((bins == one).sum())]
             for one in np.unique(bins)
         ],
     }

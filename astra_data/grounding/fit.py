@@ -19,13 +19,7 @@ from astra_data.grounding.descent import Descent, DescentConfig, WindowedConfig
 from astra_data.grounding.encoder import Encoder, HistoryEncoder
 from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
 from astra_data.grounding.history import HistoryGrounding
-from astra_data.grounding.model import (
-    GroundingModel,
-    GroundingShape,
-    LossWeights,
-    recorded_rewards,
-    telemetry,
-)
+from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, recorded_rewards, telemetry
 from astra_data.grounding.paired_episodes import PairedEpisodes
 from astra_data.grounding.scatter import fit_scatter
 from astra_data.grounding.simulator import FittedGrounding
@@ -106,8 +100,7 @@ class HistoryFit:
     def weights(self, config: GroundConfig) -> LossWeights:
         """Return the weights of the losses."""
         return LossWeights(
-            latent=config.latent_weight if self.latent else 0.0,
-            reward=config.reward_weight if self.reward else 0.0,
+            latent=config.latent_weight if self.latent else 0.0, reward=config.reward_weight if self.reward else 0.0
         )
 
     def __call__(self, fitting: Fitting) -> tuple[HistoryGrounding, dict[str, Any]]:

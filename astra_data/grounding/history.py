@@ -191,10 +191,7 @@ class HistoryGrounding(FittedGrounding):
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return weights and sizes."""
         tensors = self.model.state_dict()
-        metadata: dict[str, Any] = {
-            "shape": asdict(self.model.shape),
-            "fails_at_walls": self.fails_at_walls,
-        }
+        metadata: dict[str, Any] = {"shape": asdict(self.model.shape), "fails_at_walls": self.fails_at_walls}
         if self.model.shape.encoder == HistoryEncoder.kind:
             del metadata["shape"]["encoder"]
         for part, model in ((_FAILURES, self.failures), (_SCATTER, self.scatter_model)):

@@ -12,14 +12,7 @@ from torch import Tensor, nn
 
 from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.encoder import (
-    ENCODERS,
-    HistoryEncoder,
-    PositionFeatures,
-    add_scales,
-    mlp,
-    take_scales,
-)
+from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, add_scales, mlp, take_scales
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
 _BALL_M = 0.1

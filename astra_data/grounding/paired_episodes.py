@@ -98,10 +98,7 @@ def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor
     return episodes[:, None], steps, (steps >= drawn[:, None]) & (steps < drawn[:, None] + length)
 
 
-_COLUMNS = (
-    *(STATE, ACTION, TERMINATED),
-    *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE),
-)
+_COLUMNS = (*(STATE, ACTION, TERMINATED), *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE, ABSTRACT_SIMULATED_NEXT_STATE))
 
 
 @dataclass(frozen=True)

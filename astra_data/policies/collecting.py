@@ -297,14 +297,7 @@ def suboptimal_by_ppo(
 
 
 def suboptimal_by_sac(
-    task: Task,
-    *,
-    steps: int,
-    episode_steps: int,
-    seed: int,
-    folder: Path,
-    num_threads: int | None,
-    progress: Progress,
+    task: Task, *, steps: int, episode_steps: int, seed: int, folder: Path, num_threads: int | None, progress: Progress
 ) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory by SAC in the target, on its full state.
 

@@ -40,9 +40,7 @@ class PolicyShape:
         if not self.memory_size:
             return None
         return HistoryEncoder(
-            self.observation_size + self.action_size,
-            embedding_size=self.embedding_size,
-            latent_size=self.memory_size,
+            self.observation_size + self.action_size, embedding_size=self.embedding_size, latent_size=self.memory_size
         )
 
 

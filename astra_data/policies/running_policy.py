@@ -289,8 +289,7 @@ class PolicyFile:
             if recorded := metadata.get("simulation"):
                 variation = recorded["variation"]
                 simulation = Simulation(
-                    WorldConfig(**recorded["world"]),
-                    Variation.of_json(variation) if variation else None,
+                    WorldConfig(**recorded["world"]), Variation.of_json(variation) if variation else None
                 )
             read = cls(policy, simulation, metadata["dataset"], metadata["hash"], metadata["observed"])
         policy.to(device).requires_grad_(False)
@@ -324,10 +323,7 @@ def _put_together(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> Polic
 
 
 def running(
-    task: Task,
-    trained: PolicyFile,
-    grounding: Grounding = NO_GROUNDING,
-    target_encoder: TargetEncoder | None = None,
+    task: Task, trained: PolicyFile, grounding: Grounding = NO_GROUNDING, target_encoder: TargetEncoder | None = None
 ) -> RunningPolicy:
     """Return the policy, ready to be started; latents, if any, come from ψ^t, or without it from ψ^s."""
     world = trained.simulation.world if trained.simulation else WorldConfig()

@@ -82,7 +82,7 @@ class SimulatorEnv:
         self,
         objective: Objective,
         simulator: EpisodeSimulator,
-        world: WorldConfig = WorldConfig(),  # noqa: B008 - frozen
+        world: WorldConfig = WorldConfig(),
         *,
         starts: DataStarts | None = None,
         draws_failures: bool = False,

@@ -215,11 +215,7 @@ class InSimulator:
 
 
 def train_in(
-    env: ResumableEnv,
-    config: PpoTrainConfig | SacTrainConfig,
-    memory_size: int,
-    training: Training,
-    horizon: int,
+    env: ResumableEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training, horizon: int
 ) -> tuple[Policy, dict[str, Any]]:
     """Train a new policy in `env`; return it and its learning curve.
 
@@ -232,10 +228,7 @@ def train_in(
 
 
 def optimize(
-    learner: Learner,
-    env: ResumableEnv,
-    training: Training,
-    checkpoint_name: str = CHECKPOINT,
+    learner: Learner, env: ResumableEnv, training: Training, checkpoint_name: str = CHECKPOINT
 ) -> dict[str, Any]:
     """Train to the end, from the checkpoint in the folder if there is one; return the learning curve.
 

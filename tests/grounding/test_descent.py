@@ -102,8 +102,7 @@ def test_it_waits_for_a_lower_error_and_returns_to_the_lowest(
 
 
 @pytest.mark.parametrize(
-    ("steps", "updates", "expected"),
-    [(100, None, 600), (60_000, None, 800), (10**6, None, 1200), (60_000, 7, 7)],
+    ("steps", "updates", "expected"), [(100, None, 600), (60_000, None, 800), (10**6, None, 1200), (60_000, 7, 7)]
 )
 def test_each_recorded_step_is_seen_32_times_unless_updates_are_given(
     steps: int, updates: int | None, expected: int

@@ -10,12 +10,7 @@ from toy_episodes import no_episodes
 
 from astra_data.grounding.alignment import TargetEncoder
 from astra_data.grounding.encoder import HistoryEncoder, PositionFeatures, mlp
-from astra_data.grounding.files import (
-    load_grounding,
-    load_target_encoder,
-    save_grounding,
-    save_target_encoder,
-)
+from astra_data.grounding.files import load_grounding, load_target_encoder, save_grounding, save_target_encoder
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.methods import add_method

@@ -45,14 +45,7 @@ TRAINING, HELD_OUT = lagging_world(32, 30, seed=0), lagging_world(64, 30, seed=1
 def untrained() -> GroundingModel:
     torch.manual_seed(0)
     shape = GroundingShape(
-        2,
-        2,
-        2,
-        latent_size=SIZE,
-        embedding_size=32,
-        head_sizes=(32,),
-        position_octaves=0,
-        corrects_reward=False,
+        2, 2, 2, latent_size=SIZE, embedding_size=32, head_sizes=(32,), position_octaves=0, corrects_reward=False
     )
     model = GroundingModel(shape)
     model.set_scales(

@@ -3,11 +3,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from astra_data.policies.collecting import (
-    RandomCommands,
-    StressCommands,
-    WallWatch,
-)
+from astra_data.policies.collecting import RandomCommands, StressCommands, WallWatch
 from astra_data.robots.registry import task_named
 
 TASK = task_named("nao-navigation")

@@ -23,10 +23,7 @@ NAMES = [f"astra_data/{world}{maze}-v0" for world in ("AntMaze", "PointMaze") fo
 
 def point_mazes(num_envs: int, max_episode_steps: int) -> BatchedVectorEnv:
     env = gymnasium.make_vec(
-        NAMES[2],
-        num_envs=num_envs,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=max_episode_steps,
+        NAMES[2], num_envs=num_envs, vectorization_mode="vector_entry_point", max_episode_steps=max_episode_steps
     )
     assert isinstance(env, BatchedVectorEnv)
     return env
@@ -95,10 +92,7 @@ def test_noise_comes_from_the_seed_and_differs_from_step_to_step() -> None:
 def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
     ours = point_mazes(2, max_episode_steps=700)
     theirs = gymnasium.make_vec(
-        NAMES[2],
-        num_envs=2,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+        NAMES[2], num_envs=2, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}
     )
     for env in (ours, theirs):
         observation, infos = env.reset(seed=1)

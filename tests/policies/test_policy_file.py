@@ -73,10 +73,7 @@ def test_networks_that_could_not_be_read_again_are_not_written(tmp_path: Path) -
 def test_what_a_policy_of_another_learner_saves_and_asks_for_is_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, made = (
-        tmp_path / "policy.safetensors",
-        PolicyFile(UserPolicy(Constant(0.5), 3, 1), None, None, None),
-    )
+    path, made = (tmp_path / "policy.safetensors", PolicyFile(UserPolicy(Constant(0.5), 3, 1), None, None, None))
     monkeypatch.setitem(KINDS, Constant.kind, Constant)
     monkeypatch.setattr(Constant, "to_file", lambda self: ({"command": np.ones(1)}, {"unit": "none"}))
     with pytest.raises(BadInputError, match=r"^Constant.to_file: 'command' is a ndarray, expected a torch"):

@@ -32,7 +32,7 @@ class Risky(GroundedSimulator):
         return torch.full((len(self.state),), self.risk)
 
 
-def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> SimulatorEnv:  # noqa: ANN401
+def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> SimulatorEnv:
     """Return episodes of which every second one reaches the goal in the first step."""
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)

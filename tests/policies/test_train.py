@@ -17,14 +17,7 @@ from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.policies.ppo import Ppo
 from astra_data.policies.simulator_env import RewardSource, WorldConfig
-from astra_data.policies.train import (
-    AnyTrainConfig,
-    InSimulator,
-    PpoTrainConfig,
-    SacTrainConfig,
-    Training,
-    optimize,
-)
+from astra_data.policies.train import AnyTrainConfig, InSimulator, PpoTrainConfig, SacTrainConfig, Training, optimize
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import PlanarVariation
@@ -147,11 +140,7 @@ def test_the_curve_has_every_iteration_and_null_for_what_is_undefined(tmp_path: 
     notes: list[tuple[float, str]] = []
     given = training(tmp_path, progress=lambda share, note: notes.append((share, note)))
     _, curve = counted(given, lambda step: {"success": math.nan if step < 3 else step / 20})
-    assert [point["success"] for point in curve["points"]] == [
-        None,
-        None,
-        *[step / 20 for step in range(3, 11)],
-    ]
+    assert [point["success"] for point in curve["points"]] == [None, None, *[step / 20 for step in range(3, 11)]]
     assert [point["steps"] for point in curve["points"]] == list(range(1, 11))
     assert curve["simulator_steps_per_second"] == pytest.approx(10 / 0.5)
     assert [share for share, _ in notes] == pytest.approx([step / 10 for step in range(1, 11)])

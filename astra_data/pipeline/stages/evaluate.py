@@ -27,14 +27,7 @@ from astra_data.grounding.files import GROUNDING, TARGET_ENCODER, grounding_at, 
 from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.methods import method_named
 from astra_data.methods.follower import careful
-from astra_data.policies.episodes import (
-    Act,
-    Begin,
-    RecordedRange,
-    in_simulator,
-    in_target,
-    started,
-)
+from astra_data.policies.episodes import Act, Begin, RecordedRange, in_simulator, in_target, started
 from astra_data.policies.running_policy import POLICY, EncoderKind, PolicyFile, UserPolicy, running
 from astra_data.policies.simulator_env import SimulatorEnv, training_env
 from astra_data.reports.artifacts import EVALUATION, TRAJECTORIES

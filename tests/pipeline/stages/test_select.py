@@ -58,7 +58,7 @@ def test_each_policy_is_judged_by_the_groundings_of_other_seeds(root: Path) -> N
 def test_who_judges_whom_with_what_drawn_where(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def success(task: object, judge: object, policy: Any, episodes: int, seed: int) -> float:  # noqa: ANN401
+    def success(task: object, judge: object, policy: Any, episodes: int, seed: int) -> float:
         asked.append((policy, episodes, seed))
         return len(asked) / 100
 
@@ -94,7 +94,7 @@ def test_an_interrupted_choice_goes_on_with_the_next_policy(root: Path, monkeypa
     whole, asked = judged(root), list[object]()
     shutil.rmtree(root / "select")
 
-    def success(*given: Any) -> float:  # noqa: ANN401
+    def success(*given: Any) -> float:
         asked.append(given)
         if len(asked) == 6:
             raise KeyboardInterrupt
