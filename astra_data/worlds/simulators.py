@@ -221,3 +221,31 @@ class BatchedPhysics:
                 self.touching[row] = not watched.isdisjoint(data.contact.geom.flat)
             if measure is not None:
                 self.measured[row] = measure(data)
+
+
+class PhysicsTarget:
+    """What target environments share whose state is that of their `physics`."""
+
+    physics: BatchedPhysics
+    goal: Tensor
+    failed: Tensor
+
+    @property
+    def state(self) -> Tensor:
+        """The full target states: qpos, then qvel, (B, S) float32."""
+        return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
+
+    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
+        """Set the robots `rows` (n,) to `state` (n, S)."""
+        self.physics.set_state(rows, *np.split(state, [self.physics.model.nq], axis=1))
+        self.failed[rows] = False
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
+        arrays = {"physics": self.physics.state, "measured": self.physics.measured, "goal": self.goal.numpy()}
+        return {name: torch.from_numpy(values.copy()) for name, values in arrays.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state`."""
+        self.physics.state[:], self.physics.measured[:] = state["physics"].numpy(), state["measured"].numpy()
+        self.goal = state["goal"].clone()

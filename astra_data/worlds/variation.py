@@ -78,20 +78,13 @@ class PlanarVariation(Variation):
 
     steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "heading_bias_deg", "timestep_scale")
 
-    friction: FactorRange = (1.0, 1.0)
-    """Factor on the speed that a command gives."""
-    action_scale: Range = (0.0, 0.0)
-    """Relative error of commands: 0.1 makes them 10 % longer."""
-    action_noise: NoiseRange = (0.0, 0.0)
-    """Standard deviation of Gaussian noise on commands of ±1 per axis."""
-    position_noise_m: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on observed positions."""
-    velocity_noise_m_s: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on observed velocities."""
-    heading_bias_deg: Range = (0.0, 0.0)
-    """Commands are turned by this angle."""
-    timestep_scale: FactorRange = (1.0, 1.0)
-    """Factor on the control period."""
+    friction: FactorRange = (1.0, 1.0)  # factor on the speed that a command gives
+    action_scale: Range = (0.0, 0.0)  # relative error of commands: 0.1 makes them 10 % longer
+    action_noise: NoiseRange = (0.0, 0.0)  # standard deviation of Gaussian noise on commands of ±1 per axis
+    position_noise_m: NoiseRange = (0.0, 0.0)  # half width of the uniform noise on observed positions
+    velocity_noise_m_s: NoiseRange = (0.0, 0.0)  # half width of the uniform noise on observed velocities
+    heading_bias_deg: Range = (0.0, 0.0)  # commands are turned by this angle
+    timestep_scale: FactorRange = (1.0, 1.0)  # factor on the control period
 
 
 class BallVariation(PlanarVariation):
@@ -99,14 +92,11 @@ class BallVariation(PlanarVariation):
 
     steering: ClassVar[tuple[str, ...]] = (*PlanarVariation.steering, "ball_friction", "contact_direction_deg")
 
-    ball_friction: FactorRange = (1.0, 1.0)
-    """Factor on the deceleration of the rolling ball."""
-    ball_position_noise_m: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on observed positions of the ball."""
+    ball_friction: FactorRange = (1.0, 1.0)  # factor on the deceleration of the rolling ball
+    ball_position_noise_m: NoiseRange = (0.0, 0.0)  # half width of the uniform noise on observed positions of the ball
     ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)
     """Half width of the uniform noise on observed velocities of the ball."""
-    contact_direction_deg: Range = (0.0, 0.0)
-    """The ball leaves a contact or a kick turned by this angle."""
+    contact_direction_deg: Range = (0.0, 0.0)  # the ball leaves a contact or a kick turned by this angle
 
 
 class CommandVariation(Variation):
@@ -116,8 +106,7 @@ class CommandVariation(Variation):
 
     action_scale: Range = (0.0, 0.0)
     """Relative error of commands: 0.1 makes them 10 % longer, up to their bounds, beyond which none is."""
-    action_noise: NoiseRange = (0.0, 0.0)
-    """Standard deviation of Gaussian noise on commands, which range over ±1."""
+    action_noise: NoiseRange = (0.0, 0.0)  # standard deviation of Gaussian noise on commands, which range over ±1
 
 
 class JointVariation(Variation):
@@ -126,16 +115,11 @@ class JointVariation(Variation):
     steering: ClassVar[tuple[str, ...]] = ("friction", "action_scale", "timestep_scale")
     sensing: ClassVar[tuple[str, ...]] = ("observation_scale",)
 
-    friction: FactorRange = (1.0, 1.0)
-    """Factor on the joints' own damping; that of the position control stays."""
-    action_scale: Range = (0.0, 0.0)
-    """Relative error of commands: 0.1 makes them 10 % longer."""
-    action_noise: NoiseRange = (0.0, 0.0)
-    """Standard deviation of Gaussian noise on commands, which range over ±1."""
-    observation_scale: FactorRange = (1.0, 1.0)
-    """Factor on all entries of the observed state."""
-    timestep_scale: FactorRange = (1.0, 1.0)
-    """Factor on the control period."""
+    friction: FactorRange = (1.0, 1.0)  # factor on the joints' own damping; that of the position control stays
+    action_scale: Range = (0.0, 0.0)  # relative error of commands: 0.1 makes them 10 % longer
+    action_noise: NoiseRange = (0.0, 0.0)  # standard deviation of Gaussian noise on commands, which range over ±1
+    observation_scale: FactorRange = (1.0, 1.0)  # factor on all entries of the observed state
+    timestep_scale: FactorRange = (1.0, 1.0)  # factor on the control period
 
 
 class VariedSimulator(ABC):

@@ -21,7 +21,7 @@ from astra_data.worlds.plane.mazes import LONG_MAZE, U_MAZE, Maze
 from astra_data.worlds.plane.navigation import Navigation, PlanarObjective, PlanarTarget
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.protocols import Step, rows_in
-from astra_data.worlds.simulators import BatchedPhysics, add_walls, wall_geoms
+from astra_data.worlds.simulators import BatchedPhysics, PhysicsTarget, add_walls, wall_geoms
 from astra_data.worlds.task import PLANAR_GOAL, PLANAR_STATE, Plane, Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import RANDOMIZED_ACTIONS, WIDE_RANGES
 
@@ -148,7 +148,7 @@ class VelocityController:
         return torques_to_body(self.torque_scale * squashed.double().numpy(), quarters)
 
 
-class AntMazeEnv(PlanarTarget):
+class AntMazeEnv(PhysicsTarget, PlanarTarget):
     """B ants in a maze, states qpos, qvel (B, 29); action: world-frame velocity in m/s, (B, 2), clipped to ±1."""
 
     observation_size = STATE_SIZE + 2
@@ -176,11 +176,6 @@ class AntMazeEnv(PlanarTarget):
         self.reseed(seed)
 
     @property
-    def state(self) -> Tensor:
-        """The full target states, (B, 29) float32."""
-        return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
-
-    @property
     def position(self) -> Tensor:
         """Positions of the ants, (B, 2) float32 in m."""
         return torch.from_numpy(self.physics.qpos[:, :2]).float()
@@ -201,20 +196,6 @@ class AntMazeEnv(PlanarTarget):
         self._aim(rows)
         self.reset_to(rows, np.concatenate([qpos, np.zeros((count, STATE_SIZE - POSITIONS))], axis=1))
         return self._observe()
-
-    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
-        """Set the ants `rows` (n,) to `state` (n, 29)."""
-        self.physics.set_state(rows, state[:, :POSITIONS], state[:, POSITIONS:])
-        self.failed[rows] = False
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
-        return {"physics": torch.from_numpy(self.physics.state.copy()), "goal": self.goal.clone()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-        self.physics.state[:] = state["physics"].numpy()
-        self.goal = state["goal"].clone()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Follow the commands `action` (B, 2) for 0.05 s; rows outside `active` (B,) stay."""

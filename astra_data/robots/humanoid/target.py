@@ -8,13 +8,12 @@ from typing import Literal
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from astra_data.core.arrays import Bools, Floats, normalized
 from astra_data.core.errors import BadInputError
 from astra_data.worlds.protocols import Step, rows_in
-from astra_data.worlds.simulators import BatchedPhysics
+from astra_data.worlds.simulators import BatchedPhysics, PhysicsTarget
 
 JOINTS = (
     *("abdomen_z", "abdomen_y", "abdomen_x"),
@@ -144,7 +143,7 @@ class Locomotion:
         return np.asarray(self.forward_reward * velocity + self.healthy_reward * healthy - cost)
 
 
-class HumanoidEnv:
+class HumanoidEnv(PhysicsTarget):
     """B humanoids; action: angles of left hip, left knee, right hip, right knee, (B, 4), clipped to ±1.
 
     State (B, 47): qpos, qvel. Observation (B, 45): the state without x and y. Only falling ends an episode. Position
@@ -188,11 +187,6 @@ class HumanoidEnv:
         return self._mass_share @ data.xipos[:, 0], control @ control, contact @ contact
 
     @property
-    def state(self) -> Tensor:
-        """The full target states, (B, 47) float32."""
-        return torch.from_numpy(np.concatenate([self.physics.qpos, self.physics.qvel], axis=1)).float()
-
-    @property
     def position(self) -> Tensor:
         """Positions of the humanoids, (B, 2) float32 in m."""
         return self.state[:, :2]
@@ -211,21 +205,6 @@ class HumanoidEnv:
         rows = rows_in(mask, self.num_envs)
         self.reset_to(rows, self.locomotion.draw_starts(self._rng, len(rows)))
         return self.state[:, 2:]
-
-    def reset_to(self, rows: NDArray[np.intp], state: Floats) -> None:
-        """Set the humanoids `rows` (n,) to `state` (n, 47)."""
-        self.physics.set_state(rows, state[:, :POSITIONS], state[:, POSITIONS:])
-        self.failed[rows] = False
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return what `load_state_dict` needs to continue from here; later random draws may differ."""
-        arrays = {"physics": self.physics.state, "measured": self.physics.measured}
-        return {name: torch.from_numpy(values.copy()) for name, values in arrays.items()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-        self.physics.state[:] = state["physics"].numpy()
-        self.physics.measured[:] = state["measured"].numpy()
 
     def step(self, action: Tensor, active: Tensor | None = None) -> Step:
         """Follow the commands `action` (B, 4) for 0.015 s; rows outside `active` (B,) stay."""
