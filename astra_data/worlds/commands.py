@@ -11,7 +11,7 @@ from torch import Tensor
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION
 from astra_data.dataset.versions import open_dataset
-from astra_data.worlds.protocols import SteppedSimulator, keep_clear
+from astra_data.worlds.protocols import SteppedSimulator
 from astra_data.worlds.variation import VariedSimulator, noisy_command
 
 
@@ -74,7 +74,6 @@ class DrivenSimulator:
     """B abstract simulators of a task, given actions of ±1 and states on any device; what they lack does nothing."""
 
     def __init__(self, simulator: SteppedSimulator, commands: Commands, device: str) -> None:
-        """Drive `simulator` within the bounds of `commands`; states are given and taken on `device`."""
         self.simulator = simulator
         self._commands, self._device = commands, device
         self._there = simulator.state.device
@@ -103,10 +102,6 @@ class DrivenSimulator:
         """Apply `action` (B, A) of ±1; return the new states (B, X)."""
         landed = self.simulator.step(self._commands.in_units(action).to(self._there))
         return landed.to(self._device, copy=True)
-
-    def keep_clear(self, distance_m: float) -> None:
-        """Let corrections end no closer to walls than `distance_m`, where there are walls."""
-        keep_clear(self.simulator, distance_m)
 
     def settle(self, before: Tensor, landed: Tensor) -> Tensor:
         """Move from `before` as far toward `landed`, both (B, X), as there is room; return where (B, X)."""

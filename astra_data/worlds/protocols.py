@@ -84,8 +84,10 @@ class PlacedSimulator(SteppedSimulator, Protocol):
 
 
 def keep_clear(simulator: object, distance_m: float) -> None:
-    """Let corrections of `simulator` end no closer to walls than `distance_m`, where there are walls."""
-    if keep := getattr(simulator, "keep_clear", None):
+    """Let corrections of `simulator`, or of what it drives, end no closer to walls, if there are, than `distance_m`."""
+    while not (keep := getattr(simulator, "keep_clear", None)) and hasattr(simulator, "simulator"):
+        simulator = simulator.simulator
+    if keep:
         keep(distance_m)
 
 

@@ -15,7 +15,7 @@ from astra_data.core.seeding import derive, generator
 from astra_data.dataset.columns import Column
 from astra_data.worlds.commands import Commands
 from astra_data.worlds.objective import Objective
-from astra_data.worlds.protocols import Step
+from astra_data.worlds.protocols import Step, rows_in
 from astra_data.worlds.user_code import explained
 
 State = NDArray[np.floating[Any]] | Sequence[float]
@@ -49,8 +49,7 @@ class RobotEnv:
     ) -> None:
         """Build B robots, with the column of their states, the bounds of their commands, and φ."""
         self.num_envs, self.action_size = num_envs, len(commands)
-        self._objective, self._column, self._commands = objective, state, commands
-        self._abstraction = abstraction
+        self._objective, self._column, self._commands, self._abstraction = objective, state, commands, abstraction
         self._robots = [robot() for _ in range(num_envs)]
         taken = inspect.signature(self._robots[0].reset).parameters
         self._takes_seed = "seed" in taken or any(one.kind is one.VAR_KEYWORD for one in taken.values())
@@ -84,8 +83,7 @@ class RobotEnv:
 
     def reset(self, mask: Tensor | None = None) -> Tensor:
         """Restart the robots in `mask` (B,), by default all; return observations (B, O)."""
-        rows = range(self.num_envs) if mask is None else mask.nonzero().squeeze(1).tolist()
-        for row in rows:
+        for row in rows_in(mask, self.num_envs).tolist():
             episode = f"episode {self._episodes}"
             self._episodes += 1
             options: dict[str, Any] = {"seed": derive(self._seed, episode)} if self._takes_seed else {}
@@ -102,8 +100,7 @@ class RobotEnv:
         """Apply `action` (B, A) of ±1; robots outside `active` (B,) stay as they are."""
         before = self._abstract()
         commands = self._commands.in_units(action).double().numpy()
-        rows = range(self.num_envs) if active is None else active.nonzero().squeeze(1).tolist()
-        for row in rows:
+        for row in rows_in(active, self.num_envs).tolist():
             with explained("step of the robot"):
                 found = self._robots[row].step(commands[row])
             if not isinstance(found, tuple) or len(found) != 2:

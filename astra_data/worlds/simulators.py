@@ -23,7 +23,6 @@ class FreeStates:
     """B states (B, X) float32 in a space without obstacles."""
 
     def __init__(self, state: Tensor) -> None:
-        """Begin at `state` (B, X)."""
         self.state = state
 
     @property
@@ -72,7 +71,6 @@ class ColdSteps:
     """Steps of B copies of a MuJoCo model without actuator states, nor the solver's warm start, as pairs need it."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int | None = None) -> None:
-        """Prepare steps of `num_envs` copies of `model`; there is by default one thread per core."""
         self._data = [mujoco.MjData(model) for _ in range(min(num_threads or cores(), num_envs))]
         self._rollout = Rollout(nthread=len(self._data))
 
@@ -92,7 +90,6 @@ class MujocoModel(FreeStates):
     """B copies of a MuJoCo model, stepped cold; state: qpos (nq) then qvel (nv), action: the motors' controls (nu)."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, *, substeps: int, num_threads: int | None = None) -> None:
-        """Allocate B copies in the model's initial state."""
         if model.na:
             raise BadInputError(f"the model has {model.na} actuator states: expected actuators without states")
         # MuJoCo would put a diverging state back to the initial pose, as if the robot had jumped there.
@@ -171,9 +168,7 @@ class BatchedPhysics:
         num_threads: int | None = None,
     ) -> None:
         """Allocate B copies in the initial state; watch contacts of geoms, first to last; `measure` M numbers each."""
-        self.model = model
-        self.num_envs = num_envs
-        self.substeps = substeps
+        self.model, self.num_envs, self.substeps = model, num_envs, substeps
         self.num_threads = min(num_threads or cores(), num_envs)
         self._watched = frozenset(range(watched_geoms[0], watched_geoms[1] + 1) if watched_geoms else ())
         self._measure = measure

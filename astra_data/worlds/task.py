@@ -291,5 +291,4 @@ class Task:
 
 
 def _named(made: object) -> str:
-    """Return the name of a class, or of what a partial call builds."""
     return _named(made.func) if isinstance(made, partial) else getattr(made, "__name__", type(made).__name__)

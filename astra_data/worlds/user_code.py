@@ -99,11 +99,8 @@ def _among_neighbors(folder: str) -> Iterator[None]:
     """Let a file import those in its `folder`, not files of the same names beside other files of the user's."""
     files = {name: os.path.realpath(getattr(one, "__file__", None) or "") for name, one in sys.modules.items()}
     others = {os.path.dirname(file) for name, file in files.items() if _PREFIX in name} - {folder}
-    theirs = {
-        name: sys.modules.pop(name)
-        for name, file in files.items()
-        if _PREFIX not in name and os.path.dirname(file) in others
-    }
+    shadowing = [name for name, file in files.items() if _PREFIX not in name and os.path.dirname(file) in others]
+    theirs = {name: sys.modules.pop(name) for name in shadowing}
     paths = [*sys.path]
     sys.path[:] = [*(path for path in paths if path not in others), folder]
     try:
@@ -115,14 +112,12 @@ def _among_neighbors(folder: str) -> Iterator[None]:
 
 
 def _public_names(module: ModuleType) -> list[str]:
-    """Return the public names that a module defines itself."""
+    here = module.__name__
     return [
         name
         for name, value in vars(module).items()
-        if not name.startswith("_")
-        and not isinstance(value, ModuleType)
-        and getattr(value, "__module__" if isinstance(value, type | FunctionType) else "", module.__name__)
-        == module.__name__
+        if not (name.startswith("_") or isinstance(value, ModuleType))
+        and (not isinstance(value, type | FunctionType) or value.__module__ == here)
     ]
 
 
@@ -222,7 +217,6 @@ def _named_beside(place: Path, tree: ast.Module) -> list[Path]:
 
 
 def _imported(tree: ast.Module) -> set[str]:
-    """Return the names of the top modules that a file imports."""
     nodes = [*ast.walk(tree)]
     names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]

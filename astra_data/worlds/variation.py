@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 from torch import Tensor
 
 from astra_data.core.config import Config, in_order
-from astra_data.worlds.protocols import TaskSimulator, keep_clear
+from astra_data.worlds.protocols import TaskSimulator
 
 
 def _range(where: str, fits: Callable[[float], bool]) -> AfterValidator:
@@ -94,8 +94,7 @@ class BallVariation(PlanarVariation):
 
     ball_friction: FactorRange = (1.0, 1.0)  # factor on the deceleration of the rolling ball
     ball_position_noise_m: NoiseRange = (0.0, 0.0)  # half width of the uniform noise on observed positions of the ball
-    ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)
-    """Half width of the uniform noise on observed velocities of the ball."""
+    ball_velocity_noise_m_s: NoiseRange = (0.0, 0.0)  # half width of the uniform noise on its observed velocities
     contact_direction_deg: Range = (0.0, 0.0)  # the ball leaves a contact or a kick turned by this angle
 
 
@@ -104,8 +103,7 @@ class CommandVariation(Variation):
 
     steering: ClassVar[tuple[str, ...]] = ("action_scale",)
 
-    action_scale: Range = (0.0, 0.0)
-    """Relative error of commands: 0.1 makes them 10 % longer, up to their bounds, beyond which none is."""
+    action_scale: Range = (0.0, 0.0)  # relative error of commands: 0.1 makes them 10 % longer, up to their bounds
     action_noise: NoiseRange = (0.0, 0.0)  # standard deviation of Gaussian noise on commands, which range over ±1
 
 
@@ -126,9 +124,7 @@ class VariedSimulator(ABC):
     """B simulators with parameters that differ from row to row, observed through sensors."""
 
     def __init__(self, simulator: TaskSimulator, variation: Variation) -> None:
-        """Draw parameters of `simulator` from `variation`."""
-        self.simulator = simulator
-        self.variation = variation
+        self.simulator, self.variation = simulator, variation
         self.parameters = variation.draw(len(simulator.state), simulator.state.device)
 
     @property
@@ -149,10 +145,6 @@ class VariedSimulator(ABC):
     def blocked(self) -> Tensor:
         """Which states (B,) were stopped at the edge of the free space in the last step, bool."""
         return self.simulator.blocked
-
-    def keep_clear(self, distance_m: float) -> None:
-        """Let corrections end no closer to walls than `distance_m`, where there are walls."""
-        keep_clear(self.simulator, distance_m)
 
     def by_name(self) -> dict[str, Tensor]:
         """Return the parameters by name, (B, 1) each."""

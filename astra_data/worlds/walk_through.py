@@ -36,7 +36,8 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
 
     for check in (_rate, _abstraction, _quantities, _beyond, _robot):
         tried(check)
-    starts, goals, simulator = tried(_starts), tried(_goals), tried(_simulator, device)
+    starts = tried(_drawn, "starts", task.abstract_state.size)
+    goals, simulator = tried(_drawn, "goals", task.objective.goal_size), tried(_simulator, device)
     if starts is None or simulator is None:
         return faults
     starts = starts.to(simulator.state.device)
@@ -46,12 +47,6 @@ def check_task(task: Task, device: str = "cpu") -> list[str]:
         for judge in (_observation, _places, _judgement):
             tried(judge, before, after, goals)
     return faults
-
-
-def _of_numpy(what: str, found: object, shape: tuple[int, ...]) -> Tensor:
-    if not isinstance(found, np.ndarray):
-        raise BadInputError(f"{what}: expected a NumPy array, got a {type(found).__name__}")
-    return expect(what, torch.from_numpy(np.ascontiguousarray(found)), shape).float()
 
 
 def _rate(task: Task) -> None:
@@ -69,21 +64,17 @@ def _rate(task: Task) -> None:
     _log.warning(f"task {task.name}: {line}")
 
 
-def _starts(task: Task) -> Tensor:
-    what = f"objective.draw_starts(rng, {_COUNT})"
-    found = answered(what, task.objective.draw_starts, generator(0, "starts"), _COUNT)
-    return _of_numpy(what, found, (_COUNT, task.abstract_state.size))
-
-
-def _goals(task: Task) -> Tensor:
-    what, expected = f"objective.draw_goals(rng, {_COUNT})", task.objective.goal_size
-    found = answered(what, task.objective.draw_goals, generator(0, "goals"), _COUNT)
-    if np.ndim(found) == 2 and (size := np.shape(found)[1]) != expected:
+def _drawn(task: Task, kind: str, size: int) -> Tensor:
+    what = f"objective.draw_{kind}(rng, {_COUNT})"
+    found = answered(what, getattr(task.objective, f"draw_{kind}"), generator(0, kind), _COUNT)
+    if kind == "goals" and np.ndim(found) == 2 and (drawn := np.shape(found)[1]) != size:
         raise BadInputError(
-            f"{what}: expected shape ({_COUNT}, {expected}), got {np.shape(found)}: write "
-            f"`goal_size = {size}` beside the objective's action_size"
+            f"{what}: expected shape ({_COUNT}, {size}), got {np.shape(found)}: write `goal_size = {drawn}` beside the "
+            "objective's action_size"
         )
-    return _of_numpy(what, found, (_COUNT, expected))
+    if not isinstance(found, np.ndarray):
+        raise BadInputError(f"{what}: expected a NumPy array, got a {type(found).__name__}")
+    return expect(what, torch.from_numpy(np.ascontiguousarray(found)), (_COUNT, size)).float()
 
 
 def _states(task: Task) -> Tensor:

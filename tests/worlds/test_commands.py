@@ -10,6 +10,7 @@ from small_cart import TASK, Rail
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION
 from astra_data.worlds.commands import Commands, DrivenSimulator, VariedCommands
+from astra_data.worlds.protocols import keep_clear
 from astra_data.worlds.variation import CommandVariation
 
 DRIVE = Commands({"v": (-0.2, 1.0), "w": (-1.5, 1.5)})
@@ -129,9 +130,9 @@ def test_walls_and_parameters_of_the_simulator_are_its_own() -> None:
     assert simulator.blocked.tolist() == [True, False]
     simulator.vary({"friction": torch.ones(2, 1)})
     assert walled.varied == 1
-    simulator.keep_clear(0.3)
+    keep_clear(simulator, 0.3)
     assert walled.kept_m == 0.3
-    driven().keep_clear(0.3)  # no walls, nothing to keep clear of
+    keep_clear(driven(), 0.3)  # no walls, nothing to keep clear of
 
 
 def test_commands_vary_from_episode_to_episode() -> None:

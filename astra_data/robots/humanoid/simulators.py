@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from astra_data.dataset.columns import ABSTRACT_STATE, Column
+from astra_data.dataset.columns import ABSTRACT_STATE
 from astra_data.robots.humanoid.abstraction import (
     humanoid_to_extended_kinematics,
     humanoid_to_kinematics,
@@ -31,6 +31,7 @@ from astra_data.robots.humanoid.target import (
     humanoid_model,
 )
 from astra_data.worlds.simulators import ColdSteps, FreeStates
+from astra_data.worlds.task import column, entries
 
 
 def walker_model() -> mujoco.MjModel:
@@ -54,30 +55,24 @@ def sole_clearance(pose: Tensor) -> Tensor:
     return height - FOOT_RADIUS_M
 
 
-_JOINTS = ("left_hip", "left_knee", "right_hip", "right_knee")
-_POSE = slice(0, 6)
-_MOTION = slice(0, 13)
-_CONTACTS = slice(13, 15)
+_POSE, _MOTION, _CONTACTS = slice(0, 6), slice(0, 13), slice(13, 15)
+_HEADED, _OF_JOINTS, _OF_BODY = (("heading", "invariant"), ("joint", "invariant"), ("body", "invariant"))
 
 
 class HumanoidWalker2d(FreeStates):
     """B walkers, states (B, 15); action: angles of left hip, left knee, right hip, right knee (B, 4), clipped to ±1."""
 
     action_size = 4
-    abstract_state = Column(
+    abstract_state = column(
         ABSTRACT_STATE,
-        size=15,
-        names=(
-            *("z", "pitch", *_JOINTS),
-            *("vx", "vz", "pitch_rate", *(f"{name}_rate" for name in _JOINTS)),
-            *("left_contact", "right_contact"),
-        ),
-        meaning="torso, legs and foot contacts of a planar walker",
-        astra={
-            "unit": ["m", *["rad"] * 5, "m/s", "m/s", *["rad/s"] * 5, "1", "1"],
-            "frame": ["heading"] * 2 + ["joint"] * 4 + ["heading"] * 3 + ["joint"] * 4 + ["world"] * 2,
-            "role": ["invariant"] * 15,
-        },
+        [
+            *(*entries("z", "m", *_HEADED), *entries("pitch", "rad", *_HEADED)),
+            *entries("left_hip left_knee right_hip right_knee", "rad", *_OF_JOINTS),
+            *(*entries("vx vz", "m/s", *_HEADED), *entries("pitch_rate", "rad/s", *_HEADED)),
+            *entries("left_hip_rate left_knee_rate right_hip_rate right_knee_rate", "rad/s", *_OF_JOINTS),
+            *entries("left_contact right_contact", "1", "world", "invariant"),
+        ],
+        "torso, legs and foot contacts of a planar walker",
     )
     abstraction = humanoid_to_walker2d
 
@@ -137,31 +132,23 @@ class HumanoidWalker2d(FreeStates):
 
 
 _COUNT = len(JOINTS)
-_CENTER = slice(2 * _COUNT, 2 * _COUNT + 3)
-_VELOCITY = slice(2 * _COUNT + 3, 2 * _COUNT + 6)
-_UP = slice(2 * _COUNT + 6, 2 * _COUNT + 9)
-_SPIN = slice(2 * _COUNT + 9, None)
-_NAMES = (*JOINTS, *(f"{name}_rate" for name in JOINTS))
-_UNITS = ["rad"] * _COUNT + ["rad/s"] * _COUNT
+_CENTER, _VELOCITY, _UP, _SPIN = (slice(first, first + 3) for first in range(2 * _COUNT, 2 * _COUNT + 12, 3))
+_JOINTS = [
+    *entries(" ".join(JOINTS), "rad", *_OF_JOINTS),
+    *entries(" ".join(f"{name}_rate" for name in JOINTS), "rad/s", *_OF_JOINTS),
+]
 
 
 class HumanoidKinematics(FreeStates):
     """B humanoids' joints, (B, 34); action: angles of left hip and knee, right hip and knee, (B, 4), clipped to ±1."""
 
     action_size = 4
-    abstract_state = Column(
-        ABSTRACT_STATE,
-        size=2 * _COUNT,
-        names=_NAMES,
-        meaning="angles and rates of all joints",
-        astra={"unit": _UNITS, "frame": ["joint"] * 2 * _COUNT, "role": ["invariant"] * 2 * _COUNT},
-    )
+    abstract_state = column(ABSTRACT_STATE, _JOINTS, "angles and rates of all joints")
     abstraction = humanoid_to_kinematics
 
     ranges = CommandRanges()  # joint angles of commands
 
     def __init__(self, num_envs: int, *, device: str = "cpu") -> None:
-        """Set B humanoids' joints to zero."""
         standing = type(self).abstraction(torch.tensor(STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
         self._damping = torch.from_numpy(humanoid_model().dof_damping[-_COUNT:]).float().to(device)
@@ -195,21 +182,15 @@ class HumanoidKinematics(FreeStates):
 class HumanoidExtendedKinematics(HumanoidKinematics):
     """The same, with the center of mass and its velocity, and lean and angular velocity of the torso, (B, 46)."""
 
-    abstract_state = Column(
+    abstract_state = column(
         ABSTRACT_STATE,
-        size=2 * _COUNT + 12,
-        names=(
-            *_NAMES,
-            *("mass_x", "mass_y", "mass_z", "mass_vx", "mass_vy", "mass_vz"),
-            *("up_x", "up_y", "up_z", "wx", "wy", "wz"),
-        ),
-        meaning="angles and rates of all joints; along the heading, centre of mass, from between the feet, "
+        [
+            *(*_JOINTS, *entries("mass_x mass_y mass_z", "m", *_HEADED)),
+            *entries("mass_vx mass_vy mass_vz", "m/s", *_HEADED),
+            *(*entries("up_x up_y up_z", "1", *_OF_BODY), *entries("wx wy wz", "rad/s", *_OF_BODY)),
+        ],
+        "angles and rates of all joints; along the heading, centre of mass, from between the feet, "
         "and its velocity; which way is up from the torso, and how fast it turns",
-        astra={
-            "unit": [*_UNITS, *["m"] * 3, *["m/s"] * 3, *["1"] * 3, *["rad/s"] * 3],
-            "frame": ["joint"] * 2 * _COUNT + ["heading"] * 6 + ["body"] * 6,
-            "role": ["invariant"] * (2 * _COUNT + 12),
-        },
     )
     abstraction = humanoid_to_extended_kinematics
 

@@ -229,15 +229,11 @@ have another one, it is read as factors around theirs."""
 Kind = type[HumanoidWalker2d] | type[HumanoidKinematics]
 Quantities = dict[str, tuple[int, ...]]
 
-_JOINT_QUANTITIES: Quantities = {
-    "joints_rad": tuple(range(_COUNT)),
-    "joint_rates_rad_s": tuple(range(_COUNT, 2 * _COUNT)),
-}
-_BODY_QUANTITIES: Quantities = {
-    "mass_m": tuple(range(2 * _COUNT, 2 * _COUNT + 3)),
-    "mass_velocity_m_s": tuple(range(2 * _COUNT + 3, 2 * _COUNT + 6)),
-    "up": tuple(range(2 * _COUNT + 6, 2 * _COUNT + 9)),
-    "spin_rad_s": tuple(range(2 * _COUNT + 9, 2 * _COUNT + 12)),
+_ALL = [*range(2 * _COUNT + 12)]
+_JOINT_QUANTITIES = {"joints_rad": (*_ALL[:_COUNT],), "joint_rates_rad_s": (*_ALL[_COUNT : 2 * _COUNT],)}
+_BODY_QUANTITIES = {
+    name: (*_ALL[2 * _COUNT + first : 2 * _COUNT + first + 3],)
+    for name, first in {"mass_m": 0, "mass_velocity_m_s": 3, "up": 6, "spin_rad_s": 9}.items()
 }
 _WALKER_QUANTITIES: Quantities = {
     "height_m": (0,),

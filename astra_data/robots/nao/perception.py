@@ -34,7 +34,6 @@ class Localisation:
     """Estimated poses of B robots: x, y in m and heading in rad."""
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:
-        """Start without errors; control steps last `step_s`."""
         self.errors, self.step_s = errors, step_s
         self.pose: Floats = np.zeros((num_robots, 3))
         self._drift: Floats = np.zeros((num_robots, 3))
@@ -77,7 +76,6 @@ class BallSight:
     """Estimates of B robots of their balls, in the world frame."""
 
     def __init__(self, num_robots: int, errors: PerceptionErrors, step_s: float) -> None:
-        """Start without errors; control steps last `step_s`."""
         self.errors, self.step_s = errors, step_s
         self.position: Floats = np.zeros((num_robots, 2))
         self.velocity: Floats = np.zeros((num_robots, 2))

@@ -67,7 +67,6 @@ class BatchedBodies:
     def __init__(
         self, model: mujoco.MjModel, traits: Traits, *, longest_delay_ticks: int, style: WalkStyle, num_threads: int
     ) -> None:
-        """Allocate one body for each of `traits`' B robots; `reset` them before they are stepped."""
         self.model = model
         self.traits = traits
         self.style = style
@@ -193,7 +192,6 @@ class BatchedNao:
         spread: TraitSpread | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Build B robots standing at the origin, with traits of `spread`, each with a ball if asked."""
         self.num_robots = num_robots
         self.spread = spread or TraitSpread()
         self.has_ball = ball
@@ -311,7 +309,6 @@ class BatchedNao:
         self._seed, self._steps = int(state.get("seed", self._seed)), int(state["steps"])
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays that change from step to step, by name."""
         bodies = self.bodies
         parts = ("state", "sent", "held", "waited", "tilting", "gyro", "pressure", "fallen", "touching")
         own = {name: getattr(bodies, name) for name in parts}

@@ -67,7 +67,6 @@ class NaoEnv(PlanarTarget):
         errors: PerceptionErrors | None = None,
         num_threads: int | None = None,
     ) -> None:
-        """Build B robots, with a `ball` or without; `errors` are those of the estimates."""
         super().__init__(objective, num_envs, start_anywhere=start_anywhere)
         self.has_ball, self.action_size = ball, objective.action_size
         self.robots = BatchedNao(num_envs, seed=seed, maze=objective.maze, ball=ball, num_threads=num_threads)

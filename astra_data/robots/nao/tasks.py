@@ -55,7 +55,6 @@ _KICK = ColumnEntry("kick", "1", "body", "invariant")
 
 
 def _task(*, ball: bool, **own: Any) -> Task:
-    """Return a task with the fields `own` and those that all of the NAO's tasks share."""
     meaning = "what the robot believes of itself" + (" and of the ball" if ball else "")
     wish = ", and above 0.5 to stand and kick" if ball else ""
     rolling = _BALL if ball else []

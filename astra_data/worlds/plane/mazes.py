@@ -150,9 +150,7 @@ class FreeSpace:
     """The cells in which the center of a disc may be: not those of `blocked` (height, width)."""
 
     def __init__(self, blocked: Tensor, half_extent: Tensor, cell_m: float) -> None:
-        self.blocked = blocked
-        self.half_extent = half_extent
-        self.cell_m = cell_m
+        self.blocked, self.half_extent, self.cell_m = blocked, half_extent, cell_m
         depth = torch.from_numpy(scipy.ndimage.distance_transform_edt(blocked.cpu().numpy()))
         # Distance of blocked cells from the nearest free one, in cells; 0 in free ones.
         self._depth = depth.float().to(blocked.device)

@@ -163,16 +163,13 @@ class PlanarTarget(ABC):
         return draw(self._rng, len(rows))
 
     def _aim(self, rows: NDArray[np.intp]) -> None:
-        """Draw new goals for the robots `rows` (n,)."""
         self.goal[rows] = torch.from_numpy(self.objective.draw_goals(self._rng, len(rows))).float()
 
     def _judged(self, before: Tensor, after: Tensor, fallen: Bools) -> Step:
         """Return the outcome of a step between states with true positions; who reaches the goal has not failed."""
         success = self.objective.reached(after, self.goal)
-        failed = torch.from_numpy(fallen) | self.objective.missed(after, self.goal)
-        if self.objective.ends_at_walls:
-            failed |= self.wall_contact
-        self.failed = failed & ~success
+        walls = self.wall_contact & self.objective.ends_at_walls
+        self.failed = (torch.from_numpy(fallen) | self.objective.missed(after, self.goal) | walls) & ~success
         return Step(
             observation=self._observe(),
             reward=self.objective.reward(before, after, self.goal, self.failed),

@@ -30,8 +30,7 @@ class PlanarStates:
         device: str = "cpu",
     ) -> None:
         """Put B of them at rest at the origin, `radius_m` from walls, `speed_m_s` fast along each axis."""
-        cells = radius_m / maze.fine_m
-        if abs(cells - round(cells)) > _CELLS_APART:
+        if abs(radius_m / maze.fine_m - round(radius_m / maze.fine_m)) > _CELLS_APART:
             raise BadInputError(
                 f"radius_m: expected a multiple of the maze's fine_m, {maze.fine_m} m, got {radius_m}: "
                 "take another radius, or a finer maze"
