@@ -29,8 +29,7 @@ from astra_data.worlds.variation import VariedSimulator
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_worlds_and_columns_fit_together(task: Task) -> None:
-    assert TASKS[task.name] is task
-    assert task.fps * task.timestep_s == pytest.approx(1.0, abs=0.05)
+    assert TASKS[task.name] is task and task.fps * task.timestep_s == pytest.approx(1.0, abs=0.05)
     sizes = {column.name: column.size for column in task.state_columns}
     env = task.target(2, seed=0, num_threads=1)
     observation = env.reset()
@@ -66,8 +65,7 @@ def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(monkeyp
     names = ("rail-cart", "antmaze-umaze")
     points = [EntryPoint(name, "small_cart:TASK", TASK_GROUP) for name in names]
     monkeypatch.setattr(user_code, "entry_points", lambda group: points)
-    assert known_names() == (*TASKS, "rail-cart")
-    assert known_tasks()["antmaze-umaze"] is TASKS["antmaze-umaze"]
+    assert known_names() == (*TASKS, "rail-cart") and known_tasks()["antmaze-umaze"] is TASKS["antmaze-umaze"]
     assert place_of("rail-cart") == place_of("small_cart:TASK") == "small_cart:TASK"
     assert place_of("antmaze-umaze") == "antmaze-umaze" and place_of("unknown") == "unknown"
 
@@ -84,8 +82,7 @@ STATES = np.arange(87, dtype=np.float32).reshape(3, 29)
 def test_a_task_brings_its_own_simulator() -> None:
     pairing, task = pairing_named("antmaze-umaze"), TASKS["antmaze-umaze"]
     assert (pairing.id, pairing.origin, pairing.maze) == ("point_mass", {"task": "antmaze-umaze"}, U_MAZE)
-    assert pairing.abstract_state == task.abstract_state
-    assert built(pairing, 5).state.shape == (5, 4)
+    assert pairing.abstract_state == task.abstract_state and built(pairing, 5).state.shape == (5, 4)
     np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, [0, 1, 15, 16]])
     assert pairing_named("humanoid-kinematics").maze is None
     # Commands of ±1 need no bounds.

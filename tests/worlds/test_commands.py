@@ -35,8 +35,7 @@ def test_commands_of_one_are_left_to_the_bit() -> None:
     assert torch.equal(unit.in_units(action), action) and unit.normal(action) is action
     assert unit.in_units(torch.tensor([3.0, -3.0])).tolist() == [1.0, -1.0]
     one_of_two = Commands({"vx": (-1.0, 1.0), "w": (-2.0, 2.0)})
-    assert not one_of_two.are_normal
-    assert one_of_two.in_units(torch.tensor([0.5, 0.5])).tolist() == [0.5, 1.0]
+    assert not one_of_two.are_normal and one_of_two.in_units(torch.tensor([0.5, 0.5])).tolist() == [0.5, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -79,8 +79,7 @@ def test_columns_of_every_task_tell_all(column: Column) -> None:
 def test_values_keep_their_type_and_lone_headings_their_shape() -> None:
     yaw = Column("yaw", astra={"role": ["heading"]})
     moved = PlanarMap(rotation_rad=np.pi).of_column(yaw, np.array([0.5, -0.5], np.float32))
-    assert moved.dtype == np.float32
-    assert moved.shape == (2,)
+    assert moved.dtype == np.float32 and moved.shape == (2,)
     np.testing.assert_allclose(moved, [0.5 - np.pi, np.pi - 0.5], rtol=1e-6)
 
 

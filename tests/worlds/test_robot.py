@@ -45,8 +45,7 @@ def test_what_the_objective_misses_is_a_failure_until_the_next_episode() -> None
     env.reset()
     back = torch.tensor([[-1.0], [-0.6]])
     ended = [env.step(back).terminated.tolist() for _ in range(3)]
-    assert ended == [[False, False], [False, False], [True, False]]
-    assert env.failed.tolist() == [True, False]
+    assert ended == [[False, False], [False, False], [True, False]] and env.failed.tolist() == [True, False]
     # A robot that is done stays where it is, and failed.
     assert env.step(back, torch.tensor([False, True])).terminated.tolist() == [True, False]
     env.reset(torch.tensor([True, False]))
@@ -88,8 +87,7 @@ def test_the_same_seed_gives_the_same_goals_and_seeds(robot: type[Noted]) -> Non
     env.reset()
     goals.append(env.goal.tolist())
     assert goals[0] == goals[1] == goals[3] != goals[2] and goals[0][0] != goals[0][1]
-    assert Noted.seeds[:2] == Noted.seeds[2:4] == Noted.seeds[6:] != Noted.seeds[4:6]
-    assert -1 not in Noted.seeds
+    assert Noted.seeds[:2] == Noted.seeds[2:4] == Noted.seeds[6:] != Noted.seeds[4:6] and -1 not in Noted.seeds
 
 
 @pytest.mark.parametrize("state", [[0.0], [0.0, float("nan")], [0.0, 0.0, 0.0], None])

@@ -22,8 +22,7 @@ def test_states_are_set_row_by_row_and_those_handed_out_stay() -> None:
     given = torch.full((3, 2), 5.0)
     states.reset_to(given)
     given.zero_()
-    assert states.state.unique().tolist() == [5.0]
-    assert before.unique().tolist() == [0.0]
+    assert states.state.unique().tolist() == [5.0] and before.unique().tolist() == [0.0]
 
 
 def turn(state: Floats, command: Floats) -> Floats:

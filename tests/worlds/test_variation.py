@@ -4,14 +4,8 @@ from pydantic import create_model
 
 from astra_data.core.config import Config, validated
 from astra_data.core.errors import RecipeError
-from astra_data.worlds.variation import (
-    BallVariation,
-    CommandVariation,
-    JointVariation,
-    PlanarVariation,
-    Variation,
-    noisy_command,
-)
+from astra_data.worlds import variation as of
+from astra_data.worlds.variation import BallVariation, CommandVariation, JointVariation, PlanarVariation, Variation
 
 
 def test_parameters_are_drawn_uniformly_from_their_ranges() -> None:
@@ -57,25 +51,20 @@ def test_it_survives_json_and_knows_its_parameters(kind: type[Variation]) -> Non
 
 def test_noise_carries_no_command_beyond_one() -> None:
     torch.manual_seed(0)
-    noisy = noisy_command(torch.tensor([[1.0, -1.0, 0.0]]).expand(1000, 3), torch.full((1000, 1), 0.1))
+    noisy = of.noisy_command(torch.tensor([[1.0, -1.0, 0.0]]).expand(1000, 3), torch.full((1000, 1), 0.1))
     assert noisy.max() == 1.0 and noisy.min() == -1.0
     assert float(noisy[:, 2].std()) == pytest.approx(0.1, rel=0.1)
 
 
 @pytest.mark.parametrize("model", [PlanarVariation, BallVariation])
 @pytest.mark.parametrize(
-    ("name", "ends", "expected"),
+    ("name", "least", "expected"),
     [
-        ("friction", (0.0, 1.0), "a range above 0"),
-        ("timestep_scale", (-0.5, 1.0), "a range above 0"),
-        ("action_noise", (-0.1, 0.1), "a range from 0 up"),
-        ("position_noise_m", (-0.1, 0.1), "a range from 0 up"),
-        ("velocity_noise_m_s", (-0.1, 0.1), "a range from 0 up"),
+        *(("friction", 0.0, "a range above 0"), ("timestep_scale", -0.5, "a range above 0")),
+        *((name, -0.1, "a range from 0 up") for name in ("action_noise", "position_noise_m", "velocity_noise_m_s")),
     ],
 )
-def test_ranges_that_cannot_be_are_refused(
-    model: type[Config], name: str, ends: tuple[float, float], expected: str
-) -> None:
+def test_ranges_that_cannot_be_are_refused(model: type[Config], name: str, least: float, expected: str) -> None:
     with pytest.raises(RecipeError) as caught:
-        validated({"row": {name: list(ends)}}, create_model("Rows", row=(model, ...)), "r.toml")
-    assert str(caught.value) == f"r.toml: row.{name}: expected {expected}, got {list(ends)}"
+        validated({"row": {name: [least, 1.0]}}, create_model("Rows", row=(model, ...)), "r.toml")
+    assert str(caught.value) == f"r.toml: row.{name}: expected {expected}, got {[least, 1.0]}"

@@ -12,7 +12,6 @@ from astra_data.robots.ant.tasks import (
     VelocityController,
     ant_beyond_point_mass,
     ant_model,
-    ant_to_point_mass,
     canonical_view,
     standing_pose,
     torques_to_body,
@@ -161,16 +160,6 @@ def test_the_shipped_controller_walks_as_told(command: list[float]) -> None:
     assert np.linalg.norm(mean - command) < 0.25
 
 
-def test_keeps_planar_position_and_velocity() -> None:
-    state = np.arange(2 * 3 * 29, dtype=np.float32).reshape(2, 3, 29)
-    abstract = ant_to_point_mass(state)
-    assert abstract.shape == (2, 3, 4)
-    assert abstract.dtype == np.float32
-    np.testing.assert_array_equal(abstract[..., :2], state[..., :2])  # x, y open qpos
-    np.testing.assert_array_equal(abstract[..., 2:], state[..., 15:17])  # vx, vy open qvel
-    assert torch.equal(ant_to_point_mass(torch.from_numpy(state)), torch.from_numpy(abstract))
-
-
 def test_what_is_dropped_is_the_rest_with_slower_joint_rates() -> None:
     state = torch.arange(29.0).repeat(2, 1)
     rest = ant_beyond_point_mass(state)
@@ -209,8 +198,7 @@ def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> N
     env = placed([[-4, 4], [-4, 4]])
     rolled(env, [0], np.radians(degrees))
     step = env.step(torch.zeros(2, 2))
-    assert env.failed.tolist() == [toppled, False]
-    assert step.terminated.tolist() == [toppled, False]
+    assert env.failed.tolist() == [toppled, False] and step.terminated.tolist() == [toppled, False]
     assert float(step.reward[0]) == pytest.approx(-10.0 * toppled, abs=0.1)
     env.reset(step.terminated)
     assert not env.failed.any()
@@ -256,8 +244,7 @@ def test_states_are_named_as_mujoco_orders_them() -> None:
     expected = ("x", "y", "z", "qw", "qx", "qy", "qz", *joints)
     rates = ("vx", "vy", "vz", "wx", "wy", "wz", *(f"{joint}_rate" for joint in joints))
     assert columns[STATE].names == columns[NEXT_STATE].names == (*expected, *rates)
-    assert columns[STATE].size == model.nq + model.nv
-    assert (columns[GOAL].size, columns[ACTION].size) == (2, 2)
+    assert columns[STATE].size == model.nq + model.nv and (columns[GOAL].size, columns[ACTION].size) == (2, 2)
     data = mujoco.MjData(model)
     data.qvel[3:6] = [0.0, 0.0, 1.0]
     data.qpos[3:7] = [0.5**0.5, 0.5**0.5, 0.0, 0.0]  # rolled by 90 degrees: its z axis points along -y

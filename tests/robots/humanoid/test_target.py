@@ -102,13 +102,11 @@ def test_position_control_costs_its_torques_in_units_of_the_motors() -> None:
 def test_starts_are_upright_and_almost_at_rest() -> None:
     env = make(200)
     observation = env.reset()
-    assert observation.shape == (200, 45)
-    assert torch.equal(observation, env.state[:, 2:])
+    assert observation.shape == (200, 45) and torch.equal(observation, env.state[:, 2:])
     upright = torch.zeros(47)
     upright[2], upright[3] = 1.4, 1.0
     offset = (env.state - upright).abs()
-    assert 0.009 < float(offset.max()) <= 0.01 + 1e-4
-    assert float(offset.std()) > 0.002
+    assert 0.009 < float(offset.max()) <= 0.01 + 1e-4 and float(offset.std()) > 0.002
     torch.testing.assert_close(env.state[:, 3:7].norm(dim=1), torch.ones(200))
 
 
@@ -144,8 +142,7 @@ def test_heights_outside_of_the_range_end_an_episode(height: float, failed: bool
     env.reset_to(np.arange(2), state)
     assert not env.failed.any()
     step = env.step(torch.zeros(2, 4))
-    assert env.failed.tolist() == step.terminated.tolist() == [failed, False]
-    assert not step.success.any()
+    assert env.failed.tolist() == step.terminated.tolist() == [failed, False] and not step.success.any()
     assert (float(step.reward[0]) < 3.0) == failed  # without the bonus for health
     env.reset(step.terminated)
     assert not env.failed.any()

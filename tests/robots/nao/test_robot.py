@@ -240,8 +240,7 @@ def test_walls_are_felt_and_stop_it() -> None:
     for _ in range(15):
         nao.step(np.tile([0.2, 0.0, 0.0], (2, 1)))
         felt |= nao.touching
-    assert felt.tolist() == [True, False]
-    assert nao.pose[0, 0] > -5.95
+    assert felt.tolist() == [True, False] and nao.pose[0, 0] > -5.95
 
 
 def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:

@@ -136,10 +136,8 @@ def test_the_leading_foot_goes_aside_and_the_other_follows() -> None:
 def test_a_turn_is_split_between_wide_and_narrow_steps() -> None:
     seen = strides(one(0, 0, 1.0), 3.0)
     wide, narrow = seen[2].after[0, 2], seen[3].after[0, 2]
-    assert wide == pytest.approx(0.67 * 2 * 0.25)
-    assert narrow == pytest.approx(0.33 * 2 * 0.25)
-    assert seen[2].left_swings[0]
-    assert not seen[3].left_swings[0]
+    assert wide == pytest.approx(0.67 * 2 * 0.25) and narrow == pytest.approx(0.33 * 2 * 0.25)
+    assert seen[2].left_swings[0] and not seen[3].left_swings[0]
 
 
 def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
@@ -148,11 +146,8 @@ def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
         command = one(0.1, 0, 0) if tick < 100 else one(0, 0, 0)
         if planner(1.0).advance(gait, command, TICK_S)[0]:
             kinds.append(int(gait.kind[0]))
-    assert kinds[0] == START
-    assert kinds[-1] == STOP
-    assert set(kinds[1:-1]) == {STRIDE}
-    assert not gait.walking[0]
-    assert (gait.after == 0).all()
+    assert kinds[0] == START and kinds[-1] == STOP and set(kinds[1:-1]) == {STRIDE}
+    assert not gait.walking[0] and (gait.after == 0).all()
 
 
 STYLE = WalkStyle(step_scale=(1.0, 1.0, 1.0))
@@ -209,8 +204,7 @@ def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
     command = np.array([[0.2, 0.0, 0.0]])
     walking, again = Gait.standing(1, LIMITS), Gait.standing(1, LIMITS)
     targets = engine().advance(walking, command, 40)
-    assert targets.angles.shape == (1, 40, 11)
-    assert len(targets.gaits) == 41
+    assert targets.angles.shape == (1, 40, 11) and len(targets.gaits) == 41
     for tick in range(40):
         engine().planner.advance(again, command, TICK_S)
         np.testing.assert_allclose(

@@ -55,8 +55,7 @@ def test_who_goes_downhill_keeps_the_margin_all_the_way() -> None:
         around = [(row + dy, column + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
         row, column = min(around, key=lambda cell: float(field[cell]))
         clearance.append(float(U_MAZE.clearance_field[row, column]))
-    assert [row, column] == [*map(int, U_MAZE.fine_index(goal))]
-    assert 0.9 < min(clearance) < 1.1
+    assert [row, column] == [*map(int, U_MAZE.fine_index(goal))] and 0.9 < min(clearance) < 1.1
 
 
 @pytest.mark.parametrize(
@@ -68,9 +67,7 @@ def test_who_goes_downhill_keeps_the_margin_all_the_way() -> None:
         ({"start": (0, 1)}, r"start: expected \(row, column\) of a free cell, got \(0, 1\)"),
         ({"goal": (1, 9)}, r"goal: expected \(row, column\) of a free cell, got \(1, 9\)"),
         ({"fine_m": 0.3}, "fine_m: expected a half of the scale, 4.0 m, or a smaller part, got 0.3"),
-        ({"fine_m": 8.0}, "fine_m: expected a half of the scale"),
-        ({"fine_m": 4.0}, "fine_m: expected a half of the scale"),
-        ({"fine_m": 0.0}, "fine_m: expected a half of the scale"),
+        *(({"fine_m": wrong}, "fine_m: expected a half of the scale") for wrong in (8.0, 4.0, 0.0)),
     ],
 )
 def test_a_maze_that_cannot_be_is_refused(changes: dict[str, Any], fault: str) -> None:
@@ -90,21 +87,17 @@ def slide(maze: Maze, start: list[float], end: list[float]) -> tuple[list[float]
 @pytest.mark.parametrize(
     ("end", "rest"),
     [
-        ([1.95, 0.0], [1.9, 0.0]),
-        ([-1.95, 0.0], [-1.9, 0.0]),
-        ([0.0, 1.95], [0.0, 1.9]),
-        ([0.0, -1.95], [0.0, -1.9]),
+        *(([1.95, 0.0], [1.9, 0.0]), ([-1.95, 0.0], [-1.9, 0.0])),
+        *(([0.0, 1.95], [0.0, 1.9]), ([0.0, -1.95], [0.0, -1.9])),
         ([1.95, 1.95], [1.9, 1.9]),  # into a corner
-        ([-1.95, 1.5], [-1.9, 1.5]),  # slanted: only the blocked axis stops
-        ([1.5, -1.95], [1.5, -1.9]),
+        *(([-1.95, 1.5], [-1.9, 1.5]), ([1.5, -1.95], [1.5, -1.9])),  # slanted: only the blocked axis stops
     ],
 )
 def test_walls_stop_each_axis_by_itself(end: list[float], rest: list[float]) -> None:
     # Starts within the last free cell, for a step does not look at the cells between its ends.
     start = [float(np.clip(value, -1.85, 1.85)) for value in end]
     reached, stopped = slide(ROOM, start, end)
-    assert reached == pytest.approx(rest, abs=2e-4)
-    assert stopped
+    assert reached == pytest.approx(rest, abs=2e-4) and stopped
     free = FreeSpace.of_maze(ROOM, radius_m=0.1)
     column, row = free.cells(torch.tensor(reached))
     assert not free.blocked[row, column]
@@ -123,19 +116,15 @@ def test_a_disc_keeps_its_whole_radius_from_walls(fine_m: float, radius_m: float
 def test_a_start_in_a_blocked_cell_may_leave_but_not_go_deeper() -> None:
     # x = 1.95 is closed; 1.85 is free, 2.05 is deeper.
     reached, stopped = slide(ROOM, [1.95, 0.0], [1.85, 0.0])
-    assert reached == pytest.approx([1.85, 0.0])
-    assert not stopped
+    assert reached == pytest.approx([1.85, 0.0]) and not stopped
     reached, stopped = slide(ROOM, [1.95, 0.0], [2.05, 0.05])
-    assert stopped
-    assert reached == pytest.approx([2.0, 0.05], abs=2e-4)
+    assert stopped and reached == pytest.approx([2.0, 0.05], abs=2e-4)
     # Along the wall it is as deep everywhere.
     reached, stopped = slide(ROOM, [1.95, 0.0], [1.95, 0.15])
-    assert reached == pytest.approx([1.95, 0.15])
-    assert not stopped
+    assert reached == pytest.approx([1.95, 0.15]) and not stopped
     # Out of one wall it does not get into another, not even as deep.
     reached, stopped = slide(ROOM, [1.95, 1.85], [1.85, 1.95])
-    assert stopped
-    assert reached == pytest.approx([1.85, 1.9], abs=2e-4)
+    assert stopped and reached == pytest.approx([1.85, 1.9], abs=2e-4)
 
 
 def test_goal_distance_is_bilinear() -> None:

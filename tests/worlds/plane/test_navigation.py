@@ -57,10 +57,8 @@ def test_starts_and_goals_scatter_around_their_cells(maze: Maze) -> None:
     task = Navigation(maze, horizon=1)
     for draw, cell in ((task.draw_starts, task.maze.start), (task.draw_goals, task.maze.goal)):
         points = draw(np.random.default_rng(0), 4000)[:, :2] - np.array(task.maze.cell_center(*cell))
-        assert points.shape == (4000, 2)
-        assert points.mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.02)
-        assert points.std(axis=0) == pytest.approx([0.2, 0.2], abs=0.01)
-        assert np.abs(points).max() <= 0.6 + 1e-9
+        assert points.shape == (4000, 2) and points.mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.02)
+        assert points.std(axis=0) == pytest.approx([0.2, 0.2], abs=0.01) and np.abs(points).max() <= 0.6 + 1e-9
 
 
 def test_goals_have_to_be_within_their_cell() -> None:
@@ -131,8 +129,7 @@ def judged(target: PlanarTarget, after: Sequence[Sequence[float]], fallen: Seque
 def test_an_episode_ends_at_the_goal_or_in_a_fall() -> None:
     target = Dots(STRAIGHT, 3)
     step = judged(target, [[0.9, 0.0], [0.2, 0.0], [0.3, 0.0]], (False, True, False))
-    assert step.success.tolist() == [True, False, False]
-    assert target.failed.tolist() == [False, True, False]
+    assert step.success.tolist() == [True, False, False] and target.failed.tolist() == [False, True, False]
     assert step.terminated.tolist() == [True, True, False]
     # Meters closer to the goal, and 10 for reaching it or -10 for the fall.
     torch.testing.assert_close(step.reward, torch.tensor([10.9, 0.2 - 10.0, 0.3]))

@@ -40,8 +40,7 @@ def test_rows_are_set_by_themselves_and_states_handed_out_stay() -> None:
     handed_out = states.state
     states.blocked[:] = True
     states.reset_to(HERE[:1] + 1.0, torch.tensor([1]))
-    assert torch.equal(handed_out, HERE)
-    assert torch.equal(states.state[1], HERE[0] + 1.0)
+    assert torch.equal(handed_out, HERE) and torch.equal(states.state[1], HERE[0] + 1.0)
     assert states.blocked.tolist() == [True, False, True]
     given = HERE.clone()
     states.reset_to(given)
@@ -81,10 +80,8 @@ def test_corrections_slide_along_walls_and_keep_all_else() -> None:
     settled = states.settle(HERE, landed)
     assert states.blocked.tolist() == [True, False, False]
     # The wall's face is at 6 m, the disc's center stays 0.1 m away.
-    assert 5.8 < settled[0, 1] < 5.9001
-    assert torch.equal(settled[1:], landed[1:])
-    assert torch.equal(settled[:, 2:], landed[:, 2:])
-    assert settled is states.state
+    assert 5.8 < settled[0, 1] < 5.9001 and torch.equal(settled[1:], landed[1:])
+    assert torch.equal(settled[:, 2:], landed[:, 2:]) and settled is states.state
 
 
 def test_commands_are_clipped_then_turned_then_scaled() -> None:
@@ -104,13 +101,9 @@ def test_commands_are_clipped_then_turned_then_scaled() -> None:
 
 def test_sensors_show_other_states_than_the_true_ones() -> None:
     torch.manual_seed(0)
-    noise = BallVariation(
-        position_noise_m=(0.1, 0.1),
-        velocity_noise_m_s=(0.2, 0.2),
-        ball_position_noise_m=(0.3, 0.3),
-        ball_velocity_noise_m_s=(0.4, 0.4),
-    )
-    inner, varied = resting(3, 8, noise)
+    names = ("position_noise_m", "velocity_noise_m_s", "ball_position_noise_m", "ball_velocity_noise_m_s")
+    widths = {name: (width / 10, width / 10) for width, name in enumerate(names, start=1)}
+    inner, varied = resting(3, 8, BallVariation(**widths))
     here = torch.rand(3, 8)
     varied.reset_to(here)
     assert torch.equal(varied.state, here)
@@ -169,12 +162,8 @@ def test_each_parameter_does_what_its_name_says() -> None:
         torch.testing.assert_close(state[:2] - START[0, :2], torch.tensor(moved), atol=1e-5, rtol=0)
 
 
-def test_noise_on_commands_moves_and_noise_of_sensors_only_shows() -> None:
+def test_noise_on_commands_moves() -> None:
     torch.manual_seed(0)
     noisy = one_step(PlanarVariation(action_noise=(0.1, 0.1)), 20_000, 0.5 * ACTION)
     assert torch.equal(noisy.state, noisy.true_state)
     torch.testing.assert_close(noisy.state[:, 2:].std(0), torch.full((2,), 0.1), atol=0.005, rtol=0)
-    shown = one_step(PlanarVariation(position_noise_m=(0.03, 0.03), velocity_noise_m_s=(0.02, 0.02)), 20_000)
-    assert (shown.true_state == shown.true_state[:1]).all()
-    error = (shown.state - shown.true_state).abs().amax(0)
-    torch.testing.assert_close(error, torch.tensor([0.03, 0.03, 0.02, 0.02]), atol=1e-4, rtol=0.01)

@@ -25,14 +25,8 @@ AIM = np.array(TASK.maze.cell_center(*TASK.maze.goal), np.float32)
 
 
 def relocation(**changes: Any) -> Relocation:
-    settings: dict[str, Any] = {
-        "rotations": "quarter",
-        "translations": True,
-        "margin_m": 1.3,
-        "min_steps": 5,
-        "tries": 100,
-    }
-    return Relocation(TASK, **settings | changes)
+    settings: dict[str, Any] = {"rotations": "quarter", "translations": True, "margin_m": 1.3, "min_steps": 5}
+    return Relocation(TASK, **settings | {"tries": 100} | changes)
 
 
 def straight(start: tuple[float, float], end: tuple[float, float], steps: int) -> Episode:
@@ -51,9 +45,7 @@ def test_only_what_keeps_its_distance_may_move() -> None:
         x = path.columns[name][:, 0]
         path.columns[name][:, 1] -= np.where(np.abs(x) < 1.0, 1.5, 0.0)
     (first, second) = relocation().stretches(path)
-    assert (first[0], second[1]) == (0, 100)
-    assert abs(first[1] - 37) <= 1
-    assert abs(second[0] - 63) <= 1
+    assert (first[0], second[1]) == (0, 100) and abs(first[1] - 37) <= 1 and abs(second[0] - 63) <= 1
     assert relocation(min_steps=40).stretches(path) == []
     assert relocation(margin_m=0.3).stretches(path) == [(0, 100)]
 
@@ -79,9 +71,7 @@ def test_quarter_turns_go_everywhere_that_is_free() -> None:
     np.testing.assert_allclose(bearing, turns * np.pi / 2, atol=1e-6)
     assert set(turns % 4) == {0, 1, 2, 3}
     # In all three corridors.
-    assert ends[:, 0, 1].max() > 3
-    assert ends[:, 0, 1].min() < -3
-    assert (np.abs(ends[:, 0, 1]) < 2).any()
+    assert ends[:, 0, 1].max() > 3 and ends[:, 0, 1].min() < -3 and (np.abs(ends[:, 0, 1]) < 2).any()
 
 
 def test_what_fits_nowhere_is_given_up() -> None:
@@ -117,8 +107,7 @@ def test_each_copy_has_a_goal_of_its_own_among_those_of_the_task() -> None:
     moving, rng = [TASK.state, replace(TASK.state, name=NEXT_STATE), TASK.action], np.random.default_rng(0)
     copies = [relocation().copied(episode, moving, rng) for _ in range(12)]
     goals = np.array([copy.columns[GOAL] for copy in copies if copy is not None])
-    assert len(goals) == 12 and (goals == goals[:, :1]).all()
-    assert len(np.unique(goals[:, 0], axis=0)) == 12
+    assert len(goals) == 12 and (goals == goals[:, :1]).all() and len(np.unique(goals[:, 0], axis=0)) == 12
     assert 0.0 < np.abs(goals - AIM).max() <= 0.6 + 1e-6
 
 
@@ -167,8 +156,7 @@ def test_a_ball_begins_on_the_field_and_ends_the_copy_where_it_leaves_it() -> No
     ends = {"goal": 0, "out": 0, "field": 0}
     for columns in kicks(300, kick(12, 0.1)):
         x, y = KICKING.abstraction(columns[STATE])[0, 4:6]
-        assert -2.0 <= x < 1.5
-        assert abs(y) <= 2.0
+        assert -2.0 <= x < 1.5 and abs(y) <= 2.0
         end = KICKING.abstraction(columns[NEXT_STATE])
         x, y = end[-1, 4:6]
         is_out = x >= 1.5 or x < -2 or abs(y) > 2
@@ -187,5 +175,4 @@ def test_a_ball_begins_on_the_field_and_ends_the_copy_where_it_leaves_it() -> No
 def test_what_ended_an_episode_with_a_ball_is_not_copied() -> None:
     made = kicks(50, kick(12, 0.0, ends=True))
     assert {len(columns[TERMINATED]) for columns in made} == {11}
-    assert not any(columns[TERMINATED].any() for columns in made)
-    assert kicks(3, kick(5, 0.0, ends=True)) == []
+    assert not any(columns[TERMINATED].any() for columns in made) and kicks(3, kick(5, 0.0, ends=True)) == []
