@@ -1,7 +1,7 @@
 """Turn the rows of recordings into columns, and cut them into episodes.
 
-Rows are converted block by block, and cut once a file has ended, or an episode of a format that has its own.
-So many of them are held, and those of a whole recording whose files continue one another.
+Rows are cut once a file has ended, a recording whose files continue one another, or an episode of a format that has its
+own.
 """
 
 from collections.abc import Iterator, Sequence
@@ -70,11 +70,10 @@ class Tally:
     split_points: dict[str, int] = field(default_factory=dict)
     """Number of boundaries between episodes, by reason."""
     last_rows: int = 0
-    """Last rows of episodes, dropped because their next state was not recorded."""
+    """Last rows of episodes, dropped because their next state was not recorded ..."""
     last_terminated: int = 0
-    """Those of them that were terminated."""
+    """... those of them that were terminated, and the sum of the rewards of the others."""
     last_reward: float = 0.0
-    """The sum of the rewards of the others."""
     back_rows: int = 0
     """Those at which time goes back, within a file."""
     back_first: str = ""
@@ -89,7 +88,6 @@ class Tally:
     clock: str = ""
     """The recorded rate, gaps and jitter, where the mapping names the times."""
     unused_fields: list[str] = field(default_factory=list)
-    """Fields, or topics, that no column takes."""
     notes: list[str] = field(default_factory=list)
     """What is strange about the rates of files, in a line each."""
     topics: dict[str, list[str]] = field(default_factory=dict)
@@ -108,16 +106,12 @@ class Tally:
 
 
 class Cutter:
-    """Cuts consecutive blocks into episodes; `skip_bad` leaves out those with a value that is not finite.
-
-    Attributes:
-        tally: of the rows so far.
-        columns: of the dataset, including derived ones; known after the first block.
-    """
+    """Cuts consecutive blocks into episodes; `skip_bad` leaves out those with a value that is not finite."""
 
     def __init__(self, mapping: ImportMapping, *, skip_bad: bool = False) -> None:
         self.tally = Tally()
         self.columns: tuple[Column, ...] = ()
+        """Of the dataset, including derived ones; known after the first block."""
         self._mapping, self._skips = mapping, skip_bad and mapping.not_finite == "refuse"
         self._converted: dict[str, Column] = {}
         self._rounding: dict[str, Rounding] = {}
@@ -139,34 +133,34 @@ class Cutter:
             yield from self.cut()
             self._begins = "file" if is_apart else "back" if block.is_back else "source"
         columns, bad = self.convert(block)
-        n, split = len(block), self._mapping.split
+        n, mapping = len(block), self._mapping
         rejected = np.logical_or.reduce([np.zeros(n, bool), *bad.values()])
         self._count(block, bad, rejected)
         if is_apart or not self._parts or self._parts[-1].origin != block.origin:
             self._parts.append(replace(block, values={}, places={}, known=()))
             self._spent.append(np.zeros(3))
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
+        ends = [fields[name] for name in mapping.split.ends]
+        ends += [columns[name].reshape(n, -1) for name in (TERMINATED, TRUNCATED) if name in columns]
+        times = (
+            fields[mapping.time][:, 0].astype(np.float64) * mapping.time_scale if mapping.time else np.full(n, np.nan)
+        )
         table = columns | {
             "/finite": ~rejected,
             "/row": block.row + np.arange(n),
             "/part": np.full(n, len(self._parts) - 1),
             "/torn": (np.arange(n) == 0) & self._was_torn,
+            "/end": np.logical_or.reduce([np.zeros(n, bool), *((np.nan_to_num(v) != 0).any(axis=1) for v in ends)]),
+            "/time": times.astype(np.float64) * mapping.time_scale,
+            "/field": fields[mapping.split.field] if mapping.split.field else np.zeros((n, 1)),
         }
-        table |= {f"/ends {name}": fields[name] for name in split.ends}
-        table |= {f"/ends {name}": as_rows(columns[name]) for name in (TERMINATED, TRUNCATED) if name in columns}
-        if split.field:
-            table["/field"] = fields[split.field]
-        if self._mapping.time:
-            table["/time"] = fields[self._mapping.time][:, 0].astype(np.float64) * self._mapping.time_scale
-        for key, values in self._tables[-1].items() if self._tables else ():
-            if values.shape[1:] != table[key].shape[1:]:
-                sizes = f"{table[key].shape[1]} values, before there were {values.shape[1]}"
-                raise BadInputError(f"{block.origin}: split.{key[1:]} has {sizes}")
-        self._was_torn = block.torn > 0 and self._mapping.not_finite != "drop"
+        if self._tables and (before := self._tables[-1]["/field"].shape[1]) != (size := table["/field"].shape[1]):
+            raise BadInputError(f"{block.origin}: split.field has {size} values, before there were {before}")
+        self._was_torn = block.torn > 0 and mapping.not_finite != "drop"
         self._tables.append(table)
 
-    def cut(self, *, leaves_last: bool = False) -> Iterator[Cut]:
-        """Yield the episodes in the rows that are held, and hold none; `leaves_last` leaves out the last."""
+    def cut(self) -> Iterator[Cut]:
+        """Yield the episodes in the rows that are held, and hold none."""
         if not self._tables:
             return
         table = {key: np.concatenate([each[key] for each in self._tables]) for key in self._tables[0]}
@@ -200,7 +194,7 @@ class Cutter:
                 np.logical_or.at(table[name], kept[before[ends]], table[name][ends])
         bad = {int(episode[at]): at for at in rejected[::-1].tolist()} if self._skips else {}
         is_new = np.asarray(reasons[: REASONS.index("end")].any(axis=0))
-        for number, part in enumerate(np.split(kept, starts[1:])[: -1 if leaves_last else None]):
+        for number, part in enumerate(np.split(kept, starts[1:])):
             self._ended &= not is_new[starts[number]]
             if number in bad:
                 where = self._place(table, bad[number])
@@ -211,36 +205,27 @@ class Cutter:
             yield from self._episode(values, source | {"source_row": int(table["/row"][part[0]])})
 
     def _boundaries(self, table: Table) -> tuple[dict[str, Array], Array]:
-        """Return to which rows each reason applies, but for jumps and what begins the first, (n,) each.
+        """Return to which rows each reason applies, but for jumps, and the steps in time to them.
 
-        And the steps in time to each row from the one before, (n, 3): as recorded, held over rows without a
-        time, and held over rows that are dropped, too; NaN for the first.
+        The steps (n, 3) are as recorded, held over rows without a time, and over rows that are dropped, too.
         """
-        n, split, drops = len(table["/row"]), self._mapping.split, self._mapping.not_finite == "drop"
+        n = len(table["/row"])
         masks: dict[str, Array] = {reason: np.zeros(n, bool) for reason in REASONS}
-        for key, values in table.items():
-            if key.startswith("/ends "):
-                masks["end"][1:] |= (np.nan_to_num(values[:-1]) != 0).any(axis=1)
-        if split.field:
-            earlier, later = table["/field"][:-1], table["/field"][1:]
-            # What is missing (NaN) is the same value again, as empty cells of CSV are.
-            are_missing = (earlier != earlier) & (later != later)
-            masks["field"][1:] = ((earlier != later) & ~are_missing).any(axis=1)
-        steps_s: Array = np.full((n, 3), np.nan)
-        if "/time" in table:
-            times = np.repeat(table["/time"][:, None], 3, axis=1)
-            times[~table["/finite"] & drops, 2] = np.nan
-            known = np.where(np.isfinite(times[:, 1:]), np.arange(n)[:, None], 0)
-            times[:, 1:] = np.take_along_axis(times[:, 1:], np.maximum.accumulate(known), axis=0)
-            steps_s[1:] = np.diff(times, axis=0)
-            masks["back"] = steps_s[:, 1] < 0
-            if split.gap_s is not None:
-                masks["gap"] = np.asarray((steps_s[:, 1:] > split.gap_s).any(axis=1))
+        masks["end"][1:] = table["/end"][:-1]
+        earlier, later = table["/field"][:-1], table["/field"][1:]
+        # What is missing (NaN) is the same value again, as empty cells of CSV are.
+        masks["field"][1:] = ((earlier != later) & ~((earlier != earlier) & (later != later))).any(axis=1)
+        times = np.repeat(table["/time"][:, None], 3, axis=1)
+        times[~table["/finite"] & (self._mapping.not_finite == "drop"), 2] = np.nan
+        known = np.where(np.isfinite(times[:, 1:]), np.arange(n)[:, None], 0)
+        times[:, 1:] = np.take_along_axis(times[:, 1:], np.maximum.accumulate(known), axis=0)
+        steps_s = np.diff(times, axis=0, prepend=np.full((1, 3), np.nan))
+        masks["back"] = steps_s[:, 1] < 0
+        masks["gap"] = np.asarray((steps_s[:, 1:] > (self._mapping.split.gap_s or np.inf)).any(axis=1))
         masks["rejected"] = table["/torn"] | (~table["/finite"] & (self._mapping.not_finite == "split"))
         return masks, steps_s
 
     def _jumped(self, table: Table, kept: NDArray[np.int64]) -> Mask:
-        """Return which of the rows that are kept are a jump away from the one before."""
         jump = self._mapping.split.jump
         if not jump:
             return np.zeros(len(kept), bool)
@@ -250,12 +235,9 @@ class Cutter:
         return np.asarray(np.linalg.norm(steps, axis=1) > jump.above)
 
     def _place(self, table: Table, at: int) -> str:
-        """Name the row `at` of the table."""
-        named: str = self._parts[table["/part"][at]].row_name(int(table["/row"][at]))
-        return named
+        return str(self._parts[table["/part"][at]].row_name(int(table["/row"][at])))
 
     def _count(self, block: Block, bad: dict[str, Mask], rejected: Mask) -> None:
-        """Tally the rows of a block: those with a field that is not finite, in `bad`, are rejected."""
         tally = self.tally
         tally.rows += len(block) + block.torn
         tally.rejected_rows += int(rejected.sum()) + block.torn
@@ -330,11 +312,7 @@ class Cutter:
         return kept | {NEXT_STATE: state[1:]}
 
     def check(self) -> None:
-        """Compare fps to the rates measured from the times; tally these, and which steps float32 rounds.
-
-        The rates are the mean rate, and the usual one without pauses, of all files and of each, or of each
-        episode of formats that have their own.
-        """
+        """Compare fps to the rates of files, on average and without pauses; tally these, and what float32 rounds."""
         self.tally.notes += self.rounded()
         timed = [(part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()]
         if not timed:

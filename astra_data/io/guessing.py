@@ -3,6 +3,7 @@
 Logs are CSV files, or the episodes of a dataset.
 """
 
+import io
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -21,15 +22,7 @@ from astra_data.dataset.checkup.findings import ANGLE, LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.io.cutting import RATE_TOLERANCE
-from astra_data.io.importers.csv import (
-    SUFFIXES,
-    check_header,
-    delimiter_of,
-    explained,
-    line_of,
-    torn_bytes,
-    without_end,
-)
+from astra_data.io.importers.csv import SUFFIXES, delimiter_of, explained, line_of, whole_lines
 from astra_data.io.recording import Source, foreign, refuse_dataset
 
 Role = Literal["time", "episode", "state", "command", "goal", "failure", "success", "reward", "left out"]
@@ -201,7 +194,7 @@ def guess(paths: Sequence[Path]) -> Logs:
         for episode, kept in zip(raw, rows, strict=True)
         if kept.any()
     )
-    cut_off = tuple(str(source.path) for source in sources if torn_bytes(source))
+    cut_off = tuple(str(source.path) for source in sources if whole_lines(source, str(source.path))[1])
     logs = Logs(tuple(fields), episodes, {name: gap for name, gap in gaps.items() if gap}, cut_off)
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if role not in [field.role for field in fields]:
@@ -403,12 +396,10 @@ def read_numbers(source: Source) -> dict[str, Floats]:
     Equal texts of an episode's name have the same number. A last line that is cut off is left out. Raise
     BadInputError if it is no CSV, has too few rows, or a field of numbers has a text or is there twice.
     """
-    delimiter, mark = delimiter_of(source.path.name)
+    delimiter = delimiter_of(source.path.name)
     with explained(str(source.path), source):
-        with source.open() as stream:
-            check_header(str(source.path), stream)
-        with without_end(source, torn_bytes(source)) as stream:
-            table = csv.read_csv(stream, parse_options=csv.ParseOptions(delimiter=delimiter))
+        content, _ = whole_lines(source, str(source.path))
+        table = csv.read_csv(io.BytesIO(content), parse_options=csv.ParseOptions(delimiter=delimiter))
     if len(table) < 2:
         found = f"expected two rows or more below its header, got {len(table)}: leave it out"
         raise BadInputError(f"{source.path}: {found}")
@@ -434,6 +425,7 @@ def read_numbers(source: Source) -> dict[str, Floats]:
             raise BadInputError(f"{source.path}: expected a header of different names, got {name} twice")
         numbers[name] = series
     if not any(np.isfinite(values).any() for values in numbers.values()):
+        mark = "tabs" if delimiter == "\t" else "commas"
         raise BadInputError(f"{source.path}: expected rows of numbers separated by {mark} below a header")
     return numbers
 

@@ -280,29 +280,18 @@ def episodes(
         for number, source in enumerate(sources):
             source = replace(source, faults=left_out)
             is_apart = mapping.split.files or source.recording != recording
-            is_bad = is_fed = False
             try:
                 for block in _blocks(source, module, mapping):
                     size += VALUE_BYTES * sum(values.size for values in block.values.values())
                     source.refuse_beyond(size)
                     recording = source.recording
-                    is_bad &= not block.starts
-                    if is_bad:
-                        continue
-                    try:
+                    with source.tolerant():
                         yield from cutter.feed(block, is_apart=is_apart)
-                        is_apart, is_fed = False, True
-                    except BadInputError as error:
-                        if left_out is None:
-                            raise
-                        left_out.append(str(error))
-                        is_bad = True
-                        yield from cutter.cut(leaves_last=True) if is_fed else ()
+                        is_apart = False
             except BadInputError as error:
                 if left_out is None:
                     raise BadInputError(_all_faults(error, sources[number:], module, mapping)) from error
                 left_out.append(str(error))
-                yield from cutter.cut(leaves_last=True) if is_fed else ()
         yield from cutter.cut()
     except MemoryError as error:
         raise BadInputError(
@@ -336,10 +325,9 @@ def refuse_rejected(tally: Tally, mapping: ImportMapping) -> None:
 
 def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the blocks of a file; where fields are (episodes, steps, ...), one for each episode."""
-    row, origin = 0, ""
     with explained(source, module):
         for block in module.read(source, mapping):
-            row, origin = (row if block.origin == origin else 0), block.origin
+            origin = block.origin
             shapes = [values.shape[1:] for values in map(np.asarray, block.values.values())]
             several = [shape for shape in shapes if shape]
             steps = several[0][0] if several else 1
@@ -353,7 +341,7 @@ def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Itera
                 has_matrix, are_all = max(map(len, several)) > 1, several == shapes
                 is_short, is_sure = len(block) < steps, has_matrix and are_all
                 # With single numbers among them, or without a matrix, only too few rows give them away.
-                is_odd = is_short and row == 0 and not block.starts and (has_matrix or are_all)
+                is_odd = is_short and not block.starts and (has_matrix or are_all)
                 if (is_sure and is_short) or (len(shapes) > 1 and (is_sure or is_odd)):
                     name, shape = next(each for each in zip(block.values, shapes, strict=True) if each[1])
                     raise BadInputError(
@@ -362,13 +350,11 @@ def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Itera
                         f"mapping if these are the steps of {len(block)} episodes, else stacked = false"
                     )
             if not mapping.stacked:
-                yield replace(block, row=row)
-                row += len(block)
+                yield block
                 continue
             for episode in range(len(block)):
                 values = {field: np.asarray(stack)[episode] for field, stack in block.values.items()}
-                yield Block(values, f"{origin}/{row + episode}", starts=True, known=block.known)
-            row += len(block)
+                yield Block(values, f"{origin}/{episode}", starts=True, known=block.known)
 
 
 def _all_faults(error: BadInputError, sources: Sequence[Source], module: ModuleType, mapping: ImportMapping) -> str:

@@ -14,8 +14,9 @@ from array import array
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator
 from heapq import heappop, heappush
-from io import SEEK_END, BufferedReader, BytesIO
+from io import SEEK_END, BytesIO
 from itertools import pairwise
+from mmap import ACCESS_READ, mmap
 from typing import IO, Any, NamedTuple
 from zlib import crc32
 
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.io.recording import MOST_UNPACKED, SMALL_BYTES, Part, Source
+from astra_data.io.recording import MOST_UNPACKED, Source
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
@@ -134,17 +135,15 @@ class McapFile:
         """Yield the records of the data, those of chunks unpacked, and `checked` by their sums."""
         reading, records = optional("mcap.stream_reader"), optional("mcap.records")
         with self._source.open() as stream:
-            size = stream.seek(0, SEEK_END)
-            self._left = max(self._source.most_bytes or 0, SMALL_BYTES, MOST_UNPACKED * size)
-            stream.seek(0)
+            self._left = self._source.most_unpacked
             if self._chunks is not None:
                 for index in self._chunks:
                     stream.seek(index.chunk_start_offset + _HEAD.size)
                     yield from self._unpacked(records.Chunk.read(reading.ReadDataStream(stream)), checked)
                 return
-            whole: IO[bytes] = stream
-            if self._whole_bytes is not None:
-                whole = BufferedReader(Part(stream, self._whole_bytes))
+            whole: Any = stream
+            if self._whole_bytes is not None:  # 0 would be the whole file
+                whole = mmap(stream.fileno(), self._whole_bytes, access=ACCESS_READ) if self._whole_bytes else BytesIO()
             try:
                 for record in reading.StreamReader(whole, emit_chunks=True, validate_crcs=checked).records:
                     if isinstance(record, records.Chunk):

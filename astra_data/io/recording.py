@@ -1,6 +1,5 @@
 """Recordings in other formats: their files, and the blocks of rows that importers read from them."""
 
-import io
 import re
 import shlex
 import tarfile
@@ -8,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
-from typing import IO, Any
+from typing import IO
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import file_digest, files_below
@@ -18,9 +17,6 @@ from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.plain import read_object
 from astra_data.dataset.writer import is_text
 from astra_data.io.mapping import ImportMapping
-
-BLOCK_ROWS = 2**13
-"""Rows that an importer reads at once, if the format allows it."""
 
 VALUE_BYTES = 8
 """What a value is counted as, whatever its type."""
@@ -36,26 +32,22 @@ IN_ARCHIVES = ("csv", "json")
 
 @dataclass(frozen=True)
 class Source:
-    """One file of a recording.
-
-    Attributes:
-        path: the file, or the archive that holds it.
-        member: its entry in the archive, None for a file of its own.
-        recording: the file, folder or archive given by the user; its files follow one another.
-        most_bytes: most bytes of values that are taken from it.
-        name: what it is called, by default its path within its recording.
-        parts: the files of a recording that are joined by time, by their names in the mapping.
-        faults: episodes that cannot be read are left out, and what is wrong with them is added to it; None
-            where they are refused.
-    """
+    """One file of a recording."""
 
     path: Path
+    """The file, or the archive that holds it."""
     member: tarfile.TarInfo | None
+    """Its entry in the archive."""
     recording: Path
+    """The file, folder or archive given by the user; its files follow one another."""
     most_bytes: int = SMALL_BYTES
+    """Most bytes of values that are taken from it."""
     name: str = ""
+    """What it is called, by default its path within its recording."""
     parts: Mapping[str, "Source"] = field(default_factory=dict, compare=False)
+    """The files of a recording that are joined by time, by their names in the mapping."""
     faults: list[str] | None = field(default=None, compare=False)
+    """What is wrong with episodes that cannot be read and are left out; None where they are refused."""
 
     def refuse_beyond(self, size: int) -> None:
         """Raise BadInputError if values of `size` bytes are too many to be taken."""
@@ -64,6 +56,11 @@ class Source:
                 f"{self} holds values of {size} bytes or more, but at most {self.most_bytes} are accepted: "
                 "robot logs do not compress that much. If you trust it, pass a larger --max-bytes."
             )
+
+    @property
+    def most_unpacked(self) -> int:
+        """Most bytes that are unpacked, values or not."""
+        return max(self.most_bytes, SMALL_BYTES, MOST_UNPACKED * self.path.stat().st_size)
 
     @contextmanager
     def tolerant(self) -> Iterator[None]:
@@ -76,11 +73,9 @@ class Source:
             self.faults.append(str(error))
 
     def __str__(self) -> str:
-        if self.name:
-            return self.name
-        if self.member is not None:
-            return f"{self.path.name}/{self.member.name}"
-        return named(self.path, self.recording)
+        if self.name or self.member is None:
+            return self.name or named(self.path, self.recording)
+        return f"{self.path.name}/{self.member.name}"
 
     @contextmanager
     def open(self) -> Iterator[IO[bytes]]:
@@ -89,6 +84,8 @@ class Source:
             with self.path.open("rb") as stream:
                 yield stream
             return
+        if self.member.size > self.most_unpacked:
+            self.refuse_beyond(self.member.size)
         with tarfile.open(self.path) as archive:
             content = archive.extractfile(self.member)
             assert content is not None, "find_sources returns plain files"
@@ -96,51 +93,30 @@ class Source:
                 yield content
 
 
-class Part(io.RawIOBase):
-    """The first `size` bytes of a stream, from where it is."""
-
-    def __init__(self, stream: IO[bytes], size: int) -> None:
-        self._stream, self._left = stream, size
-
-    def readable(self) -> bool:
-        """Return True."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 - what Python's own streams fill
-        """Fill `buffer`, and return with how many bytes."""
-        read = self._stream.read(min(len(buffer), self._left))
-        buffer[: len(read)] = read
-        self._left -= len(read)
-        return len(read)
-
-
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Consecutive rows.
-
-    Attributes:
-        values: field to n rows, (n,) or (n, ...).
-        origin: the file and part of the file that they come from.
-        starts: whether an episode of the format itself begins with the first row.
-        torn: how many rows after the last one are cut off at the end of the file, 0 or 1.
-        notes: what the import's report tells of them, in a line each.
-        is_back: whether that episode begins since time goes back.
-        places: where the values of some rows were recorded, if the number of the row does not tell.
-        line: gives the line of a row of the file by its number, where lines may be empty.
-        known: the fields, or topics, that this part of the file has.
-        row: the number of the first in that part; set by what reads them all.
-    """
+    """Consecutive rows: those of a file, or of an episode of a format that has its own."""
 
     values: Mapping[str, Array]
+    """Field to n rows, (n,) or (n, ...)."""
     origin: str
+    """The file and part of the file that they come from."""
     starts: bool = False
+    """Whether an episode of the format itself begins with the first row."""
     torn: int = 0
+    """How many rows after the last one are cut off at the end of the file, 0 or 1."""
     notes: tuple[str, ...] = ()
+    """What the import's report tells of them, in a line each."""
     is_back: bool = False
+    """Whether that episode begins since time goes back."""
     places: Mapping[int, str] = field(default_factory=dict)
+    """Where the values of some rows were recorded, if the number of the row does not tell."""
     line: Callable[[int], int] | None = None
+    """Gives the line of a row of the file by its number, where lines may be empty."""
     known: Collection[str] = ()
+    """The fields, or topics, that this part of the file has."""
     row: int = 0
+    """The number of the first row in that part."""
 
     def __len__(self) -> int:
         return len(next(iter(self.values.values())))
@@ -151,9 +127,7 @@ class Block:
 
     def row_name(self, number: int) -> str:
         """Name the row, or the cut off one after the last, that has a `number` in its part of the file."""
-        if self.line is None:
-            return row_name(self.origin, number)
-        return f"{self.origin} line {self.line(number)}"
+        return f"{self.origin} line {self.line(number)}" if self.line else f"{self.origin} row {number}"
 
 
 ZARR = (".zgroup", ".zarray", ".zattrs", "zarr.json")
@@ -358,13 +332,6 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
     if faults:
         raise BadInputError(f"{archive}: expected plain files; {'; '.join(faults)}")
     return members
-
-
-def row_name(origin: str, row: int) -> str:
-    """Name a row, counted from 0 in its part of a file; of CSV and JSON Lines the line, as an editor does."""
-    if not origin.lower().endswith((".csv", ".tsv", ".jsonl", ".ndjson")):
-        return f"{origin} row {row}"
-    return f"{origin} line {row + (2 if origin.lower().endswith('sv') else 1)}"
 
 
 def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int, ...]]) -> int:

@@ -12,15 +12,16 @@ most of its step.
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.checkup.findings import GAP
-from astra_data.dataset.columns import ACTION, STATE, Array
+from astra_data.dataset.columns import ACTION, STATE
 from astra_data.io.cutting import RATE_TOLERANCE
 from astra_data.io.mapping import ImportMapping
 
@@ -39,7 +40,7 @@ _AVERAGED = 20
 
 
 class Resampler:
-    """Holds the last values of all topics and samples rows from them.
+    """Holds the last messages of all topics and samples rows from them.
 
     Attributes:
         topics: topic to its fields.
@@ -80,7 +81,8 @@ class Resampler:
         self._moments = {topic: np.asarray(each, np.int64) for topic, each in moments.items()}
         self._refuse_apart()
         self._periods = usual_periods(self._moments, round((mapping.split.gap_s or 0) * 1e9))
-        self._values: dict[str, Array] = {}
+        self._held: dict[str, Any] = {}
+        self._is_back = False
         self._start: int | None = None
         self._row = self._rows = self._delay_ns = 0
         often = {topic: _messages_per_row(1e9 / mapping.fps / period) for topic, period in self._periods.items()}
@@ -95,29 +97,27 @@ class Resampler:
         self._commands = {t: n for n, c in columns if n.startswith(ACTION) for t in map(of.__getitem__, c.fields)}
         self._lossy = self._commands.keys() | {of[field] for field in mapping.flag_fields}
 
-    def receive(self, topic: str, time: int, values: Mapping[str, Array]) -> None:
-        """Update the values of `topic` with a message at `time` ns."""
-        if self._start is not None:
-            self._messages[topic] += 1
-            self._skipped[topic] += topic in self._fresh
-        self._fresh.add(topic)
-        self._values |= values
-        self.times[topic] = time
-        is_complete = self.times.keys() == self.topics.keys() and not self._silent(time)
-        if self._start is None and is_complete:
-            self._delay_ns = self._midway(time)
-            self._start, self._row = time + self._delay_ns, 0
+    def rows(self, messages: Iterable[tuple[str, int, Any, bool]]) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
+        """Yield whether a row begins an episode, whether it does since time goes back, and each topic's message.
 
-    def rows_before(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
-        """Yield the rows before `time` that have not been sampled yet, and whether each begins an episode."""
-        # A pause: all topics that are not latched are silent for too long.
-        if self._start is not None and len(self._silent(time)) == len(self._expiring):
-            yield from self._sampled(self._end(max(self.times[topic] for topic in self._expiring)))
-            self._start = None
-        yield from self._sampled(time)
-
-    def last_rows(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
-        """Yield the rows that are left after the last message, at `time` ns."""
+        Messages have a topic, a time in ns, what they hold, and whether the clock was set back before them.
+        """
+        time = 0
+        for topic, time, message, goes_back in messages:
+            # A pause: all topics that are not latched are silent for too long.
+            if self._start is not None and len(self._silent(time)) == len(self._expiring):
+                yield from self._sampled(self._end(max(self.times[topic] for topic in self._expiring)))
+                self._start = None
+            yield from self._sampled(time)
+            self._is_back |= goes_back
+            if self._start is not None:
+                self._messages[topic] += 1
+                self._skipped[topic] += topic in self._fresh
+            self._fresh.add(topic)
+            self._held[topic], self.times[topic] = message, time
+            if self._start is None and self.times.keys() == self.topics.keys() and not self._silent(time):
+                self._delay_ns = self._midway(time)
+                self._start, self._row = time + self._delay_ns, 0
         if self._start is not None:
             yield from self._sampled(self._end(time))
 
@@ -158,7 +158,8 @@ class Resampler:
                 )
         return tuple(f"{self._origin}: {note}" for note in notes)
 
-    def _sampled(self, time: int) -> Iterator[tuple[bool, dict[str, Array]]]:
+    def _sampled(self, time: int) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
+        """Yield the rows before `time` that have not been sampled yet."""
         self._refuse_gap(time)
         while self._start is not None:
             moment = self._start + self._row * 10**9 // self._fps
@@ -173,7 +174,8 @@ class Resampler:
                 repeated = self.topics.keys() - self._fresh
                 self._repeated.update(repeated)
             self._fresh.clear()
-            yield self._row == 0, dict(self._values)
+            yield self._row == 0, self._row == 0 and self._is_back, dict(self._held)
+            self._is_back &= self._row > 0
             self._row += 1
 
     def _midway(self, time: int) -> int:

@@ -1,14 +1,10 @@
 """What the cutter makes of rows whose outcome is known."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, TRUNCATED, Array
@@ -28,16 +24,12 @@ def cutter(**changes: Any) -> Cutter:
     return Cutter(ImportMapping.model_validate(settings | changes))
 
 
-def cut(cutter: Cutter, bounds: Sequence[int] = (), **fields: ArrayLike) -> list[dict[str, Array]]:
-    """Cut one file with an `x` and an `a` that tells the row, in blocks that begin at `bounds`, too."""
+def cut(cutter: Cutter, **fields: ArrayLike) -> list[dict[str, Array]]:
+    """Cut one file with an `x` and an `a` that tells the row."""
     arrays = {name: np.asarray(values) for name, values in fields.items()}
-    n = len(arrays["x"])
-    arrays.setdefault("a", np.arange(n))
-    episodes = []
-    for first, last in pairwise([0, *bounds, n]):
-        block = Block({name: array[first:last] for name, array in arrays.items()}, "log", row=first)
-        episodes += [columns for columns, _ in cutter.feed(block, is_apart=first == 0)]
-    return episodes + [columns for columns, _ in cutter.cut()]
+    arrays.setdefault("a", np.arange(len(arrays["x"])))
+    assert not list(cutter.feed(Block(arrays, "log"), is_apart=True))
+    return [columns for columns, _ in cutter.cut()]
 
 
 def rows(episodes: list[dict[str, Array]]) -> list[list[int]]:
@@ -272,39 +264,3 @@ def test_columns_may_have_any_names() -> None:
         for episode, first in zip(episodes, (0, 30), strict=True):
             np.testing.assert_array_equal(episode[name], x[first : first + 29])
     cutting.check()
-
-
-cells = st.sampled_from([0.0, 0.0, 0.0, 1.0, np.nan])
-steps = st.sampled_from([0.1, 0.1, 0.1, 0.0, -0.3, 2.0, np.nan])
-lines = st.tuples(cells, steps, cells, cells, cells, st.sampled_from([0, 0, 0, 5]))
-
-
-@given(
-    table=st.lists(lines, min_size=2, max_size=30),
-    bounds=st.lists(st.integers(1, 29), max_size=6),
-    not_finite=st.sampled_from(["refuse", "drop", "split"]),
-    terminal=st.sampled_from(["drop", "stand_still"]),
-    skip_bad=st.booleans(),
-)
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
-def test_where_blocks_end_changes_nothing(
-    table: list[tuple[float, ...]], bounds: list[int], not_finite: str, terminal: str, skip_bad: bool
-) -> None:
-    columns = {name: {"fields": (field,)} for name, field in ((STATE, "x"), (ACTION, "a"), (REWARD, "a"))}
-    columns |= {TERMINATED: {"fields": ("over",)}, SUCCESS: {"fields": ("won",)}}
-    split = {"gap_s": 0.5, "field": "k", "jump": {"column": STATE, "values": (0,), "above": 3.0}}
-    mapping = ImportMapping.model_validate(
-        {"name": "log", "task": "walk", "fps": 10, "time": "t", "columns": columns, "split": split}
-        | {"not_finite": not_finite, "terminal": terminal}
-    )
-    x, t, over, won, k, jump = np.array(table).T
-    fields = {"x": x + np.nancumsum(jump), "t": np.nancumsum(t) + 0 * t, "over": over, "won": won, "k": k}
-    found = []
-    for at in ([], sorted({bound for bound in bounds if bound < len(x)})):
-        cutting = Cutter(mapping, skip_bad=skip_bad)
-        found.append((cut(cutting, at, **fields), asdict(cutting.tally)))
-    (whole, counts), (parts, others) = found
-    assert counts == others
-    for episode, expected in zip(parts, whole, strict=True):
-        for name, values in expected.items():
-            np.testing.assert_array_equal(episode[name], values, err_msg=name)

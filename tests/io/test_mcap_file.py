@@ -54,9 +54,9 @@ def test_no_more_is_unpacked_than_the_limit(
 ) -> None:
     path = write(tmp_path / "log.mcap", compression=compression)
     unpacked = 300 * (22 + 9 + 23)  # of a message: what stands before it, and its content
-    monkeypatch.setattr("astra_data.io.mcap_file.MOST_UNPACKED", 0)
+    monkeypatch.setattr("astra_data.io.recording.MOST_UNPACKED", 0)
     for limit, is_read in ((unpacked + 1000, True), (unpacked - 5000, False)):
-        monkeypatch.setattr("astra_data.io.mcap_file.SMALL_BYTES", limit)
+        monkeypatch.setattr("astra_data.io.recording.SMALL_BYTES", limit)
         file = McapFile(Source(path, None, path, most_bytes=0), ["/used", "/other"])
         if is_read:
             assert len(list(file.messages(checked=True))) == LENGTH

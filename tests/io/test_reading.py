@@ -97,23 +97,6 @@ def test_a_demonstration_that_is_bad_is_left_out_and_its_file_is_not(tmp_path: P
         assert found.startswith(f"log.h5/{fault}")
 
 
-def test_episodes_before_a_fault_in_a_file_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("astra_data.io.importers.json.BLOCK_ROWS", 4)
-    paths = [write_table(tmp_path / f"{number}.jsonl", rows(number)) for number in range(3)]
-    lines = paths[1].read_text().splitlines()
-    lines[17] = lines[17].replace('"y": ', '"y": "far"; ')
-    paths[1].write_text("\n".join(lines))
-    dataset, report = imported(tmp_path, paths, skip_bad=True)
-    assert [
-        (source, row) for source, row in zip(dataset.metadata["source"], dataset.metadata["source_row"], strict=True)
-    ] == [
-        *[("0.jsonl", row) for row in (0, 6, 15)],
-        ("1.jsonl", 0),
-        *[("2.jsonl", row) for row in (0, 6, 15)],
-    ]
-    assert len(report.left_out) == 1 and report.left_out[0].startswith("1.jsonl line 18: expected an object")
-
-
 def test_nothing_is_imported_where_all_files_are_bad(tmp_path: Path) -> None:
     with pytest.raises(
         BadInputError,

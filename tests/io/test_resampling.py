@@ -39,12 +39,8 @@ def sampled(
     times = {"/odom": odom, "/cmd": commands}
     resampler = Resampler(mapping, "log", {topic: t * MS for topic, t in times.items()})
     messages = sorted((t, topic, k) for topic, series in times.items() for k, t in enumerate(series))
-    rows = []
-    for t, topic, k in messages:
-        rows += [row for _, row in resampler.rows_before(round(t * MS))]
-        resampler.receive(topic, round(t * MS), {f"{topic}:k": np.array(k)})
-    rows += [row for _, row in resampler.last_rows(round(messages[-1][0] * MS))]
-    return resampler, [(int(row["/odom:k"]), int(row["/cmd:k"])) for row in rows]
+    rows = [row for *_, row in resampler.rows((topic, round(t * MS), k, False) for t, topic, k in messages)]
+    return resampler, [(row["/odom"], row["/cmd"]) for row in rows]
 
 
 @pytest.mark.parametrize("late_ms", [1.0, 12.0, -12.0])

@@ -1,16 +1,13 @@
-"""CSV: one row per step, a header with the fields' names; read block by block."""
+"""CSV: one row per step, a header with the fields' names."""
 
 import codecs
 import csv as python_csv
 import io
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 from itertools import islice
-from typing import IO
 
 import numpy as np
 import pyarrow as pa
@@ -21,30 +18,34 @@ from astra_data.core.errors import BadInputError, in_short
 from astra_data.core.naming import shortened
 from astra_data.dataset.columns import Array
 from astra_data.io.mapping import ImportMapping
-from astra_data.io.recording import Block, Part, Source, row_count
+from astra_data.io.recording import Block, Source, row_count
 
 SUFFIXES = (".csv", ".tsv")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE)
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
 _LIST = re.compile(r"\s*[\[(](.*)[\])]\s*", re.DOTALL)
-_LONGEST_HEADER = 2**20
 _SAVE = "save it as UTF-8"
 _SHOWN = 80
 """Characters of a line above the header that are shown."""
 
 
-def delimiter_of(name: str) -> tuple[str, str]:
-    """Return what parts the fields of the file `name`, and what it is called."""
-    return ("\t", "tabs") if name.lower().endswith(".tsv") else (",", "commas")
+def delimiter_of(name: str) -> str:
+    """Return what parts the fields of the file `name`."""
+    return "\t" if name.lower().endswith(".tsv") else ","
 
 
-def check_header(name: str, stream: IO[bytes]) -> None:
-    """Raise BadInputError if the file `name` is no UTF-8, or its header no names parted as it tells."""
-    line = _first_line(stream)
-    if line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+def whole_lines(source: Source, name: str) -> tuple[bytes, bool]:
+    """Return the file `name` without a last line that ends within a row, and whether there was such a line.
+
+    That line has no end and fewer fields than the header, as where a battery went empty; with quotes it is left to
+    the parser. Raise BadInputError if the file is no UTF-8, or its header no names parted as its name tells.
+    """
+    with source.open() as stream:
+        content = stream.read()
+    header = re.match(rb"(?:\r?\n)*(.*)", content)[1].rstrip(b"\r")  # type: ignore[index]
+    if header.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise BadInputError(f"{name}: expected text in UTF-8, got UTF-16: {_SAVE}")
-    delimiter, mark = delimiter_of(name)
-    first = line.decode("utf-8", "ignore" if len(line) == _LONGEST_HEADER else "strict")
+    delimiter, first = delimiter_of(str(source)), header.decode()
     cells = [cell.strip().strip('"') for cell in first.split(delimiter)]
     # Of pandas, columns without names are called 0, 1, 2, ...
     if cells != [str(number) for number in range(len(cells))] and all(map(_NUMBER.fullmatch, cells)):
@@ -55,16 +56,13 @@ def check_header(name: str, stream: IO[bytes]) -> None:
         )
     if delimiter not in first and (others := [other for part, other in _MARKS.items() if part in first]):
         raise BadInputError(
-            f"{name}: expected fields parted by {mark}, got {others[0]} in its header: "
+            f"{name}: expected fields parted by {_MARKS[delimiter]}, got {others[0]} in its header: "
             "write it with commas, or with tabs as .tsv"
         )
-
-
-def _first_line(stream: IO[bytes]) -> bytes:
-    """Read the first line that is not empty, with its end."""
-    while (line := stream.readline(_LONGEST_HEADER)) in (b"\n", b"\r\n"):
-        pass
-    return line
+    tail = content[max(content.rfind(b"\n"), content.rfind(b"\r")) + 1 :]
+    mark = delimiter.encode()
+    is_torn = 0 < len(tail) < len(content) and tail.count(mark) < header.count(mark) and b'"' not in header + tail
+    return content[: len(content) - len(tail)] if is_torn else content, is_torn
 
 
 @contextmanager
@@ -103,13 +101,16 @@ def line_of(source: Source, row: int) -> int:
 def _lines(source: Source) -> Iterator[Iterator[tuple[int, list[str]]]]:
     """Open a file as its lines that are not empty: their numbers, from 1, and their cells."""
     with source.open() as stream, io.TextIOWrapper(stream, "utf-8", "replace", newline="") as text:
-        reader = python_csv.reader(text, delimiter=delimiter_of(str(source))[0])
+        reader = python_csv.reader(text, delimiter=delimiter_of(str(source)))
         yield ((reader.line_num, cells) for cells in reader if cells)
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows: whole numbers, numbers, lists, or true and false; an empty cell is NaN."""
-    return _joined(source, mapping) if source.parts else _read(source, mapping.all_fields, mapping.fields)
+    if source.parts:
+        yield from _joined(source, mapping)
+    elif block := _read(source, mapping.all_fields, mapping.fields):
+        yield block
 
 
 def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
@@ -127,11 +128,9 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     tables: dict[str, dict[str, Array]] = {}
     for name in (main, *rest):
         fields = [time, *_plain(f for f in mapping.all_fields if f.startswith(f"{name}:"))]
-        blocks = [block.values for block in _read(source.parts[name], fields, numbers)]
+        block = _read(source.parts[name], fields, numbers)
         tables[name] = {
-            f"{name}:{field}" if field != time else time: np.concatenate([each[field] for each in blocks])
-            if blocks
-            else np.empty(0)
+            f"{name}:{field}" if field != time else time: np.asarray(block.values[field]) if block else np.empty(0)
             for field in fields
         }
     values = tables[main]
@@ -149,14 +148,14 @@ def _joined(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     kept = np.flatnonzero(is_known)
     if len(now) and not len(kept):
         raise BadInputError(f"{source}: no row has rows of {', '.join(rest)} before it that are recent enough")
-    for rows in np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else ():
+    begins = np.flatnonzero(np.diff(kept, prepend=-2) > 1).tolist()
+
+    def line(row: int) -> int:
+        return line_of(source.parts[main], int(kept[row]))
+
+    for first, rows in zip(begins, np.split(kept, begins[1:]), strict=False):
         part = {field: column[rows] for field, column in values.items()}
-        yield Block(
-            part,
-            str(source),
-            starts=bool(rows[0] != kept[0]),
-            line=lambda row: line_of(source.parts[main], int(kept[row])),
-        )
+        yield Block(part, str(source), starts=first > 0, row=first, line=line)
 
 
 def _plain(fields: Iterable[str]) -> list[str]:
@@ -164,122 +163,61 @@ def _plain(fields: Iterable[str]) -> list[str]:
     return [field.partition(":")[2] for field in fields if ":" in field]
 
 
-def _read(source: Source, fields: Sequence[str], numbers: Sequence[str]) -> Iterator[Block]:
-    """Yield the rows of `fields`; those that are not among `numbers` stay text."""
-    with source.open() as stream:
-        first = stream.readline(_LONGEST_HEADER)
-    if len(first) < _LONGEST_HEADER and b"\n" not in first and b"\r" not in first:
-        return  # only just begun
-    torn = torn_bytes(source)
-    last: Block | None = None
-    with explained(str(source), source), without_end(source, torn) as stream:
-        known = _checked(source, fields, torn)
-        # As text first, since the type of a column may change after its first block.
-        reader = csv.open_csv(
-            stream,
-            parse_options=csv.ParseOptions(delimiter=delimiter_of(str(source))[0]),
+def _read(source: Source, fields: Sequence[str], numbers: Sequence[str]) -> Block | None:
+    """Return the rows of `fields`, None if there are none; those that are not among `numbers` stay text."""
+    with explained(str(source), source):
+        with source.open() as stream:
+            if not re.search(rb"[\r\n]", stream.readline(2**20)):
+                return None  # only just begun
+        content, is_torn = whole_lines(source, str(source))
+        options = csv.ParseOptions(delimiter=delimiter_of(str(source)))
+        header = csv.open_csv(io.BytesIO(content), parse_options=options).schema.names
+        row_count(str(source), fields, dict.fromkeys(header, (0,)))
+        if doubled := sorted({name for name in fields if header.count(name) > 1}):
+            raise BadInputError(f"{source}: the header has {', '.join(doubled)} more than once")
+        table = csv.read_csv(
+            io.BytesIO(content),
+            parse_options=options,
             convert_options=csv.ConvertOptions(
-                column_types=dict.fromkeys(fields, pa.string()),
-                strings_can_be_null=True,
-                include_columns=fields,
+                column_types=dict.fromkeys(fields, pa.string()), strings_can_be_null=True, include_columns=fields
             ),
         )
-        row = 0
-        for batch in reader:
-            values: dict[str, Array] = {}
-            for field in fields:
-                if field in numbers:
-                    values[field] = _numbers(batch.column(field), source, field, row)
-                else:
-                    values[field] = np.array(batch.column(field).to_pylist(), dtype=str)
-            row += len(batch)
-            if last is not None:
-                yield last
-            line = partial(line_of, source)
-            last = Block(values, str(source), line=line, known=known) if len(batch) else None
-    if last is not None:
-        yield replace(last, torn=int(torn > 0))
+    if not table.num_rows:
+        return None
+    columns = {name: table.column(name).combine_chunks() for name in fields}
+    values = {
+        name: _numbers(cells, source, name) if name in numbers else np.array(cells.to_pylist(), dtype=str)
+        for name, cells in columns.items()
+    }
+    known = [name for name in header if name]
+    return Block(values, str(source), torn=is_torn, line=partial(line_of, source), known=known)
 
 
-def torn_bytes(source: Source) -> int:
-    """Return how long a last line is that ends within a row, as where a battery went empty; 0 if it is whole.
-
-    It has no end, and fewer fields than the header; with quotes it is left to the parser.
-    """
-    with source.open() as stream:
-        first = _first_line(stream)
-        begin, end = stream.tell(), stream.seek(0, os.SEEK_END)
-        stream.seek(max(1, begin, end - _LONGEST_HEADER) - 1)
-        _, line_end, tail = stream.read().replace(b"\r", b"\n").rpartition(b"\n")
-    delimiter = delimiter_of(str(source))[0].encode()
-    is_short = tail.count(delimiter) < first.count(delimiter)
-    return len(tail) if line_end and is_short and b'"' not in first + tail else 0
-
-
-@contextmanager
-def without_end(source: Source, size: int) -> Iterator[IO[bytes]]:
-    """Open a file for reading, without its last `size` bytes."""
-    with source.open() as stream:
-        if size:
-            end = stream.seek(0, os.SEEK_END)
-            stream.seek(0)
-            yield io.BufferedReader(Part(stream, end - size))
-        else:
-            yield stream
-
-
-def _checked(source: Source, fields: Sequence[str], torn: int) -> list[str]:
-    with source.open() as stream:
-        check_header(str(source), stream)
-    with without_end(source, torn) as stream:
-        options = csv.ParseOptions(delimiter=delimiter_of(str(source))[0])
-        header = csv.open_csv(stream, parse_options=options).schema.names
-    row_count(str(source), fields, dict.fromkeys(header, (0,)))
-    doubled = sorted({name for name in fields if header.count(name) > 1})
-    if doubled:
-        raise BadInputError(f"{source}: the header has {', '.join(doubled)} more than once")
-    return [name for name in header if name]
-
-
-def _numbers(texts: pa.StringArray, source: Source, field: str, row: int) -> Array:
-    """Return the numbers of a field's `texts`, without blanks around them; the first is in `row`."""
+def _numbers(texts: pa.StringArray, source: Source, field: str) -> Array:
+    """Return the numbers of a field's `texts`, without blanks around them."""
     trimmed = pc.utf8_trim_whitespace(texts)
     texts = pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
     whole = [] if texts.null_count else [pa.int64()]  # An empty cell has no integer value.
     for kind in (*whole, pa.float64(), pa.bool_()):
-        try:
+        with suppress(pa.ArrowInvalid):
             numbers = pc.cast(texts, kind)
-        except pa.ArrowInvalid:
-            continue
-        if kind == pa.int64():
-            return np.from_dlpack(numbers)
-        return np.from_dlpack(numbers.cast(pa.float64()).fill_null(np.nan))
-    if (lists := _lists(texts, source, field, row)) is not None:
-        return lists
-    cells = list(enumerate(texts.to_pylist()))
-    words = [cell for cell in cells if cell[1] and not _NUMBER.fullmatch(cell[1])]
-    number, text = ([cell for cell in words if cell[1].lower() not in ("true", "false")] or words or cells)[0]
-    raise BadInputError(
-        f"{source} line {line_of(source, row + number)}: field '{field}': "
-        f"expected numbers, or true and false, got '{text}'"
-    )
-
-
-def _lists(texts: pa.StringArray, source: Source, field: str, row: int) -> Array | None:
-    """Return the numbers (n, size) of cells that are lists, "[0.1, 2]" or "[0.1 2]"; None where none is."""
-    cells = [_LIST.fullmatch(text or "") for text in texts.to_pylist()]
-    if not any(cells):
-        return None
-    rows: list[list[float]] = []
-    for number, cell in enumerate(cells):
+            return np.from_dlpack(numbers if kind == pa.int64() else numbers.cast(pa.float64()).fill_null(np.nan))
+    cells = texts.to_pylist()
+    lists = [_LIST.fullmatch(text or "") for text in cells]
+    if not any(lists):
+        words = [row for row, cell in enumerate(cells) if cell and not _NUMBER.fullmatch(cell)]
+        row = ([row for row in words if cells[row].lower() not in ("true", "false")] or words or [0])[0]
+        expected = f"numbers, or true and false, got '{cells[row]}'"
+        raise BadInputError(f"{source} line {line_of(source, row)}: field '{field}': expected {expected}")
+    rows: list[list[float]] = []  # of cells that are lists, "[0.1, 2]" or "[0.1 2]"
+    for row, cell in enumerate(lists):
         try:
             rows.append([float(word) for word in re.split(r"[,;\s]+", cell[1].strip()) if word] if cell else [])
         except ValueError:
             rows.append([])
         if not rows[-1] or len(rows[-1]) != len(rows[0]):
-            found = shortened(str(texts[number]), _SHOWN)
             raise BadInputError(
-                f"{source} line {line_of(source, row + number)}: field '{field}': expected a list of "
-                f"{len(rows[0]) or 'some'} numbers as in the rows before, got '{found}'"
+                f"{source} line {line_of(source, row)}: field '{field}': expected a list of "
+                f"{len(rows[0]) or 'some'} numbers as in the rows before, got '{shortened(str(texts[row]), _SHOWN)}'"
             )
     return np.array(rows)

@@ -1,4 +1,4 @@
-"""HDF5: one dataset per field; the layouts of D4RL, robomimic and d3rlpy are known. Read block by block."""
+"""HDF5: one dataset per field; the layouts of D4RL, robomimic and d3rlpy are known."""
 
 import json
 import math
@@ -12,7 +12,7 @@ import numpy as np
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
-from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED, Array
+from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED
 from astra_data.io.hdf5_file import (
     D3RLPY,
     D4RL,
@@ -23,7 +23,7 @@ from astra_data.io.hdf5_file import (
     unpacked_bytes,
 )
 from astra_data.io.mapping import ImportMapping
-from astra_data.io.recording import BLOCK_ROWS, Block, Source, natural, row_count
+from astra_data.io.recording import Block, Source, natural, row_count
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
 _COMMANDS = re.compile(r"(?<![a-z])actions?(?![a-z])")
@@ -55,13 +55,12 @@ def _blocks(
     known = [name for name, shape in shapes.items() if shape]
     check_storage(used, origin)
     source.refuse_beyond(unpacked_bytes(used))
-    for first in range(0, n, BLOCK_ROWS):
-        rows = slice(first, min(first + BLOCK_ROWS, n))
-        values = {
-            field: dataset[..., rows].T if mapping.transposed else dataset[rows] for field, dataset in used.items()
-        }
-        values |= {field: _at_the_end(value, rows, n) for field, value in ends.items()}
-        yield Block(values, origin, starts=mapping.episodes is not None and first == 0, known=known)
+    if n:
+        values = {field: dataset[()].T if mapping.transposed else dataset[()] for field, dataset in used.items()}
+        for field in ends:  # in the last row, and 0 before it
+            values[field] = np.zeros((n, *ends[field].shape), ends[field].dtype)
+            values[field][-1] = ends[field]
+        yield Block(values, origin, starts=mapping.episodes is not None, known=known)
 
 
 @contextmanager
@@ -170,13 +169,6 @@ def _episodes(
             numbered.setdefault(int(found[2]), {})[found[1]] = dataset
     for number in sorted(numbered):
         yield f"{origin}/{number}", numbered[number], {}
-
-
-def _at_the_end(value: Array, rows: slice, n: int) -> Array:
-    """Return the values of `rows` of n: `value` in the last, and 0 before it."""
-    values = np.zeros((n, *value.shape), value.dtype)
-    values[-1] = value
-    return values[rows]
 
 
 def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py

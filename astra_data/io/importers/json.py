@@ -1,34 +1,31 @@
 """JSON: one object of fields with their rows, as the NAO's logs are, or an object a row, in a list or lines.
 
 Fields of objects in objects have the names of both: `pose/x`.
-
-The former is read whole, since JSON cannot be parsed in blocks; files larger than `LIMIT_BYTES` are refused.
-Lines, of at most as many bytes, are read block by block.
 """
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import batched, islice
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from astra_data.core.errors import BadInputError, in_short
 from astra_data.io.mapping import ImportMapping
-from astra_data.io.recording import BLOCK_ROWS, Block, Source, row_count
+from astra_data.io.recording import Block, Source, row_count
 
 LINES = (".jsonl", ".ndjson")
 SUFFIXES = (".json", ".log", *LINES)
 LIMIT_BYTES = 2**28
+"""Larger files of one object or list are refused, since these cannot be parsed in parts."""
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield all rows as one block, or lines in several."""
-    if str(source).lower().endswith(LINES):
-        yield from _read_lines(source, mapping)
+    """Yield all rows."""
+    origin, names = str(source), mapping.all_fields
+    if origin.lower().endswith(LINES):
+        yield from _read_lines(source, names)
         return
     with source.open() as stream:
         text = stream.read(LIMIT_BYTES + 1)
@@ -36,23 +33,50 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
         raise BadInputError(f"{source}: expected at most {LIMIT_BYTES // 2**20} MB of JSON, split the file")
     fields = json.loads(text, object_pairs_hook=_once)
     if isinstance(fields, list) and fields and all(isinstance(row, dict) for row in fields):
-        yield from _read_rows(fields, source, mapping)
+        rows = [_picked(row, names, f"{source} row {number}") for number, row in enumerate(fields)]
+        yield replace(_block(rows, names, origin), known=_flat(fields[0]))
         return
     fields = _flat(fields)
     if not isinstance(fields, dict):
         raise BadInputError(f"{source}: expected an object of fields, got {type(fields).__name__}")
     shapes = {name: (len(rows),) if isinstance(rows, list) else () for name, rows in fields.items()}
-    if row_count(str(source), mapping.all_fields, shapes):
-        yield _block(fields, mapping, str(source))
+    if row_count(origin, names, shapes):
+        yield replace(_block(zip(*(fields[name] for name in names), strict=True), names, origin), known=fields)
 
 
-def _read_rows(rows: list[dict[str, Any]], source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows of a list with an object each."""
-    flat = [_flat(row) for row in rows]
-    for number, row in enumerate(flat):
-        row_count(f"{source} row {number}", mapping.all_fields, dict.fromkeys(row, (1,)))
-    block = _block({name: [row[name] for row in flat] for name in mapping.all_fields}, mapping, str(source))
-    yield replace(block, known=flat[0])
+def _read_lines(source: Source, names: Sequence[str]) -> Iterator[Block]:
+    """Yield the rows of lines with an object each; a last line that is cut off is left out and counted."""
+    rows: list[list[Any]] = []
+    numbers: list[int] = []
+    known: dict[str, Any] = {}
+    is_torn = False
+    with source.open() as stream:
+        for number, line in enumerate(stream, start=1):
+            if not line.strip():
+                continue
+            numbers.append(number)
+            origin = f"{source} line {number}"
+            try:
+                row = json.loads(line, object_pairs_hook=_once)
+            except (ValueError, BadInputError) as error:
+                is_torn = isinstance(error, ValueError) and not line.endswith(b"\n")
+                if is_torn:
+                    break
+                raise BadInputError(f"{origin}: expected an object of fields ({in_short(error)})") from error
+            if not isinstance(row, dict):
+                raise BadInputError(f"{origin}: expected an object of fields, got {type(row).__name__}")
+            known = known or _flat(row)
+            rows.append(_picked(row, names, origin))
+    if rows:
+        yield replace(_block(rows, names, str(source)), torn=is_torn, known=known, line=numbers.__getitem__)
+
+
+def _picked(row: dict[str, Any], names: Sequence[str], origin: str) -> list[Any]:
+    """Return the values of the fields `names` in a row."""
+    flat = _flat(row)
+    if not all(name in flat for name in names):
+        row_count(origin, names, dict.fromkeys(flat, (1,)))
+    return [flat[name] for name in names]
 
 
 def _flat(value: Any) -> Any:  # noqa: ANN401 - any JSON
@@ -67,74 +91,18 @@ def _flat(value: Any) -> Any:  # noqa: ANN401 - any JSON
     return flat
 
 
-def _read_lines(source: Source, mapping: ImportMapping) -> Iterator[Block]:
-    """Yield the rows of lines with an object each; a last line that is cut off is left out and counted."""
-    last: Block | None = None
-    fields = mapping.all_fields
-    with source.open() as stream:
-        for lines in batched(enumerate(_lines(stream, source), start=1), BLOCK_ROWS):
-            torn = int(_is_torn(lines[-1][1]))
-            whole = [(number, line) for number, line in lines[: len(lines) - torn] if line.strip()]
-            rows = [_row(line, f"{source} line {number}", fields) for number, line in whole]
-            if rows:
-                if last is not None:
-                    yield last
-                block = _block({name: [row[name] for row in rows] for name in fields}, mapping, str(source))
-                last = replace(block, line=partial(_line_of, source), known=rows[0])
-            if last is not None:
-                last = replace(last, torn=torn)
-    if last is not None:
-        yield last
-
-
-def _line_of(source: Source, row: int) -> int:
-    """Return the number of the line, from 1, of a row, from 0; blank lines are no rows."""
-    with source.open() as stream:
-        lines = enumerate(_lines(stream, source), start=1)
-        return next(islice((number for number, line in lines if line.strip()), row, None))
-
-
-def _lines(stream: IO[bytes], source: Source) -> Iterator[bytes]:
-    while line := stream.readline(LIMIT_BYTES + 1):
-        if len(line) > LIMIT_BYTES:
-            raise BadInputError(f"{source}: expected lines of at most {LIMIT_BYTES // 2**20} MB of JSON")
-        yield line
-
-
-def _row(line: bytes, origin: str, fields: Sequence[str]) -> dict[str, Any]:
-    try:
-        row = json.loads(line, object_pairs_hook=_once)
-    except (ValueError, BadInputError) as error:
-        raise BadInputError(f"{origin}: expected an object of fields ({in_short(error)})") from error
-    if not isinstance(row, dict):
-        raise BadInputError(f"{origin}: expected an object of fields, got {type(row).__name__}")
-    row = _flat(row)
-    if not all(name in row for name in fields):
-        row_count(origin, fields, dict.fromkeys(row, (1,)))
-    return dict(row)
-
-
-def _block(fields: dict[str, list[Any]], mapping: ImportMapping, origin: str) -> Block:
-    """Return the rows of the mapping's fields; null among numbers is NaN, as an empty cell of CSV is."""
+def _block(rows: Iterable[Sequence[Any]], names: Sequence[str], origin: str) -> Block:
+    """Return the rows of the fields `names`; null among numbers is NaN, as an empty cell of CSV is."""
     columns = {}
-    for field in mapping.all_fields:
+    for name, column in zip(names, zip(*rows, strict=True), strict=True):
         try:
-            values = np.array(fields[field])
+            values = np.array(column)
         except ValueError:
-            raise BadInputError(f"{origin}: field '{field}': expected as many values in each row") from None
+            raise BadInputError(f"{origin}: field '{name}': expected as many values in each row") from None
         if values.dtype == object and all(isinstance(value, int | float | None) for value in values.flat):
             values = values.astype(float)
-        columns[field] = values
-    return Block(columns, origin, known=fields)
-
-
-def _is_torn(line: bytes) -> bool:
-    """Return whether a line has no end and is no JSON, as one that was written when a battery went empty."""
-    try:
-        json.loads(line)
-    except ValueError:
-        return bool(line.strip()) and not line.endswith(b"\n")
-    return False
+        columns[name] = values
+    return Block(columns, origin)
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -18,10 +18,12 @@ from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.mcap_file import McapFile, Timeline
-from astra_data.io.recording import BLOCK_ROWS, Block, Source
+from astra_data.io.recording import VALUE_BYTES, Block, Source
 from astra_data.io.resampling import Resampler
 
 SUFFIXES = (".mcap",)
+Message = tuple[int, Mapping[str, Array]]
+"""The time of a message in ns, by the recorder's clock, and the values of its fields."""
 _MISSING = object()
 _NAMES = "name"
 """The part of a message that names the values of the lists beside it, as of joints in ROS."""
@@ -122,18 +124,25 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     topic_of = {field.name: topic for topic, each in fields.items() for field in each}
     resampler = Resampler(mapping, str(source), timeline.moments, topic_of)
     known = sorted(file.topics - {field.topic for each in fields.values() for field in each})
-    rows: list[tuple[dict[str, Array], dict[str, int]]] = []
-    starts = goes_back = False
-    for begins, is_back, row, times in _rows(source, resampler, timeline, fields):
-        if rows and (begins or len(rows) == BLOCK_ROWS):
-            block = _block(source, rows, topic_of)
-            yield replace(block, starts=starts, is_back=goes_back, known=known)
-            rows, starts, goes_back = [], False, False
-        starts, goes_back = starts or begins, goes_back or is_back
-        rows.append((row, times))
-    if rows:
-        block = replace(_block(source, rows, topic_of), starts=starts, is_back=goes_back, known=known)
-        yield replace(block, torn=int(file.is_cut), notes=resampler.unevenness())
+    rows: dict[str, list[Message]] = {topic: [] for topic in fields}
+    first = count = 0
+    is_back = False
+    for begins, goes_back, row in resampler.rows(_messages(source, timeline, fields)):
+        if begins and count > first:
+            yield replace(_block(source, rows, fields), row=first, is_back=is_back, known=known)
+            rows, first = {topic: [] for topic in fields}, count
+        is_back = goes_back if begins else is_back
+        for topic, message in row.items():
+            rows[topic].append(message)
+        count += 1
+        source.refuse_beyond(count * VALUE_BYTES * len(mapping.all_fields))
+    if silent := sorted(resampler.topics.keys() - resampler.times.keys()):
+        raise BadInputError(f"{source}: no messages on {', '.join(silent)}")
+    for silence in resampler.endings():
+        _log.warning("%s", silence)
+    if count > first:
+        block = replace(_block(source, rows, fields), row=first, is_back=is_back, known=known)
+        yield replace(block, torn=file.is_cut, notes=resampler.unevenness())
 
 
 def _fields(mapping: ImportMapping) -> dict[str, list[MessageField]]:
@@ -180,45 +189,31 @@ def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str],
     return sorted({of[name] for name in _sent(file, fields, message)})
 
 
-def _rows(
-    source: Source, resampler: Resampler, timeline: Timeline, fields: Mapping[str, list[MessageField]]
-) -> Iterator[tuple[bool, bool, dict[str, Array], dict[str, int]]]:
-    """Yield whether a row begins an episode, and since time goes back, its values and the topics' times."""
-    time = 0
-    is_back = False
-    log_times: dict[str, int] = {}
+def _messages(
+    source: Source, timeline: Timeline, fields: Mapping[str, list[MessageField]]
+) -> Iterator[tuple[str, int, Message, bool]]:
+    """Yield messages as a `Resampler` takes them."""
     sizes: dict[str, tuple[int, ...]] = {}
-    for topic, time, log_time, content, begins_back in timeline.messages():
+    for topic, time, log_time, content, is_back in timeline.messages():
         values = _values(content, fields[topic], f"{source} at {log_time} ns")
         changed = [name for name, v in values.items() if sizes.setdefault(name, v.shape) != v.shape]
         if changed:
             raise BadInputError(f"{source} at {log_time} ns: {', '.join(changed)} changes in size")
-        for begins, row in resampler.rows_before(time):
-            yield begins, begins and is_back, row, dict(log_times)
-            is_back &= not begins
-        is_back |= begins_back
-        log_times[topic] = log_time
-        resampler.receive(topic, time, values)
-    for begins, row in resampler.last_rows(time):
-        yield begins, begins and is_back, row, dict(log_times)
-        is_back &= not begins
-    silent = sorted(resampler.topics.keys() - resampler.times.keys())
-    if silent:
-        raise BadInputError(f"{source}: no messages on {', '.join(silent)}")
-    for silence in resampler.endings():
-        _log.warning("%s", silence)
+        yield topic, time, (log_time, values), is_back
 
 
-def _block(source: Source, rows: list[tuple[dict[str, Array], dict[str, int]]], topic_of: Mapping[str, str]) -> Block:
-    """Return rows, each with the times of its topics, which name the places of values that are not finite."""
-    values = {name: np.stack([row[name] for row, _ in rows]) for name in rows[0][0]}
-    places = {
-        row: f"{source} at {rows[row][1][topic_of[name]]} ns"
-        for name, column in reversed(values.items())
-        if column.dtype.kind == "f"
-        for row in np.flatnonzero(~np.isfinite(column.reshape(len(column), -1)).all(axis=1)).tolist()
-    }
-    return Block(values, str(source), places=places)
+def _block(
+    source: Source, rows: Mapping[str, Sequence[Message]], fields: Mapping[str, Sequence[MessageField]]
+) -> Block:
+    """Return the rows of an episode, with each topic's messages; their times name what is not finite."""
+    values, places = {}, dict[int, str]()
+    for topic, messages in rows.items():
+        for name in [field.name for field in fields[topic]]:
+            values[name] = np.stack([message[name] for _, message in messages])
+            if values[name].dtype.kind == "f":
+                odd = np.flatnonzero(~np.isfinite(values[name].reshape(len(messages), -1)).all(axis=1)).tolist()
+                places = {row: f"{source} at {messages[row][0]} ns" for row in odd} | places
+    return Block(values, str(source), starts=True, places=places)
 
 
 def _check_mapping(mapping: ImportMapping, origin: str) -> None:

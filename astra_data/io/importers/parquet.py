@@ -1,4 +1,4 @@
-"""Parquet: a column per field, of numbers or of lists that are equally long. Read block by block."""
+"""Parquet: a column per field, of numbers or of lists that are equally long."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import Array
 from astra_data.io.mapping import ImportMapping
-from astra_data.io.recording import BLOCK_ROWS, VALUE_BYTES, Block, Source, row_count
+from astra_data.io.recording import VALUE_BYTES, Block, Source, row_count
 
 SUFFIXES = (".parquet",)
 
@@ -18,21 +18,15 @@ _ONE_LENGTH = "expected lists of one length, without missing ones"
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     """Yield the rows of the fields; missing numbers are NaN, and times whole numbers of their own unit."""
-    fields = list(mapping.all_fields)
+    fields = mapping.all_fields
     with source.open() as stream, pq.ParquetFile(stream) as file:
         shapes = dict.fromkeys(file.schema_arrow.names, (file.metadata.num_rows,))
         row_count(str(source), fields, shapes)
         source.refuse_beyond(VALUE_BYTES * _values_of(file.metadata, set(fields)))
-        first: dict[str, Array] = {}
-        for batch in file.iter_batches(BLOCK_ROWS, columns=fields):
-            if not batch.num_rows:
-                continue
-            values = {field: _array(batch.column(field), f"{source}: field '{field}'") for field in fields}
-            first = first or values
-            for field, rows in values.items():
-                if rows.shape[1:] != first[field].shape[1:]:
-                    raise BadInputError(f"{source}: field '{field}': {_ONE_LENGTH}")
-            yield Block(values, str(source), known=file.schema_arrow.names)
+        table = file.read(fields)
+    if table.num_rows:
+        values = {field: _array(table.column(field).combine_chunks(), f"{source}: field '{field}'") for field in fields}
+        yield Block(values, str(source), known=file.schema_arrow.names)
 
 
 def _values_of(metadata: pq.FileMetaData, fields: set[str]) -> int:

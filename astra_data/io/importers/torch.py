@@ -14,7 +14,7 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.io.mapping import ImportMapping
-from astra_data.io.recording import BLOCK_ROWS, VALUE_BYTES, Block, Source, row_count
+from astra_data.io.recording import VALUE_BYTES, Block, Source, row_count
 
 SUFFIXES = (".pt", ".pth")
 PACE = {STATE: "dof_pos", ACTION: "des_dof_pos"}
@@ -29,10 +29,8 @@ def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:
     n = row_count(str(source), mapping.all_fields, {name: value.shape for name, value in tensors.items()})
     used = {field: tensors[field] for field in mapping.all_fields}
     source.refuse_beyond(sum(VALUE_BYTES * value.numel() for value in used.values()))
-    for first in range(0, n, BLOCK_ROWS):
-        rows = slice(first, first + BLOCK_ROWS)
-        values = {name: value[rows].numpy() for name, value in used.items()}
-        yield Block(values, str(source), known=tensors)
+    if n:
+        yield Block({name: value.numpy() for name, value in used.items()}, str(source), known=tensors)
 
 
 def layout(source: Source) -> dict[str, Any]:

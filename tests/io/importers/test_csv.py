@@ -117,9 +117,10 @@ TORN = (
 )
 
 
-@pytest.mark.parametrize(("rows", "end"), [(3, "\n"), (3, "\r\n"), (70_000, "\n")])
-def test_a_last_line_that_is_cut_off_is_rejected_alone(tmp_path: Path, rows: int, end: str) -> None:
-    """In the first block of 1 MB, or in one after it; in a file, and in an archive."""
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_last_line_that_is_cut_off_is_rejected_alone(tmp_path: Path, end: str) -> None:
+    """In a file, and in an archive."""
+    rows = 3
     whole = f"x,y,z{end}" + "".join(f"{row},{row}.5,0000{end}" for row in range(rows))
     for number, torn in enumerate((f"{rows},", f"{rows}")):
         log = tmp_path / "log.csv"

@@ -6,16 +6,13 @@ import pytest
 from recordings import imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
-from astra_data.io.importers import npz
 from astra_data.io.importing import import_dataset
-from astra_data.io.mapping import ImportMapping
-from astra_data.io.recording import Source
 
 
 def test_npz_is_never_unpickled(tmp_path: Path) -> None:
     with (tmp_path / "log.npz").open("wb") as file:
         np.savez(file, **rows() | {"reward": np.array([{}] * 20)})  # type: ignore[arg-type]
-    with pytest.raises(BadInputError, match=r"\.npz: reward\.npy holds Python objects"):
+    with pytest.raises(BadInputError, match=r"\.npz: reward\.npy: Object arrays cannot be loaded"):
         imported(tmp_path, tmp_path / "log.npz")
 
 
@@ -26,22 +23,8 @@ def test_an_array_that_ends_early_is_told(tmp_path: Path) -> None:
     with ZipFile(path, "w") as archive:
         for name, content in members.items():
             archive.writestr(name, content[:-10] if name == "x.npy" else content)
-    with pytest.raises(BadInputError, match=r"x\.npy: ends early, 10 bytes are missing"):
+    with pytest.raises(BadInputError, match=r"x\.npy: EOF: reading array data, expected 160 bytes got 150"):
         imported(tmp_path, path)
-
-
-def test_blocks_hold_consecutive_rows_of_every_array(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(npz, "BLOCK_ROWS", 7)
-    fields = {"a": np.arange(20), "b": np.arange(40.0).reshape(20, 2)}
-    path = write_table(tmp_path / "log.npz", fields)
-    columns = {name: {"fields": (name,)} for name in fields}
-    mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
-    blocks = list(npz.read(Source(path, None, path), mapping))
-    assert [len(block) for block in blocks] == [7, 7, 6]
-    for name, values in fields.items():
-        read = np.concatenate([block.values[name] for block in blocks])
-        np.testing.assert_array_equal(read, values)
-        assert read.dtype == values.dtype
 
 
 def bomb(path: Path, rows: int) -> Path:

@@ -19,17 +19,12 @@ from astra_data.io.recording import Source
 
 
 def read(path: Path, columns: dict[str, pa.Array | list[Any]]) -> dict[str, np.ndarray[Any, Any]]:
-    """Write `columns` and return them as they are read, in blocks of two rows."""
+    """Write `columns` and return them as they are read."""
     pq.write_table(pa.table(columns), path)
     fields = {name: {"fields": (name,)} for name in columns}
     mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": fields})
-    blocks = list(parquet.read(Source(path, None, path), mapping))
-    return {name: np.concatenate([block.values[name] for block in blocks]) for name in columns}
-
-
-@pytest.fixture(autouse=True)
-def two_rows_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "BLOCK_ROWS", 2)
+    [block] = parquet.read(Source(path, None, path), mapping)
+    return dict(block.values)
 
 
 def test_every_kind_of_number_and_list_is_read(tmp_path: Path) -> None:

@@ -8,14 +8,10 @@ from recordings import LENGTHS, STEPS, TABLES, imported, rows, write_table
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, DONE, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED
-from astra_data.io.importers import hdf5, npz, parquet
 
 
-@pytest.mark.parametrize("block_rows", [4, 2**13])
 @pytest.mark.parametrize("name", TABLES)
-def test_every_value_arrives(tmp_path: Path, name: str, block_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (npz, hdf5, parquet):
-        monkeypatch.setattr(module, "BLOCK_ROWS", block_rows)
+def test_every_value_arrives(tmp_path: Path, name: str) -> None:
     fields = rows()
     dataset, report = imported(tmp_path, write_table(tmp_path / name, fields))
     assert dataset.lengths.tolist() == list(STEPS)

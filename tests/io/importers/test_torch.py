@@ -10,7 +10,6 @@ from toy_joints import FPS, NAMES, positions, targets, write_log
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE
 from astra_data.dataset.reader import Dataset
-from astra_data.io.importers import torch as importer
 from astra_data.io.importing import import_dataset
 
 PACE = Path(__file__).parents[3] / "recipes/imports/pace_anymal.toml"
@@ -28,9 +27,7 @@ def anymal(path: Path, count: int = 1200) -> dict[str, torch.Tensor]:
     return log
 
 
-@pytest.mark.parametrize("block_rows", [500, 2**13])
-def test_a_log_of_pace_arrives_row_by_row(tmp_path: Path, block_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importer, "BLOCK_ROWS", block_rows)
+def test_a_log_of_pace_arrives_row_by_row(tmp_path: Path) -> None:
     log = anymal(tmp_path / "chirp_data.pt")
     report = import_dataset([tmp_path / "chirp_data.pt"], PACE, out=tmp_path / "out")
     dataset = Dataset.open(report.root)
