@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -42,51 +43,33 @@ def roll(
     return position + direction * way, direction * slower
 
 
-def knock(
-    before: Tensor,
-    after: Tensor,
-    ball: Tensor,
-    velocity: Tensor,
-    *,
-    reach_m: float,
-    speed_m_s: Tensor | float,
-    turn_rad: Tensor | float = 0.0,
-) -> tuple[Tensor, Tensor]:
-    """Move the balls that bodies walk into, from `before` to `after`; return places and velocities, (B, 2).
+class Contact(NamedTuple):
+    """How bodies or their kicks move balls within reach: along the line between the centers, turned."""
 
-    They leave with `speed_m_s` along the line between the centers, closer than `reach_m`, turned by `turn_rad`.
-    """
-    direction, distance = _seen_from(after, ball)
-    approaches = ((after - before) * direction).sum(-1, keepdim=True) > 0
-    touched = (distance < reach_m) & approaches
-    leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
-    return (
-        torch.where(touched, after + direction * reach_m, ball),
-        torch.where(touched, leaving * speed_m_s, velocity),
-    )
+    reach_m: float
+    speed_m_s: Tensor | float  # (B, 1) or one for all
+    turn_rad: Tensor | float = 0.0  # (B,) or one for all
+
+    def of(self, body: Tensor, ball: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the direction (B, 2) of balls from bodies, which are in reach (B, 1), and how they leave (B, 2)."""
+        apart = ball - body
+        distance = apart.norm(dim=-1, keepdim=True)
+        direction = apart / distance.clamp_min(1e-9)
+        leaving = turned(direction, torch.as_tensor(self.turn_rad, device=ball.device))
+        return direction, distance < self.reach_m, leaving * self.speed_m_s
 
 
-def kick_away(
-    body: Tensor,
-    ball: Tensor,
-    velocity: Tensor,
-    asked: Tensor,
-    *,
-    reach_m: float,
-    speed_m_s: Tensor | float,
-    turn_rad: Tensor | float = 0.0,
-) -> Tensor:
-    """Return the velocities (B, 2) of balls; bodies that are `asked` (B, 1) kick those within reach: see `knock`."""
-    direction, distance = _seen_from(body, ball)
-    leaving = turned(direction, torch.as_tensor(turn_rad, device=ball.device))
-    return torch.where(asked & (distance < reach_m), leaving * speed_m_s, velocity)
+def knock(before: Tensor, after: Tensor, ball: Tensor, velocity: Tensor, contact: Contact) -> tuple[Tensor, Tensor]:
+    """Move the balls that bodies walk into, from `before` to `after`; return places and velocities, (B, 2)."""
+    direction, within, leaving = contact.of(after, ball)
+    touched = within & (((after - before) * direction).sum(-1, keepdim=True) > 0)
+    return torch.where(touched, after + direction * contact.reach_m, ball), torch.where(touched, leaving, velocity)
 
 
-def _seen_from(body: Tensor, ball: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the direction (B, 2) and distance (B, 1) of balls from bodies, both (B, 2)."""
-    apart = ball - body
-    distance = apart.norm(dim=-1, keepdim=True)
-    return apart / distance.clamp_min(1e-9), distance
+def kick_away(body: Tensor, ball: Tensor, velocity: Tensor, asked: Tensor, contact: Contact) -> Tensor:
+    """Return the velocities (B, 2) of balls, of which bodies that are `asked` (B, 1) kick those within reach."""
+    _, within, leaving = contact.of(body, ball)
+    return torch.where(asked & within, leaving, velocity)
 
 
 _LIES_M_S = 0.15
@@ -116,17 +99,15 @@ class BallAgent(PlanarStates):
         maze: Maze,
         num_envs: int,
         *,
-        timestep_s: float,
-        radius_m: float,
-        speed_m_s: float,
         reach_m: float,
         knock_m_s: float,
         kick_reach_m: float,
         kick_m_s: float,
         device: str = "cpu",
+        **body: float,
     ) -> None:
-        """Build B of them, which touch the ball within `reach_m` of it and can kick it within `kick_reach_m`."""
-        super().__init__(maze, num_envs, timestep_s=timestep_s, radius_m=radius_m, speed_m_s=speed_m_s, device=device)
+        """Build B of them; `knock_m_s` and `kick_m_s` are speeds of balls within reach, `body` is of the mass."""
+        super().__init__(maze, num_envs, device=device, **body)
         self.parameters |= {"reach_m": reach_m, "knock_m_s": knock_m_s}
         self.parameters |= {"kick_reach_m": kick_reach_m, "kick_m_s": kick_m_s}
         self._rolls = torch.zeros(num_envs, 1, dtype=torch.bool, device=device)
@@ -157,12 +138,8 @@ class BallAgent(PlanarStates):
         position, _, ball, velocity = self.state.split(2, dim=-1)
         way = ~kicks * self.commanded_velocity(action[:, :2]) * self.period_s
         moved, self.blocked = self.free.slide(position, position + way)
-        ball, velocity = knock(
-            position, moved, ball, velocity, reach_m=of["reach_m"], speed_m_s=of["knock_m_s"], turn_rad=turn
-        )
-        velocity = kick_away(
-            moved, ball, velocity, kicks, reach_m=of["kick_reach_m"], speed_m_s=of["kick_m_s"], turn_rad=turn
-        )
+        ball, velocity = knock(position, moved, ball, velocity, Contact(of["reach_m"], of["knock_m_s"], turn))
+        velocity = kick_away(moved, ball, velocity, kicks, Contact(of["kick_reach_m"], of["kick_m_s"], turn))
         self._rolls = velocity.norm(dim=-1, keepdim=True) > _LIES_M_S
         ball, velocity = roll(ball, velocity, self.period_s, self._deceleration_m_s2)
         self.state = torch.cat([moved, (moved - position) / self.period_s, ball, velocity], dim=-1)

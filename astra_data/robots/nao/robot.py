@@ -232,7 +232,8 @@ class BatchedNao:
 
     def step(self, command: Floats, active: Bools | None = None, kick: Bools | None = None) -> None:
         """Walk for 0.192 s at `command` (B, 3), m/s ahead and left, rad/s; who is to `kick` does in its next swing."""
-        rows = np.flatnonzero(~self.fallen if active is None else active & ~self.fallen)
+        upright = ~self.bodies.fallen
+        rows = np.flatnonzero(upright if active is None else active & upright)
         targets = self._engine.advance(replace(self.gait), command, TICKS, self._kicking_feet(kick))
         noise = np.random.default_rng([self._seed, self._steps]).normal(
             0.0, self.spread.gyro_noise_rad_s, (self.num_robots, TICKS, 3)
@@ -252,16 +253,6 @@ class BatchedNao:
         to_the_left = np.cos(yaw) * y - np.sin(yaw) * x
         sides = np.stack([to_the_left > -_MIDDLE_M, to_the_left < _MIDDLE_M], axis=1)
         return np.asarray(kick[:, None] & sides)
-
-    @property
-    def fallen(self) -> Bools:
-        """Which robots lie on the floor, (B,)."""
-        return self.bodies.fallen
-
-    @property
-    def touching(self) -> Bools:
-        """Which robots touched a wall in their last control step, (B,)."""
-        return self.bodies.touching
 
     @property
     def pose(self) -> Floats:

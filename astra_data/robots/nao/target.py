@@ -112,7 +112,7 @@ class NaoEnv(PlanarTarget):
     @property
     def wall_contact(self) -> Tensor:
         """Which robots touched a wall in their last step, (B,) bool."""
-        return torch.from_numpy(self.robots.touching.copy())
+        return torch.from_numpy(self.robots.bodies.touching.copy())
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of starts, goals, headings, traits, errors and sensors at `seed`."""
@@ -151,7 +151,7 @@ class NaoEnv(PlanarTarget):
         if self.has_ball:
             estimated = self.localisation.pose
             self.sight.update(self.robots.ball, self.robots.pose, estimated, self._rng, moving)
-        return self._judged(before, self.truth, self.robots.fallen)
+        return self._judged(before, self.truth, self.robots.bodies.fallen)
 
     def _body_command(self, velocity: Tensor, kick: NDArray[np.bool_] | None) -> Floats:
         """Turn world-frame commands (B, 2) into forward, left and turning speed (B, 3): see `NaoEnv`."""

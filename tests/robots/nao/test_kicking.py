@@ -5,7 +5,16 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.robots.nao.kicking import ROLLING_M_S2, BallAgent, Kicking, asks_to_kick, kick_away, knock, roll
+from astra_data.robots.nao.kicking import (
+    ROLLING_M_S2,
+    BallAgent,
+    Contact,
+    Kicking,
+    asks_to_kick,
+    kick_away,
+    knock,
+    roll,
+)
 from astra_data.worlds.plane.mazes import FIELD
 from astra_data.worlds.plane.point_mass import VariedPlanar
 from astra_data.worlds.variation import BallVariation
@@ -23,11 +32,11 @@ def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
 def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     before, after = torch.tensor([[0.0, 0.0]]), torch.tensor([[0.1, 0.0]])
     ball = torch.tensor([[0.2, 0.1]])
-    place, velocity = knock(before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7)
+    place, velocity = knock(before, after, ball, torch.zeros(1, 2), Contact(0.19, 0.7))
     diagonal = 0.5**0.5
     assert velocity[0].tolist() == pytest.approx([0.7 * diagonal, 0.7 * diagonal], abs=1e-6)
     assert place[0].tolist() == pytest.approx([0.1 + 0.19 * diagonal, 0.19 * diagonal], abs=1e-6)
-    beside, turned = knock(before, after, ball, torch.zeros(1, 2), reach_m=0.19, speed_m_s=0.7, turn_rad=torch.pi / 4)
+    beside, turned = knock(before, after, ball, torch.zeros(1, 2), Contact(0.19, 0.7, torch.pi / 4))
     # It begins where the body touches it, whichever way it leaves.
     assert torch.equal(beside, place) and turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
 
@@ -37,11 +46,11 @@ def test_a_kick_sends_balls_within_reach_straight_away() -> None:
     ball = torch.tensor([[0.18, 0.24], [0.18, 0.24], [0.3, 0.4], [-0.3, 0.0]])
     rolling = torch.tensor([[0.1, 0.2]]).expand(4, 2)
     asked = asks_to_kick(torch.tensor([[0.9, 0.9, 0.6], [0.9, 0.9, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
-    velocity = kick_away(bodies, ball, rolling, asked, reach_m=0.35, speed_m_s=2.0)
+    velocity = kick_away(bodies, ball, rolling, asked, Contact(0.35, 2.0))
     # Kicked; not asked to; out of reach; behind, which a body without a heading kicks as well.
     torch.testing.assert_close(velocity, torch.tensor([[1.2, 1.6], [0.1, 0.2], [0.1, 0.2], [-2.0, 0.0]]))
     quarter = torch.full((4,), torch.pi / 2)
-    turned = kick_away(bodies, ball, rolling, asked, reach_m=0.35, speed_m_s=2.0, turn_rad=quarter)
+    turned = kick_away(bodies, ball, rolling, asked, Contact(0.35, 2.0, quarter))
     torch.testing.assert_close(turned[[0, 3]], torch.tensor([[-1.6, 1.2], [0.0, -2.0]]))
 
 

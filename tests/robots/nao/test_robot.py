@@ -215,7 +215,7 @@ def test_it_walks_as_told(command: tuple[float, float, float]) -> None:
         assert moved[2] == pytest.approx(command[2], rel=0.3)
     else:
         np.testing.assert_allclose(moved[:2], command[:2], atol=0.3 * max(np.abs(command)))
-    assert not nao.fallen.any()
+    assert not nao.bodies.fallen.any()
 
 
 def turned(*roll_pitch_yaw: float) -> Floats:
@@ -239,7 +239,7 @@ def test_walls_are_felt_and_stop_it() -> None:
     felt = np.zeros(2, dtype=bool)
     for _ in range(15):
         nao.step(np.tile([0.2, 0.0, 0.0], (2, 1)))
-        felt |= nao.touching
+        felt |= nao.bodies.touching
     assert felt.tolist() == [True, False] and nao.pose[0, 0] > -5.95
 
 
@@ -248,12 +248,12 @@ def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
     half = np.radians(30)
     nao.bodies.qpos[0, 3:7] = [np.cos(half), 0.0, np.sin(half), 0.0]
     nao.step(np.zeros((2, 3)))
-    assert nao.fallen.tolist() == [True, False]
+    assert nao.bodies.fallen.tolist() == [True, False]
     lying = nao.bodies.state[0].copy()
     nao.step(np.full((2, 3), 0.1))
     np.testing.assert_array_equal(nao.bodies.state[0], lying)
     nao.reset(np.array([0]), np.zeros((1, 3)), np.random.default_rng(0))
-    assert not nao.fallen.any()
+    assert not nao.bodies.fallen.any()
 
 
 @pytest.mark.parametrize("side", [1, -1])

@@ -46,7 +46,7 @@ def test_a_kick_reaches_a_foot_far_and_moves_no_robot() -> None:
         one.step(torch.tensor([[1.0, 0.0, 1.0]]).expand(8, 3))
         fastest = np.maximum(fastest, np.linalg.norm(one.robots.ball_velocity, axis=1))
     assert fastest[::2].min() > 0.35 and fastest[1::2].max() == pytest.approx(0.0, abs=0.02)
-    assert np.abs(one.robots.pose[:, :2]).max() < 0.1 and not one.robots.fallen.any()
+    assert np.abs(one.robots.pose[:, :2]).max() < 0.1 and not one.robots.bodies.fallen.any()
 
 
 def test_robots_can_be_stood_where_a_state_believes_them() -> None:
