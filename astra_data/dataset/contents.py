@@ -172,5 +172,4 @@ def _converted(
         if run is None or episode is None or len(run) != lengths[episode]:
             raise CorruptDatasetError("its files were altered while they were read")
         place = (episode, int(contents.starts[episode]), int(contents.uids[episode]))
-        values = {column.name: rows.values(column, run, *place) for column in columns}
-        yield values, episodes[position : position + 1]
+        yield rows.values(columns, run, *place), episodes[position : position + 1]

@@ -5,7 +5,7 @@ following row; the last row of an episode has none and is left out, as are camer
 """
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from astra_data.dataset.lerobot_rows import (
     RecordedFiles,
     Rows,
     declared_columns,
+    ends_with,
     lacking,
     name_of,
     our_columns,
@@ -71,28 +72,21 @@ def open_recording(root: Path) -> Contents:
     kept = [episode for episode in episodes if episode.steps]
     if not kept:
         raise BadInputError(f"{root}, recorded by LeRobot, has no episode of two rows or more")
-    known = [*(spec.name for spec in specs), *names.RESERVED]
-    _announce(root, info, rows, columns, episodes, known, roundings.found())
-    uids = [episode.uid for episode in kept]
-    lengths = np.array([episode.steps for episode in kept])
-    first, last = episodes[0], episodes[-1]
-    description = {
-        "name": name_of(root),
-        "stage": "record",
-        "config": {"codebase_version": layout.CODEBASE_VERSION},
-        "environment": robot_of(info),
-    }
-    order = {uid: index for index, uid in enumerate(uids)}
-    stored_columns = layout.stored_columns(columns)
-    frames = int(lengths.sum())
+    others = sorted(info["features"].keys() - {*(spec.name for spec in specs), *names.RESERVED})
+    _announce(root, rows, columns, episodes, others, roundings.found())
+    uids, lengths = [episode.uid for episode in kept], np.array([episode.steps for episode in kept])
+    positions = {uid: index for index, uid in enumerate(uids)}
+    described = {"codebase_version": layout.CODEBASE_VERSION}
+    description = {"name": name_of(root), "stage": "record", "config": described, "environment": robot_of(info)}
+    all_columns, frames = layout.stored_columns(columns), int(lengths.sum())
     return Contents(
         root=root,
-        info=dict(layout.dataset_info(stored_columns, fps=fps, episodes=len(kept), frames=frames)),
+        info=dict(layout.dataset_info(all_columns, fps=fps, episodes=len(kept), frames=frames)),
         description=complete_description(description) | {"content_hash": content_hash},
-        metadata={key: [episode.metadata[key] for episode in kept] for key in first.metadata},
+        metadata={key: [episode.metadata[key] for episode in kept] for key in kept[0].metadata},
         uids=np.array(uids),
         lengths=lengths,
-        order=[order[uid] for uid in permutation(uids, 0)],
+        order=[positions[uid] for uid in permutation(uids, 0)],
         subset_seed=0,
         task=" / ".join(tasks[index] for index in sorted(tasks)),
         paths=plain.data_files(root),
@@ -100,7 +94,7 @@ def open_recording(root: Path) -> Contents:
         recorded=RecordedFiles(
             rows=rows,
             first_rows=np.array([episode.first_row for episode in kept]),
-            total_rows=last.first_row + last.steps + rows.dropped,
+            total_rows=episodes[-1].first_row + episodes[-1].steps + rows.dropped,
             digests=digests,
         ),
     )
@@ -115,9 +109,7 @@ def _survey(
     roundings: Roundings,
 ) -> tuple[list[Found], str, Digests]:
     """Read every value once, for `roundings`, too; return all episodes, hash and digests of what is ours."""
-    stored = list(rows.stored.values())
-    specs = layout.stored_columns(columns)
-    ends = [name for name in ENDS if name in rows.stored]
+    stored, specs = list(rows.stored.values()), layout.stored_columns(columns)
     found: list[Found] = []
     faults: list[str] = []
     digests: dict[str, list[int]] = {spec.name: [] for spec in specs}
@@ -125,7 +117,8 @@ def _survey(
     tables = read_blocks(plain.data_files(root), [column.name for column in stored])
     for number, run in enumerate(plain.runs(root / "data", tables, stored)):
         faults += [fault for _, fault in plain.run_faults(run, number=number, row=row, fps=rows.fps)]
-        faults += plain.flag_faults({name: run.columns[name] for name in ends}, f"episode {number} ")
+        flags = {name: run.columns[name] for name in ENDS if name in rows.stored}
+        faults += plain.flag_faults(flags, f"episode {number} ")
         if len(faults) >= MOST_FAULTS:
             break
         uid = int(run.columns.get(names.EPISODE_UID, run.columns[names.EPISODE_INDEX])[0])
@@ -136,12 +129,11 @@ def _survey(
             continue
         if not faults:
             roundings.add(run.columns)
-        for spec in specs:
-            values = rows.values(spec, run, kept, steps, uid)
-            content.update(spec.name, values)
-            digests[spec.name].append(digest_of(values))
+        for name, values in rows.values(specs, run, kept, steps, uid).items():
+            content.update(name, values)
+            digests[name].append(digest_of(values))
             if values.dtype.kind == "f" and not faults and not np.isfinite(values).all():
-                faults.append(f"{spec.name} in episode {number} is too large for {spec.dtype}")
+                faults.append(f"{name} in episode {number} is too large for {values.dtype}")
         kept, steps = kept + 1, steps + episode.steps
     counted = (info.get("total_episodes"), info.get("total_frames"))
     if not faults and (len(found), row) != counted:
@@ -160,18 +152,20 @@ def _survey(
 
 def found_in(run: plain.Run, rows: Rows, tasks: Mapping[int, str], *, row: int, uid: int) -> Found:
     """Return the episode of the rows `run`, which begins in the given row of the files."""
-    ends = rows.lost_success(run), rows.lost_reward(run), rows.is_done_early(run)
-    return Found(uid, row, len(run) - rows.dropped, _facts(run, tasks), *ends)
-
-
-def _facts(run: plain.Run, tasks: Mapping[int, str]) -> dict[str, Scalar]:
-    """Return the metadata of an episode, of all its rows."""
-    facts: dict[str, Scalar] = {}
-    if names.SUCCESS in run.columns:
-        facts["success"] = bool(run.columns[names.SUCCESS].any())
+    columns, facts = run.columns, dict[str, Scalar]()
+    lost_success, lost_reward = False, 0.0
+    is_terminated = ends_with(names.TERMINATED, run)
+    if (success := columns.get(names.SUCCESS)) is not None:
+        facts["success"] = bool(success.any())
+        is_over = is_terminated or ends_with(names.DONE, run)
+        lost_success = bool(rows.dropped and success[-1] and not success[:-1].any() and not is_over)
     if len(tasks) > 1:
-        facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
-    return facts
+        facts["task"] = tasks.get(int(columns[names.TASK_INDEX][0]), "unknown")
+    if names.REWARD in columns and rows.dropped and (len(run) == 1 or not is_terminated):
+        lost_reward = float(columns[names.REWARD][-1])
+    # No end of an episode is made of `next.done`.
+    is_done_early = names.DONE in columns and bool(columns[names.DONE][:-1].any())
+    return Found(uid, row, len(run) - rows.dropped, facts, lost_success, lost_reward, is_done_early)
 
 
 def left_out(rows: Rows, episodes: Sequence[Found]) -> list[str]:
@@ -197,11 +191,10 @@ def left_out(rows: Rows, episodes: Sequence[Found]) -> list[str]:
 
 def _announce(
     root: Path,
-    info: Mapping[str, Any],
     rows: Rows,
     columns: Sequence[Column],
     episodes: Sequence[Found],
-    known: Collection[str],
+    others: Sequence[str],
     rounded: Sequence[str],
 ) -> None:
     """Say in one line what is left out or rounded, and which ends are not those of episodes."""
@@ -216,7 +209,6 @@ def _announce(
         stored = rows.stored.get(column.name)
         if stored and not np.can_cast(stored.dtype, column.dtype):
             parts.append(f"{column.name} is {column.dtype} here, recorded as {stored.dtype}")
-    others = sorted(info["features"].keys() - set(known))
     if others:
         parts.append(f"left out, because they are not lists of numbers: {', '.join(others)}")
     _log.warning("%s", f"{root}, recorded by LeRobot: {'; '.join(parts) or 'without our metadata'}")

@@ -43,76 +43,39 @@ class Rows:
         """Rows at the end of each episode that are left out: 1 where next states are derived, otherwise 0."""
         return 0 if names.NEXT_STATE in self.stored else 1
 
-    def values(self, spec: Column, run: Run, episode: int, start: int, uid: int) -> Array:
-        """Return the column `spec` of one episode, (T,) or (T, size)."""
-        steps, name = len(run) - self.dropped, spec.name
-        if name in (names.TERMINATED, names.TRUNCATED, names.DONE):
-            terminated, truncated = self._ends(run, steps)
-            return {names.TERMINATED: terminated, names.TRUNCATED: truncated}.get(name, terminated | truncated)
-        if name in names.RESERVED:
-            start_of = {"uid": uid, "episode": episode, "start": start}
-            values = reserved_values(steps, **start_of, fps=self.fps)[name]
-        elif name == names.SUCCESS and self.dropped:
-            values = self._successes(run, steps)
-        elif name == names.NEXT_STATE and self.dropped:
-            values = run.columns[names.STATE][1:]
-        else:
-            values = run.columns[names.TASK_INDEX if name == RECORDED_TASK else name][:steps]
-        if name == names.REWARD and self._hands_on(run):
-            values = values.astype(np.float64)
-            values[-1] += run.columns[names.REWARD][-1]
-        with np.errstate(over="ignore", invalid="ignore"):
-            return values.astype(spec.dtype)
+    def values(self, specs: Iterable[Column], run: Run, episode: int, start: int, uid: int) -> dict[str, Array]:
+        """Return the columns `specs` of one episode, (T,) or (T, size).
 
-    def lost_success(self, run: Run) -> bool:
-        """Whether of an episode only the row that is left out succeeded, and no step takes that over."""
-        if not self.dropped or names.SUCCESS not in self.stored:
-            return False
-        successes = run.columns[names.SUCCESS] != 0
-        is_handed_on = self._ends_with(names.TERMINATED, run) or self._ends_with(names.DONE, run)
-        return bool(successes[-1] and not successes[:-1].any() and not is_handed_on)
-
-    def lost_reward(self, run: Run) -> float:
-        """Return the reward of the row that is left out, 0 where the step before takes it over."""
-        is_lost = self.dropped and names.REWARD in self.stored and not self._hands_on(run)
-        return float(run.columns[names.REWARD][-1]) if is_lost else 0.0
-
-    def is_done_early(self, run: Run) -> bool:
-        """Whether `next.done`, of which no end of an episode is made, is set before the last row."""
-        return names.DONE in self.stored and bool(run.columns[names.DONE][:-1].any())
-
-    def _ends(self, run: Run, steps: int) -> tuple[Array, Array]:
-        """Return terminated and truncated, (T,); an episode that is cut off is truncated.
-
-        If the row that is left out is terminated, the step before it is.
+        An episode that is cut off is truncated. If the row that is left out is terminated, the step before it is,
+        and has its reward and its success or failure; of one that is done, only its success.
         """
-        terminated, truncated = (
-            run.columns[name][:steps] != 0 if name in self.stored else np.zeros(steps, bool) for name in ENDS
-        )
-        terminated[-1] |= self._ends_with(names.TERMINATED, run)
+        steps, stored = len(run) - self.dropped, run.columns
+        found = {name: values[:steps] for name, values in stored.items()}
+        found |= reserved_values(steps, uid=uid, episode=episode, start=start, fps=self.fps)
+        found[RECORDED_TASK] = stored[names.TASK_INDEX][:steps]
+        is_terminated, is_done = ends_with(names.TERMINATED, run), ends_with(names.DONE, run)
+        terminated, truncated = (found[name] != 0 if name in stored else np.zeros(steps, bool) for name in ENDS)
+        terminated[-1] |= is_terminated
         truncated[-1] |= not terminated[-1]
-        return terminated, truncated
+        flags = {names.TERMINATED: terminated, names.TRUNCATED: truncated, names.DONE: terminated | truncated}
+        if self.dropped:
+            found[names.NEXT_STATE] = stored[names.STATE][1:]
+            if names.SUCCESS in stored:
+                success = stored[names.SUCCESS] != 0
+                flags[names.SUCCESS] = success[:steps].copy()
+                if is_terminated or (is_done and success[-1]):
+                    flags[names.SUCCESS][-1] = success[-1]
+            if names.REWARD in stored and is_terminated:
+                found[names.REWARD] = found[names.REWARD].astype(np.float64)
+                found[names.REWARD][-1] += stored[names.REWARD][-1]
+        found |= flags
+        with np.errstate(over="ignore", invalid="ignore"):
+            return {spec.name: found[spec.name].astype(spec.dtype) for spec in specs}
 
-    def _successes(self, run: Run, steps: int) -> Array:
-        """Return which steps succeeded, (T,).
 
-        The last takes over the success of a row left out that is done; of a terminated one, also its failure.
-        """
-        stored = run.columns[names.SUCCESS] != 0
-        success: Array = stored[:steps].copy()
-        if self._ends_with(names.TERMINATED, run):
-            success[-1] = stored[-1]
-        elif self._ends_with(names.DONE, run):
-            success[-1] |= stored[-1]
-        return success
-
-    def _hands_on(self, run: Run) -> bool:
-        """Whether a row is left out that terminates the episode, whose outcome the step before takes over."""
-        return bool(self.dropped) and len(run) > 1 and self._ends_with(names.TERMINATED, run)
-
-    def _ends_with(self, flag: str, run: Run) -> bool:
-        """Whether the last row of an episode has this flag, (T,)."""
-        return flag in self.stored and bool(run.columns[flag][-1])
+def ends_with(flag: str, run: Run) -> bool:
+    """Whether the last row of an episode has this flag, (T,)."""
+    return flag in run.columns and bool(run.columns[flag][-1])
 
 
 @dataclass(frozen=True)
@@ -153,34 +116,30 @@ def next_state_of(state: Column) -> Column:
 def declared_columns(folder: Path, info: Mapping[str, Any]) -> tuple[list[PlainColumn], list[Column], int]:
     """Return from info.json the columns of numbers as stored, ours for their values, and the fps."""
     features, fps = info.get("features"), info.get("fps")
-    columns = plain_columns(features)[0] if isinstance(features, dict) else []
+    features = features if isinstance(features, dict) else {}
+    columns = plain_columns(features)[0]
     found = {column.name: column for column in columns}
     missing = sorted({c.name for c in DEFAULT_COLUMNS} - found.keys())
     faults = [f"lacks the columns {', '.join(missing)}, which are LeRobot's own"] if missing else []
     if strange := [c.name for c in DEFAULT_COLUMNS if c.name in found and not _fits(found[c.name], c)]:
         faults.append(f"has no single number a step as {', '.join(strange)}")
-    if not isinstance(fps, int | float) or not 1 <= fps < MOST_FPS or fps != int(fps):
+    rate = fps if isinstance(fps, int | float) and 1 <= fps < MOST_FPS and fps == int(fps) else 0
+    if not rate:
         faults.append(f"has fps {fps!r}, expected a whole number of frames per second")
     if faults:
         raise CorruptDatasetError(f"{folder}: {INFO_PATH} {' and '.join(faults)}")
-    assert isinstance(features, dict) and isinstance(fps, int | float)
     specs = []
     for column in columns:
-        if column.name in names.RESERVED:
-            continue
-        feature = features[column.name]
-        known = feature | {
-            "dtype": DTYPES[np.dtype(column.dtype).kind],
-            "names": _labels(feature.get("names"), column.size),
-        }
-        specs.append(Column.from_feature(column.name, known))
-    return columns, specs, int(fps)
+        if column.name not in names.RESERVED:
+            feature = features[column.name]
+            labels, kind = _labels(feature.get("names"), column.size), np.dtype(column.dtype).kind
+            specs.append(Column.from_feature(column.name, feature | {"dtype": DTYPES[kind], "names": labels}))
+    return columns, specs, int(rate)
 
 
 def _fits(stored: PlainColumn, own: Column) -> bool:
     """Return whether a column can be one of LeRobot's own."""
-    kinds = "f" if own.dtype == "float32" else "iu"
-    return stored.size == 1 and np.dtype(stored.dtype).kind in kinds
+    return stored.size == 1 and np.dtype(stored.dtype).kind in ("f" if own.dtype == "float32" else "iu")
 
 
 def name_of(folder: Path) -> str:

@@ -149,6 +149,8 @@ def test_repaired_it_is_as_it_was_opened(arm: Dataset, recorded: Path, tmp_path:
     [note] = [note for note in notes if note.startswith("next states are those of the following rows")]
     assert "the last row of each episode, 4 of 20 rows; 1 of them in episodes of a single row" in note
     assert check(whole.root).faults == []
+    repair(arm.root, out=tmp_path / "renamed", new_uids=True)
+    assert Dataset.open(tmp_path / "renamed").content_hash == arm.content_hash
 
 
 def test_what_cannot_be_is_one_line(recorded: Path, tmp_path: Path) -> None:

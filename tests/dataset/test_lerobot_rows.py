@@ -9,6 +9,7 @@ from astra_data.core.errors import CorruptDatasetError
 from astra_data.dataset import columns as names
 from astra_data.dataset.columns import STATE, Array, Column
 from astra_data.dataset.format import DEFAULT_COLUMNS
+from astra_data.dataset.lerobot_recording import found_in
 from astra_data.dataset.lerobot_rows import RECORDED_TASK, Rows, declared_columns, name_of
 from astra_data.dataset.plain import PlainColumn, Run
 
@@ -33,7 +34,7 @@ def rows_and_run(more: Mapping[str, Array]) -> tuple[Rows, Run]:
 
 def values(name: str, dtype: str = "float32", size: int = 1, more: Mapping[str, Array] | None = None) -> Array:
     rows, run = rows_and_run(more or {})
-    return rows.values(Column(name, dtype, size), run, 3, 100, 9)
+    return rows.values([Column(name, dtype, size)], run, 3, 100, 9)[name]
 
 
 def test_rows_are_numbered_anew() -> None:
@@ -93,11 +94,11 @@ def test_a_terminated_row_that_is_left_out_hands_its_reward_to_the_step_before()
     sparse: dict[str, Array] = {names.REWARD: 5.0 * last, names.TERMINATED: last}
     assert values(names.REWARD, more=sparse).tolist() == [0, 0, 5]
     rows, run = rows_and_run(dict(sparse))
-    assert rows.lost_reward(run) == 0.0
+    assert found_in(run, rows, {}, row=0, uid=9).lost_reward == 0.0
     cut_off = sparse | {names.TERMINATED: ~last & last}
     assert values(names.REWARD, more=cut_off).tolist() == [0, 0, 0]
     rows, run = rows_and_run(cut_off)
-    assert rows.lost_reward(run) == 5.0
+    assert found_in(run, rows, {}, row=0, uid=9).lost_reward == 5.0
 
 
 def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_over() -> None:
@@ -112,11 +113,11 @@ def test_a_success_of_the_row_that_is_left_out_is_lost_unless_the_episode_is_ove
         ({}, False),
     ):
         rows, run = rows_and_run(dict(more))
-        assert rows.lost_success(run) == lost
+        assert found_in(run, rows, {}, row=0, uid=9).lost_success == lost
     rows, run = rows_and_run({names.REWARD: np.arange(STEPS, dtype=np.float32)})
-    assert rows.lost_reward(run) == STEPS - 1
+    assert found_in(run, rows, {}, row=0, uid=9).lost_reward == STEPS - 1
     rows, run = rows_and_run({names.REWARD: np.ones(STEPS), names.NEXT_STATE: np.ones((STEPS, 2))})
-    assert rows.lost_reward(run) == 0.0
+    assert found_in(run, rows, {}, row=0, uid=9).lost_reward == 0.0
 
 
 WHOLE = "expected a whole number of frames per second"

@@ -4,8 +4,7 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
@@ -53,38 +52,38 @@ class Report:
 
     episodes: int = 0
     frames: int = 0
-    _faults: dict[str, list[str]] = field(default_factory=dict)
-    _notes: dict[str, list[str]] = field(default_factory=dict)
+    found: dict[bool, dict[str, list[str]]] = field(default_factory=lambda: {True: {}, False: {}})
+    """Faults (True) and notes, by their kind."""
 
     def fault(self, kind: str, sentence: str) -> None:
         """Add a fault."""
-        self._faults.setdefault(kind, []).append(sentence)
+        self.found[True].setdefault(kind, []).append(sentence)
 
     def note(self, kind: str, sentence: str) -> None:
         """Add something worth knowing that is not a fault."""
-        self._notes.setdefault(kind, []).append(sentence)
+        self.found[False].setdefault(kind, []).append(sentence)
 
     @property
     def faults(self) -> list[str]:
         """The faults, a sentence each, the first `MOST` of each kind."""
-        return list(_first_of_each(self._faults))
-
-    @property
-    def fault_count(self) -> int:
-        """The number of all faults."""
-        return sum(map(len, self._faults.values()))
+        return self._first_of_each(True)
 
     @property
     def notes(self) -> list[str]:
         """The notes, likewise."""
-        return list(_first_of_each(self._notes))
+        return self._first_of_each(False)
 
+    @property
+    def fault_count(self) -> int:
+        """The number of all faults."""
+        return sum(map(len, self.found[True].values()))
 
-def _first_of_each(found: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    for kind, sentences in found.items():
-        yield from sentences[:MOST]
-        if len(sentences) > MOST:
-            yield f"{kind}: and {len(sentences) - MOST} more of this kind"
+    def _first_of_each(self, is_fault: bool) -> list[str]:
+        shown = []
+        for kind, sentences in self.found[is_fault].items():
+            more = len(sentences) - MOST
+            shown += [*sentences[:MOST], *([f"{kind}: and {more} more of this kind"] if more > 0 else [])]
+        return shown
 
 
 def check(root: Path) -> Report:
@@ -121,23 +120,18 @@ def check(root: Path) -> Report:
 
 def _info_faults(info: Mapping[str, Any], report: Report) -> list[plain.PlainColumn]:
     """Check meta/info.json; return the columns whose values can be checked, none if some are missing."""
-    version, fps, features = info.get("codebase_version"), info.get("fps"), info.get("features")
-    faults = []
-    if version != layout.CODEBASE_VERSION:
-        report.fault(
-            layout.INFO_PATH,
-            f"{layout.INFO_PATH}: the format is {version}, expected {layout.CODEBASE_VERSION}",
-        )
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < plain.MOST_FPS:
-        faults.append(f"fps is {fps!r}, expected a positive number below 2^31")
-    if not isinstance(features, dict):
-        faults.append(f"features is {features!r}, expected an object")
-    if not plain.is_data_path(data_path := info.get("data_path")):
-        expected = f"expected a path inside the folder such as {layout.DATA_PATH}"
-        faults.append(f"data_path is {data_path!r}, {expected}")
-    for fault in faults:
+    version, fps, features, path = (info.get(key) for key in ("codebase_version", "fps", "features", "data_path"))
+    is_rate = isinstance(fps, int | float) and not isinstance(fps, bool) and 0 < fps < plain.MOST_FPS
+    inside = f"expected a path inside the folder such as {layout.DATA_PATH}"
+    checks = {
+        f"the format is {version}, expected {layout.CODEBASE_VERSION}": version == layout.CODEBASE_VERSION,
+        f"fps is {fps!r}, expected a positive number below 2^31": is_rate,
+        f"features is {features!r}, expected an object": isinstance(features, dict),
+        f"data_path is {path!r}, {inside}": plain.is_data_path(path),
+    }
+    for fault in (fault for fault, holds in checks.items() if not holds):
         report.fault(layout.INFO_PATH, f"{layout.INFO_PATH}: {fault}")
-    if faults or not isinstance(features, dict):
+    if not isinstance(features, dict) or not all(list(checks.values())[1:]):
         return []
     columns, others = plain.plain_columns(features)
     if others:
@@ -209,35 +203,36 @@ def _sealed_faults(root: Path, columns: list[plain.PlainColumn], report: Report)
         return {}
 
 
-class EpisodeChecks:
-    """Reads all episodes once, one in memory at a time."""
+def _every_run(root: Path, columns: Sequence[plain.PlainColumn]) -> Iterator[plain.Run]:
+    for path in plain.data_files(root):
+        yield from plain.runs(path, read_blocks([path], [column.name for column in columns]), columns)
 
-    def __init__(
-        self,
-        root: Path,
-        info: Mapping[str, Any],
-        columns: Sequence[plain.PlainColumn],
-        digests: Digests,
-        report: Report,
-    ) -> None:
-        """Prepare; where there are `digests`, values are compared with them, else statistics with values."""
-        self._root, self._info, self._columns = root, info, columns
-        self._digests, self._report = digests, report
-        self._total: dict[str, Floats] = {}
-        tasks = plain.read_tasks(root)
-        if isinstance(tasks, str):
-            report.fault("tasks", f"{layout.TASKS_PATH} {tasks}")
-        self._tasks = {} if isinstance(tasks, str) else tasks
+
+@dataclass
+class EpisodeChecks:
+    """Reads all episodes once, one in memory at a time.
+
+    Where there are `digests`, values are compared with them, else statistics with values.
+    """
+
+    root: Path
+    info: Mapping[str, Any]
+    columns: Sequence[plain.PlainColumn]
+    digests: Digests
+    report: Report
+    tasks: Mapping[int, str] = field(default_factory=dict)
+    total: dict[str, Floats] = field(default_factory=dict)
+    """The statistics of all rows so far."""
 
     def run(self) -> None:
         """Check every episode, and what is counted over all of them."""
-        report, first = self._report, dict[int, int]()
-        every = (
-            run
-            for path in plain.data_files(self._root)
-            for run in plain.runs(path, read_blocks([path], [c.name for c in self._columns]), self._columns)
-        )
-        for number, (run, row) in enumerate(zip_longest(every, plain.episode_rows(self._root))):
+        report, first, tasks = self.report, dict[int, int](), plain.read_tasks(self.root)
+        if isinstance(tasks, str):
+            report.fault("tasks", f"{layout.TASKS_PATH} {tasks}")
+        else:
+            self.tasks = tasks
+        every = _every_run(self.root, self.columns)
+        for number, (run, row) in enumerate(zip_longest(every, plain.episode_rows(self.root))):
             if run is None:
                 report.fault("meta/episodes", f"meta/episodes has episode {number}, the data has not")
                 continue
@@ -251,67 +246,64 @@ class EpisodeChecks:
                 report.fault("uids", f"episodes {first[uid]} and {number} have the same uid {uid}")
             report.episodes += 1
             report.frames += len(run)
-        found = {"total_episodes": report.episodes, "total_frames": report.frames}
-        for key, count in (found | {"total_tasks": len(self._tasks)}).items():
-            if self._info.get(key) != count:
-                report.fault("counts", f"{key} is {self._info.get(key)}, expected {count}")
+        counts = {"episodes": report.episodes, "frames": report.frames, "tasks": len(self.tasks)}
+        for key, count in counts.items():
+            if (found := self.info.get(f"total_{key}")) != count:
+                report.fault("counts", f"total_{key} is {found}, expected {count}")
         if not report.frames:
             report.fault("values", "there are no steps")
-        elif not self._digests:
+        elif not self.digests:
             self._check_global()
 
     def _check_run(self, number: int, run: plain.Run) -> None:
-        report = self._report
-        for name, fault in plain.run_faults(run, number=number, row=report.frames, fps=self._info["fps"]):
+        report = self.report
+        for name, fault in plain.run_faults(run, number=number, row=report.frames, fps=self.info["fps"]):
             report.fault(name, fault)
         for faults in (plain.flag_faults, plain.open_end_faults):
             for fault in faults(run.columns, f"episode {number} "):
                 report.note("flags", fault)
-        unknown = [t for t in np.unique(run.columns[names.TASK_INDEX]).tolist() if t not in self._tasks]
+        unknown = [t for t in np.unique(run.columns[names.TASK_INDEX]).tolist() if t not in self.tasks]
         if unknown:
             report.fault("tasks", f"episode {number} has the unknown tasks {unknown}")
-        if altered := altered_columns(run.columns, number, self._digests):
+        if altered := altered_columns(run.columns, number, self.digests):
             report.fault("values", alteration(altered, run.path, run.row, len(run), number))
 
     def _check_row(self, number: int, run: plain.Run, row: Mapping[str, Any]) -> None:
         """Compare an episode with its row of meta/episodes."""
-        start = self._report.frames
-        place = {"chunk_index": row.get("data/chunk_index"), "file_index": row.get("data/file_index")}
+        start = self.report.frames
+        place = {key: row.get(f"data/{key}") for key in ("chunk_index", "file_index")}
         known = all(isinstance(index, int) for index in place.values())
-        path = self._info["data_path"].format(**place) if known else None
-        present = {self._tasks.get(int(task)) for task in np.unique(run.columns[names.TASK_INDEX])}
-        listed = row.get("tasks")
+        present = {self.tasks.get(int(task)) for task in np.unique(run.columns[names.TASK_INDEX])}
         compared: dict[str, tuple[object, object]] = {
             "episode_index": (row.get("episode_index"), number),
             "length": (row.get("length"), len(run)),
             "dataset_from_index": (row.get("dataset_from_index"), start),
             "dataset_to_index": (row.get("dataset_to_index"), start + len(run)),
-            "the file": (path, str(run.path.relative_to(self._root))),
+            "the file": (
+                self.info["data_path"].format(**place) if known else None,
+                str(run.path.relative_to(self.root)),
+            ),
         }
+        listed = row.get("tasks")
         if not isinstance(listed, list) or set(map(str, listed)) != set(map(str, present)):
             compared["tasks"] = (listed, present)
         for key, (found, expected) in compared.items():
             if found != expected:
                 fault = f"meta/episodes: {key} of episode {number} is {found}, expected {expected}"
-                self._report.fault("meta/episodes", fault)
-        if not self._digests:
+                self.report.fault("meta/episodes", fault)
+        if not self.digests:
             statistics = dict(zip(layout.STATISTICS, episode_statistics(run.columns.values()), strict=True))
             statistics["count"] = np.full(statistics["min"].shape, float(len(run)))
             self._add(statistics)
-            stored = {
-                (column.name, kind): row.get(f"stats/{column.name}/{kind}")
-                for column in self._columns
-                for kind in plain.PLAIN_STATISTICS
-            }
-            self._compare(stored, statistics, f" in episode {number}")
+            self._compare(lambda name, kind: row.get(f"stats/{name}/{kind}"), statistics, f" in episode {number}")
 
     def _add(self, found: Mapping[str, Floats]) -> None:
         """Take an episode's statistics into those of all rows."""
-        old = self._total or found
-        count = self._total.get("count", 0.0) + found["count"]
+        old = self.total or found
+        count = self.total.get("count", 0.0) + found["count"]
         share, shift = found["count"] / count, found["mean"] - old["mean"]
         variance = old["std"] ** 2 * (1 - share) + found["std"] ** 2 * share
-        self._total = {
+        self.total = {
             "min": np.minimum(old["min"], found["min"]),
             "max": np.maximum(old["max"], found["max"]),
             "mean": old["mean"] + shift * share,
@@ -320,26 +312,24 @@ class EpisodeChecks:
         }
 
     def _check_global(self) -> None:
-        stored = plain.read_object(self._root / layout.STATS_PATH)
+        stored = plain.read_object(self.root / layout.STATS_PATH)
         if isinstance(stored, str):
-            self._report.fault("statistics", f"{layout.STATS_PATH} {stored}")
-        elif self._total:
-            kinds = plain.PLAIN_STATISTICS
+            self.report.fault("statistics", f"{layout.STATS_PATH} {stored}")
+        elif self.total:
             every = {name: each for name, each in stored.items() if isinstance(each, dict)}
-            of_each = {(c.name, kind): every.get(c.name, {}).get(kind) for c in self._columns for kind in kinds}
-            self._compare(of_each, self._total, "")
+            self._compare(lambda name, kind: every.get(name, {}).get(kind), self.total, "")
 
-    def _compare(self, stored: Mapping[tuple[str, str], object], found: Mapping[str, Floats], where: str) -> None:
-        """Note which statistics differ from those of the values."""
-        for column, part in side_by_side(self._columns):
+    def _compare(self, stored: Callable[[str, str], object], found: Mapping[str, Floats], where: str) -> None:
+        """Note which statistics, as `stored` has them by column and kind, differ from those of the values."""
+        for column, part in side_by_side(self.columns):
             largest = np.maximum(np.abs(found["min"][part]), np.abs(found["max"][part]))
             for kind in plain.PLAIN_STATISTICS:
-                one, expected = stored[column.name, kind], found[kind][part]
+                one, expected = stored(column.name, kind), found[kind][part]
                 if kind == "count":
                     expected = expected[:1].astype(np.int64)
                 if not is_estimate(kind, one, expected, largest):
                     what = f"{kind} of {column.name}{where} is {one}, expected {expected.tolist()}"
-                    self._report.note("statistics", f"statistics: {what}")
+                    self.report.note("statistics", f"statistics: {what}")
 
 
 def is_estimate(kind: str, stored: object, expected: Floats, largest: Floats) -> bool:
@@ -348,33 +338,19 @@ def is_estimate(kind: str, stored: object, expected: Floats, largest: Floats) ->
         found = np.asarray(stored, dtype=np.float64).ravel()
     except (OverflowError, TypeError, ValueError):
         return False
-    if found.size != expected.size:
-        return False
-    if kind == "count":
-        return bool((found == expected).all())
+    if found.size != expected.size or kind == "count":
+        return np.array_equal(found, expected)
     if kind == "std":
         found, expected, largest = found**2, expected**2, largest**2
-    error = ESTIMATED * np.abs(expected) + _SUMS * largest
-    return bool((np.abs(found - expected) <= error).all())
+    return bool((np.abs(found - expected) <= ESTIMATED * np.abs(expected) + _SUMS * largest).all())
 
 
-@contextmanager
-def _unchanged_logging() -> Iterator[None]:
-    """Remove the handlers that the block adds to the root logger, which put a prefix before our messages."""
-    root = logging.getLogger()
-    before = list(root.handlers)
-    try:
-        yield
-    finally:
-        root.handlers[:] = before
-
-
-@_unchanged_logging()
 def compare_with_lerobot(root: Path, report: Report) -> None:
     """Open the dataset with `LeRobotDataset` and compare windows of observations and actions with the files.
 
     Works offline and leaves no cache behind; importing lerobot takes seconds and 0.8 GB.
     """
+    handlers = list(logging.getLogger().handlers)
     os.environ["HF_HUB_OFFLINE"] = "1"
     optional("lerobot")
     import datasets.config  # noqa: PLC0415 - slow, and only after the environment is set
@@ -405,6 +381,7 @@ def compare_with_lerobot(root: Path, report: Report) -> None:
     finally:
         datasets.config.HF_DATASETS_CACHE = usual
         cache.cleanup()
+        logging.getLogger().handlers[:] = handlers  # those that lerobot adds put a prefix before our messages
 
 
 def _windows(
@@ -415,10 +392,9 @@ def _windows(
     split = (names.EPISODE_INDEX, names.FRAME_INDEX)
     read = [*columns, *(plain.PlainColumn(name, "int64", 1) for name in split)]
     first = 0
-    for path in plain.data_files(root):
-        for run in plain.runs(path, read_blocks([path], [column.name for column in read]), read):
-            for row in sorted(wanted & set(range(first, first + len(run)))):
-                steps = row - first + OFFSETS
-                inside = np.clip(steps, 0, len(run) - 1)
-                yield row, {c.name: run.columns[c.name][inside] for c in columns}, steps != inside
-            first += len(run)
+    for run in _every_run(root, read):
+        for row in sorted(wanted & set(range(first, first + len(run)))):
+            steps = row - first + OFFSETS
+            inside = np.clip(steps, 0, len(run) - 1)
+            yield row, {c.name: run.columns[c.name][inside] for c in columns}, steps != inside
+        first += len(run)

@@ -81,82 +81,68 @@ def repair(
     refuse_run(folder)
     sources = [like] if isinstance(like, Dataset) else list(like or ())
     result = Repaired()
-    remains = remains_of(folder, sources, result.notes)
+    notes = result.notes
+    remains = remains_of(folder, sources, notes)
     rows, tasks = remains.rows, remains.tasks
     whole = partial(whole_runs, folder, remains.columns, remains.digests, remains.fps, repeated=new_uids)
     joined: list[Joined] = []
     if sources or new_uids:
-        joined = join(((uid, run.columns) for uid, run in whole([])), remains.specs, sources)
+        stored = [spec for spec in remains.specs if spec.name in {column.name for column in remains.columns}]
+        joined = join(((uid, run.columns) for uid, run in whole([])), stored, sources)
         renamed = sum("merged_uid" in episode.metadata for episode in joined)
-        result.notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
+        notes += [f"{renamed} episodes have new uids, because theirs were taken"] if renamed else []
     unknown = 0
     roundings = Roundings(remains.specs, {column.name: column.dtype for column in remains.columns})
     recorded: list[Found] = []
     theirs = {uid for source in sources for uid in source.uids.tolist()}
+    task = " / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown"
+    description, seed = _description(folder, remains, sources), remains.subset_seed
     with DatasetWriter(
-        out,
-        remains.specs,
-        fps=remains.fps,
-        task=" / ".join(str(tasks[index]) for index in sorted(tasks)) or "unknown",
-        description=remains.description,
-        subset_seed=remains.subset_seed,
+        out, remains.specs, fps=remains.fps, task=task, description=description, subset_seed=seed
     ) as writer:
-        for number, (uid, run) in enumerate(whole(result.notes)):
+        for number, (uid, run) in enumerate(whole(notes)):
             known = joined[number] if joined else Joined(uid, {}, is_known=False)
             if not sources:
                 facts = remains.metadata.get(uid, {}) | known.metadata
                 known = Joined(known.uid, facts, uid in remains.metadata)
             elif uid in theirs and not known.is_known and not new_uids:
-                result.notes.append(
-                    f"left out the episode of uid {uid}: its values are not those in "
-                    f"{' or '.join(source.reference for source in sources)}"
-                )
+                references = " or ".join(source.reference for source in sources)
+                notes.append(f"left out the episode of uid {uid}: its values are not those in {references}")
                 continue
-            facts = known.metadata
             if rows:
                 found = found_in(run, rows, tasks, row=0, uid=uid)
                 recorded.append(found)
                 if not found.steps:
                     continue
-                facts |= found.metadata
+                known.metadata.update(found.metadata)
             if len(tasks) > 1:
-                facts["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
+                known.metadata["task"] = tasks.get(int(run.columns[names.TASK_INDEX][0]), "unknown")
             try:
-                episode = Episode(known.uid, _values(remains.specs, run, rows, uid), facts)
+                episode = Episode(known.uid, remains.values(run, uid), known.metadata)
                 writer.add(episode)
                 roundings.add(run.columns)
             except BadInputError as error:
-                result.notes.append(f"left out the episode of uid {uid}: {error}")
+                notes.append(f"left out the episode of uid {uid}: {error}")
                 continue
             unknown += not known.is_known
             result.episodes += 1
             result.frames += len(episode)
         if rows and recorded:
-            result.notes.append("; ".join(left_out(rows, recorded)))
-        result.notes += roundings.found()
-        result.notes += _losses(remains, result.episodes, writer.content_hash)
+            notes.append("; ".join(left_out(rows, recorded)))
+        notes += [*roundings.found(), *remains.losses(result.episodes, writer.content_hash)]
         if (remains.metadata or sources) and unknown:
-            result.notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
+            notes.append(f"{unknown} episodes have no metadata: they are not among the known ones")
         if len(tasks) > 1:
-            result.notes.append(
-                f"the {len(tasks)} tasks were merged into one; each episode's own is in its metadata 'task'"
-            )
-        writer.made = {"repaired": result.notes}
+            merged = f"the {len(tasks)} tasks were merged into one"
+            notes.append(f"{merged}; each episode's own is in its metadata 'task'")
+        writer.made = {"repaired": notes}
         writer.policy = policy if (policy := folder / layout.POLICY_PATH).is_file() else None
         if not result.episodes:
-            raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(result.notes)}")
+            raise CorruptDatasetError(f"{folder}: not one whole episode; {'; '.join(notes)}")
     return result
 
 
-def _values(specs: Sequence[Column], run: Run, rows: Rows | None, uid: int) -> dict[str, Array]:
-    """Return the columns `specs` of an episode; the writer refuses what is too large for its type."""
-    if rows:
-        return {spec.name: rows.values(spec, run, 0, 0, uid) for spec in specs}
-    with np.errstate(over="ignore"):
-        return {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in specs}
-
-
-@dataclass(frozen=True)
+@dataclass
 class Remains:
     """What is known of a damaged dataset before its episodes are read; empty is what cannot be relied on."""
 
@@ -170,24 +156,28 @@ class Remains:
     tasks: Mapping[int, str]
     rows: Rows | None
     """How its rows become ours, where LeRobot recorded it without next states; otherwise None."""
-    description: Mapping[str, Any]
-    """Of the new dataset."""
-    old: Mapping[str, Any]
-    """Its own description."""
-    digests: Digests
-    metadata: Mapping[int, dict[str, Scalar]]
-    """The episodes' metadata by uid."""
     subset_seed: int
+    old: Mapping[str, Any] = field(default_factory=dict)
+    """Its own description."""
+    digests: Digests = field(default_factory=dict)
+    metadata: Mapping[int, dict[str, Scalar]] = field(default_factory=dict)
+    """The episodes' metadata by uid."""
 
+    def values(self, run: Run, uid: int) -> dict[str, Array]:
+        """Return the columns of an episode; the writer refuses what is too large for its type."""
+        if self.rows:
+            return self.rows.values(self.specs, run, 0, 0, uid)
+        with np.errstate(over="ignore"):
+            return {spec.name: run.columns[spec.name].astype(spec.dtype, copy=False) for spec in self.specs}
 
-def _losses(remains: Remains, episodes: int, content_hash: str) -> Iterator[str]:
-    """Say what of the dataset is not among the episodes saved, and whether their values are those written."""
-    counted = remains.info.get("total_episodes")
-    if isinstance(counted, int) and counted > episodes:
-        yield f"{counted - episodes} of the {counted} episodes that {layout.INFO_PATH} counts are lost"
-    is_all = counted == episodes and len(remains.columns) == len(remains.info["features"])
-    if is_all and remains.old and remains.old["content_hash"] != content_hash:
-        yield ("a value was altered after it was written, because the content hash differs; which one is unknown")
+    def losses(self, episodes: int, content_hash: str) -> Iterator[str]:
+        """Say what is not among the episodes saved, and whether their values are those written."""
+        counted = self.info.get("total_episodes")
+        if isinstance(counted, int) and counted > episodes:
+            yield f"{counted - episodes} of the {counted} episodes that {layout.INFO_PATH} counts are lost"
+        is_all = counted == episodes and len(self.columns) == len(self.info["features"])
+        if is_all and self.old and self.old["content_hash"] != content_hash:
+            yield "a value was altered after it was written, because the content hash differs; which one is unknown"
 
 
 class Joined(NamedTuple):
@@ -207,24 +197,22 @@ def join(
     known: dict[tuple[int, bytes], tuple[int | None, Mapping[str, Scalar]]] = {}
     for number, source in enumerate(sources):
         for episode in source.episodes([column.name for column in shared]):
-            key = (episode.uid, _digest(episode.columns, shared))
-            known.setdefault(key, (number, episode.metadata))
+            known.setdefault((episode.uid, _digest(episode.columns, shared)), (number, episode.metadata))
     found = [(uid, _digest(values, shared)) for uid, values in episodes]
-    reserved = {uid for uid, _ in found}
-    taken: set[int] = set()
+    reserved, taken, renames = {uid for uid, _ in found}, set[int](), list[int]()
     renamed: dict[int | None, dict[int, int]] = {}
-    renames: list[int] = []
-    for uid, digest in found:
+    for key in found:
+        uid, digest = key
         name = new_uid(uid, digest, reserved) if uid in taken else uid
         reserved.add(name)
         taken.add(name)
         renames.append(name)
-        renamed.setdefault(known.get((uid, digest), (None, {}))[0], {})[uid] = name
+        renamed.setdefault(known.get(key, (None, {}))[0], {})[uid] = name
     joined = []
-    for (uid, digest), name in zip(found, renames, strict=True):
-        origin, facts = known.get((uid, digest), (None, {}))
-        metadata = renamed_metadata(uid, facts, renamed[origin] | {uid: name})
-        joined.append(Joined(name, metadata, (uid, digest) in known))
+    for key, name in zip(found, renames, strict=True):
+        origin, facts = known.get(key, (None, {}))
+        metadata = renamed_metadata(key[0], facts, renamed[origin] | {key[0]: name})
+        joined.append(Joined(name, metadata, key in known))
     return joined
 
 
@@ -244,19 +232,16 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     columns, specs, fps = declared_columns(folder, info)
     if sources and names.EPISODE_UID not in info["features"]:
         raise BadInputError(f"{folder} has no column {names.EPISODE_UID}, by which it joins {sources[0].reference}")
-    tasks = read_tasks(folder)
-    rows: Rows | None = Rows({column.name: column for column in columns}, fps)
+    tasks, rows = read_tasks(folder), Rows({column.name: column for column in columns}, fps)
     has_ours = (folder / layout.OUR_FOLDER).is_dir()
-    assert rows is not None
-    if names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lacking(specs):
-        rows = None
-    else:
+    is_ours = names.EPISODE_UID in rows.stored or has_ours or not rows.dropped or lacking(specs)
+    if not is_ours:
         specs = our_columns(specs, has_tasks=not isinstance(tasks, str) and len(tasks) > 1)
     if is_format_2(folder):
         notes.append(f"LeRobot's format {info['codebase_version']} became {layout.CODEBASE_VERSION}")
-    kinds = {spec.name: spec.dtype for spec in specs}
-    if others := sorted(info["features"].keys() - {column.name for column in columns}):
+    if others := sorted(info["features"].keys() - rows.stored.keys()):
         notes.append(f"left out, because they are not numeric: {', '.join(others)}")
+    kinds = {spec.name: spec.dtype for spec in specs}
     for column in columns:
         kind = kinds.get(column.name, DTYPES[np.dtype(column.dtype).kind])
         if column.dtype != kind:
@@ -264,67 +249,53 @@ def remains_of(folder: Path, sources: Sequence[Dataset], notes: list[str]) -> Re
     if isinstance(tasks, str):
         notes.append(f"{layout.TASKS_PATH} {tasks}: the task is unknown")
         tasks = {}
-    old: Mapping[str, Any] = {}
-    digests: Digests = {}
-    metadata: Mapping[int, dict[str, Scalar]] = {}
     seed = sources[0].subset_seed if sources else 0
+    remains = Remains(info, columns, specs, fps, tasks, None if is_ours else rows, seed)
     # Of what LeRobot's tools made, our metadata is no longer true, where they left it.
-    if has_ours and not sources:
-        try:
-            old = read_description(folder)
-        except CorruptDatasetError as error:
-            if (folder / layout.DATASET_PATH).exists():
-                notes.append(f"{error}: the origin is unknown")
-        # A missing file is told where it is read.
-        altered = [path for path in altered_files(folder, old) if (folder / path).exists()]
-        noted = [path for path in altered if path in _IF_ALTERED]
-        notes += [f"{path} was altered after it was written: {_IF_ALTERED[path]}" for path in noted]
-        try:
-            digests = read_digests(folder, [column.name for column in columns], altered)
-        except CorruptDatasetError as error:
-            notes.append(f"{error}: the values were compared with the content hash only, as a whole")
-        metadata = {} if layout.METADATA_PATH in altered else _metadata(folder, notes)
-        seed = 0 if layout.SUBSETS_PATH in altered else _subset_seed(folder, notes)
-    return Remains(
-        info=info,
-        columns=columns,
-        specs=specs,
-        fps=fps,
-        tasks=tasks,
-        rows=rows,
-        description=_description(folder, info, sources, old),
-        old=old,
-        digests=digests,
-        metadata=metadata,
-        subset_seed=seed,
-    )
+    if not has_ours or sources:
+        return remains
+    try:
+        remains.old = read_description(folder)
+    except CorruptDatasetError as error:
+        if (folder / layout.DATASET_PATH).exists():
+            notes.append(f"{error}: the origin is unknown")
+    # A missing file is told where it is read.
+    altered = [path for path in altered_files(folder, remains.old) if (folder / path).exists()]
+    notes += [
+        f"{path} was altered after it was written: {_IF_ALTERED[path]}" for path in altered if path in _IF_ALTERED
+    ]
+    try:
+        remains.digests = read_digests(folder, [column.name for column in columns], altered)
+    except CorruptDatasetError as error:
+        notes.append(f"{error}: the values were compared with the content hash only, as a whole")
+    if layout.METADATA_PATH not in altered:
+        remains.metadata = _metadata(folder, notes)
+    if layout.SUBSETS_PATH not in altered:
+        remains.subset_seed = _subset_seed(folder, notes)
+    return remains
 
 
 def _metadata(folder: Path, notes: list[str]) -> dict[int, dict[str, Scalar]]:
     """Return the episodes' metadata by uid, empty where it cannot be read."""
     table = read_small_table(folder / layout.METADATA_PATH)
-    columns = {} if isinstance(table, str) else table.to_pydict()
-    uids = columns.pop(names.EPISODE_UID, [])
-    columns.pop("length", None)
     found = {
-        uid: {key: value for key, values in columns.items() if (value := values[row]) is not None}
-        for row, uid in enumerate(uids)
-        if isinstance(uid, int)
+        row[names.EPISODE_UID]: {
+            key: value for key, value in row.items() if key not in layout.METADATA_KEYS and value is not None
+        }
+        for row in ([] if isinstance(table, str) else table.to_pylist())
+        if isinstance(row.get(names.EPISODE_UID), int)
     }
     if not found:
         notes.append(f"{layout.METADATA_PATH} {table if isinstance(table, str) else 'has no uids'}: {_LOST}")
     return found
 
 
-def _description(
-    folder: Path, info: Mapping[str, Any], sources: Sequence[Dataset], old: Mapping[str, Any]
-) -> dict[str, Any]:
-    config, parents = {"folder": folder.name}, []
-    if sources:
-        first, *others = sources
-        old, parents = first.description, [other.identity for other in others]
+def _description(folder: Path, remains: Remains, sources: Sequence[Dataset]) -> dict[str, Any]:
+    """Return that of the new dataset."""
+    config, old = {"folder": folder.name}, sources[0].description if sources else remains.old
     if not old:
-        return {"name": name_of(folder), "stage": "repair", "config": config, "environment": robot_of(info)}
+        return {"name": name_of(folder), "stage": "repair", "config": config, "environment": robot_of(remains.info)}
+    parents = [other.identity for other in sources[1:]]
     return successor(old, "episodes", stage="repair", config=config, out=folder, parents=parents)[0]
 
 

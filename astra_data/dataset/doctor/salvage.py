@@ -4,6 +4,7 @@ import io
 import mmap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import accumulate, chain, groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,20 +19,18 @@ from astra_data.dataset.description import Digests, alteration, altered_columns
 from astra_data.dataset.format import INFO_PATH
 from astra_data.dataset.parquet import UNREADABLE
 
-_DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3
-_DETAILS = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}
-"""Field of a page's header with the details of this kind of page."""
-_ENCODING = {_DATA: 2, _DICTIONARY: 2, _DATA_V2: 4}
-"""Field of these details with the encoding."""
+_DICTIONARY, _DATA_V2 = 2, 3
+_FIELDS = {0: (5, 2), _DICTIONARY: (7, 2), _DATA_V2: (8, 4)}
+"""Of each kind of page, the field of its header with the details, and the field of these with the encoding."""
 _FIXED_WIDTH = (0, 9)
 """Encodings PLAIN and BYTE_STREAM_SPLIT."""
 _HEADER = 1000
 """Upper bound of a page header in bytes, including the extremes of its values."""
-_SNAPPY, _ZSTD = 1, 6
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SNAPPY, _ZSTD, _ZSTD_MAGIC = 1, 6, b"\x28\xb5\x2f\xfd"
 TRUE, FALSE, BYTE, I16, I32, I64 = range(1, 7)
 BINARY, LIST, STRUCT = 8, 9, 12
 Struct = dict[int, tuple[int, Any]]
+"""Of Thrift's compact protocol: field number to (type, value); the value of a list is (type, values)."""
 
 
 def whole_runs(
@@ -70,10 +69,8 @@ def whole_runs(
         if place is None and number < most:
             is_known = (number > episode and first > row) or (number < episode and first < row)
         if is_known and number < episode:
-            notes.append(
-                f"left out rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}: "
-                f"they are of episode {number} once more"
-            )
+            rows = f"rows {run.row} to {run.row + len(run) - 1} of {_name(run.path)}"
+            notes.append(f"left out {rows}: they are of episode {number} once more")
             continue
         if is_known and number > episode:
             notes.append(_lost(episode, number - 1))
@@ -99,13 +96,11 @@ def whole_runs(
         notes.append(_lost(episode, max(places)))
 
 
-def _claimed(run: plain.Run) -> tuple[int, int, int]:
+def _claimed(run: plain.Run) -> tuple[int, ...]:
     """Return the episode, the first row in the dataset and the first frame that most rows of `run` tell."""
-    steps = np.arange(len(run))
-    columns = run.columns
+    steps, columns = np.arange(len(run)), run.columns
     recorded = columns[names.EPISODE_INDEX], columns[names.INDEX] - steps, columns[names.FRAME_INDEX] - steps
-    number, first, frame = (int(np.sort(values)[len(run) // 2]) for values in recorded)
-    return number, first, frame
+    return tuple(int(np.sort(values)[len(run) // 2]) for values in recorded)
 
 
 def _lost(first: int, last: int) -> str:
@@ -133,50 +128,43 @@ def _runs_of(path: Path, columns: Sequence[plain.PlainColumn], notes: list[str])
     """Yield the runs of a file, and whether the rows after each cannot be read."""
     is_whole = not isinstance(plain.read_footer(path), str)
     schema = pa.schema([(column.name, column.arrow_type) for column in columns])
+    held: plain.Run | None = None
     with pq.ParquetFile(path, metadata=None if is_whole else rebuilt_metadata(path, schema)) as file:
         counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
+        starts = [0, *accumulate(counts)]
         if not is_whole:
             notes.append(f"{_name(path)} has no footer: {len(counts)} whole row groups were found in it")
-        group = 0
-        while group < len(counts):
-            rows: list[int] = []
-            faults: list[str] = []
-            held: plain.Run | None = None
-            first = sum(counts[:group])
-            for run in plain.runs(path, _row_groups(file, columns, group, rows, faults), columns):
-                if held is not None:
-                    yield held, False
-                held = replace(run, row=first + run.row)
-            group += len(rows) + 1
-            # LeRobot writes a row group per episode. With others, the last episode may be incomplete.
-            if held is not None and not is_whole and group > len(counts) and len(held) != rows[-1]:
-                part = f"the last {len(held)} frames in {path.name} may be part of an episode"
-                notes.append(f"{part} and were left out")
-            elif held is not None:
-                yield held, bool(faults)
-            if faults:
-                lost = first + sum(rows)
-                where = f"{_name(path)} rows {lost} to {lost + counts[group - 1] - 1}"
-                notes.append(f"{where} cannot be read ({faults[0]})")
+        for is_read, stretch in groupby(_row_groups(file, columns), lambda one: isinstance(one[1], pa.Table)):
+            if is_read:
+                group, table = next(stretch)
+                for run in plain.runs(path, chain([table], (one for _, one in stretch)), columns):
+                    if held is not None:
+                        yield held, False
+                    held = replace(run, row=starts[group] + run.row)
+                continue
+            if held is not None:
+                yield held, True
+            held = None
+            for group, fault in stretch:
+                rows = f"rows {starts[group]} to {starts[group + 1] - 1}"
+                notes.append(f"{_name(path)} {rows} cannot be read ({fault})")
+    # LeRobot writes a row group per episode. With others, the last episode may be incomplete.
+    if held is not None and not is_whole and len(held) != counts[-1]:
+        notes.append(f"the last {len(held)} frames in {path.name} may be part of an episode and were left out")
+    elif held is not None:
+        yield held, False
 
 
-def _row_groups(
-    file: pq.ParquetFile, columns: Sequence[plain.PlainColumn], first: int, rows: list[int], faults: list[str]
-) -> Iterator[pa.Table]:
-    """Yield row groups from `first` up to an unreadable one.
-
-    Append their numbers of rows to `rows`, and what is wrong with the unreadable one to `faults`.
-    """
-    for group in range(first, file.num_row_groups):
+def _row_groups(file: pq.ParquetFile, columns: Sequence[plain.PlainColumn]) -> Iterator[tuple[int, pa.Table | str]]:
+    """Yield the number of each row group, and its table or what is wrong with it."""
+    for group in range(file.num_row_groups):
         try:
             table = file.read_row_group(group, columns=[column.name for column in columns], use_threads=False)
             if not plain.schema_faults(table.schema, columns):
                 plain.block_values(table, columns)
+            yield group, table
         except (*UNREADABLE, CorruptDatasetError) as error:
-            faults.append(in_short(error))
-            return
-        rows.append(table.num_rows)
-        yield table
+            yield group, in_short(error)
 
 
 class _Page(NamedTuple):
@@ -187,15 +175,9 @@ class _Page(NamedTuple):
     unpacked: int
     kind: int
     values: int
+    """0 of a dictionary."""
     encoding: int
     is_zstd: bool
-
-    def fits(self, column: "_Leaf") -> bool:
-        """Return whether it may belong to `column`: does the size match that of values of its width?"""
-        if self.kind == _DICTIONARY or self.encoding not in _FIXED_WIDTH:
-            return True
-        least = self.values * column.bits // 8
-        return least <= self.unpacked <= least + self.values // 2 + _HEADER
 
 
 class _Leaf(NamedTuple):
@@ -204,17 +186,23 @@ class _Leaf(NamedTuple):
     size: int
     bits: int
 
+    def may_have(self, page: _Page) -> bool:
+        """Return whether `page` may belong to it: does the size match that of values of its width?"""
+        least = page.values * self.bits // 8
+        is_fixed = page.kind != _DICTIONARY and page.encoding in _FIXED_WIDTH
+        return not is_fixed or least <= page.unpacked <= least + page.values // 2 + _HEADER
+
 
 def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
-    """Rebuild the metadata of the parquet file at `path`, which then reads with `ParquetFile(metadata=...)`.
-
-    Returns:
-        the metadata of all whole row groups.
-    """
-    leaves = [_leaf(field) for field in schema]
-    pages = _pages(path)
-    groups: list[list[list[_Page]]] = []
-    first = 0
+    """Return the metadata of all whole row groups of the parquet file at `path`, for `ParquetFile(metadata=...)`."""
+    leaves = []
+    for field in schema:
+        is_list = pa.types.is_fixed_size_list(field.type)
+        value = field.type.value_type if is_list else field.type
+        if not pa.types.is_primitive(value):
+            raise CorruptDatasetError(f"column {field.name} ({field.type}) cannot be read without a footer")
+        leaves.append(_Leaf(field.type.list_size if is_list else 1, value.bit_width))
+    pages, groups, first = list(_pages(path)), list[list[list[_Page]]](), 0
     while group := _row_group(pages, first, leaves):
         groups.append(group)
         first += sum(map(len, group))
@@ -228,59 +216,46 @@ def rebuilt_metadata(path: Path, schema: pa.Schema) -> pq.FileMetaData:
     return pq.read_metadata(pa.BufferReader(file))
 
 
-def _leaf(field: pa.Field) -> _Leaf:
-    is_list = pa.types.is_fixed_size_list(field.type)
-    value = field.type.value_type if is_list else field.type
-    if not pa.types.is_primitive(value):
-        raise CorruptDatasetError(f"column {field.name} ({field.type}) cannot be read without a footer")
-    return _Leaf(field.type.list_size if is_list else 1, value.bit_width)
-
-
-def _pages(path: Path) -> list[_Page]:
-    pages: list[_Page] = []
+def _pages(path: Path) -> Iterator[_Page]:
     if not path.is_file():
-        return pages
+        return
     with path.open("rb") as file:
-        if file.read(4) != b"PAR1":
-            return pages
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as data:
-            end = 4
-            while page := _page(data, end):
-                pages.append(page)
-                end = page.end
-    return pages
+        if file.read(4) == b"PAR1":
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as data:
+                end = 4
+                while page := _page(data, end):
+                    yield page
+                    end = page.end
 
 
 def _page(data: memoryview, start: int) -> _Page | None:
     """Read the header at `start`; None if there is none, or its page is not whole."""
-    reader = _Reader(data, start)
     try:
-        header = reader.struct()
+        header, body = _decoded(data, start)
         kind, unpacked, packed = (header[field][1] for field in (1, 2, 3))
-        details = header[_DETAILS[kind]][1]
-        values, encoding = details[1][1], details[_ENCODING[kind]][1]
+        details_field, encoding_field = _FIELDS[kind]
+        details = header[details_field][1]
+        values, encoding = details[1][1], details[encoding_field][1]
         # In pages of the second kind, levels come first, and are not compressed.
         levels = sum(details[field][1] for field in (5, 6)) if kind == _DATA_V2 else 0
-        body, end = reader.position + levels, reader.position + packed
-        if min(unpacked, packed, values, encoding, levels) < 0 or end > len(data):
-            return None
     except (IndexError, KeyError, RecursionError, TypeError, ValueError):
         return None
-    size = unpacked + reader.position - start
-    return _Page(start, end, size, kind, values, encoding, data[body : body + 4] == _ZSTD_MAGIC)
+    if min(unpacked, packed, values, encoding, levels) < 0 or body + packed > len(data):
+        return None
+    is_zstd = data[body + levels : body + levels + 4] == _ZSTD_MAGIC
+    values = 0 if kind == _DICTIONARY else values
+    return _Page(start, body + packed, unpacked + body - start, kind, values, encoding, is_zstd)
 
 
 def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[_Leaf]) -> list[list[_Page]] | None:
     """Split the pages from `first` on into one chunk per column, of equally many rows; None if too few."""
     values = 0
     for number in range(first, len(pages)):
-        if pages[number].kind == _DICTIONARY:
-            if number > first:
-                return None
-            continue
+        if pages[number].kind == _DICTIONARY and number > first:
+            return None
         values += pages[number].values
         rows, rest = divmod(values, leaves[0].size)
-        if not rest and (group := _chunks(pages, first, leaves, rows)):
+        if rows and not rest and (group := _chunks(pages, first, leaves, rows)):
             return group
     return None
 
@@ -288,29 +263,25 @@ def _row_group(pages: Sequence[_Page], first: int, leaves: Sequence[_Leaf]) -> l
 def _chunks(pages: Sequence[_Page], position: int, leaves: Sequence[_Leaf], rows: int) -> list[list[_Page]] | None:
     chunks: list[list[_Page]] = []
     for leaf in leaves:
-        chunk: list[_Page] = []
-        missing = rows * leaf.size
+        first, missing = position, rows * leaf.size
         while missing > 0:
-            if position == len(pages) or (chunk and pages[position].kind == _DICTIONARY):
+            is_next = position > first and position < len(pages) and pages[position].kind == _DICTIONARY
+            if position == len(pages) or is_next or not leaf.may_have(pages[position]):
                 return None
-            page = pages[position]
-            if not page.fits(leaf):
-                return None
-            chunk.append(page)
-            missing -= 0 if page.kind == _DICTIONARY else page.values
+            missing -= pages[position].values
             position += 1
         if missing < 0:
             return None
-        chunks.append(chunk)
+        chunks.append(list(pages[first:position]))
     return chunks
 
 
 def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_Leaf]) -> bytes:
     """Return parquet's FileMetaData: the schema of `template`, a file of one row group, and `groups`."""
     length = int.from_bytes(template[-8:-4], "little")
-    metadata = _Reader(template[-8 - length : -8]).struct()
+    metadata = _decoded(template[-8 - length : -8], 0)[0]
     columns = [column[3][1] for column in metadata[4][1][1][0][1][1][1]]
-    rows = [_values(group[0]) // leaves[0].size for group in groups]
+    rows = [sum(page.values for page in group[0]) // leaves[0].size for group in groups]
     row_groups: list[Struct] = []
     for count, group in zip(rows, groups, strict=True):
         chunks = [_column_chunk(column, pages) for column, pages in zip(columns, group, strict=True)]
@@ -321,81 +292,74 @@ def _footer(template: bytes, groups: list[list[list[_Page]]], leaves: Sequence[_
 
 def _column_chunk(column: Struct, pages: Sequence[_Page]) -> Struct:
     """Return parquet's ColumnChunk of `pages`, with type and path of the template's `column`."""
-    data = [page for page in pages if page.kind != _DICTIONARY]
+    first = pages[0]
     metadata: Struct = {
         1: column[1],
         2: (LIST, (I32, sorted({page.encoding for page in pages}))),
         3: column[3],
         4: (I32, _ZSTD if any(page.is_zstd for page in pages) else _SNAPPY),
-        5: (I64, _values(pages)),
+        5: (I64, sum(page.values for page in pages)),
         6: (I64, sum(page.unpacked for page in pages)),
-        7: (I64, pages[-1].end - pages[0].start),
-        9: (I64, data[0].start),
+        7: (I64, pages[-1].end - first.start),
+        9: (I64, next(page.start for page in pages if page.kind != _DICTIONARY)),
     }
-    if pages[0].kind == _DICTIONARY:
-        metadata[11] = (I64, pages[0].start)
-    return {2: (I64, pages[0].start), 3: (STRUCT, metadata)}
+    if first.kind == _DICTIONARY:
+        metadata[11] = (I64, first.start)
+    return {2: (I64, first.start), 3: (STRUCT, metadata)}
 
 
-def _values(pages: Sequence[_Page]) -> int:
-    return sum(page.values for page in pages if page.kind != _DICTIONARY)
+def _decoded(data: bytes | memoryview, position: int) -> tuple[Struct, int]:
+    """Read the struct at `position`, and return where it ends; IndexError or ValueError where there is none."""
 
+    def byte() -> int:
+        nonlocal position
+        position += 1
+        return data[position - 1]
 
-class _Reader:
-    """Reads structs of Thrift's compact protocol; IndexError or ValueError where there is none.
-
-    A struct is a dict of field number to (type, value), a list is (type, values).
-    """
-
-    def __init__(self, data: bytes | memoryview, position: int = 0) -> None:
-        self.data, self.position = data, position
-
-    def struct(self) -> Struct:
-        fields: Struct = {}
-        number = 0
-        while header := self._byte():
-            kind = header & 15
-            number = number + (header >> 4) if header >> 4 else self._signed()
-            fields[number] = (kind, kind == TRUE if kind in (TRUE, FALSE) else self._value(kind))
-        return fields
-
-    def _value(self, kind: int) -> Any:  # noqa: ANN401 - any thrift value
-        if kind in (TRUE, FALSE, BYTE):  # in a list, unlike in a struct, a truth value is a byte of its own
-            return self._byte()
-        if kind in (I16, I32, I64):
-            return self._signed()
-        if kind == BINARY:
-            size = self._unsigned()
-            self.position += size
-            return bytes(self.data[self.position - size : self.position])
-        if kind == LIST:
-            header = self._byte()
-            size = header >> 4 if header >> 4 < 15 else self._unsigned()
-            return header & 15, [self._value(header & 15) for _ in range(size)]
-        if kind == STRUCT:
-            return self.struct()
-        raise ValueError(f"thrift type {kind}")
-
-    def _byte(self) -> int:
-        self.position += 1
-        return self.data[self.position - 1]
-
-    def _unsigned(self) -> int:
+    def unsigned() -> int:
         number = 0
         for shift in range(0, 70, 7):
-            byte = self._byte()
-            number |= (byte & 127) << shift
-            if byte < 128:
+            part = byte()
+            number |= (part & 127) << shift
+            if part < 128:
                 return number
         raise ValueError("a number does not end")
 
-    def _signed(self) -> int:
-        number = self._unsigned()
+    def signed() -> int:
+        number = unsigned()
         return (number >> 1) ^ -(number & 1)
+
+    def value(kind: int) -> Any:  # noqa: ANN401 - any thrift value
+        nonlocal position
+        if kind in (TRUE, FALSE, BYTE):  # in a list, unlike in a struct, a truth value is a byte of its own
+            return byte()
+        if kind in (I16, I32, I64):
+            return signed()
+        if kind == BINARY:
+            size = unsigned()
+            position += size
+            return bytes(data[position - size : position])
+        if kind == LIST:
+            header = byte()
+            size = header >> 4 if header >> 4 < 15 else unsigned()
+            return header & 15, [value(header & 15) for _ in range(size)]
+        if kind == STRUCT:
+            return struct()
+        raise ValueError(f"thrift type {kind}")
+
+    def struct() -> Struct:
+        fields, number = Struct(), 0
+        while header := byte():
+            kind = header & 15
+            number = number + (header >> 4) if header >> 4 else signed()
+            fields[number] = (kind, kind == TRUE if kind in (TRUE, FALSE) else value(kind))
+        return fields
+
+    return struct(), position
 
 
 def _encoded(kind: int, value: Any) -> bytes:  # noqa: ANN401 - any thrift value
-    """Return the bytes of a value as `_Reader` returns it."""
+    """Return the bytes of a value as `_decoded` returns it."""
     if kind in (TRUE, FALSE, BYTE):
         return bytes([value])
     if kind in (I16, I32, I64):
@@ -416,8 +380,4 @@ def _encoded(kind: int, value: Any) -> bytes:  # noqa: ANN401 - any thrift value
 
 
 def _unsigned(number: int) -> bytes:
-    out = bytearray()
-    while number > 127:
-        out.append(number & 127 | 128)
-        number >>= 7
-    return bytes([*out, number])
+    return bytes([number & 127 | 128]) + _unsigned(number >> 7) if number > 127 else bytes([number])

@@ -427,4 +427,5 @@ def test_what_is_missing_or_altered_is_noted(
     found, notes = seen(whole.root)
     assert notes == [note]
     assert not lost or not getattr(found, lost)
-    assert found.description["parents"] == [whole.identity]
+    repair(whole.root, out=whole.root.parent / "out")
+    assert Dataset.open(whole.root.parent / "out").description["parents"] == [whole.identity]
