@@ -28,15 +28,7 @@ from astra_data.dataset.writer import DatasetWriter
 from astra_data.io.cutting import Cut, Cutter, Tally
 from astra_data.io.importers import csv, hdf5, json, mcap, minari, npz, parquet, torch
 from astra_data.io.mapping import ImportMapping, read_mapping
-from astra_data.io.recording import (
-    VALUE_BYTES,
-    Block,
-    Source,
-    find_sources,
-    format_of,
-    identities,
-    other_files,
-)
+from astra_data.io.recording import VALUE_BYTES, Block, Source, find_sources, format_of, identities, other_files
 
 if TYPE_CHECKING:
     import datasets

@@ -9,17 +9,7 @@ from fake_dataset import COLUMNS, LENGTHS, fake_columns, write_fake, writer
 from fake_transitions import NEXT, write_transitions
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.columns import (
-    ACTION,
-    GOAL,
-    NEXT_STATE,
-    REWARD,
-    STATE,
-    TERMINATED,
-    TRUNCATED,
-    Column,
-    Episode,
-)
+from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.io.exporters import EXPORTERS, export, hdf5_file
 from astra_data.io.importing import import_dataset
@@ -55,10 +45,7 @@ def test_the_import_reads_what_the_export_writes(tmp_path: Path, format: str) ->
 VECTORS_OF = {
     "d3rlpy": ("observations_1", "actions_1"),
     "d4rl": ("observations", "actions", "next_observations", "infos/goal"),
-    "minari": (
-        *("episode_1/observations/observation", "episode_1/observations/desired_goal"),
-        "episode_1/actions",
-    ),
+    "minari": (*("episode_1/observations/observation", "episode_1/observations/desired_goal"), "episode_1/actions"),
     "robomimic": tuple(
         f"data/demo_1/{field}" for field in ("obs/state", "next_obs/state", "obs/goal", "next_obs/goal", "actions")
     ),

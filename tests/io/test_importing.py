@@ -22,10 +22,7 @@ def parts(folder: Path) -> list[Path]:
     """Write the trials to files of their own."""
     fields = rows()
     return [
-        write_table(
-            folder / f"part_{8 + trial}.csv",
-            {name: v[fields["trial"] == trial] for name, v in fields.items()},
-        )
+        write_table(folder / f"part_{8 + trial}.csv", {name: v[fields["trial"] == trial] for name, v in fields.items()})
         for trial in range(len(LENGTHS))
     ]
 
@@ -84,8 +81,7 @@ def test_times_in_no_order_are_told_with_their_place(tmp_path: Path) -> None:
     first = int((np.diff(seconds) < 0).argmax()) + 1
     back = int((np.diff(seconds) < 0).sum())
     with pytest.raises(
-        BadInputError,
-        match=rf"fps is 10: .*time goes back in {back} rows, first in log.npz row {first}: sort",
+        BadInputError, match=rf"fps is 10: .*time goes back in {back} rows, first in log.npz row {first}: sort"
     ):
         with_times(tmp_path, seconds)
 
@@ -195,16 +191,7 @@ def test_a_file_without_a_row_is_one_without_an_episode(tmp_path: Path, begun: s
 def test_files_of_other_endings_are_named(tmp_path: Path) -> None:
     mapping = csv_logs(tmp_path, drive(9))
     logs = tmp_path / "logs"
-    names = (
-        "drive_10.txt",
-        "drive_3.csv.gz",
-        "drive_4.TSV",
-        "map.toml",
-        "README",
-        "readme.txt",
-        "notes.md",
-        ".x",
-    )
+    names = ("drive_10.txt", "drive_3.csv.gz", "drive_4.TSV", "map.toml", "README", "readme.txt", "notes.md", ".x")
     for name in names:
         (logs / name).write_text(drive(9).replace(",", "\t"))
     report = import_dataset([logs], mapping, out=tmp_path / "out")
@@ -237,11 +224,7 @@ def test_a_second_import_is_told_to_raise_the_version(tmp_path: Path, monkeypatc
             "t,x,a\n" + "".join(f"{row / 10},{row},{row}\n" for row in range(20, 0, -1)),
             "'t' goes back in 19 rows, first in 0.csv line 3: sort the rows by it",
         ),
-        (
-            '[split]\nfield = "x"',
-            drive(20),
-            "'x' changes in 19 rows: sort by it, or write a file of each",
-        ),
+        ('[split]\nfield = "x"', drive(20), "'x' changes in 19 rows: sort by it, or write a file of each"),
     ],
 )
 def test_what_cuts_every_row_is_named(tmp_path: Path, split: str, log: str, why: str) -> None:
@@ -313,8 +296,7 @@ def test_fields_that_are_not_finite_are_named_with_their_places(tmp_path: Path) 
     wide = write_table(tmp_path / "log.npz", rows() | {"x": np.where(np.eye(20, 3), np.nan, 1.0)})
     mapping = MAPPING.replace('fields = ["x", "y"]', 'fields = ["x"]\ntake = [2, 0]')
     with pytest.raises(
-        BadInputError,
-        match=r"2 of 20 rows .*: x\[2\] in 1 row, log\.npz row 2; x\[0\] in 1 row, log\.npz row 0",
+        BadInputError, match=r"2 of 20 rows .*: x\[2\] in 1 row, log\.npz row 2; x\[0\] in 1 row, log\.npz row 0"
     ):
         imported(tmp_path / "wide", wide, mapping.replace('role = ["position"]\n', ""))
 
@@ -322,11 +304,5 @@ def test_fields_that_are_not_finite_are_named_with_their_places(tmp_path: Path) 
 def test_what_is_strange_about_topics_of_several_files_is_told_once() -> None:
     tally = Tally(topics={"/odom is late": ["0.mcap"], "/odom is slow": [f"{k}.mcap" for k in range(9)]})
     tally.notes += ["0.csv: 40 Hz, 20 Hz declared"]
-    lines = [
-        "",
-        "0.mcap: /odom is late",
-        "0.mcap, 1.mcap and 7 more: /odom is slow",
-        *tally.notes,
-        "rejected",
-    ]
+    lines = ["", "0.mcap: /odom is late", "0.mcap, 1.mcap and 7 more: /odom is slow", *tally.notes, "rejected"]
     assert "\n".join(lines) in str(ImportReport(Path("out"), 2, 7, tally, 0.25))

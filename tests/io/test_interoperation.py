@@ -64,12 +64,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
         ],
         "train": [
             *["lerobot-train", "--dataset.repo_id=a/b", f"--dataset.root={dataset.root}"],
-            *[
-                "--policy.type=act",
-                "--policy.device=cpu",
-                "--policy.push_to_hub=false",
-                "--wandb.enable=false",
-            ],
+            *["--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--wandb.enable=false"],
             *["--policy.dim_model=16", "--policy.n_heads=2", "--policy.dim_feedforward=16"],
             *["--policy.chunk_size=4", "--policy.n_action_steps=4", "--policy.use_vae=false"],
             *["--num_workers=0", "--batch_size=4", f"--steps={TRAINING_STEPS}", "--log_freq=1"],

@@ -24,14 +24,8 @@ from astra_data.io.mapping import ColumnMapping, ImportMapping, Jump, Split, rea
         (('columns."next.reward"', 'columns."next/reward"'), "expected a name without '/'"),
         (('fields = ["reward"]', "fields = []"), "columns.next.reward.fields: "),
         (('field = "trial"', 'jump = {column = "pose", values = [0], above = 1}'), "jump.column 'pose'"),
-        (
-            ('fields = ["fell"]', 'fields = ["fell"]\ndtype = "int64"'),
-            "terminated has dtype int64, expected bool",
-        ),
-        (
-            ("[columns.action]", '[columns.action]\ndtype = "int64"'),
-            "column action has dtype int64, expected float32",
-        ),
+        (('fields = ["fell"]', 'fields = ["fell"]\ndtype = "int64"'), "terminated has dtype int64, expected bool"),
+        (("[columns.action]", '[columns.action]\ndtype = "int64"'), "column action has dtype int64, expected float32"),
         (('"next.terminated"', '"next.terminate"'), "column next.terminate: did you mean 'next.terminated'"),
         (("columns.gait", 'columns.""'), "column '': expected a name without '/'"),
         (('"int64"', '"float64"'), "gait.dtype: expected 'float32', 'int64' or 'bool'"),

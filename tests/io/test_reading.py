@@ -88,19 +88,14 @@ def test_a_demonstration_that_is_bad_is_left_out_and_its_file_is_not(tmp_path: P
     mapping = 'episodes = "demo_*"\n' + MAPPING
     dataset, report = imported(tmp_path, path, mapping, skip_bad=True)
     assert dataset.metadata["source"] == ["log.h5/demo_0", "log.h5/demo_4"]
-    told = [
-        "demo_1: no field 'command'",
-        "demo_2: fields differ in their",
-        "demo_3: columns.gait: expected whole",
-    ]
+    told = ["demo_1: no field 'command'", "demo_2: fields differ in their", "demo_3: columns.gait: expected whole"]
     for fault, found in zip(told, report.left_out, strict=True):
         assert found.startswith(f"log.h5/{fault}")
 
 
 def test_nothing_is_imported_where_all_files_are_bad(tmp_path: Path) -> None:
     with pytest.raises(
-        BadInputError,
-        match=r"^1\.csv: no field 'command'[^\n]*\n2\.csv: no field .*\n3\.csv: no field 'gait'",
+        BadInputError, match=r"^1\.csv: no field 'command'[^\n]*\n2\.csv: no field .*\n3\.csv: no field 'gait'"
     ):
         imported(tmp_path, logs(tmp_path)[1:4], skip_bad=True)
     assert not (tmp_path / "out").exists()

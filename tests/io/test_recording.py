@@ -7,15 +7,7 @@ from pathlib import Path
 import pytest
 
 from astra_data.core.errors import BadInputError
-from astra_data.io.recording import (
-    MOST_UNPACKED,
-    SMALL_BYTES,
-    Source,
-    find_sources,
-    identities,
-    is_archive,
-    row_count,
-)
+from astra_data.io.recording import MOST_UNPACKED, SMALL_BYTES, Source, find_sources, identities, is_archive, row_count
 
 
 def listed(*paths: Path, suffixes: Sequence[str] = (".csv",), max_bytes: int | None = None) -> list[Source]:

@@ -15,15 +15,18 @@ from astra_data.dataset.doctor.check import check
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version, home_of, open_dataset
 from astra_data.io.hub.stores import (
+    SUMS_PATH,
     HubStore,
     RemoteFolder,
     UrlStore,
+    altered,
     explained,
     is_address,
+    make_sums,
     parse_place,
     parse_source,
+    parse_sums,
 )
-from astra_data.io.hub.sums import SUMS_PATH, Listed, altered, make_sums, parse_sums
 
 MOST_BYTES = 100 * 10**9
 """Most bytes that are downloaded unless more are asked for; a robot's logs stay far below."""
@@ -105,7 +108,7 @@ def _refuse_change(there: RemoteFolder, local: Dataset) -> None:
             f"{there.name} holds other values or was altered: {SUMS_PATH} there differs in "
             f"{', '.join(others)}. Versions never change: give the dataset a new one, or push elsewhere."
         )
-    if changed := there.altered(ours):
+    if changed := [path for path, digest in ours.items() if there.differs(path, local.root / path, digest)]:
         raise SharingError(
             f"{there.name} was altered: {', '.join(changed)} there differ from {SUMS_PATH}. "
             "Delete this version there and push again, or push elsewhere."
@@ -191,27 +194,17 @@ def opened(data: str | Path) -> Dataset:
 
 def _fetch_all(
     remote: RemoteFolder,
-    sums: Mapping[str, Listed],
+    sums: Mapping[str, str],
     target: Path,
     description: Mapping[str, Any],
     max_bytes: int,
     progress: Progress,
 ) -> None:
     """Download the files of `sums` and, once their values are verified, rename their folder to `target`."""
-    sizes = {path: remote.facts(path).get("size") for path in sums}
-    wrong = [
-        f"{path} has {sizes[path]} bytes, listed are {listed.size}"
-        for path, listed in sums.items()
-        if sizes[path] not in (None, listed.size)
-    ]
-    if wrong:
-        raise SharingError(f"{remote.name} was altered: {'; '.join(wrong)}. Nothing was downloaded.")
-    total = sum(listed.size for listed in sums.values())
+    too_large = f"of which at most {max_bytes} are taken. If you trust it, pass a larger --max-bytes."
+    total = sum(remote.facts(path).get("size") or 0 for path in sums)
     if total > max_bytes:
-        raise SharingError(
-            f"{remote.name} has {total} bytes, of which at most {max_bytes} are taken; nothing was "
-            "downloaded. If you trust it, pass a larger --max-bytes."
-        )
+        raise SharingError(f"{remote.name} has {total} bytes, {too_large}")
     partial = target.with_name(f".{target.name}.pull-{description['version']}")
     partial.mkdir(parents=True, exist_ok=True)
     refuse_planted(partial)
@@ -223,20 +216,22 @@ def _fetch_all(
                 file.unlink()
         for number, path in enumerate(altered(partial, sums)):
             progress(number / len(sums), path)
-            fetch(remote, path, partial, sums[path].size)
+            max_bytes -= fetch(remote, path, partial, max_bytes + 1)
+            if max_bytes < 0:  # where the place does not know sizes
+                (partial / path).unlink()
+                raise SharingError(f"{remote.name} has more bytes, {too_large}")
         _check(partial, sums, description, remote.name)
         publish(partial, target)
     progress(1.0, f"{len(sums)} files")
 
 
-def fetch(remote: RemoteFolder, path: str, folder: Path, size: int) -> None:
-    """Download the file `path` into `folder`: never more than one byte over its listed `size`."""
+def fetch(remote: RemoteFolder, path: str, folder: Path, most: int) -> int:
+    """Download up to `most` bytes of the file `path` into `folder`; return how many."""
     target = folder / path
     with explained(f"{remote.name}: {path}"), writing(target, place=False):
         target.parent.mkdir(parents=True, exist_ok=True)
         with target.open("wb") as file:
-            for block in remote.blocks(path, size + 1):
-                file.write(block)
+            return sum(map(file.write, remote.blocks(path, most)))
 
 
 def refuse_planted(folder: Path) -> None:
@@ -250,17 +245,15 @@ def refuse_planted(folder: Path) -> None:
             )
 
 
-def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Listed]) -> Dataset:
+def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, str]) -> Dataset:
     """Return the dataset in folder `target`, which must be the one described, whole."""
     changed = altered(target, sums)
     try:
         dataset = Dataset.open(target)
         is_other = dataset.content_hash != description.get("content_hash")
-    except CorruptDatasetError as error:
-        if len(changed) < len(sums):
+    except AstraDataError as error:
+        if isinstance(error, CorruptDatasetError) and len(changed) < len(sums):
             raise CorruptDatasetError(f"{error} Delete it, or pull to another folder.") from error
-        is_other = True
-    except AstraDataError:
         is_other = True
     if is_other:
         raise BadInputError(f"{target} exists already and holds something else; delete it or choose another folder.")
@@ -272,13 +265,13 @@ def _present(target: Path, description: Mapping[str, Any], sums: Mapping[str, Li
     return dataset
 
 
-def _check(folder: Path, sums: Mapping[str, Listed], description: Mapping[str, Any], name: str) -> None:
+def _check(folder: Path, sums: Mapping[str, str], description: Mapping[str, Any], name: str) -> None:
     """Check that the downloaded files are the complete dataset; they may have been written by anybody."""
     if wrong := altered(folder, sums):
         for path in wrong:
             (folder / path).unlink(missing_ok=True)
         raise SharingError(
-            f"{name}: {', '.join(wrong)} do not have the size and sha256 in {SUMS_PATH}: the download was "
+            f"{name}: {', '.join(wrong)} do not have the sha256 in {SUMS_PATH}: the download was "
             "cut off, or they were altered there; run the same command again."
         )
     try:

@@ -1,6 +1,6 @@
 """The places where datasets are shared: a repository on the Hugging Face Hub, or a folder at any URL.
 
-Both hold a dataset's own files and SHA256SUMS, which lists them all, under the tag of each version.
+Both hold a dataset's own files and SHA256SUMS, which lists them all as `sha256sum` does, under the tag of each version.
 """
 
 import json
@@ -20,7 +20,6 @@ from astra_data.dataset import format as layout
 from astra_data.dataset.description import VERSION
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import Version
-from astra_data.io.hub.sums import SUMS_PATH, Listed, dataset_files
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -33,10 +32,61 @@ BLOCK_BYTES = 2**24
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 """Protocol → the extra of this package that is needed for it."""
 
+SUMS_PATH = "SHA256SUMS"
+_NUMBERED = r"chunk-[0-9]{3,}/file-[0-9]{3,}\.parquet"
+_PATH = re.compile(
+    rf"(data|meta/episodes)/{_NUMBERED}"
+    r"|meta/(info\.json|stats\.json|tasks\.parquet)"
+    r"|meta/astra/[a-z_]+\.(json|parquet|safetensors)"
+)
+"""Paths of the files of a dataset, by the names of the format; none of them leads out of its folder."""
+_LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
+
 _WORD = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 _HUB = re.compile(rf"(hf://datasets/)?(?P<repo>{_WORD}/{_WORD})/?")
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://.+")
 _VERSION = re.compile(rf"[@/](data-)?(?P<version>{VERSION.pattern})/?$")
+
+
+def dataset_files(root: Path) -> list[str]:
+    """List the files that belong to the dataset in folder `root`, relative to it, and no others."""
+    places = ("data/*/*", "meta/*", "meta/astra/*", "meta/episodes/*/*")  # globs follow links, ** would not
+    paths = [path.relative_to(root).as_posix() for place in places for path in root.glob(place) if path.is_file()]
+    return sorted(path for path in paths if _PATH.fullmatch(path))
+
+
+def make_sums(root: Path) -> str:
+    """Return SHA256SUMS of the dataset in folder `root`."""
+    return "".join(f"{file_digest(root / path)}  {path}\n" for path in dataset_files(root))
+
+
+def parse_sums(text: str, source: str) -> dict[str, str]:
+    """Read SHA256SUMS: file path to sha256.
+
+    Raises:
+        SharingError: a line is malformed, or a path is not one of a dataset, such as a script or one that
+            leads out of the folder; lists every fault.
+    """
+    sums: dict[str, str] = {}
+    faults = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not (found := _LINE.fullmatch(line)):
+            faults.append(f"line {number} is not a sha256 with a path")
+        elif not _PATH.fullmatch(found[2]):
+            expected = "expected one of a dataset's files, within data/ or meta/"
+            faults.append(f"line {number} has the path {found[2]!r}, {expected}")
+        elif found[2] in sums:
+            faults.append(f"line {number} lists {found[2]} again")
+        else:
+            sums[found[2]] = found[1]
+    if faults:
+        raise SharingError(f"{source}: {SUMS_PATH} cannot be trusted: {'; '.join(faults)}. Nothing was downloaded.")
+    return sums
+
+
+def altered(root: Path, sums: Mapping[str, str]) -> list[str]:
+    """Return which files of `sums` are missing from folder `root` or differ."""
+    return [path for path, digest in sums.items() if not (root / path).is_file() or file_digest(root / path) != digest]
 
 
 def parse_place(text: str) -> "HubStore | UrlStore":
@@ -56,9 +106,7 @@ def parse_place(text: str) -> "HubStore | UrlStore":
 def parse_source(text: str) -> "tuple[HubStore | UrlStore, Version | None]":
     """Read a place and, if named, a version: "user/name@data-1.2.0", "s3://…/name/data-1.2.0"."""
     named = _VERSION.search(text)
-    if named is None:
-        return parse_place(text), None
-    return parse_place(text[: named.start()]), Version.parse(named["version"])
+    return parse_place(text[: named.start()] if named else text), Version.parse(named["version"]) if named else None
 
 
 def is_address(data: str | Path) -> bool:
@@ -70,17 +118,13 @@ def is_address(data: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class RemoteFolder:
-    """The files of one version, wherever they are; of what a stranger put there, only plain files are read.
-
-    Attributes:
-        filesystem: an fsspec file system.
-        path: of the folder in it.
-        name: of the version, for messages.
-    """
+    """The files of one version, wherever they are; of what a stranger put there, only plain files are read."""
 
     filesystem: Any
+    """Of fsspec."""
     path: str
     name: str
+    """Of the version, for messages."""
 
     def facts(self, path: str) -> dict[str, Any]:
         """Return what the file system knows of a file, such as its "size"; empty if it is not there.
@@ -93,16 +137,15 @@ class RemoteFolder:
                 facts = dict(self.filesystem.info(f"{self.path}/{path}"))
             except FileNotFoundError:
                 return {}
-            root = os.path.realpath(self.path)
-            is_linked = self._is_here and os.path.realpath(f"{self.path}/{path}") != os.path.join(root, path)
+            whole = os.path.join(os.path.realpath(self.path), path)
+            is_linked = self._is_here and os.path.realpath(f"{self.path}/{path}") != whole
         if facts.get("type") != "file" or facts.get("islink") or is_linked:
             raise SharingError(f"{self.name}: {path} is a link, a device or a pipe, expected a file.")
         return facts
 
     def blocks(self, path: str, most: int) -> Iterator[bytes]:
         """Yield the bytes of the file `path`, at most `most` in all, in blocks."""
-        options = {"block_size": BLOCK_BYTES, "cache_type": "none"}
-        with self.filesystem.open(f"{self.path}/{path}", "rb", **options) as source:
+        with self.filesystem.open(f"{self.path}/{path}", "rb", block_size=BLOCK_BYTES, cache_type="none") as source:
             while most > 0 and (block := source.read(min(BLOCK_BYTES, most))):
                 most -= len(block)
                 yield block
@@ -125,25 +168,12 @@ class RemoteFolder:
         except (RecursionError, TypeError, ValueError) as error:
             raise SharingError(f"{self.name}: {layout.DATASET_PATH} is not a JSON object ({error}).") from error
 
-    def altered(self, sums: Mapping[str, Listed]) -> list[str]:
-        """Return which files of `sums` are missing here or differ, as far as is known without a download.
-
-        Sizes are compared everywhere, the sha256 of large files on the Hub and of all in folders here.
-        """
-        found = {path: self.facts(path) for path in sums}
-        return [
-            path
-            for path, listed in sums.items()
-            if not found[path]
-            or found[path].get("size") not in (None, listed.size)
-            or self._digest(path, found[path]) not in (None, listed.digest)
-        ]
-
-    def _digest(self, path: str, facts: Mapping[str, Any]) -> str | None:
-        """Return the sha256 of a file, None where it would have to be downloaded for that."""
-        if self._is_here:
-            return file_digest(Path(self.path, path))
-        return facts["lfs"]["sha256"] if facts.get("lfs") else None
+    def differs(self, path: str, file: Path, digest: str) -> bool:
+        """Return whether a file is missing here or other than `file`, as far as is known without a download."""
+        if not (facts := self.facts(path)) or facts.get("size") not in (None, file.stat().st_size):
+            return True
+        found = file_digest(Path(self.path, path)) if self._is_here else (facts.get("lfs") or {}).get("sha256")
+        return found not in (None, digest)
 
     @property
     def _is_here(self) -> bool:
@@ -184,11 +214,7 @@ class HubStore:
         return RemoteFolder(HfFileSystem(skip_instance_cache=True), path, f"{self.repo}@{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
-        """Add `dataset`: its files and card, then the tag "v3.0", then the tag that marks it as complete.
-
-        `upload_folder` may make several commits, of which the first would leave a mixture behind. The folder
-        `card` has SHA256SUMS, README.md and perhaps its figure.
-        """
+        """Add `dataset`, its files and the `card`, then the tag "v3.0", then the tag that marks it as complete."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete  # noqa: PLC0415 - slow to import
 
         version = Version.parse(dataset.description["version"])
@@ -259,13 +285,13 @@ class UrlStore:
             with explained(url):
                 self._filesystem, self._path = fsspec.core.url_to_fs(url)
         except SharingError as error:
-            if not isinstance(error.__cause__, ImportError | ValueError):
+            cause = error.__cause__
+            if not isinstance(cause, ImportError | ValueError):
                 raise
-            how = f"expected a URL such as s3://bucket/folder ({error.__cause__})"
-            if isinstance(error.__cause__, ImportError):
-                extra = EXTRAS.get(protocol)
-                how = f"the package for {protocol}:// is not installed: "
-                how += how_to_install(extra) if extra else str(error.__cause__)
+            how = f"expected a URL such as s3://bucket/folder ({cause})"
+            if isinstance(cause, ImportError):
+                how = how_to_install(EXTRAS[protocol]) if protocol in EXTRAS else str(cause)
+                how = f"the package for {protocol}:// is not installed: {how}"
             raise BadInputError(f"{url}: {how}") from error
 
     def __str__(self) -> str:
@@ -296,10 +322,9 @@ class UrlStore:
         return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}", f"{self.url}/{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
-        """Upload `dataset`: `layout.DATASET_PATH` is written last and marks it as complete.
+        """Upload `dataset` and its card: SHA256SUMS first, and `layout.DATASET_PATH` last, which marks it as complete.
 
-        SHA256SUMS is written first and identifies the upload: the next push of the same files repeats an
-        interrupted one, and no existing file is ever deleted. Raise BadInputError if the folder holds others.
+        The next push of the same files repeats an interrupted one. Raise BadInputError if the folder holds others.
         """
         remote = self.folder(Version.parse(dataset.description["version"]))
         sums = (card / SUMS_PATH).read_bytes()
@@ -359,37 +384,29 @@ def explained(place: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise SharingError(f"{place}: does not exist ({error}); check the spelling.") from error
     except Exception as error:
-        raise _of_the_hub(place, error) or SharingError(
+        raise (_of_the_hub(place, error) if "Hugging Face Hub" in place else None) or SharingError(
             f"{place}: {type(error).__name__}: {error}; check the address, the credentials and the network, "
             "then run the same command again."
         ) from error
 
 
 def _of_the_hub(place: str, error: Exception) -> AstraDataError | None:
-    """Return what to say of an exception of the Hub's; None if it is none."""
-    if "Hugging Face Hub" not in place:
-        return None
-    from huggingface_hub.errors import (  # noqa: PLC0415 - slow to import
-        HfHubHTTPError,
-        HFValidationError,
-        RepositoryNotFoundError,
-    )
+    from huggingface_hub import errors  # noqa: PLC0415 - slow to import
 
-    if isinstance(error, ValueError) and not isinstance(error, HFValidationError):
-        return BadInputError(f"{place} rejects this: {error}")
     # A failed upload raises the exception of its transfer, wrapped or not.
-    cause = error if isinstance(error, HfHubHTTPError) else error.__cause__ or error
-    if isinstance(cause, HFValidationError):
+    cause = error if isinstance(error, errors.HfHubHTTPError) else error.__cause__ or error
+    if isinstance(cause, errors.HFValidationError):
         return BadInputError(f"{place}: not a valid repository name: {cause}")
-    if isinstance(cause, RepositoryNotFoundError):
-        return SharingError(
-            f"{place}: no such dataset, or no rights to see it; check its name, log in with `hf auth login`."
-        )
-    if isinstance(cause, HfHubHTTPError):
-        status = cause.response.status_code
-        causes = dict.fromkeys(
-            (401, 403), "no rights to do this; log in with `hf auth login` and a token that may write."
-        ) | dict.fromkeys((409, 412), "it was changed by somebody else at the same time; run the same command again.")
-        answered = f"it answered {status}: {cause.server_message or cause}"
-        return SharingError(f"{place}: {causes.get(status, answered)}")
-    return None
+    if isinstance(error, ValueError):
+        return BadInputError(f"{place} rejects this: {error}")
+    if not isinstance(cause, errors.HfHubHTTPError):
+        return None
+    status = cause.response.status_code
+    why = f"it answered {status}: {cause.server_message or cause}"
+    if isinstance(cause, errors.RepositoryNotFoundError):
+        why = "no such dataset, or no rights to see it; check its name, log in with `hf auth login`."
+    elif status in (401, 403):
+        why = "no rights to do this; log in with `hf auth login` and a token that may write."
+    elif status in (409, 412):
+        why = "it was changed by somebody else at the same time; run the same command again."
+    return SharingError(f"{place}: {why}")

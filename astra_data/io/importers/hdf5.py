@@ -13,15 +13,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED
-from astra_data.io.hdf5_file import (
-    D3RLPY,
-    D4RL,
-    NUMBERED,
-    ROBOMIMIC,
-    check_storage,
-    stored_datasets,
-    unpacked_bytes,
-)
+from astra_data.io.hdf5_file import D3RLPY, D4RL, NUMBERED, ROBOMIMIC, check_storage, stored_datasets, unpacked_bytes
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block, Source, natural, row_count
 

@@ -14,12 +14,7 @@ import numpy as np
 from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
-from astra_data.io.hdf5_file import (
-    check_storage,
-    refuse_links,
-    stored_datasets,
-    unpacked_bytes,
-)
+from astra_data.io.hdf5_file import check_storage, refuse_links, stored_datasets, unpacked_bytes
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import Block, Source, row_count
 

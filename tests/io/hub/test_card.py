@@ -8,15 +8,7 @@ from fake_dataset import COLUMNS, DESCRIPTION, concatenated, fake_episodes, writ
 from huggingface_hub import DatasetCard
 
 from astra_data.core.config import load_recipe
-from astra_data.dataset.columns import (
-    ACTION,
-    NEXT_STATE,
-    OUTCOME_COLUMNS,
-    STATE,
-    SUCCESS,
-    Column,
-    Episode,
-)
+from astra_data.dataset.columns import ACTION, NEXT_STATE, OUTCOME_COLUMNS, STATE, SUCCESS, Column, Episode
 from astra_data.dataset.reader import Dataset
 from astra_data.io.hub.card import Notes, render_card, write_card
 from astra_data.robots.registry import TASKS
@@ -51,9 +43,7 @@ def test_the_card_tells_all_that_the_dataset_knows(tmp_path: Path) -> None:
     assert str(dataset.description["git_commit"]) in text
 
 
-def test_long_names_stand_below_the_table_and_facts_are_of_the_episodes_that_have_them(
-    tmp_path: Path,
-) -> None:
+def test_long_names_stand_below_the_table_and_facts_are_of_the_episodes_that_have_them(tmp_path: Path) -> None:
     joints = tuple("abcde")
     columns = [Column("near", size=5, names=joints), Column("far", size=5, names=joints)]
     columns += [Column("few", size=4, names=joints[:4]), Column(SUCCESS, "bool")]

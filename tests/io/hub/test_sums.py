@@ -7,7 +7,7 @@ from shared_files import contents
 
 from astra_data.core.errors import SharingError
 from astra_data.dataset.reader import Dataset
-from astra_data.io.hub.sums import SUMS_PATH, dataset_files, make_sums, parse_sums
+from astra_data.io.hub.stores import SUMS_PATH, dataset_files, make_sums, parse_sums
 
 DIGEST = "0" * 64
 DATA = "data/chunk-000/file-000.parquet"
@@ -18,17 +18,6 @@ def test_sums_are_those_of_sha256sum(fake: Dataset, tmp_path: Path) -> None:
     told = subprocess.run(["sha256sum", "-c", tmp_path / SUMS_PATH], cwd=fake.root, capture_output=True, text=True)
     assert told.returncode == 0
     assert told.stdout.count(": OK") == len(contents(fake.root)) == len(parse_sums(make_sums(fake.root), "it"))
-
-
-def test_sizes_are_listed_and_sums_without_them_are_refused(fake: Dataset) -> None:
-    text = make_sums(fake.root)
-    files = contents(fake.root)
-    assert {path: listed.size for path, listed in parse_sums(text, "it").items()} == {
-        path: len(content) for path, content in files.items()
-    }
-    old = "".join(line for line in text.splitlines(keepends=True) if not line.startswith("#"))
-    with pytest.raises(SharingError, match=f"{DATA} is listed without size"):
-        parse_sums(old, "it")
 
 
 def test_other_files_in_the_folder_are_left_out(tmp_path: Path) -> None:
@@ -54,10 +43,10 @@ def test_a_path_that_is_none_of_a_dataset_is_refused(path: str) -> None:
 
 
 def test_every_fault_is_told() -> None:
-    lines = ["nonsense", f"{DIGEST}  {DATA}", f"{DIGEST}  {DATA}", f"{DIGEST}  ../c", "# 3 bytes  meta/x"]
+    lines = ["nonsense", f"{DIGEST}  {DATA}", f"{DIGEST}  {DATA}", f"{DIGEST}  ../c"]
     with pytest.raises(SharingError) as told:
         parse_sums("\n".join(lines), "it")
-    for fault in ("line 1 is no", f"line 3 lists {DATA} again", "'../c'", "meta/x is listed without"):
+    for fault in ("line 1 is no", f"line 3 lists {DATA} again", "'../c'"):
         assert fault in str(told.value)
 
 

@@ -80,8 +80,7 @@ def test_what_is_no_number_is_told_with_its_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "mark", "told"),
-    [("log.csv", ";", "commas, got semicolons"), ("log.tsv", ",", "tabs, got commas")],
+    ("name", "mark", "told"), [("log.csv", ";", "commas, got semicolons"), ("log.tsv", ",", "tabs, got commas")]
 )
 def test_another_separator_is_told(tmp_path: Path, name: str, mark: str, told: str) -> None:
     log = tmp_path / name
@@ -95,14 +94,8 @@ def test_another_separator_is_told(tmp_path: Path, name: str, mark: str, told: s
     [
         (b"x,y,\xb0\n0,0,0\n1,1,1\n", "log.csv: expected text in UTF-8, got the byte 0xb0: save it as UTF-8"),
         ("x,y\n0,0\n1,1\n".encode("utf-16"), "log.csv: expected text in UTF-8, got UTF-16: save it as UTF-8"),
-        (
-            b'x,y\n\n0,0\n1,"1\n\n",2\n2,2\n',
-            "log.csv cannot be read as csv: line 6: Expected 2 columns, got 3: ",
-        ),
-        (
-            b"# today\nx,y\n0,0\n",
-            "line 2: Expected 1 columns, got 2: leave out what is above the header, '# to",
-        ),
+        (b'x,y\n\n0,0\n1,"1\n\n",2\n2,2\n', "log.csv cannot be read as csv: line 6: Expected 2 columns, got 3: "),
+        (b"# today\nx,y\n0,0\n", "line 2: Expected 1 columns, got 2: leave out what is above the header, '# to"),
     ],
 )
 def test_why_a_file_is_no_csv_is_told(tmp_path: Path, content: bytes, expected: str) -> None:

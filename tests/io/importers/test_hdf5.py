@@ -239,9 +239,7 @@ def write_demos(path: Path, successes: list[bool | None], **fields: tuple[int, .
     return path
 
 
-def test_commands_among_observations_are_left_out_and_the_success_of_a_demonstration_is_read(
-    tmp_path: Path,
-) -> None:
+def test_commands_among_observations_are_left_out_and_the_success_of_a_demonstration_is_read(tmp_path: Path) -> None:
     """As in what Isaac Lab's recorder writes."""
     shapes: dict[str, tuple[int, ...]] = {"actions": (2,), "obs__joint_pos": (3,), "obs__contraction": ()}
     shapes |= {"obs__actions": (2,), "obs__last_action": (2,), "obs__camera": (4, 4, 3), "states": (5,)}

@@ -47,8 +47,7 @@ fields = ["observations/achieved_goal"]
     dataset, _ = imported(tmp_path, path, mapping)
     assert dataset.lengths.tolist() == [length - 1 for length in LENGTHS]
     np.testing.assert_array_equal(
-        next(dataset.episodes()).columns[STATE],
-        made[0]["observations"]["achieved_goal"][:3].astype(np.float32),
+        next(dataset.episodes()).columns[STATE], made[0]["observations"]["achieved_goal"][:3].astype(np.float32)
     )
 
 
