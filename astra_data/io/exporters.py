@@ -1,14 +1,9 @@
-"""Export of datasets to the formats of other libraries, episode by episode, whole or not at all.
-
-`import` reads an export as it does any file of the format. HDF5 loses a failure that it meets while it closes
-a file, and the process ends in a segmentation fault. So it writes through an object that never fails: the
-first error is kept, and raised once HDF5 is done.
-"""
+"""Export of datasets to the formats of other libraries, whole or not at all."""
 
 import io
 import json
 import logging
-from collections.abc import Buffer, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -60,23 +55,14 @@ def _d4rl(dataset: Dataset, path: Path, out: Path) -> None:
     The last step of every episode is a terminal or a timeout, since nothing else separates the episodes.
     """
     fields = _fields(dataset, {name: field for name, field in D4RL.items() if name != TRUNCATED})
-    rows = int(dataset.lengths.sum())
-    with hdf5_file(path) as (file, disk):
-        for column in dataset.schema:
-            shape = (rows, column.size) if column.name in VECTORS or column.size > 1 else (rows,)
-            file.create_dataset(fields[column.name], shape, column.dtype)
-        file.create_dataset(D4RL[TRUNCATED], (rows,), bool)
-        if REWARD not in dataset.features:
-            file.create_dataset(D4RL[REWARD], (rows,), np.float32)
-        first = 0
-        for _, episode, values in _episodes(dataset, disk):
-            part = slice(first, first + len(episode))
-            for name, array in values.items():
-                file[fields[name]][part] = array
-            timeouts = values[TRUNCATED].copy()
-            timeouts[-1] = True
-            file[D4RL[TRUNCATED]][part] = timeouts & ~values[TERMINATED]
-            first = part.stop
+    columns = [values for *_, values in _episodes(dataset)]
+    ends = np.cumsum(dataset.lengths) - 1
+    with hdf5_file(path) as file:
+        for name in (*(column.name for column in dataset.schema), *({REWARD} - dataset.features.keys())):
+            file[fields[name]] = np.concatenate([values[name] for values in columns])
+        timeouts = np.concatenate([values[TRUNCATED] for values in columns])
+        timeouts[ends] = True
+        file[D4RL[TRUNCATED]] = timeouts & ~np.concatenate([values[TERMINATED] for values in columns])
 
 
 def _d3rlpy(dataset: Dataset, path: Path, out: Path) -> None:
@@ -86,11 +72,11 @@ def _d3rlpy(dataset: Dataset, path: Path, out: Path) -> None:
     algorithms take one observation, so the goal, where there is one, follows the state.
     """
     fields = _fields(dataset, D3RLPY | {TERMINATED: "infos/next.terminated"})
-    with hdf5_file(path) as (file, disk):
+    with hdf5_file(path) as file:
         file["columns"] = list(D3RLPY.values())
         file["num_episodes"] = len(dataset)
         file["version"] = "2.1"
-        for number, _, values in _episodes(dataset, disk):
+        for number, _, values in _episodes(dataset):
             file[f"terminated_{number}"] = bool(values[TERMINATED][-1])
             goal = [values.pop(GOAL)] if GOAL in values else []
             values[STATE] = np.concatenate([values[STATE], *goal], axis=1)
@@ -115,11 +101,11 @@ def _robomimic(dataset: Dataset, path: Path, out: Path) -> None:
         "type": 2,  # gym
         "env_kwargs": {key: value for key, value in environment.items() if key != "id"},
     }
-    with hdf5_file(path) as (file, disk):
+    with hdf5_file(path) as file:
         data = file.create_group("data")
         data.attrs["total"] = int(dataset.lengths.sum())
         data.attrs["env_args"] = json.dumps(arguments)
-        for number, episode, values in _episodes(dataset, disk):
+        for number, episode, values in _episodes(dataset):
             demo = data.create_group(f"demo_{number}")
             demo.attrs["num_samples"] = len(episode)
             demo.attrs["episode_uid"] = episode.uid
@@ -170,8 +156,8 @@ def _minari(dataset: Dataset, path: Path, out: Path) -> None:
         observed = {STATE: "observations/observation", GOAL: "observations/desired_goal"}
     fields = _fields(dataset, MINARI | observed)
     storage = MinariStorage.new(path.absolute() / "data", seen, boxes[ACTION])
-    with hdf5_file(path / "data/main_data.hdf5", track_order=True) as (file, disk):
-        for number, episode, values in _episodes(dataset, disk):
+    with hdf5_file(path / "data/main_data.hdf5", track_order=True) as file:
+        for number, episode, values in _episodes(dataset):
             group = file.create_group(f"episode_{number}")
             group.attrs.update({"id": number, "total_steps": len(episode)})
             if isinstance(seed := episode.metadata.get("seed"), int):
@@ -234,66 +220,20 @@ def _fields(dataset: Dataset, standard: dict[str, str]) -> dict[str, str]:
     return fields
 
 
-def _episodes(dataset: Dataset, disk: "Disk") -> Iterator[tuple[int, Episode, dict[str, Array]]]:
-    """Yield each episode with its number and its columns, (T,) or (T, size), while the disk takes them."""
+def _episodes(dataset: Dataset) -> Iterator[tuple[int, Episode, dict[str, Array]]]:
+    """Yield each episode with its number and its columns, (T,) or (T, size)."""
     for number, episode in enumerate(dataset.episodes([column.name for column in dataset.schema])):
         values = {name: as_rows(v) if name in VECTORS else v for name, v in episode.columns.items()}
         yield number, episode, {REWARD: np.zeros(len(episode), np.float32)} | values
-        disk.check()
-
-
-class Disk(io.RawIOBase):
-    """A new file at `path` that keeps its first error of writing as `failure` instead of raising it."""
-
-    def __init__(self, path: Path) -> None:
-        self.failure: OSError | None = None
-        self._file = path.open("w+b", buffering=0)
-        self.seek, self.tell, self.readinto = self._file.seek, self._file.tell, self._file.readinto  # type: ignore[method-assign]
-
-    def check(self) -> None:
-        """Raise the first error, if there was one."""
-        if self.failure:
-            raise self.failure
-
-    def write(self, content: Buffer, /) -> int:
-        """Write all of `content`, as far as the disk takes it."""
-        rest = memoryview(content).cast("B")
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except OSError as error:
-            self.failure = self.failure or error
-        return memoryview(content).nbytes
-
-    def truncate(self, size: int | None = None, /) -> int:
-        """Cut or extend the file."""
-        try:
-            return self._file.truncate(size)
-        except OSError as error:
-            self.failure = self.failure or error
-            return size or 0
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()
 
 
 @contextmanager
-def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[tuple[Any, Disk]]:
-    """Yield a new HDF5 file at `path`, and the disk that it is written to; raise OSError if that failed.
+def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[Any]:
+    """Yield a new HDF5 file, written to `path` once it is whole: HDF5 itself crashes where a disk fails.
 
     `track_order` lists groups in the order of their making instead of by name.
     """
-    h5py = optional("h5py")
-    disk = Disk(path)
-    try:
-        with h5py.File(disk, "w", track_order=track_order) as file:
-            yield file, disk
-    except Exception:
-        # What HDF5 stumbles over after a failed write is not the reason.
-        disk.check()
-        raise
-    finally:
-        disk.close()
-    disk.check()
+    content = io.BytesIO()
+    with optional("h5py").File(content, "w", track_order=track_order) as file:
+        yield file
+    path.write_bytes(content.getbuffer())

@@ -227,30 +227,6 @@ def test_minari_refuses_next_states_that_do_not_follow(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
-def test_what_hdf5_overwrites_comes_back(tmp_path: Path) -> None:
-    values = np.random.default_rng(0).normal(size=(1000, 3))
-    with hdf5_file(tmp_path / "a.h5", track_order=True) as (file, _):
-        for name in ("b", "a"):
-            file[name] = values
-            del file[name]  # what was written is read back, cut and written over
-            file[name] = values
-    with h5py.File(tmp_path / "a.h5") as again:
-        assert list(again) == ["b", "a"]
-        np.testing.assert_array_equal(again["b"], values)
-        np.testing.assert_array_equal(again["a"], values)
-
-
-def test_the_first_failure_of_a_disk_is_raised() -> None:
-    with pytest.raises(OSError, match="No space left"), hdf5_file(FULL) as (file, _):
-        file["a"] = 1  # only the close meets it
-    with pytest.raises(OSError, match="No space left"), hdf5_file(FULL) as (file, disk):
-        file["a"] = np.zeros(10000)
-        assert disk.failure
-        raise RuntimeError("address overflowed")
-
-
-def test_nothing_more_is_made_once_a_write_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(OSError, match="No space left"), hdf5_file(FULL) as (file, disk):
-        file["a"] = np.zeros(10000)
-        disk.check()
-        pytest.fail("went on")
+def test_the_failure_of_a_disk_is_raised() -> None:
+    with pytest.raises(OSError, match="No space left"), hdf5_file(FULL) as file:
+        file["a"] = 1
