@@ -7,8 +7,7 @@ import typer
 
 from astra_data.cli.arguments import show_table
 
-_NAMED = 5
-"""Files that are named in a line."""
+_NAMED = 5  # files that are named in a line
 
 
 def new(

@@ -31,8 +31,7 @@ class DiskError(AstraDataError):
     """A disk is full, read-only, failing or gone; the message names the file and what to do."""
 
 
-_LONGEST = 300
-"""Characters of an error message of a library that are shown."""
+_LONGEST = 300  # characters of an error message of a library that are shown
 
 
 def in_short(error: Exception) -> str:

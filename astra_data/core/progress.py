@@ -5,8 +5,7 @@ from collections.abc import Callable, Mapping
 
 Progress = Callable[[float, str], None]
 """Called with the fraction done, in [0, 1], and a short note, such as the rate and the loss."""
-CLOCKS = ("wall_seconds", "cpu_seconds")
-"""What is measured: time by the clock, and that of the processor."""
+CLOCKS = ("wall_seconds", "cpu_seconds")  # what is measured: time by the clock, and that of the processor
 
 
 def silent(fraction: float, note: str) -> None:

@@ -17,32 +17,22 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import as_column
 from astra_data.core.errors import BadInputError
 
-STATE = "observation.state"
-"""(T, S) float32: the full target state s_t."""
+STATE = "observation.state"  # (T, S) float32: the full target state s_t
 GOAL = "observation.environment_state"
 """(T, G) float32: the goal, where a task has one; LeRobot's own policies need it to train."""
-ACTION = "action"
-"""(T, A) float32: a_t, as given to the target environment and to the abstract simulator."""
-NEXT_STATE = "next.observation.state"
-"""(T, S) float32: s_{t+1}, stored so that readers need not shift s_t."""
-REWARD = "next.reward"
-"""(T,) float32: the target reward r_t."""
+ACTION = "action"  # (T, A) float32: a_t, as given to the target environment and to the abstract simulator
+NEXT_STATE = "next.observation.state"  # (T, S) float32: s_{t+1}, stored so that readers need not shift s_t
+REWARD = "next.reward"  # (T,) float32: the target reward r_t
 TERMINATED = "next.terminated"
 """(T,) bool: the task ended, in success or failure; learners bootstrap unless this is set."""
-TRUNCATED = "next.truncated"
-"""(T,) bool: time ran out."""
-DONE = "next.done"
-"""(T,) bool: terminated or truncated."""
-SUCCESS = "next.success"
-"""(T,) bool: the goal is reached in s_{t+1}."""
-ABSTRACT_STATE = "abstract.state"
-"""(T, X) float32: the abstract state of s_t."""
-ABSTRACT_NEXT_STATE = "abstract.next_state"
-"""(T, X) float32: the abstract state of s_{t+1}."""
+TRUNCATED = "next.truncated"  # (T,) bool: time ran out
+DONE = "next.done"  # (T,) bool: terminated or truncated
+SUCCESS = "next.success"  # (T,) bool: the goal is reached in s_{t+1}
+ABSTRACT_STATE = "abstract.state"  # (T, X) float32: the abstract state of s_t
+ABSTRACT_NEXT_STATE = "abstract.next_state"  # (T, X) float32: the abstract state of s_{t+1}
 ABSTRACT_SIMULATED_NEXT_STATE = "abstract.simulated_next_state"
 """(T, X) float32: the abstract simulator's next state, from the abstract state of s_t under a_t."""
-EPISODE_UID = "episode_uid"
-"""(T,) int64: identifies the episode through all later edits; filled in by the writer."""
+EPISODE_UID = "episode_uid"  # (T,) int64: identifies the episode through all later edits; filled in by the writer
 TIMESTAMP, FRAME_INDEX = "timestamp", "frame_index"
 EPISODE_INDEX, INDEX, TASK_INDEX = "episode_index", "index", "task_index"
 RESERVED = (EPISODE_UID, TIMESTAMP, FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX)

@@ -18,30 +18,22 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import home_of
 
 _DESCRIBED = ("name", "version", "stage", "config", "seeds", "environment", "simulator", "parents")
-_SHOWN = 5
-"""Entries of a list in the provenance; those of longer ones are counted."""
-_Described = tuple[Path, Mapping[str, Any]]
-"""Folder and description."""
-_Key = tuple[str, str, str]
-"""Name, version and content hash."""
-Ancestors = dict[_Key, _Described | None]
-"""A dataset and its ancestors; None for those of which no folder was found."""
+_SHOWN = 5  # entries of a list in the provenance; those of longer ones are counted
+_Described = tuple[Path, Mapping[str, Any]]  # folder and description
+_Key = tuple[str, str, str]  # name, version and content hash
+Ancestors = dict[_Key, _Described | None]  # a dataset and its ancestors; None for those of which no folder was found
 
 
 @dataclass(frozen=True)
 class Differences:
     """How a dataset B differs from a dataset A: sentences, and uids of episodes, ascending."""
 
-    schema: list[str]
-    """Columns, fps and task."""
+    schema: list[str]  # columns, fps and task
     only_in_a: list[int]
     only_in_b: list[int]
-    values: list[int]
-    """Episodes of both whose values differ."""
-    metadata: dict[str, list[int]]
-    """The keys that differ, each with the episodes."""
-    description: list[str]
-    """Provenance, such as "config.noise_m: 0.1, then 0.2"."""
+    values: list[int]  # episodes of both whose values differ
+    metadata: dict[str, list[int]]  # the keys that differ, each with the episodes
+    description: list[str]  # provenance, such as "config.noise_m: 0.1, then 0.2"
 
 
 def differences(a: Dataset, b: Dataset) -> Differences:

@@ -24,8 +24,7 @@ from astra_data.dataset.plain import episodes_files, read_object, read_small_tab
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Valid names of datasets; they name folders, with some letters added, and file systems take 255."""
-VERSION = re.compile(r"[0-9]{1,9}\.[0-9]{1,9}\.[0-9]{1,9}")
-"""Valid versions of datasets."""
+VERSION = re.compile(r"[0-9]{1,9}\.[0-9]{1,9}\.[0-9]{1,9}")  # valid versions of datasets
 _DEFAULTS: dict[str, Any] = {
     "name": None,
     "version": "1.0.0",
@@ -151,8 +150,7 @@ def read_description(root: Path) -> dict[str, Any]:
     return found
 
 
-Digests = Mapping[str, NDArray[np.uint64]]
-"""Column to the digest of each episode, (E,)."""
+Digests = Mapping[str, NDArray[np.uint64]]  # column to the digest of each episode, (E,)
 SEALED = (
     layout.INFO_PATH,
     layout.STATS_PATH,

@@ -18,8 +18,7 @@ from astra_data.dataset.description import permutation
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version
 
-MOST_UIDS = 8
-"""Uids listed in a message."""
+MOST_UIDS = 8  # uids listed in a message
 _IMPORTED = (
     "one of another origin gets the meanings of the others, and no robot_type, by an import of its files: "
     "`astra-data import FOLDER/data/*/*.parquet --mapping FILE`, with the others' mapping"

@@ -23,8 +23,7 @@ from astra_data.dataset.columns import (
 )
 
 CODEBASE_VERSION = "v3.0"
-CHUNK_SIZE = 1000
-"""Files per chunk folder."""
+CHUNK_SIZE = 1000  # files per chunk folder
 DATA_FILE_SIZE_MB = 100
 VIDEO_FILE_SIZE_MB = 200
 INFO_PATH = "meta/info.json"
@@ -39,16 +38,14 @@ METADATA_PATH = f"{OUR_FOLDER}/episodes.parquet"
 SUBSETS_PATH = f"{OUR_FOLDER}/subsets.json"
 DIGESTS_PATH = f"{OUR_FOLDER}/digests.parquet"
 POLICY_PATH = f"{OUR_FOLDER}/policy.safetensors"
-METADATA_KEYS = ("episode_uid", "length")
-"""First columns of `METADATA_PATH`; the others are the episodes' own metadata."""
+METADATA_KEYS = ("episode_uid", "length")  # first columns of `METADATA_PATH`; the others are the episodes' own metadata
 
 COMPRESSIONS = ("snappy", "zstd")
 """Of the data files: snappy, as LeRobot writes, is faster, zstd smaller; every reader supports both."""
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
-STORED_STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
-"""In LeRobot's order."""
+STORED_STATISTICS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")  # in LeRobot's order
 
 DEFAULT_COLUMNS = (
     Column(TIMESTAMP),

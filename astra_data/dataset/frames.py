@@ -20,11 +20,9 @@ from astra_data.dataset.columns import Array, Column
 from astra_data.dataset.reader import Dataset
 
 Padding = Literal["valid", "edge"]
-MEMORY_SHARE = 0.5
-"""Columns that take more than this share of the machine's memory are memory-mapped."""
+MEMORY_SHARE = 0.5  # columns that take more than this share of the machine's memory are memory-mapped
 IS_PAD = "is_pad"
-Batch = dict[str, Tensor]
-"""Column name to (B, ...)."""
+Batch = dict[str, Tensor]  # column name to (B, ...)
 
 
 class Order:

@@ -9,12 +9,9 @@ from astra_data.core.arrays import Floats, Ints, as_rows
 from astra_data.dataset.columns import NEXT_STATE, REWARD, STATE, SUCCESS, TERMINATED, Array, Column
 from astra_data.dataset.reader import Dataset
 
-BINS = 16
-"""Bins of a histogram, from the smallest to the largest value."""
-CELLS = 64
-"""Cells of a map along its longer side."""
-NEEDED = (STATE, NEXT_STATE, TERMINATED)
-"""Columns that show how an episode ends."""
+BINS = 16  # bins of a histogram, from the smallest to the largest value
+CELLS = 64  # cells of a map along its longer side
+NEEDED = (STATE, NEXT_STATE, TERMINATED)  # columns that show how an episode ends
 
 
 @dataclass(frozen=True)
@@ -48,11 +45,9 @@ class Map:
 class Endings:
     """How many episodes end in which way."""
 
-    terminated: int = 0
-    """In success or failure."""
+    terminated: int = 0  # in success or failure
     cut_off: int = 0
-    made_up: int = 0
-    """Terminated ones whose last next state is the state itself, to the bit."""
+    made_up: int = 0  # terminated ones whose last next state is the state itself, to the bit
 
     def add(self, columns: Mapping[str, Array]) -> None:
         """Count an episode with these columns, of which `NEEDED` are looked at."""
@@ -77,17 +72,12 @@ class Inspection:
 
     reference: str
     fps: int
-    lengths: Ints
-    """Steps of each episode, (E,)."""
-    success: int | None
-    """Number of successful episodes."""
+    lengths: Ints  # steps of each episode, (E,)
+    success: int | None  # number of successful episodes
     endings: Endings | None
-    spreads: tuple[Spread, ...]
-    """One per column."""
-    positions: Map | None
-    """Of the robot, in m."""
-    velocities: Map | None
-    """In the plane, in m/s."""
+    spreads: tuple[Spread, ...]  # one per column
+    positions: Map | None  # of the robot, in m
+    velocities: Map | None  # in the plane, in m/s
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:

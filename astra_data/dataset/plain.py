@@ -17,12 +17,9 @@ from astra_data.dataset import format as layout
 from astra_data.dataset.columns import Array
 from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks, to_numpy
 
-TIMESTAMP_TOLERANCE_S = 1e-4
-"""As LeRobot's own; what float32 cannot tell apart is allowed beside it."""
-EPISODES_AT_ONCE = 100
-"""Rows of meta/episodes held in memory."""
-MOST_FPS = 2**31
-"""Upper bound of steps per second."""
+TIMESTAMP_TOLERANCE_S = 1e-4  # as LeRobot's own; what float32 cannot tell apart is allowed beside it
+EPISODES_AT_ONCE = 100  # rows of meta/episodes held in memory
+MOST_FPS = 2**31  # upper bound of steps per second
 _NUMBERS = (
     *("bool", "float16", "float32", "float64"),
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
@@ -36,11 +33,9 @@ _FORMAT_2 = {
     "data": "data/chunk-{:03d}/episode_{:06d}.parquet",
 }
 """Files of LeRobot's formats 2.0 and 2.1: one of the data for each episode."""
-PLAIN_STATISTICS = ("min", "max", "mean", "std", "count")
-"""Those that every file of the format has of every column."""
+PLAIN_STATISTICS = ("min", "max", "mean", "std", "count")  # those that every file of the format has of every column
 _MOST_ROWS = 10**12
-_MOST_BYTES = 2**28
-"""Of a file of metadata in JSON."""
+_MOST_BYTES = 2**28  # of a file of metadata in JSON
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,8 @@ if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 
-REPAIR = "astra-data repair {} --out DIR"
-"""The command that writes what is intact in a folder to another one."""
-_SHOWN = 4
-"""Datasets of a run."""
+REPAIR = "astra-data repair {} --out DIR"  # the command that writes what is intact in a folder to another one
+_SHOWN = 4  # datasets of a run
 
 
 class Dataset(Contents):

@@ -7,18 +7,12 @@ import numpy as np
 from astra_data.core.arrays import as_rows
 from astra_data.dataset.columns import Array, Column
 
-_LARGE = 2**16
-"""Numbers beyond it that float32 cannot hold are refused: times, and positions far from their origin."""
-_ROUNDED = 0.05
-"""Mean error of a step, as a share of a typical step, from which on rounding is warned of ..."""
-_LOST = 0.5
-"""... and from which on large numbers are refused."""
-_TYPICAL = 0.9
-"""Quantile of the steps that is typical: robots often stand still, and their sensors do not."""
-_ENOUGH = 10
-"""Fewer steps tell nothing of rounding."""
-_SAMPLES, _MOST_SAMPLES = 2**9, 2**15
-"""Steps that are looked at in a block, and in all."""
+_LARGE = 2**16  # numbers beyond it that float32 cannot hold are refused: times, and positions far from their origin
+_ROUNDED = 0.05  # mean error of a step, as a share of a typical step, from which on rounding is warned of ...
+_LOST = 0.5  # ... and from which on large numbers are refused
+_TYPICAL = 0.9  # quantile of the steps that is typical: robots often stand still, and their sensors do not
+_ENOUGH = 10  # fewer steps tell nothing of rounding
+_SAMPLES, _MOST_SAMPLES = 2**9, 2**15  # steps that are looked at in a block, and in all
 
 
 class Rounding:

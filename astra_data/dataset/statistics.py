@@ -14,10 +14,8 @@ from astra_data.dataset.format import EPISODES_PATH, QUANTILES, STATISTICS, STOR
 from astra_data.dataset.parquet import RotatingWriter, read_arrays, to_lists
 from astra_data.dataset.plain import PlainColumn
 
-BLOCK_VALUES = 2**26
-"""Values held in memory at once: 256 MiB of float32."""
-ROWS_AT_ONCE = 1000
-"""Rows held in memory before they are written."""
+BLOCK_VALUES = 2**26  # values held in memory at once: 256 MiB of float32
+ROWS_AT_ONCE = 1000  # rows held in memory before they are written
 
 
 def statistics(rows: NDArray[np.float64]) -> NDArray[np.float64]:

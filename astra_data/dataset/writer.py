@@ -33,8 +33,7 @@ from astra_data.dataset.reader import Dataset
 from astra_data.dataset.statistics import EpisodeRows, episode_statistics, global_statistics
 
 _METADATA_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
-MOST_CHARACTERS = 2**20
-"""Characters of a text in the metadata."""
+MOST_CHARACTERS = 2**20  # characters of a text in the metadata
 
 
 class DatasetWriter:
@@ -217,8 +216,7 @@ class Admission:
     def __init__(self, columns: Sequence[Column]) -> None:
         self._columns = {column.name: column for column in columns}
         self._uids: set[int] = set()
-        self.metadata_types: dict[str, type] = {}
-        """Of each metadata key seen so far."""
+        self.metadata_types: dict[str, type] = {}  # of each metadata key seen so far
 
     def admit(self, episode: Episode) -> None:
         """Accept `episode`, or refuse it with a BadInputError that lists every fault."""

@@ -11,8 +11,7 @@ import numpy as np
 import onnxruntime
 
 HERE = Path(__file__).parent
-FAR = 5.0
-"""How far beyond the recorded range a state may be, in widths of it: values in another unit are farther."""
+FAR = 5.0  # how far beyond the recorded range a state may be, in widths of it: values in another unit are farther
 
 
 class RobotPolicy:

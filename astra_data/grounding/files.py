@@ -60,10 +60,8 @@ def load_target_encoder(path: Path | str) -> TargetEncoder:
         return loaded(TargetEncoder(**metadata["sizes"]), tensors)
 
 
-_WRITTEN = ("kind", "to_file", "from_file")
-"""The parts that a grounding does not inherit."""
-_ROUNDING = 1e-6
-"""Between states that are the same, relative to their size and absolute."""
+_WRITTEN = ("kind", "to_file", "from_file")  # the parts that a grounding does not inherit
+_ROUNDING = 1e-6  # between states that are the same, relative to their size and absolute
 
 
 def missing_parts(grounding: type) -> list[str]:

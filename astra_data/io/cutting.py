@@ -36,19 +36,14 @@ REASONS = ("file", "source", "field", "end", "gap", "back", "jump", "rejected")
 """Why a new episode begins, the first that applies: a new file, the format's own episodes, a field that
 changes, a flag in the row before (next.terminated and next.truncated too), a gap in time, time that goes
 back, a jump, rows that were rejected."""
-RATE_TOLERANCE = 0.1
-"""Largest relative difference between fps and the rate measured from the times."""
-_TIMED = 20
-"""Steps of a file of which its rate can be told."""
-EXACT = 2**53
-"""Floats represent whole numbers below this exactly."""
-_SHOWN = 8
-"""Fields and files that are listed."""
+RATE_TOLERANCE = 0.1  # largest relative difference between fps and the rate measured from the times
+_TIMED = 20  # steps of a file of which its rate can be told
+EXACT = 2**53  # floats represent whole numbers below this exactly
+_SHOWN = 8  # fields and files that are listed
 _KINDS = {"U": "text", "S": "text", "O": "values that are not numbers, such as missing ones"}
 
 Mask = NDArray[np.bool_]
-Cut = tuple[dict[str, Array], dict[str, Scalar]]
-"""The columns and the metadata of an episode."""
+Cut = tuple[dict[str, Array], dict[str, Scalar]]  # the columns and the metadata of an episode
 Table = dict[str, Array]
 """Rows: columns by name and, by words that begin with "/" as no column does, what decides their cuts."""
 
@@ -58,38 +53,26 @@ class Tally:
     """How many rows were read and dropped, and why."""
 
     rows: int = 0
-    rejected_rows: int = 0
-    """Those with a value that is not finite, and torn ones."""
+    rejected_rows: int = 0  # those with a value that is not finite, and torn ones
     not_finite: dict[str, tuple[int, str]] = field(default_factory=dict)
     """Field to how many rows it is not finite in, and where the first is."""
-    bad_episodes: list[str] = field(default_factory=list)
-    """Those that are left out for such a row, in a line each."""
-    torn_rows: int = 0
-    """Those that are cut off at the end of their files."""
+    bad_episodes: list[str] = field(default_factory=list)  # those that are left out for such a row, in a line each
+    torn_rows: int = 0  # those that are cut off at the end of their files
     torn_first: str = ""
-    split_points: dict[str, int] = field(default_factory=dict)
-    """Number of boundaries between episodes, by reason."""
-    last_rows: int = 0
-    """Last rows of episodes, dropped because their next state was not recorded ..."""
-    last_terminated: int = 0
-    """... those of them that were terminated, and the sum of the rewards of the others."""
+    split_points: dict[str, int] = field(default_factory=dict)  # number of boundaries between episodes, by reason
+    last_rows: int = 0  # last rows of episodes, dropped because their next state was not recorded ...
+    last_terminated: int = 0  # ... those of them that were terminated, and the sum of the rewards of the others
     last_reward: float = 0.0
-    back_rows: int = 0
-    """Those at which time goes back, within a file."""
+    back_rows: int = 0  # those at which time goes back, within a file
     back_first: str = ""
-    still_rows: int = 0
-    """Those with the time of the row before."""
+    still_rows: int = 0  # those with the time of the row before
     still_first: str = ""
-    short_rows: int = 0
-    """Rows of episodes that were too short."""
-    rows_after_end: int = 0
-    """Terminated rows right after a terminated one: the log went on, the episode did not."""
+    short_rows: int = 0  # rows of episodes that were too short
+    rows_after_end: int = 0  # terminated rows right after a terminated one: the log went on, the episode did not
     endings: Endings = field(default_factory=Endings)
-    clock: str = ""
-    """The recorded rate, gaps and jitter, where the mapping names the times."""
+    clock: str = ""  # the recorded rate, gaps and jitter, where the mapping names the times
     unused_fields: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    """What is strange about the rates of files, in a line each."""
+    notes: list[str] = field(default_factory=list)  # what is strange about the rates of files, in a line each
     topics: dict[str, list[str]] = field(default_factory=dict)
     """What is strange about topics, in a line each, with the files that it is true of."""
 
@@ -110,8 +93,7 @@ class Cutter:
 
     def __init__(self, mapping: ImportMapping, *, skip_bad: bool = False) -> None:
         self.tally = Tally()
-        self.columns: tuple[Column, ...] = ()
-        """Of the dataset, including derived ones; known after the first block."""
+        self.columns: tuple[Column, ...] = ()  # of the dataset, including derived ones; known after the first block
         self._mapping, self._skips = mapping, skip_bad and mapping.not_finite == "refuse"
         self._converted: dict[str, Column] = {}
         self._rounding: dict[str, Rounding] = {}

@@ -29,8 +29,7 @@ MINARI = {ACTION: "actions", REWARD: "rewards", TERMINATED: "terminations", TRUN
 NUMBERED = "{field}_{number}"
 """The pattern of episodes whose fields have the episode's number at the end of their names."""
 
-MOST_COMPRESSED = 10_000
-"""Larger than the compression ratio of any filter; beyond it, the values were never written."""
+MOST_COMPRESSED = 10_000  # larger than the compression ratio of any filter; beyond it, the values were never written
 
 
 def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py

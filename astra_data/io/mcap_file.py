@@ -29,11 +29,9 @@ from astra_data.core.optional import optional
 from astra_data.io.recording import MOST_UNPACKED, Source
 
 MAGIC = b"\x89MCAP0\r\n"
-_HEAD = struct.Struct("<BQ")
-"""Of a record: its kind and its length."""
+_HEAD = struct.Struct("<BQ")  # of a record: its kind and its length
 _BLOCK_BYTES = 2**16
-FEWEST = 10
-"""Messages to a step back of the clock."""
+FEWEST = 10  # messages to a step back of the clock
 
 
 class McapFile:
@@ -222,13 +220,10 @@ class McapMessage(NamedTuple):
     """A message: its topic, its times in ns, and what it holds."""
 
     topic: str
-    time: int
-    """On a clock that only goes forward."""
-    log_time: int
-    """By the recorder's clock."""
+    time: int  # on a clock that only goes forward
+    log_time: int  # by the recorder's clock
     content: Any
-    is_back: bool
-    """Whether it is the first after the clock was set back."""
+    is_back: bool  # whether it is the first after the clock was set back
 
 
 class _Stretch:
@@ -236,8 +231,7 @@ class _Stretch:
 
     def __init__(self) -> None:
         self.times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
-        self.latest = self.late_ns = 0
-        """The largest of them, and how far they are out of order."""
+        self.latest = self.late_ns = 0  # the largest of them, and how far they are out of order
 
     def add(self, topic: str, time: int) -> None:
         """Add a message."""
@@ -272,8 +266,7 @@ class Timeline:
         self._file = file
         self._stretches = self._survey(round(gap_s * 1e9))
         file.check_topics()
-        self._shifts = [0]
-        """What is added to the times of each stretch, so that it begins a pause after the one before."""
+        self._shifts = [0]  # what is added to the times of each stretch, so that it begins a pause after the one before
         for before, stretch in pairwise(self._stretches):
             pause_ns = 2 * round(pause_s * 1e9) + 1
             self._shifts.append(before.latest + self._shifts[-1] + pause_ns - stretch.earliest)

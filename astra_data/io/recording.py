@@ -18,32 +18,24 @@ from astra_data.dataset.plain import read_object
 from astra_data.dataset.writer import is_text
 from astra_data.io.mapping import ImportMapping
 
-VALUE_BYTES = 8
-"""What a value is counted as, whatever its type."""
-SMALL_BYTES = 2**28
-"""Values of so many bytes are taken from recordings of any size."""
+VALUE_BYTES = 8  # what a value is counted as, whatever its type
+SMALL_BYTES = 2**28  # values of so many bytes are taken from recordings of any size
 MOST_UNPACKED = 100
 """Larger than what logs of a robot are compressed by; files made to fill a memory are compressed by more."""
 
 ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
-IN_ARCHIVES = ("csv", "json")
-"""Formats that are read sequentially, so that they can be read inside archives."""
+IN_ARCHIVES = ("csv", "json")  # formats that are read sequentially, so that they can be read inside archives
 
 
 @dataclass(frozen=True)
 class Source:
     """One file of a recording."""
 
-    path: Path
-    """The file, or the archive that holds it."""
-    member: tarfile.TarInfo | None
-    """Its entry in the archive."""
-    recording: Path
-    """The file, folder or archive given by the user; its files follow one another."""
-    most_bytes: int = SMALL_BYTES
-    """Most bytes of values that are taken from it."""
-    name: str = ""
-    """What it is called, by default its path within its recording."""
+    path: Path  # the file, or the archive that holds it
+    member: tarfile.TarInfo | None  # its entry in the archive
+    recording: Path  # the file, folder or archive given by the user; its files follow one another
+    most_bytes: int = SMALL_BYTES  # most bytes of values that are taken from it
+    name: str = ""  # what it is called, by default its path within its recording
     parts: Mapping[str, "Source"] = field(default_factory=dict, compare=False)
     """The files of a recording that are joined by time, by their names in the mapping."""
     faults: list[str] | None = field(default=None, compare=False)
@@ -97,26 +89,18 @@ class Source:
 class Block:
     """Consecutive rows: those of a file, or of an episode of a format that has its own."""
 
-    values: Mapping[str, Array]
-    """Field to n rows, (n,) or (n, ...)."""
-    origin: str
-    """The file and part of the file that they come from."""
-    starts: bool = False
-    """Whether an episode of the format itself begins with the first row."""
-    torn: int = 0
-    """How many rows after the last one are cut off at the end of the file, 0 or 1."""
-    notes: tuple[str, ...] = ()
-    """What the import's report tells of them, in a line each."""
-    is_back: bool = False
-    """Whether that episode begins since time goes back."""
+    values: Mapping[str, Array]  # field to n rows, (n,) or (n, ...)
+    origin: str  # the file and part of the file that they come from
+    starts: bool = False  # whether an episode of the format itself begins with the first row
+    torn: int = 0  # how many rows after the last one are cut off at the end of the file, 0 or 1
+    notes: tuple[str, ...] = ()  # what the import's report tells of them, in a line each
+    is_back: bool = False  # whether that episode begins since time goes back
     places: Mapping[int, str] = field(default_factory=dict)
     """Where the values of some rows were recorded, if the number of the row does not tell."""
     line: Callable[[int], int] | None = None
     """Gives the line of a row of the file by its number, where lines may be empty."""
-    known: Collection[str] = ()
-    """The fields, or topics, that this part of the file has."""
-    row: int = 0
-    """The number of the first row in that part."""
+    known: Collection[str] = ()  # the fields, or topics, that this part of the file has
+    row: int = 0  # the number of the first row in that part
 
     def __len__(self) -> int:
         return len(next(iter(self.values.values())))

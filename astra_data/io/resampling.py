@@ -25,18 +25,12 @@ from astra_data.dataset.columns import ACTION, STATE
 from astra_data.io.cutting import RATE_TOLERANCE
 from astra_data.io.mapping import ImportMapping
 
-MOST_HELD_ROWS = 10**6
-"""Most rows in which the same values may be held: five hours at 50 Hz."""
-MOST_UNEVEN = 0.05
-"""Largest share of a topic's rows, steps or messages that are odd without a warning."""
-_WHOLE = 0.005
-"""Relative error of a measured rate that is taken for a whole number."""
-_SMOOTH = 10
-"""With so many messages a row, or more, one more or less changes a step too little for a warning."""
-_NEAR = 4
-"""Rates of rows that are proposed are up to so many times as high or low as `fps`."""
-_AVERAGED = 20
-"""Messages of a topic over which jitter is averaged; over many more, a rate that is a little off counts."""
+MOST_HELD_ROWS = 10**6  # most rows in which the same values may be held: five hours at 50 Hz
+MOST_UNEVEN = 0.05  # largest share of a topic's rows, steps or messages that are odd without a warning
+_WHOLE = 0.005  # relative error of a measured rate that is taken for a whole number
+_SMOOTH = 10  # with so many messages a row, or more, one more or less changes a step too little for a warning
+_NEAR = 4  # rates of rows that are proposed are up to so many times as high or low as `fps`
+_AVERAGED = 20  # messages of a topic over which jitter is averaged; over many more, a rate that is a little off counts
 
 
 class Resampler:
@@ -182,8 +176,7 @@ class Resampler:
         """Return how long after `time` the widest gap between the messages that are in step is half over."""
         if not self._states:
             return 0
-        phases = []
-        """How long after `time`, in ns below the spacing, messages of each topic come but for jitter."""
+        phases = []  # how long after `time`, in ns below the spacing, messages of each topic come but for jitter
         for topic in self._in_step:
             first = np.searchsorted(self._moments[topic], self.times[topic])
             moments = self._moments[topic][first : first + _AVERAGED]

@@ -15,11 +15,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 RECIPES = next(folder for folder in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes") if folder.is_dir())
 """The folder of recipes: in the installed package, or beside it in a checkout."""
 
-IMPORTS = "imports"
-"""The folder of mappings, below `RECIPES`."""
+IMPORTS = "imports"  # the folder of mappings, below `RECIPES`
 
-START_HERE = ("quickstart", "cart", "antmaze_quick")
-"""Recipes to begin with, the first first."""
+START_HERE = ("quickstart", "cart", "antmaze_quick")  # recipes to begin with, the first first
 _EXAMPLES = "Examples: your own robot, data and methods"
 _ROBOTS = {"antmaze": "An ant in mazes", "nao": "A humanoid robot, NAO", "humanoid": "A simulated humanoid"}
 """Titles of groups, by the beginnings of tasks."""

@@ -41,8 +41,7 @@ from astra_data.worlds.protocols import TargetEnv
 from astra_data.worlds.task import Task
 
 _FORESIGHT_S = 1.0
-_CHOICES = 16
-"""Random commands to choose one from that stays clear of walls."""
+_CHOICES = 16  # random commands to choose one from that stays clear of walls
 
 HoldTimes = Annotated[tuple[NotNegative, NotNegative], AfterValidator(in_order)]
 """The shortest and the longest time for which a random command is held."""
@@ -258,19 +257,15 @@ def _step(env: TargetEnv, behavior: Behavior, active: Tensor, *, last: bool) -> 
 
 
 _PPO_ENVS = 128
-_SAC_ENVS = 32
-"""Target environments stepped side by side."""
+_SAC_ENVS = 32  # target environments stepped side by side
 
-_SAC = SacConfig(buffer_size=1_000_000)
-"""Settings with which the humanoid learns to stay up; its rewards are 5 a step."""
-_SAC_SIZES = (256, 256)
-"""Hidden layers of actor and critics."""
+_SAC = SacConfig(buffer_size=1_000_000)  # settings with which the humanoid learns to stay up; its rewards are 5 a step
+_SAC_SIZES = (256, 256)  # hidden layers of actor and critics
 
 type Metadata = dict[str, Any]
 """What a dataset records about the behavior."""
 
-_TEST_EPISODES = 32
-"""Test episodes after each iteration."""
+_TEST_EPISODES = 32  # test episodes after each iteration
 
 
 def suboptimal_by_ppo(

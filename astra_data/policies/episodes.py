@@ -76,8 +76,7 @@ class EpisodeRecord:
         )
 
 
-TOLERANCE = 0.01
-"""Share of the recorded range by which a command may be beyond it."""
+TOLERANCE = 0.01  # share of the recorded range by which a command may be beyond it
 
 
 class RecordedRange:
@@ -115,8 +114,7 @@ class RecordedRange:
 
 
 Act = Callable[[Tensor, Tensor], Tensor]
-Begin = Callable[[Tensor], Act]
-"""Given the goals (N, G) of new episodes, returns the function that acts in them."""
+Begin = Callable[[Tensor], Act]  # given the goals (N, G) of new episodes, returns the function that acts in them
 
 
 def started(policy: RunningPolicy, act: Act, goal: Tensor) -> Act:
@@ -158,8 +156,7 @@ class ObservedTargetEnv:
     torch's global generator.
     """
 
-    penalty_scale = 1.0
-    """Without effect, as there are no penalties here."""
+    penalty_scale = 1.0  # without effect, as there are no penalties here
 
     def __init__(
         self,

@@ -212,8 +212,7 @@ def _abstract(task: str, num_envs: int) -> SeededSimulatorEnv:
     return SeededSimulatorEnv(SimulatorEnv(found.objective, NO_GROUNDING.simulator(found, num_envs)))
 
 
-_POINTS = 50
-"""Of a learning curve."""
+_POINTS = 50  # of a learning curve
 
 
 class WatchedEnv(BatchedVectorEnv):

@@ -28,14 +28,11 @@ from astra_data.grounding.paired_episodes import draw_steps
 from astra_data.policies.networks import Policy
 
 _LARGEST_WEIGHT = 100.0
-_CRITIC_BATCH = 256
-"""Transitions per update of the critics."""
+_CRITIC_BATCH = 256  # transitions per update of the critics
 _CRITIC_SIZES = (128, 128)
 _CRITIC_LEARNING_RATE = 1e-3
-_TARGET_RATE = 0.005
-"""Polyak rate of the target action values, per update."""
-_GRADIENT_NORM = 1.0
-"""The policy's gradients are clipped to this norm."""
+_TARGET_RATE = 0.005  # polyak rate of the target action values, per update
+_GRADIENT_NORM = 1.0  # the policy's gradients are clipped to this norm
 _ROWS_AT_ONCE = 8192
 
 

@@ -13,10 +13,8 @@ from torch import Tensor
 from astra_data.core.seeding import derive
 from astra_data.worlds.protocols import BatchedEnv, Step
 
-_ROUNDING = 1e-9
-"""Of a sum of shares."""
-_ROWS = ("previous_action", "hidden", "first", "age", "lasted")
-"""What checkpoints hold of the rows."""
+_ROUNDING = 1e-9  # of a sum of shares
+_ROWS = ("previous_action", "hidden", "first", "age", "lasted")  # what checkpoints hold of the rows
 
 
 class Taken(NamedTuple):
@@ -157,14 +155,10 @@ class Learner(ABC):
 
 Points = Sequence[Mapping[str, float | None]]
 
-_RECENT = 5
-"""Points of the learning curve over which success is averaged."""
-MASTERED = 0.95
-"""Success of training episodes from which on a simulator counts as mastered."""
-FAST = 6.0
-"""Pace of a training that has mastered its simulator, of one that has not."""
-_GROWTH_SHARE = 0.25
-"""Share of the training over which penalties grow from 0 to full size."""
+_RECENT = 5  # points of the learning curve over which success is averaged
+MASTERED = 0.95  # success of training episodes from which on a simulator counts as mastered
+FAST = 6.0  # pace of a training that has mastered its simulator, of one that has not
+_GROWTH_SHARE = 0.25  # share of the training over which penalties grow from 0 to full size
 
 
 def is_mastered(points: Points) -> bool:

@@ -11,8 +11,7 @@ from torch.nn import functional
 
 from astra_data.grounding.encoder import HistoryEncoder, mlp
 
-_SMALLEST_SQUASHED = 1e-6 - 1.0
-"""Actions beyond it are taken for it, since the tanh of no number is -1."""
+_SMALLEST_SQUASHED = 1e-6 - 1.0  # actions beyond it are taken for it, since the tanh of no number is -1
 
 
 @dataclass(frozen=True)
@@ -166,8 +165,7 @@ class ActorCritic(Policy):
 
 
 _SMALLEST_SCALE = 1e-3
-_UNIT_SCALE = math.log(math.e - 1.0)
-"""Its softplus is 1."""
+_UNIT_SCALE = math.log(math.e - 1.0)  # its softplus is 1
 
 
 class SoftActor(Policy):
@@ -198,8 +196,7 @@ class SoftActor(Policy):
         return torch.tanh(loc if generator is None else torch.normal(loc, scale, generator=generator))
 
 
-SHORTEST_HISTORY = 40
-"""Steps that the student's convolutions span."""
+SHORTEST_HISTORY = 40  # steps that the student's convolutions span
 
 
 @dataclass(frozen=True)

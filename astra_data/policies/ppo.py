@@ -17,10 +17,8 @@ from astra_data.policies.learner import Learner
 from astra_data.policies.networks import ActorCritic, gaussian_log_prob
 from astra_data.worlds.protocols import BatchedEnv
 
-EPOCHS, MINIBATCHES = 5, 16
-"""Passes over a rollout, and updates per pass."""
-_SEGMENT_STEPS = 16
-"""At most, of a segment: it begins with the memory that the policy had there when it acted."""
+EPOCHS, MINIBATCHES = 5, 16  # passes over a rollout, and updates per pass
+_SEGMENT_STEPS = 16  # at most, of a segment: it begins with the memory that the policy had there when it acted
 GAE_LAMBDA, CLIP, VALUE_WEIGHT, GRADIENT_NORM = 0.95, 0.2, 0.5, 0.5
 _CRITIC_GAIN = 0.01
 """Initial gain of the critic's last layer. With 1, its values exceed small returns, so the first advantages
@@ -31,8 +29,7 @@ rollout: as action noise fades, ever smaller updates undo learning."""
 _FINAL_STD, _FADE_SHARE = 0.15, 0.5
 """The limit of the actions' standard deviation falls to this, by equal factors, over this share of the
 training, so that the policy is trained as it is tested."""
-_PULL = 0.05
-"""Weight in the loss of the square by which clipped means are beyond ±1."""
+_PULL = 0.05  # weight in the loss of the square by which clipped means are beyond ±1
 
 _SEEN = ("observation", "previous_action", "hidden", "start")
 _LEARNED = ("action", "action_log_prob", "advantage", "value_target")
@@ -185,8 +182,7 @@ def generalized_advantages(
     return advantage
 
 
-_LARGEST = 10.0
-"""Scaled rewards are clipped to this."""
+_LARGEST = 10.0  # scaled rewards are clipped to this
 
 
 class ReturnScale:

@@ -100,8 +100,7 @@ class UserPolicy(Policy):
         return torch.from_numpy(action).clamp(-1.0, 1.0)
 
 
-Given = Tensor | NDArray[np.float32] | NDArray[np.float64]
-"""What measures and goals come in."""
+Given = Tensor | NDArray[np.float32] | NDArray[np.float64]  # what measures and goals come in
 
 EncoderKind = Literal["target", "source"]
 Observed = Literal["abstract", "full"]
@@ -224,15 +223,13 @@ class RunningPolicy:
         return action
 
 
-POLICY = "policy.safetensors"
-"""Name of the file of its artifact."""
+POLICY = "policy.safetensors"  # name of the file of its artifact
 _KINDS: dict[str, tuple[type[Policy], type[PolicyShape]]] = {
     "actor_critic": (ActorCritic, ActorCriticShape),
     "adaptive": (Student, AdaptiveShape),
     "soft_actor": (SoftActor, PolicyShape),
 }
-_PART = "policy"
-"""Of the tensors of a file: the policy's networks."""
+_PART = "policy"  # of the tensors of a file: the policy's networks
 
 
 def add_policy_kind(made: type[SavedPolicy]) -> None:

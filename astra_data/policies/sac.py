@@ -23,12 +23,9 @@ from astra_data.policies.learner import Learner
 from astra_data.policies.networks import PolicyShape, SoftActor, features_of
 from astra_data.worlds.protocols import BatchedEnv
 
-_REWARD_SCALE = 0.1
-"""Factor on the reward that the critics learn from."""
-_INITIAL_TEMPERATURE = 0.2
-"""Weight of the entropy in the reward at the start."""
-_TARGET_RATE = 0.005
-"""Polyak rate of the target critics, per update."""
+_REWARD_SCALE = 0.1  # factor on the reward that the critics learn from
+_INITIAL_TEMPERATURE = 0.2  # weight of the entropy in the reward at the start
+_TARGET_RATE = 0.005  # polyak rate of the target critics, per update
 
 
 class SacConfig(Config):

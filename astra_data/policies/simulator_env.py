@@ -188,8 +188,7 @@ class SimulatorEnv:
 
 
 _ALONG_AN_AXIS = 1.0
-_LEAST_RATIO = 1.5
-"""Of the rates of failures above and below the limit."""
+_LEAST_RATIO = 1.5  # of the rates of failures above and below the limit
 
 
 @torch.no_grad()
@@ -214,8 +213,7 @@ def command_limit(task: Task, episodes: PairedEpisodes) -> float:
     return _ALONG_AN_AXIS if is_riskier else NO_LIMIT
 
 
-_CHANGE_PENALTY = 0.02
-"""Of the plus settings; recorded ants fall where commands change."""
+_CHANGE_PENALTY = 0.02  # of the plus settings; recorded ants fall where commands change
 
 
 def plus(world: WorldConfig, command_limit: float) -> WorldConfig:
@@ -229,8 +227,7 @@ class Simulation:
     """The abstract simulator that a policy is trained in."""
 
     world: WorldConfig
-    variation: Variation | None = None
-    """Ranges of the simulator's parameters, drawn for each episode."""
+    variation: Variation | None = None  # ranges of the simulator's parameters, drawn for each episode
 
 
 @torch.no_grad()

@@ -148,8 +148,7 @@ class Training:
         return self.config.episode_steps or self.task.objective.horizon
 
 
-Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]
-"""Returns the policy and its learning curve."""
+Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]  # returns the policy and its learning curve
 
 
 class ResumableEnv(BatchedEnv, Protocol):

@@ -91,16 +91,12 @@ class Evaluation(Artifact):
     tested_in: Literal["target", "grounded", "raw"] = "target"
     """Where the row was tested: a simulator, if the task has no target."""
     target: Outcomes | None = None
-    simulated: Outcomes | None = None
-    """In the simulator that the policy was trained in; None if it was trained in none."""
-    raw: Outcomes | None = None
-    """In the raw simulator; None for a policy that cannot act on abstract states."""
-    grounded: Outcomes | None = None
-    """In the reference grounded simulator; None if there is none, or likewise."""
+    simulated: Outcomes | None = None  # in the simulator that the policy was trained in; None if it was trained in none
+    raw: Outcomes | None = None  # in the raw simulator; None for a policy that cannot act on abstract states
+    grounded: Outcomes | None = None  # in the reference grounded simulator; None if there is none, or likewise
     beyond_recorded: float | None = None
     """Share of the steps, where the row was tested, whose command is beyond the range of its dataset."""
-    encoder: str | None = None
-    """Which one its figures in the target are of; None for a hand-written row."""
+    encoder: str | None = None  # which one its figures in the target are of; None for a hand-written row
     encoders: dict[str, dict[str, float]] = Field(default_factory=dict)
     """Mean of each measure by encoder, if there is more than one."""
 
@@ -169,8 +165,7 @@ class Metrics(Artifact):
     replays_per_second: float | None = None
     epochs: list[dict[str, JsonValue]] = Field(default_factory=list)
     """Losses and R² on held-out episodes during the fit; the last are those of the grounding."""
-    failures: dict[str, Foresight] = Field(default_factory=dict)
-    """By what predicts them; empty without a failure model."""
+    failures: dict[str, Foresight] = Field(default_factory=dict)  # by what predicts them; empty without a failure model
 
     def numbers(self) -> dict[str, float | None]:
         """Return times, speeds, the last R² and, by dotted names, the figures of predicted failures."""

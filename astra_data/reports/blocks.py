@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 
-_PIXEL = 2
-"""Pixels of a figure for each of the page."""
+_PIXEL = 2  # pixels of a figure for each of the page
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 

@@ -15,10 +15,8 @@ from astra_data.reports.blocks import Section, TableBlock, Text, markdown
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summarize
 
 TRIALS = "trials.json"
-PSEUDO_TRIALS = 4
-"""Trials that a prediction counts as: as a Beta prior it is then off by 0.2 or so, as predictions are."""
-LEAST_TRIALS = 2
-"""Of a candidate in a round: with one, chance decides; with more, fewer candidates are tried at all."""
+PSEUDO_TRIALS = 4  # trials that a prediction counts as: as a Beta prior it is then off by 0.2 or so, as predictions are
+LEAST_TRIALS = 2  # of a candidate in a round: with one, chance decides; with more, fewer candidates are tried at all
 
 Attempt = Callable[[int, tuple[int, ...], int], Sequence[int]]
 """Given a round's number, its candidates and the trials of each, returns how many of these succeeded."""
@@ -138,10 +136,8 @@ class Candidate(WrittenPart):
 
     row: str
     seed: int
-    percent: int | None = None
-    """Size of the dataset, if there are several."""
-    success: dict[int, float] = Field(min_length=1)
-    """Seed of the judge → share of the episodes."""
+    percent: int | None = None  # size of the dataset, if there are several
+    success: dict[int, float] = Field(min_length=1)  # seed of the judge → share of the episodes
 
     @property
     def key(self) -> tuple[str, int, int | None]:
@@ -167,10 +163,8 @@ class Candidate(WrittenPart):
 class Judgment(WrittenPart):
     """All candidates of a recipe; nothing in it comes from the target."""
 
-    judge: str
-    """The method whose groundings judge."""
-    episodes: int = Field(ge=1)
-    """Of each candidate with each judge."""
+    judge: str  # the method whose groundings judge
+    episodes: int = Field(ge=1)  # of each candidate with each judge
     shares_episodes: bool = False
     """Whether the judges were fitted to the candidates' own episodes: all seeds have the same `data`."""
     candidates: list[Candidate] = Field(min_length=1)

@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 
 PAGE = "gap.md"
 RELIABILITY = "gap_reliability.png"
-_SURE = 0.1
-"""Probability of a failure soon above which predictions are compared with what happened."""
-_EXACT = 1e-3
-"""Share of the persistence baseline's error below which a prediction is exact."""
+_SURE = 0.1  # probability of a failure soon above which predictions are compared with what happened
+_EXACT = 1e-3  # share of the persistence baseline's error below which a prediction is exact
 _FITS = {
     "r2_state": "state",
     "r2_reward": "reward of steps that go on",

@@ -36,10 +36,8 @@ from astra_data.reports.statistics import (
 )
 from astra_data.reports.verdict import verdict_of
 
-COSTED = ("ground", "train", "align", "evaluate")
-"""Stages that run once for each method and seed."""
-LEAST_POLICIES = 5
-"""Policies below which no correlation over them is shown."""
+COSTED = ("ground", "train", "align", "evaluate")  # stages that run once for each method and seed
+LEAST_POLICIES = 5  # policies below which no correlation over them is shown
 WORDS = {
     "astra": "ASTRA: the paper's correction, prediction of rewards and aligned encoder",
     "nas": "NAS: neural-augmented simulation, a correction of the simulator's next state alone",

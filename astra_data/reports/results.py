@@ -28,12 +28,10 @@ from astra_data.worlds.objective import SUCCESS, Score
 if TYPE_CHECKING:
     import pandas as pd
 
-WHOLE = 100
-"""The size of the dataset, in percent, of a recipe that does not sweep over sizes."""
+WHOLE = 100  # the size of the dataset, in percent, of a recipe that does not sweep over sizes
 TESTED, SIMULATED = "tested", "simulated"
 """Places: where a method was tested (the target, if there is one), and the simulator of its training."""
-SHARES = ("success", "failed")
-"""Measures that are shares of episodes."""
+SHARES = ("success", "failed")  # measures that are shares of episodes
 
 NullableFloat = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
 """A float whose NaN is null in JSON."""
@@ -80,19 +78,16 @@ class OfSeed(Facts):
 class Line(OfSeed):
     """What was measured of a method and seed in one place; NaN is left out."""
 
-    where: str
-    """`TESTED`, `SIMULATED`, "raw" or "grounded" (test simulators), "encoder …", or a stage."""
+    where: str  # `TESTED`, `SIMULATED`, "raw" or "grounded" (test simulators), "encoder …", or a stage
     values: dict[str, float]
 
 
 class Errors(OfSeed):
     """Open-loop error of a simulator on held-out episodes: its mean, and the ends of its 95 % interval."""
 
-    simulator: str
-    """"grounded", "raw", or "still" for the persistence baseline, which predicts no motion."""
+    simulator: str  # "grounded", "raw", or "still" for the persistence baseline, which predicts no motion
     quantity: str
-    horizons: list[int]
-    """Steps ahead, K of them."""
+    horizons: list[int]  # steps ahead, K of them
     mean: list[NullableFloat]
     low: list[NullableFloat]
     high: list[NullableFloat]
@@ -110,32 +105,20 @@ class Results(Facts):
 
     recipe: str
     task: str
-    command: str
-    """The command that produced these results."""
-    rows: tuple[str, ...]
-    """Methods of the recipe, each alone or with `_plus`, in the order of the tables."""
-    scores: tuple[Score, ...] = (SUCCESS,)
-    """Scores that methods are compared by, the headline first."""
-    compare: tuple[str, ...] = ("astra",)
-    """Methods that are compared with the others."""
-    episodes: int
-    """Per method and seed."""
-    tested_in: Literal["target", "simulators"] = "target"
-    """Where all methods were tested; a task may have no target."""
-    timestep_s: float | None = None
-    """Of the task."""
-    leg_scale: float = 1.0
-    """Leg length of the target's robot, relative to the one that collected the data."""
-    stand_in: str | None = None
-    """The simulator that stands in for a physical robot in the target, if any."""
+    command: str  # the command that produced these results
+    rows: tuple[str, ...]  # methods of the recipe, each alone or with `_plus`, in the order of the tables
+    scores: tuple[Score, ...] = (SUCCESS,)  # scores that methods are compared by, the headline first
+    compare: tuple[str, ...] = ("astra",)  # methods that are compared with the others
+    episodes: int  # per method and seed
+    tested_in: Literal["target", "simulators"] = "target"  # where all methods were tested; a task may have no target
+    timestep_s: float | None = None  # of the task
+    leg_scale: float = 1.0  # leg length of the target's robot, relative to the one that collected the data
+    stand_in: str | None = None  # the simulator that stands in for a physical robot in the target, if any
     paper_success: dict[str, float] = Field(default_factory=dict)
     """Method → the success rate that the paper prints for it."""
-    judged: Judgment | None = None
-    """The choice without the target; None where `select` was not run."""
-    settings: dict[str, JsonValue] = Field(default_factory=dict)
-    """All settings of the recipe, with defaults filled in."""
-    origins: list[Origin] = Field(default_factory=list)
-    """Normally one; more if code or machine changed between stages."""
+    judged: Judgment | None = None  # the choice without the target; None where `select` was not run
+    settings: dict[str, JsonValue] = Field(default_factory=dict)  # all settings of the recipe, with defaults filled in
+    origins: list[Origin] = Field(default_factory=list)  # normally one; more if code or machine changed between stages
     user_code: dict[str, str] = Field(default_factory=dict)
     """Digests of the user's code: "task", and methods by their names."""
     datasets: list[DatasetUse] = Field(default_factory=list)

@@ -46,8 +46,7 @@ from astra_data.worlds.objective import SUCCESS, Score
 
 DATASET_STAGES = ("collect", "label", "augment", "pair", "subset")
 """Stages that write a dataset of each seed, in their order."""
-SHARED_WORLDS = ("raw", "grounded")
-"""Simulators in which all methods are tested."""
+SHARED_WORLDS = ("raw", "grounded")  # simulators in which all methods are tested
 
 
 @dataclass(frozen=True, kw_only=True)

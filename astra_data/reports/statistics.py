@@ -17,12 +17,9 @@ import numpy as np
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
 
-REPLICATES = 2000
-"""Bootstrap resamples per interval."""
-CONFIDENCE = 0.95
-"""Nominal coverage of an interval."""
-LEAST_SEEDS = 3
-"""Seeds below which no interval is given."""
+REPLICATES = 2000  # bootstrap resamples per interval
+CONFIDENCE = 0.95  # nominal coverage of an interval
+LEAST_SEEDS = 3  # seeds below which no interval is given
 
 
 @dataclass(frozen=True)

@@ -22,44 +22,30 @@ from astra_data.dataset.checkup.findings import (
 from astra_data.dataset.columns import ACTION, NEXT_STATE, STATE, TERMINATED, Array, Column
 from astra_data.dataset.reader import Dataset
 
-SATURATED = 0.2
-"""Share of steps at the edge of the range above which a command is saturated."""
-DISCRETE = 8
-"""A command with at most so many different values is a choice among them and has no edge."""
-STUCK = 0.5
-"""Share of an episode without any change above which a value is stuck, if others move in as many steps."""
-MOST = 0.5
-"""Share of the episodes above which they are most."""
+SATURATED = 0.2  # share of steps at the edge of the range above which a command is saturated
+DISCRETE = 8  # a command with at most so many different values is a choice among them and has no edge
+STUCK = 0.5  # share of an episode without any change above which a value is stuck, if others move in as many steps
+MOST = 0.5  # share of the episodes above which they are most
 SMALLEST_SPAN = 0.01
 """Share of its whole range that a value moves through in most episodes: noise of a simulator is no motion."""
-MOVING = 0.1
-"""Longest rest in most episodes: what often rests, such as a ball, is not stuck where it does."""
-FEWEST_STEPS = 10
-"""Shorter episodes tell nothing of it."""
-FEW_FAILURES = 10
-"""Fewer failures are little for a failure model (docs/results/failures.md)."""
+MOVING = 0.1  # longest rest in most episodes: what often rests, such as a ball, is not stuck where it does
+FEWEST_STEPS = 10  # shorter episodes tell nothing of it
+FEW_FAILURES = 10  # fewer failures are little for a failure model (docs/results/failures.md)
 MOST_REPEATED = 0.05
 """Share of the steps above which states that repeat the row before, between others that move, are many."""
-MOST_ROWS = 5
-"""Rows in a row that repeat a state; a robot that stands still does so for longer."""
-LAGS = range(-3, 4)
-"""Rows between a step and the action that is tried as its cause."""
-CLEAR = 0.2
-"""By how much more of the variance of steps another row's action explains, where rows are off."""
-MOST_STEPS = 2**13
-"""Steps that a shift is estimated from."""
+MOST_ROWS = 5  # rows in a row that repeat a state; a robot that stands still does so for longer
+LAGS = range(-3, 4)  # rows between a step and the action that is tried as its cause
+CLEAR = 0.2  # by how much more of the variance of steps another row's action explains, where rows are off
+MOST_STEPS = 2**13  # steps that a shift is estimated from
 
 
 @dataclass(frozen=True)
 class Checkup:
     """What a check-up found."""
 
-    reference: str
-    """Name and version of the dataset."""
-    summary: tuple[str, ...]
-    """A line each on how episodes end, on commands and on the rate."""
-    findings: tuple[Finding, ...]
-    """Warnings first."""
+    reference: str  # name and version of the dataset
+    summary: tuple[str, ...]  # a line each on how episodes end, on commands and on the rate
+    findings: tuple[Finding, ...]  # warnings first
 
     def record(self) -> dict[str, Any]:
         """Return it for JSON."""

@@ -12,14 +12,10 @@ from astra_data.core.arrays import Floats, as_rows
 from astra_data.core.naming import first_few
 from astra_data.dataset.columns import NEXT_STATE, RESERVED, STATE, Column, Episode
 
-SHOWN = 5
-"""Episodes that a line names; further ones are counted."""
-ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")
-"""Names of angles."""
-TURNS = {"rad": 2 * math.pi, "deg": 360.0}
-"""What a full turn is in each unit."""
-LARGEST = 4 * math.pi
-"""Few robots turn further than twice around."""
+SHOWN = 5  # episodes that a line names; further ones are counted
+ANGLE = re.compile(r"(.+_)?(heading|yaw|theta|psi|roll|pitch|angle|q\d*|joint\d*)")  # names of angles
+TURNS = {"rad": 2 * math.pi, "deg": 360.0}  # what a full turn is in each unit
+LARGEST = 4 * math.pi  # few robots turn further than twice around
 
 
 @dataclass(frozen=True)
@@ -30,8 +26,7 @@ class Finding:
     """A warning if a grounding would be fitted to something that the robot did not do."""
     what: str
     advice: str
-    episodes: tuple[int, ...] = ()
-    """Uids of the episodes where it is; empty if it concerns the whole dataset."""
+    episodes: tuple[int, ...] = ()  # uids of the episodes where it is; empty if it concerns the whole dataset
 
     def __str__(self) -> str:
         """Say it in a line."""
@@ -98,20 +93,14 @@ def continuity(episodes: Iterable[Episode]) -> list[Finding]:
     return [Finding("warning", what, advice, uids)] if uids else []
 
 
-GAP = 1.5
-"""A step that takes more than so many periods is a gap."""
-HELD = 0.75
-"""Periods for which an MCAP topic may be held, as is proposed: rows that lack a message hold one longer."""
+GAP = 1.5  # a step that takes more than so many periods is a gap
+HELD = 0.75  # periods for which an MCAP topic may be held, as is proposed: rows that lack a message hold one longer
 WRONG_RATE = 0.05
 """Relative difference between the declared and the recorded rate above which the declared one is wrong."""
-JITTERY = 0.2
-"""Periods by which 5 % of the steps are off at least in a jittery recording."""
-MANY_GAPS = 0.01
-"""Share of the steps from which on gaps are many."""
-INNER = 0.95
-"""Share of the steps that the rate and the jitter are of."""
-FINE = 1000
-"""Shares of a period, and `MOST_PERIODS` of them, beyond which a step is in another unit than is thought."""
+JITTERY = 0.2  # periods by which 5 % of the steps are off at least in a jittery recording
+MANY_GAPS = 0.01  # share of the steps from which on gaps are many
+INNER = 0.95  # share of the steps that the rate and the jitter are of
+FINE = 1000  # shares of a period, and `MOST_PERIODS` of them, beyond which a step is in another unit than is thought
 MOST_PERIODS = 100
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 
@@ -129,10 +118,8 @@ class Clock:
     name: str
     fps: int
     scale: float = 1.0
-    is_whole: bool = False
-    """Whether the times are integers."""
-    steps_s: list[Floats] = field(default_factory=list)
-    """Of each episode, (n,)."""
+    is_whole: bool = False  # whether the times are integers
+    steps_s: list[Floats] = field(default_factory=list)  # of each episode, (n,)
     uids: list[int] = field(default_factory=list)
 
     @classmethod

@@ -24,8 +24,7 @@ from astra_data.reports.figures.style import coverage, png
 
 TAGS = ("LeRobot", "robotics", "abstract-sim2real", "astra-data")
 
-WIDE = 4
-"""Columns with more values than this have their names listed below the table."""
+WIDE = 4  # columns with more values than this have their names listed below the table
 
 CITATION = """\
 ```bibtex

@@ -25,8 +25,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IG
 _MARKS = {";": "semicolons", "\t": "tabs", ",": "commas"}
 _LIST = re.compile(r"\s*[\[(](.*)[\])]\s*", re.DOTALL)
 _SAVE = "save it as UTF-8"
-_SHOWN = 80
-"""Characters of a line above the header that are shown."""
+_SHOWN = 80  # characters of a line above the header that are shown
 
 
 def delimiter_of(name: str) -> str:

@@ -17,8 +17,7 @@ from astra_data.io.recording import Block, Source, row_count
 
 LINES = (".jsonl", ".ndjson")
 SUFFIXES = (".json", ".log", *LINES)
-LIMIT_BYTES = 2**28
-"""Larger files of one object or list are refused, since these cannot be parsed in parts."""
+LIMIT_BYTES = 2**28  # larger files of one object or list are refused, since these cannot be parsed in parts
 
 
 def read(source: Source, mapping: ImportMapping) -> Iterator[Block]:

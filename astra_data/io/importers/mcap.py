@@ -25,8 +25,7 @@ SUFFIXES = (".mcap",)
 Message = tuple[int, Mapping[str, Array]]
 """The time of a message in ns, by the recorder's clock, and the values of its fields."""
 _MISSING = object()
-_NAMES = "name"
-"""The part of a message that names the values of the lists beside it, as of joints in ROS."""
+_NAMES = "name"  # the part of a message that names the values of the lists beside it, as of joints in ROS
 
 _log = logging.getLogger(__name__)
 

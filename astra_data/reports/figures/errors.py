@@ -23,8 +23,7 @@ from astra_data.reports.figures.style import (
 from astra_data.reports.results import Results
 from astra_data.reports.runs import SHARED_WORLDS
 
-SAME = 0.01
-"""Ungrounded simulators whose errors differ by less than this share are drawn once."""
+SAME = 0.01  # ungrounded simulators whose errors differ by less than this share are drawn once
 _UNITS = {"_m_s2": "m/s²", "_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_deg": "°", "_m": "m"}
 """Endings of the names of quantities."""
 

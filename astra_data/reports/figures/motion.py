@@ -81,16 +81,12 @@ def replay_commands(task: Task) -> CommandReplay:
     )
 
 
-COLUMNS, PANEL_INCHES = 4, 2.0
-"""Panels side by side, at most, and the width of one."""
-TITLE_POINTS, TITLE_LETTERS = 10.0, 17
-"""Font size of a panel's title; one of more letters is smaller."""
+COLUMNS, PANEL_INCHES = 4, 2.0  # panels side by side, at most, and the width of one
+TITLE_POINTS, TITLE_LETTERS = 10.0, 17  # font size of a panel's title; one of more letters is smaller
 TIMES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
 """Times at which pictures of an episode are taken, in addition to the time limit."""
-PICTURE_INCHES = 0.95
-"""Width of such a picture."""
-RIM = 0.35
-"""Visible width of the outer walls, in cells."""
+PICTURE_INCHES = 0.95  # width of such a picture
+RIM = 0.35  # visible width of the outer walls, in cells
 
 
 def trajectories(results: Results, scene: Scene) -> Figure | None:

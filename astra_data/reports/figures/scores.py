@@ -29,10 +29,8 @@ from astra_data.reports.figures.style import (
 )
 from astra_data.reports.results import SIMULATED, TESTED, Results, titled
 
-CURVE_POINTS = 200
-"""Points at which curves of different seeds are interpolated."""
-PANELS_ACROSS = 4
-"""Learning-curve panels side by side, at most."""
+CURVE_POINTS = 200  # points at which curves of different seeds are interpolated
+PANELS_ACROSS = 4  # learning-curve panels side by side, at most
 _DOT: dict[str, Any] = {"mfc": "white", "mec": INK, "clip_on": False}
 """Not clipped: the axis would cut what lies on 0 in half."""
 
