@@ -124,9 +124,7 @@ class Cutter:
         fields = {name: np.asarray(values).reshape(n, -1) for name, values in block.values.items()}
         ends = [fields[name] for name in mapping.split.ends]
         ends += [columns[name].reshape(n, -1) for name in (TERMINATED, TRUNCATED) if name in columns]
-        times = (
-            fields[mapping.time][:, 0].astype(np.float64) * mapping.time_scale if mapping.time else np.full(n, np.nan)
-        )
+        times = fields[mapping.time][:, 0] if mapping.time else np.full(n, np.nan)
         table = columns | {
             "/finite": ~rejected,
             "/row": block.row + np.arange(n),
