@@ -22,8 +22,7 @@ stores.BLOCK_BYTES = 1024
 
 
 def check(out: Path, truth: Path) -> None:
-    assert Dataset.open(out).verify() == []
-    assert contents(out) == contents(truth)
+    assert Dataset.open(out).verify() == [] and contents(out) == contents(truth)
 
 
 def main(source: str, out: Path, truth: Path, kills: int) -> None:
@@ -41,8 +40,7 @@ def main(source: str, out: Path, truth: Path, kills: int) -> None:
             finished += 1
             assert forked(lambda: check(out, truth)) == 0
             shutil.rmtree(out)
-    assert forked(lambda: pull(source, out=out)) == 0
-    assert forked(lambda: check(out, truth)) == 0
+    assert forked(lambda: pull(source, out=out)) == 0 and forked(lambda: check(out, truth)) == 0
     assert [path.name for path in out.parent.iterdir() if path.name.startswith(".")] == []
     print(f"{kills} kills: {resumed} left a part, {finished} a whole dataset, {longest:.2f} s a pull")
     print("whole")

@@ -191,8 +191,7 @@ def test_recipe_keys_named_in_the_text_exist() -> None:
     known = set(chain.from_iterable(model.model_fields for model in subclasses(Config)))
     named = re.compile(r"`(?:\[\w+\]\s+)?(\w+)\s+=\s[^`]*`|`\[\w+\]\s+(\w+)`")
     keys = [(page, a or b) for page, text in PAGES.items() for a, b in named.findall(text)]
-    assert len(keys) > 10
-    assert [(page, key) for page, key in keys if key not in known] == []
+    assert len(keys) > 10 and [(page, key) for page, key in keys if key not in known] == []
 
 
 def subclasses(model: type[Config]) -> set[type[Config]]:
@@ -201,8 +200,7 @@ def subclasses(model: type[Config]) -> set[type[Config]]:
 
 def test_blocks_that_are_not_run_say_why_and_are_few() -> None:
     reasons = [block.reason for page in PAGES for block in blocks(page) if block.reason is not None]
-    assert set(reasons) <= NOT_RUN
-    assert len(reasons) <= MOST_NOT_RUN
+    assert set(reasons) <= NOT_RUN and len(reasons) <= MOST_NOT_RUN
     markers = [marker for text in PAGES.values() for marker in re.findall(r"<!--.*?-->", text)]
     assert len(markers) == len(reasons), "every comment stands right before its block"
     assert not [block for page in PAGES for block in blocks(page) if block.language == "python" and block.reason]
@@ -220,18 +218,15 @@ def words(text: str) -> int:
 
 def test_pages_are_short() -> None:
     guides = {name: words(text) for name, text in PAGES.items() if name.startswith("docs/guide/")}
-    assert len(guides) > 15
-    assert not {name: count for name, count in guides.items() if count > 700}
+    assert len(guides) > 15 and not {name: count for name, count in guides.items() if count > 700}
     assert sum(guides.values()) <= 12_000
     assert sum(words(text) for name, text in PAGES.items() if name != "CONTRIBUTING.md") <= 25_000
-    assert words(README) <= 1000
-    assert words((ROOT / "CHANGELOG.md").read_text()) <= 1000
+    assert words(README) <= 1000 and words((ROOT / "CHANGELOG.md").read_text()) <= 1000
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_every_command_and_option_has_help(name: str) -> None:
-    assert COMMANDS[name].help
-    assert all(getattr(parameter, "help", "") for parameter in COMMANDS[name].params)
+    assert COMMANDS[name].help and all(getattr(parameter, "help", "") for parameter in COMMANDS[name].params)
 
 
 def test_the_table_names_every_command_once() -> None:
@@ -261,8 +256,7 @@ def test_links_and_figures_lead_somewhere(page: str) -> None:
 
 def test_the_index_leads_to_every_page() -> None:
     pages = {name.removeprefix("docs/") for name in PAGES if name.startswith("docs/")} - {"index.md"}
-    assert pages == set(re.findall(r"\]\(([\w/]+\.md)\)", PAGES["docs/index.md"]))
-    assert "docs/index.md" in README
+    assert pages == set(re.findall(r"\]\(([\w/]+\.md)\)", PAGES["docs/index.md"])) and "docs/index.md" in README
 
 
 def test_nothing_that_no_registry_has_is_installed() -> None:

@@ -45,8 +45,7 @@ def python(code: str, *arguments: str) -> str:
 
 
 def test_these_names_are_public_and_no_others() -> None:
-    assert astra_data.__all__ == sorted(PUBLIC)
-    assert dir(astra_data) == sorted(PUBLIC)
+    assert astra_data.__all__ == sorted(PUBLIC) and dir(astra_data) == sorted(PUBLIC)
     tree = ast.parse(Path(astra_data.__file__).read_text())
     typed = [alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
     assert sorted(name for name in typed if name) == sorted(PUBLIC)
@@ -125,5 +124,4 @@ def test_what_needs_an_extra_says_which() -> None:
         "import astra_data\nfrom astra_data.core.errors import BadInputError\n"
         "try: astra_data.pair\nexcept BadInputError as error: print(error)\n"
     )
-    assert "uv sync --extra sim" in python(code)
-    assert issubclass(BadInputError, Exception)
+    assert "uv sync --extra sim" in python(code) and issubclass(BadInputError, Exception)

@@ -69,6 +69,5 @@ def test_cells_share_names_and_keep_text_values_and_figures() -> None:
     first, second, third, fourth = (cell["outputs"] for cell in made["cells"])
     assert first == [{"output_type": "stream", "name": "stdout", "text": ["two\n"]}]
     assert [output["data"] for output in second] == [{"text/plain": ["3"]}]
-    assert [[*output["data"]] for output in third] == [["image/png"]]
-    assert fourth == []
+    assert [[*output["data"]] for output in third] == [["image/png"]] and fourth == []
     assert [cell["execution_count"] for cell in made["cells"]] == [1, 2, 3, 4]

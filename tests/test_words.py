@@ -96,8 +96,7 @@ def test_no_module_has_a_name_that_says_nothing() -> None:
 
 def test_each_word_is_defined_once_and_used() -> None:
     words = [word.removesuffix(" (phi)") for word, _ in rows(WORDS)]
-    assert len(words) > 50
-    assert len(words) == len(set(words))
+    assert len(words) > 50 and len(words) == len(set(words))
     avoided = [word for word, _ in rows(AVOIDED)]
     assert avoided == sorted(set(avoided))
     pages = [path for path in ROOT.glob("docs/*/*.md")]

@@ -33,8 +33,7 @@ def test_help_loads_none_of_the_large_packages() -> None:
 def test_the_package_runs_as_a_module_does(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "astra_data", "inspect", str(tmp_path / "none")]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -89,8 +88,7 @@ def test_a_mistake_in_names_is_told_with_what_comes_close(
 ) -> None:
     monkeypatch.chdir(place)
     found = CliRunner().invoke(cli.app, arguments)
-    assert found.exit_code == 1 and told in str(found.exception)
-    assert not (place / "runs/small").exists()
+    assert found.exit_code == 1 and told in str(found.exception) and not (place / "runs/small").exists()
 
 
 @pytest.fixture(scope="module")
@@ -196,5 +194,4 @@ def test_waiting_for_the_disk_can_be_left_out(tmp_path: Path, monkeypatch: pytes
     for options, is_synced in (([], True), (["--no-fsync"], False)):
         synced.clear()
         arguments = ["subset", source, "--percent", "100", "--out", str(tmp_path / f"set_{is_synced}")]
-        assert CliRunner().invoke(cli.app, [*options, *arguments]).exit_code == 0
-        assert bool(synced) == is_synced
+        assert CliRunner().invoke(cli.app, [*options, *arguments]).exit_code == 0 and bool(synced) == is_synced

@@ -28,8 +28,7 @@ SMALL = ["--episodes", "2", "--max-steps", "3"]
 def test_a_dataset_is_collected_and_paired_without_a_recipe(home: Path) -> None:
     collected = call("collect", "antmaze-umaze", *SMALL, "--seed", "3")
     folder = home / "antmaze-umaze-random-seed3/data-1.0.0"
-    assert collected.output.splitlines()[-1] == f"finished: {folder}"
-    assert "target steps/s" in collected.output
+    assert collected.output.splitlines()[-1] == f"finished: {folder}" and "target steps/s" in collected.output
     dataset = Dataset.open(folder)
     assert (len(dataset), dataset.lengths.tolist()) == (2, [3, 3])
     paired = call("pair", "antmaze-umaze-random-seed3", "--simulator", "antmaze-umaze")
@@ -170,8 +169,7 @@ def test_a_task_is_walked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (tmp_path / "wrong.py").write_text(WRONG)
     told = "objective.reward(before, after, goal, failed): expected shape (3,), got (3, 1)"
     result = CliRunner().invoke(app, ["check", "wrong.py:TASK"])
-    assert result.exit_code == 1
-    assert str(result.exception) == f"task wrong.py:TASK: {told}"
+    assert result.exit_code == 1 and str(result.exception) == f"task wrong.py:TASK: {told}"
     (tmp_path / "wrong.toml").write_text('task = "wrong.py:TASK"\nmethods = ["nas"]\nseeds = [0]\n' + SETTINGS)
     result = CliRunner().invoke(app, ["check", "wrong.toml"])
     assert result.exit_code == 1

@@ -34,8 +34,7 @@ def test_every_edit_is_the_next_version_at_home(fake: str, tmp_path: Path) -> No
     assert "(fake@data-1.4.0, 5 episodes, 55 " in output_of(
         "merge", "fake@data-1.3.0", "fake@data-1.4.0", "--out", str(tmp_path / "here")
     )
-    assert open_dataset(tmp_path / "here").verify() == []
-    assert len(versions_at_home("fake")) == 5
+    assert open_dataset(tmp_path / "here").verify() == [] and len(versions_at_home("fake")) == 5
 
 
 def test_an_edit_tells_what_the_name_means_from_now_on(fake: str, tmp_path: Path) -> None:
@@ -66,8 +65,7 @@ def test_episodes_are_those_between_the_bounds_and_of_the_stored_order(fake: str
 
 def test_a_refused_edit_writes_nothing(fake: str) -> None:
     result = call("filter", fake, "--without", "1")
-    assert isinstance(result.exception, BadInputError)
-    assert len(versions_at_home("fake")) == 1
+    assert isinstance(result.exception, BadInputError) and len(versions_at_home("fake")) == 1
 
 
 def test_a_recipe_says_its_sizes_itself() -> None:
@@ -209,10 +207,8 @@ def test_validate_and_repair(
     (root / "meta/stats.json").write_text("{}")
     assert called(monkeypatch, "validate", root) == 1
     told = capsys.readouterr().err
-    assert told.startswith(f"error: {root} has ")
-    assert "meta/tasks.parquet is missing" in told
-    assert "meta/stats.json was altered" in told
-    assert told.endswith(f"astra-data repair {root} --out DIR\n")
+    assert told.startswith(f"error: {root} has ") and "meta/tasks.parquet is missing" in told
+    assert "meta/stats.json was altered" in told and told.endswith(f"astra-data repair {root} --out DIR\n")
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 0
     assert "finished: " in capsys.readouterr().out
     assert called(monkeypatch, "repair", root, "--out", tmp_path / "saved") == 1

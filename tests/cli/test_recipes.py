@@ -145,8 +145,7 @@ def test_ctrl_c_says_how_to_go_on(recipe: Path, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr("astra_data.pipeline.run.record_code", interrupted)
     result = CliRunner().invoke(cli.app, ["run", str(recipe), "--root", str(recipe.parent)])
-    assert result.exit_code == 130
-    assert "run the same command again" in result.output
+    assert result.exit_code == 130 and "run the same command again" in result.output
 
 
 def test_options_that_a_recipe_sets_itself_are_refused() -> None:

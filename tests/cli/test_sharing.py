@@ -24,10 +24,8 @@ def test_options_override_the_mapping(tmp_path: Path, monkeypatch: pytest.Monkey
     result = CliRunner().invoke(cli.app, [*arguments, "--name", "renamed", "--fps", "5", "--task", "run"])
     assert result.exit_code == 0, result.output
     dataset = Dataset.open(tmp_path / "home/renamed/data-1.0.0")
-    assert "3 episodes, 18 frames from 20 rows" in result.output
-    assert "split points: field 2" in result.output
-    assert dataset.info["fps"] == 5
-    assert dataset.description["stage"] == "import"
+    assert "3 episodes, 18 frames from 20 rows" in result.output and "split points: field 2" in result.output
+    assert dataset.info["fps"] == 5 and dataset.description["stage"] == "import"
     assert dataset.description["config"]["recordings"][0]["name"] == "log.data"
 
 

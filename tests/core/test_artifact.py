@@ -166,8 +166,7 @@ def test_a_manifest_holds_sizes_and_sums_by_which_damage_is_found(tmp_path: Path
         "made_from": {"dataset": "d1"},
     }
     manifest = read_manifest(tmp_path)
-    assert manifest is not None
-    assert manifest.faults(tmp_path, verify=True) == manifest.foreign(tmp_path) == []
+    assert manifest is not None and manifest.faults(tmp_path, verify=True) == manifest.foreign(tmp_path) == []
     (tmp_path / "weights").write_bytes(b"abd")
     assert manifest.faults(tmp_path, verify=False) == []
     assert manifest.faults(tmp_path, verify=True) == ["weights was altered"]

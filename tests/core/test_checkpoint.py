@@ -27,13 +27,11 @@ def assert_same(actual: object, expected: object) -> None:
     if isinstance(expected, Tensor):
         assert torch.equal(torch.as_tensor(actual), expected)
     elif isinstance(expected, Mapping):
-        assert isinstance(actual, Mapping)
-        assert list(actual) == list(expected)
+        assert isinstance(actual, Mapping) and list(actual) == list(expected)
         for key in expected:
             assert_same(actual[key], expected[key])
     elif isinstance(expected, list | tuple):
-        assert isinstance(actual, list | tuple)
-        assert len(actual) == len(expected)
+        assert isinstance(actual, list | tuple) and len(actual) == len(expected)
         for one, other in zip(actual, expected, strict=True):
             assert_same(one, other)
     else:
@@ -154,11 +152,9 @@ def test_it_goes_on_with_points_time_and_state(tmp_path: Path) -> None:
     first.keep(state)
     states: list[dict[str, Any]] = []
     second = Logbook(checkpoint, states.append)
-    assert second.points == [{"steps": 3, "loss": None}]
-    assert second.stopwatch.seconds > 0.01
+    assert second.points == [{"steps": 3, "loss": None}] and second.stopwatch.seconds > 0.01
     (read,) = states
-    assert torch.equal(read.pop("weight"), torch.arange(3.0))
-    assert read == {"rates": [0.1, 0.2], "done": 7}
+    assert torch.equal(read.pop("weight"), torch.arange(3.0)) and read == {"rates": [0.1, 0.2], "done": 7}
 
 
 def test_a_checkpoint_is_due_a_while_after_the_last(monkeypatch: pytest.MonkeyPatch) -> None:

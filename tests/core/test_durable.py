@@ -191,8 +191,7 @@ def test_only_faults_of_what_is_written_are_blamed_on_it(name: str, is_ours: boo
 def test_other_errors_pass(error: Exception) -> None:
     with pytest.raises(type(error)) as caught, writing(Path("a/set")):
         raise error
-    assert caught.value is error
-    assert disk_error(error) is None
+    assert caught.value is error and disk_error(error) is None
 
 
 def test_a_run_is_alone_in_its_folder_or_told_what_to_do(tmp_path: Path) -> None:
@@ -258,8 +257,7 @@ def test_nothing_is_overwritten(tmp_path: Path, writing: Callable[[Path], Abstra
 
     with writing(target) as path:
         write(path, "first")
-        assert path.relative_to(tmp_path).parts[0].startswith(".set.tmp-")
-        assert not target.exists()
+        assert path.relative_to(tmp_path).parts[0].startswith(".set.tmp-") and not target.exists()
     with pytest.raises(BadInputError, match="exists already"), writing(target):
         raise AssertionError("refused before anything is written")
     other = tmp_path / "other"

@@ -39,8 +39,7 @@ def test_as_many_as_are_shown_are_all_named() -> None:
 
 def test_a_long_text_is_cut_and_says_so() -> None:
     """One that fits stays as it is."""
-    assert shortened("grounding", 9) == "grounding"
-    assert shortened("grounding", 8) == "groundin…"
+    assert shortened("grounding", 9) == "grounding" and shortened("grounding", 8) == "groundin…"
 
 
 def test_no_name_controls_a_terminal() -> None:
@@ -58,5 +57,4 @@ def test_no_name_is_more_than_words_in_markdown() -> None:
     """Neither tag nor heading, link or code."""
     text = "run\n# fast <script>alert(1)</script> [a](b) `c` x_1"
     shown = r"run # fast &lt;script&gt;alert(1)&lt;/script&gt; \[a\](b) \`c\` x_1"
-    assert in_markdown(text) == shown
-    assert in_code("a`b\n```c") == "`a'b " + 3 * "'" + "c`"
+    assert in_markdown(text) == shown and in_code("a`b\n```c") == "`a'b " + 3 * "'" + "c`"

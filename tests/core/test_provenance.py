@@ -45,8 +45,7 @@ def test_the_commit_is_the_one_that_the_process_began_with(checkout: Path, chang
 
 def test_a_gpu_is_named_where_the_networks_are_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU {device}")
-    assert origin("cuda:1")["machine"]["gpu"] == "GPU cuda:1"
-    assert origin()["machine"]["gpu"] is None
+    assert origin("cuda:1")["machine"]["gpu"] == "GPU cuda:1" and origin()["machine"]["gpu"] is None
     assert origin()["machine"]["cores"] >= 1
 
 

@@ -10,8 +10,7 @@ def test_streams_are_the_same_on_every_machine() -> None:
 
 def test_seeds_and_purposes_give_different_streams() -> None:
     seeds = {derive(seed, purpose) for seed in range(100) for purpose in ("a", "b", "1", "11")}
-    assert len(seeds) == 400
-    assert all(0 <= seed < 2**63 for seed in seeds)
+    assert len(seeds) == 400 and all(0 <= seed < 2**63 for seed in seeds)
 
 
 def test_streams_of_two_purposes_are_uncorrelated() -> None:

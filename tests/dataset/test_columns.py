@@ -43,8 +43,7 @@ def test_an_episode_makes_its_columns_contiguous_and_its_metadata_plain() -> Non
     batch = np.zeros((5, 8, 3), np.float32)
     metadata: dict[str, Any] = {"success": np.bool_(True), "return": np.float32(0.5)}
     episode = Episode(0, {STATE: batch[:, 2]}, metadata)
-    assert episode.columns[STATE].flags.c_contiguous
-    assert episode.metadata == {"success": True, "return": 0.5}
+    assert episode.columns[STATE].flags.c_contiguous and episode.metadata == {"success": True, "return": 0.5}
     assert {type(value) for value in episode.metadata.values()} == {bool, float}
 
 
@@ -129,11 +128,8 @@ def test_a_block_ends_with_the_episode_that_fills_it() -> None:
 def test_a_uid_that_is_taken_is_replaced_by_one_that_is_free_and_fits_a_column() -> None:
     """It is 64 bits with a sign, and depends on where the episode comes from."""
     new = new_uid(7, b"origin", {7})
-    assert new != 7
-    assert 0 <= new < 2**63
-    assert new == new_uid(7, b"origin", {7})
-    assert new != new_uid(7, b"another", {7})
-    assert new_uid(7, b"origin", {7, new}) not in {7, new}
+    assert new != 7 and 0 <= new < 2**63 and new == new_uid(7, b"origin", {7})
+    assert new != new_uid(7, b"another", {7}) and new_uid(7, b"origin", {7, new}) not in {7, new}
 
 
 def test_metadata_name_the_episodes_by_their_new_uids() -> None:

@@ -31,9 +31,7 @@ PARENT = {"name": "raw", "version": "1.0.0", "hash": "0"}
 
 def test_a_description_is_completed_with_defaults_packages_and_the_machine() -> None:
     full = complete_description({"name": "walks", "stage": "pair", "parents": [PARENT], "config": {"a": (1, 2)}})
-    assert full["version"] == "1.0.0"
-    assert full["parents"] == [PARENT]
-    assert full["config"] == {"a": [1, 2]}
+    assert full["version"] == "1.0.0" and full["parents"] == [PARENT] and full["config"] == {"a": [1, 2]}
     assert full["packages"]["numpy"] == np.__version__
     assert full["machine"]["cores"] == len(os.sched_getaffinity(0))
     assert full["seeds"] == full["environment"] == full["simulator"] == {}
@@ -81,8 +79,7 @@ def test_changed_values_are_found_at_any_depth() -> None:
 
 def test_a_permutation_does_not_depend_on_the_other_uids() -> None:
     order = permutation(range(100), seed=3)
-    assert sorted(order) == list(range(100))
-    assert order != permutation(range(100), seed=4)
+    assert sorted(order) == list(range(100)) and order != permutation(range(100), seed=4)
     assert permutation(range(0, 100, 3), seed=3) == [uid for uid in order if uid % 3 == 0]
     # Uniform: over many seeds each uid comes first about equally often.
     first = [permutation(range(4), seed)[0] for seed in range(1000)]

@@ -46,11 +46,9 @@ def test_subsets_are_nested_and_described(forty: Dataset, tmp_path: Path) -> Non
     for folder in folders:
         assert_taken_over(forty, folder)
     made = Dataset.open(folders[0])
-    assert made.reference == "fake@data-1.1.0"
-    assert made.description["stage"] == "subset"
+    assert made.reference == "fake@data-1.1.0" and made.description["stage"] == "subset"
     assert made.description["config"] == {"episodes": 10, "percent": 25, "of": None, "seed": 3}
-    assert made.description["parents"] == [forty.identity]
-    assert made.subset_seed == 3
+    assert made.description["parents"] == [forty.identity] and made.subset_seed == 3
 
 
 def test_a_subset_of_a_subset_is_the_subset(forty: Dataset, tmp_path: Path) -> None:
@@ -141,8 +139,7 @@ def test_filters_that_cannot_work_are_refused(forty: Dataset, tmp_path: Path) ->
 def test_merge_puts_one_after_the_other(tmp_path: Path) -> None:
     parts = [write(tmp_path / f"{first}", range(first, first + 5)) for first in (10, 0, 5)]
     made = Dataset.open(merge(parts, out=tmp_path / "all"))
-    assert made.verify() == []
-    assert made.uids.tolist() == [*range(10, 15), *range(5), *range(5, 10)]
+    assert made.verify() == [] and made.uids.tolist() == [*range(10, 15), *range(5), *range(5, 10)]
     assert made.description["parents"] == [part.identity for part in parts]
     for found, part in zip(made.episodes(), itertools.chain(*(part.episodes() for part in parts)), strict=True):
         assert found.metadata == part.metadata
@@ -154,8 +151,7 @@ def test_repeated_uids_are_refused_or_replaced(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"1 episodes have the uid .*\(4\).*--new-uids"):
         merge([a, b], out=tmp_path / "all")
     made = Dataset.open(merge([a, b, b], new_uids=True, out=tmp_path / "all"))
-    assert made.uids[:5].tolist() == [0, 1, 2, 3, 4]
-    assert len(set(made.uids.tolist())) == 11
+    assert made.uids[:5].tolist() == [0, 1, 2, 3, 4] and len(set(made.uids.tolist())) == 11
     assert made.metadata["merged_uid"][:6] == [None] * 5 + [4]
     again = Dataset.open(merge([a, b, b], new_uids=True, out=tmp_path / "again"))
     assert again.content_hash == made.content_hash

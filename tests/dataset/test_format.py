@@ -25,8 +25,7 @@ def test_constants_are_lerobots(lerobot: SimpleNamespace) -> None:
     assert parquet.FILE_SIZE_LIMIT == files.DEFAULT_DATA_FILE_SIZE_IN_MB * 1024**2
     assert layout.VIDEO_FILE_SIZE_MB == files.DEFAULT_VIDEO_FILE_SIZE_IN_MB
     assert (layout.INFO_PATH, layout.STATS_PATH) == (files.INFO_PATH, files.STATS_PATH)
-    assert layout.TASKS_PATH == files.DEFAULT_TASKS_PATH
-    assert layout.EPISODES_PATH == files.DEFAULT_EPISODES_PATH
+    assert layout.TASKS_PATH == files.DEFAULT_TASKS_PATH and layout.EPISODES_PATH == files.DEFAULT_EPISODES_PATH
     assert layout.DATA_PATH == files.DEFAULT_DATA_PATH
     assert list(layout.QUANTILES) == lerobot.package.DEFAULT_QUANTILES
     defaults = {c.name: c.feature() | {"shape": (c.size,)} for c in layout.DEFAULT_COLUMNS}
@@ -58,8 +57,7 @@ def test_the_arrow_schema_is_lerobots(lerobot: SimpleNamespace) -> None:
 
 def test_info_has_lerobots_fields(lerobot: SimpleNamespace, fake: Dataset) -> None:
     info = lerobot.files.DatasetInfo.from_dict(json.loads((fake.root / "meta/info.json").read_text()))
-    assert info.to_dict() == fake.info
-    assert set(asdict(info)) - set(fake.info) == {"tools"}
+    assert info.to_dict() == fake.info and set(asdict(info)) - set(fake.info) == {"tools"}
 
 
 def test_the_tasks_table_is_a_pandas_frame_with_the_task_as_index() -> None:
@@ -95,8 +93,7 @@ def test_files_equal_those_that_lerobot_writes(fake: Dataset, reference: Path) -
         assert ours.schema.remove_metadata().equals(theirs.schema.remove_metadata().empty_table().schema)
         assert strip(ours.to_pylist()) == strip(theirs.to_pylist())
     theirs, ours = (pq.read_table(root / "meta/tasks.parquet").to_pandas() for root in (reference, fake.root))
-    assert ours.equals(theirs)
-    assert ours.index.name == theirs.index.name == "task"
+    assert ours.equals(theirs) and ours.index.name == theirs.index.name == "task"
 
 
 def test_statistics_agree_with_lerobots_where_its_own_are_exact(fake: Dataset, reference: Path) -> None:

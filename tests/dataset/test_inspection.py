@@ -53,14 +53,12 @@ def test_the_map_counts_every_position_where_it_was(inspection: Inspection) -> N
         np.linspace(left, right, places.counts.shape[1] + 1),
     ]
     theirs, _, _ = np.histogram2d(points[:, 1], points[:, 0], edges)
-    assert np.abs(places.counts - theirs).sum() <= 4
-    assert places.counts.sum() == sum(LENGTHS)
+    assert np.abs(places.counts - theirs).sum() <= 4 and places.counts.sum() == sum(LENGTHS)
     assert inspection.velocities is None  # no column has that role
 
 
 def test_episodes_are_summed_up(inspection: Inspection) -> None:
-    assert inspection.lengths.tolist() == list(LENGTHS)
-    assert inspection.success == 2
+    assert inspection.lengths.tolist() == list(LENGTHS) and inspection.success == 2
     assert (inspection.reference, inspection.fps) == ("fake@data-1.0.0", 20)
 
 
@@ -73,8 +71,7 @@ def test_a_robot_that_never_moved_has_a_map_of_one_cell(tmp_path: Path) -> None:
             episode.columns[STATE][:] = 1.5
             writer.add(episode)
     places = inspect_dataset(Dataset.open(root)).positions
-    assert places is not None
-    assert places.counts.tolist() == [[sum(LENGTHS)]]
+    assert places is not None and places.counts.tolist() == [[sum(LENGTHS)]]
 
 
 def test_only_a_terminated_last_step_that_stands_still_was_made_up(tmp_path: Path) -> None:

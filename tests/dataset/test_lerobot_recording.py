@@ -86,8 +86,7 @@ def arm(recorded: Path) -> Dataset:
 
 
 def test_next_states_are_those_of_the_following_rows(arm: Dataset) -> None:
-    assert arm.uids.tolist() == list(KEPT)
-    assert arm.lengths.tolist() == [5, 8, 3]
+    assert arm.uids.tolist() == list(KEPT) and arm.lengths.tolist() == [5, 8, 3]
     for number, episode in zip(KEPT, arm.episodes(), strict=True):
         expected = values("arm", number)
         np.testing.assert_array_equal(episode.columns[STATE], expected[STATE][:-1])
@@ -113,13 +112,10 @@ def test_what_is_left_out_is_said_in_one_line(recorded: Path, caplog: pytest.Log
     [line] = caplog.messages
     assert "the last row of each episode, 4 of 20 rows; 1 of them in episodes of a single row" in line
     assert line.endswith("left out, because they are not lists of numbers: observation.images.top")
-    assert "\n" not in line
-    assert caplog.records[0].levelno == logging.WARNING
-    assert "succeeded" not in line
+    assert "\n" not in line and caplog.records[0].levelno == logging.WARNING and "succeeded" not in line
     reward = sum(float(values("arm", number)[REWARD][-1]) for number in range(4))
     assert f"with the last rows a reward of {reward:g} in sum is left out" in line
-    assert line.count(" here, recorded as ") == 1
-    assert "; force is float32 here, recorded as float64; " in line
+    assert line.count(" here, recorded as ") == 1 and "; force is float32 here, recorded as float64; " in line
 
 
 def test_steps_that_float32_rounds_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -190,8 +186,7 @@ def test_a_dataset_of_ours_without_its_metadata_keeps_uids_and_next_states(tmp_p
     shutil.copytree(ours.root, tmp_path / "bare")
     shutil.rmtree(tmp_path / "bare/meta/astra")
     bare = Dataset.open(tmp_path / "bare")
-    assert bare.uids.tolist() == ours.uids.tolist()
-    assert bare.content_hash == ours.content_hash
+    assert bare.uids.tolist() == ours.uids.tolist() and bare.content_hash == ours.content_hash
 
 
 def merged_episodes(recorded: Path) -> list[dict[str, Array]]:
@@ -207,8 +202,7 @@ def test_a_merge_of_lerobot_keeps_every_episode_under_new_uids(recorded: Path, t
     assert "1 episodes have new uids, because theirs were taken" in result.output
     saved = Dataset.open(tmp_path / "set")
     uids = saved.uids.tolist()
-    assert uids[:5] + uids[6:] == [*sources[0].uids.tolist(), 7]
-    assert len(set(uids)) == 7
+    assert uids[:5] + uids[6:] == [*sources[0].uids.tolist(), 7] and len(set(uids)) == 7
     for found, expected in zip(saved.episodes(), merged_episodes(recorded), strict=True):
         for name, array in expected.items():
             np.testing.assert_array_equal(found.columns[name], array, err_msg=name)

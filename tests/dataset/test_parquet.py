@@ -27,8 +27,7 @@ def test_values_go_to_arrow_and_back(values: Array, kind: pa.DataType) -> None:
     chunks = pa.chunked_array([column[:1], column[1:]])
     size = values.shape[1] if values.ndim > 1 else 1
     back = to_numpy(chunks, size, values.dtype.name)
-    assert back.dtype == values.dtype
-    assert back.flags.c_contiguous
+    assert back.dtype == values.dtype and back.flags.c_contiguous
     np.testing.assert_array_equal(back, values)
 
 

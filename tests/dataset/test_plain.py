@@ -37,13 +37,10 @@ def test_only_rows_of_numbers_are_plain_columns() -> None:
 
 def test_a_column_fits_lists_with_and_without_their_size() -> None:
     column = PlainColumn("state", "float32", 3)
-    assert column.fits(pa.list_(pa.float32(), 3))
-    assert column.fits(pa.list_(pa.float32()))
-    assert not column.fits(pa.list_(pa.float32(), 2))
-    assert not column.fits(pa.list_(pa.float64()))
+    assert column.fits(pa.list_(pa.float32(), 3)) and column.fits(pa.list_(pa.float32()))
+    assert not column.fits(pa.list_(pa.float32(), 2)) and not column.fits(pa.list_(pa.float64()))
     single = PlainColumn("reward", "float32", 1)
-    assert single.fits(pa.float32())
-    assert not single.fits(pa.list_(pa.float32()))
+    assert single.fits(pa.float32()) and not single.fits(pa.list_(pa.float32()))
 
 
 @pytest.mark.parametrize(
@@ -125,8 +122,7 @@ def test_wrong_values_of_a_run_are_found(name: str, at: int | tuple[int, int], v
     values = a_run().columns[name].copy()
     values[at] = value
     [(column, fault)] = run_faults(a_run(**{name: values}), number=3, row=20, fps=10)
-    assert column == name
-    assert sentence in fault
+    assert column == name and sentence in fault
 
 
 @pytest.mark.parametrize(
@@ -148,5 +144,4 @@ def test_flags_end_the_last_step_only_and_agree(
     found = list(flag_faults(run.columns, "episode 3 "))
     assert len(found) == len(faults)
     for sentence, (name, part) in zip(found, faults, strict=True):
-        assert sentence.startswith(f"next.{name} is ")
-        assert part in sentence
+        assert sentence.startswith(f"next.{name} is ") and part in sentence

@@ -24,8 +24,7 @@ def test_columns_come_back_whole(fake: Dataset, monkeypatch: pytest.MonkeyPatch,
     columns = fake.columns([column.name for column in COLUMNS])
     for name, values in columns.items():
         expected = concatenated(name)
-        assert values.dtype == expected.dtype
-        assert values.flags.c_contiguous
+        assert values.dtype == expected.dtype and values.flags.c_contiguous
         np.testing.assert_array_equal(values, expected)
 
 
@@ -65,8 +64,7 @@ def test_what_the_writer_was_told_comes_back(fake: Dataset) -> None:
     assert fake.uids.tolist() == [13, 4, 2**53 + 1, 6, 0]
     assert fake.metadata["success"] == [True, False, True, False, False]
     assert fake.metadata["source_episode"] == [None, None, 2**53, 5, -1]
-    assert fake.description["config"] == {"episodes": 5, "noise_m": 0.1}
-    assert fake.info["fps"] == 20
+    assert fake.description["config"] == {"episodes": 5, "noise_m": 0.1} and fake.info["fps"] == 20
     assert fake.reference == "fake@data-1.0.0"
     assert repr(fake).startswith("Dataset(fake@data-1.0.0, 5 episodes, 55 steps, observation.state (3) float32")
 
@@ -183,8 +181,7 @@ def test_a_folder_of_logs_is_no_dataset_yet(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 def test_the_rows_are_those_of_lerobots_object(fake: Dataset, lerobot: SimpleNamespace) -> None:
     rows, opened = fake.to_huggingface(), fake.to_lerobot()
-    assert isinstance(rows, datasets.Dataset)
-    assert isinstance(opened, lerobot.dataset.LeRobotDataset)
+    assert isinstance(rows, datasets.Dataset) and isinstance(opened, lerobot.dataset.LeRobotDataset)
     assert rows.features == opened.hf_dataset.features
     assert rows.with_format("arrow")[:].equals(opened.hf_dataset.with_format("arrow")[:])
     for name, values in fake.columns(list(rows.features)).items():

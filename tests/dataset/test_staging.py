@@ -164,8 +164,7 @@ def test_a_kill_in_any_operation_never_mixes_two_recordings(tmp_path: Path) -> N
                 write_episodes(root, episodes)
         else:
             write_episodes(root, episodes)
-        assert contents(root) == whole
-        assert leftovers(root.parent) == []
+        assert contents(root) == whole and leftovers(root.parent) == []
 
         try:
             write_episodes(without, others, description=other)
@@ -174,8 +173,7 @@ def test_a_kill_in_any_operation_never_mixes_two_recordings(tmp_path: Path) -> N
             assert not without.exists()
             shutil.rmtree(without.with_name(".set.staged"))
             write_episodes(without, others, description=other)
-        assert contents(without) == second
-        assert leftovers(without.parent) == []
+        assert contents(without) == second and leftovers(without.parent) == []
         if len(calls) <= at:
             break
     assert at > 15
@@ -212,8 +210,7 @@ def test_on_a_full_disk_the_episodes_are_safe_and_the_recording_goes_on(tmp_path
         with small_files(20_000), pytest.raises(DiskError):
             writer.add(long)
         writer.add(long)
-    assert Dataset.open(tmp_path / "set").uids.tolist() == [episodes[0].uid, 99]
-    assert leftovers(tmp_path) == []
+    assert Dataset.open(tmp_path / "set").uids.tolist() == [episodes[0].uid, 99] and leftovers(tmp_path) == []
 
 
 @pytest.mark.usefixtures("fsync")
@@ -228,8 +225,7 @@ def test_a_disk_that_fails_at_any_operation_loses_no_episode(tmp_path: Path, mon
             try:
                 write_episodes(root, episodes)
             except AstraDataError as error:
-                assert isinstance(error, DiskError)
-                assert f"{root.parent}" in str(error)
+                assert isinstance(error, DiskError) and f"{root.parent}" in str(error)
         if not root.exists():
             write_episodes(root, episodes)
         assert contents(root) == whole

@@ -37,8 +37,7 @@ def test_versions_order_as_numbers() -> None:
 def test_the_next_version_is_free() -> None:
     taken = versions("1.2.3", "1.4.0", "1.2.7", "3.1.0")
     version = Version.parse("1.2.3")
-    assert str(version.next("columns", taken)) == "4.0.0"
-    assert str(version.next("episodes", taken)) == "1.5.0"
+    assert str(version.next("columns", taken)) == "4.0.0" and str(version.next("episodes", taken)) == "1.5.0"
     assert str(version.next("description", taken)) == "1.2.8"
 
 
@@ -69,8 +68,7 @@ def test_a_missing_dataset_is_refused(home: Path, name: str, fault: str) -> None
 def test_a_successor_names_its_parent_and_its_place(home: Path, tmp_path: Path) -> None:
     source = write_fake(tmp_path / "first")
     description, folder = successor(source.description, "episodes", stage="subset", config={"count": 2})
-    assert description["version"] == "1.1.0"
-    assert description["parents"] == [source.identity]
+    assert description["version"] == "1.1.0" and description["parents"] == [source.identity]
     assert folder == home_of(description) == home / source.description["name"] / "data-1.1.0"
     folder.mkdir(parents=True)
     assert successor(source.description, "episodes", stage="subset", config={})[0]["version"] == "1.2.0"
@@ -90,8 +88,7 @@ def test_the_next_version_has_the_columns_of_its_source_and_more(tmp_path: Path)
             phase = np.zeros(len(episode), np.float32)
             writer.add(replace(episode, columns={**episode.columns, "phase": phase}))
     written = open_dataset(writer.root)
-    assert written.root == tmp_path / "next"
-    assert written.schema == [*source.schema, *more]
+    assert written.root == tmp_path / "next" and written.schema == [*source.schema, *more]
     assert (written.task, written.info["fps"]) == (source.task, source.info["fps"])
     assert (written.subset_seed, source.subset_seed) == (3, 0)
     assert written.description["parents"] == [source.identity, other.identity]

@@ -70,8 +70,7 @@ def test_one_row_group_per_episode_in_encodings_that_suit_the_values(tmp_path: P
     chunks = [metadata.row_group(0).column(index) for index in range(metadata.num_columns)]
     encodings = {chunk.path_in_schema: chunk.encodings for chunk in chunks}
     assert "BYTE_STREAM_SPLIT" in encodings["observation.state.list.element"]
-    assert "BYTE_STREAM_SPLIT" in encodings["next.reward"]
-    assert "DELTA_BINARY_PACKED" in encodings["mode"]
+    assert "BYTE_STREAM_SPLIT" in encodings["next.reward"] and "DELTA_BINARY_PACKED" in encodings["mode"]
     assert {chunk.compression for chunk in chunks} == {"SNAPPY"}
 
 
@@ -83,8 +82,7 @@ def test_files_rotate_when_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     split = write_fake(tmp_path / "split")
     names = [str(path.relative_to(split.root)) for path in split.paths]
     assert names[:3] == [f"data/chunk-{at}.parquet" for at in ("000/file-000", "000/file-001", "001/file-000")]
-    assert len(list((split.root / "meta/episodes").glob("*/*.parquet"))) == 3
-    assert split.verify() == []
+    assert len(list((split.root / "meta/episodes").glob("*/*.parquet"))) == 3 and split.verify() == []
     assert split.content_hash == whole.content_hash
     for name in whole.features:
         np.testing.assert_array_equal(whole.columns([name])[name], split.columns([name])[name])
@@ -95,8 +93,7 @@ def test_a_kill_leaves_nothing_and_the_next_run_succeeds(tmp_path: Path, moment:
     root = tmp_path / "set"
     assert forked(partial(write_and_be_killed, root, moment)) == -signal.SIGKILL
     [left] = tmp_path.iterdir()
-    assert left.name.startswith(".set.tmp-")
-    assert write_fake(root).verify() == []
+    assert left.name.startswith(".set.tmp-") and write_fake(root).verify() == []
     assert list(tmp_path.iterdir()) == [root]
 
 
@@ -218,7 +215,6 @@ def test_metadata_that_no_file_can_hold_is_refused_when_it_is_added(
     with writer(tmp_path / "set") as open_writer:
         with pytest.raises(BadInputError, match=fault) as caught:
             open_writer.add(Episode(1, fake_columns(4, seed=1), {key: value}))
-        assert "\n" not in str(caught.value)
-        assert len(str(caught.value)) < 200
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 200
         open_writer.add(Episode(1, fake_columns(4, seed=1), {"log": "x" * 2**20, "serial": 2**63 - 1}))
     assert Dataset.open(tmp_path / "set").metadata["serial"] == [2**63 - 1]

@@ -57,13 +57,11 @@ def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) 
     about = json.loads((folder / "policy.json").read_text())
     task = TASKS["antmaze-umaze"]
     assert about["rate_hz"] == 20 and about["row"] == "nas" and about["encoder"] == "source"
-    assert tuple(about["state"]["names"]) == task.state.names
-    assert len(about["state"]["units"]) == 29
+    assert tuple(about["state"]["names"]) == task.state.names and len(about["state"]["units"]) == 29
     assert len(about["goal"]["names"]) == 2
     assert about["command"]["least"] == [-1, -1] and about["command"]["largest"] == [1, 1]
     assert about["hidden"]["size"] == sum(about["hidden"]["parts"].values()) == 2 + 2 + 16
-    assert len(about["trained_on"]["hash"]) == 64
-    assert about["largest_difference"] < 1e-6
+    assert len(about["trained_on"]["hash"]) == 64 and about["largest_difference"] < 1e-6
     manifest = read_manifest(folder)
     assert manifest is not None and manifest.faults(folder, verify=True) == []
     assert manifest.made_from == about["made_from"] and set(about["made_from"]) == {"train", "ground"}
@@ -71,8 +69,7 @@ def test_the_folder_tells_all_that_is_needed_to_run_it(folder: Path, run: Path) 
     ends = [about["state"][f"recorded_{end}"] for end in ("least", "largest")]
     np.testing.assert_array_equal(ends, [states.min(0), states.max(0)])
     page = " ".join((folder / "README.md").read_text().split())
-    assert "20 times a second" in page and "{" not in page
-    assert str(run.parent) not in page + json.dumps(about)
+    assert "20 times a second" in page and "{" not in page and str(run.parent) not in page + json.dumps(about)
 
 
 def test_its_page_runs(folder: Path) -> None:

@@ -154,13 +154,11 @@ def test_it_drives_by_odometry_and_stops_without(ros: Ros, folder: Path) -> None
     policy = ros.node.policy
     imported = tomllib.loads((EXAMPLE.parents[2] / "imports/ros2_base.toml").read_text())
     assert [*policy.names[0]] == imported["columns"]["observation.state"]["names"]
-    assert policy.names[1] == ["gx", "gy"]
-    assert ros.rate_hz == pytest.approx(10.0)
+    assert policy.names[1] == ["gx", "gy"] and ros.rate_hz == pytest.approx(10.0)
     driven = [(0.1, -0.5), (0.2, -0.5), (0.0, 0.0), (0.0, 0.0), (pytest.approx(0.3), -0.5)]
     assert ros.sent == [(0.0, 0.0), *driven, (0.0, 0.0)]  # a stop comes last
     assert policy.begun == 2 and ros.warned == ["no odometry for 0.2 s: the robot is stopped"]
-    assert policy.acted[0] == ((1.0, 2.0, 0.6, 0.8, 0.3, 0.4), [3.0, -1.0])
-    assert policy.acted[2][0][0] == 1.5
+    assert policy.acted[0] == ((1.0, 2.0, 0.6, 0.8, 0.3, 0.4), [3.0, -1.0]) and policy.acted[2][0][0] == 1.5
     assert not ros.is_up
 
 

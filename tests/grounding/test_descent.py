@@ -65,11 +65,9 @@ def test_from_a_checkpoint_it_goes_on_to_the_bit(tmp_path: Path) -> None:
     first.keep(loss=0.25, nothing=None)
     second = Descent(resumed, CONFIG, checkpoint=checkpoint)
     assert (second.done, second.share, second.is_over) == (15, 15 / 40, False)
-    assert second.points == [{"step": 15, "loss": 0.25, "nothing": None}]
-    assert second.stopwatch.seconds > 0
+    assert second.points == [{"step": 15, "loss": 0.25, "nothing": None}] and second.stopwatch.seconds > 0
     fit(resumed, second)
-    assert second.is_over
-    assert torch.equal(resumed.weight, whole.weight)
+    assert second.is_over and torch.equal(resumed.weight, whole.weight)
 
 
 @pytest.mark.parametrize("stopped", [None, 4, 8, 12])
@@ -95,8 +93,7 @@ def test_it_waits_for_a_lower_error_and_returns_to_the_lowest(
         if descent.done == stopped:
             one = nn.Linear(3, 2)
             descent = Descent(one, CONFIG, checkpoint=checkpoint)
-    assert (descent.best, descent.done) == (best, last)
-    assert not torch.equal(one.weight, seen[best])
+    assert (descent.best, descent.done) == (best, last) and not torch.equal(one.weight, seen[best])
     descent.finish()
     assert torch.equal(one.weight, seen[best])
 

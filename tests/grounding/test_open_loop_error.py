@@ -42,8 +42,7 @@ def untrained() -> HistoryGrounding:
 
 def test_a_perfect_simulator_has_no_gap() -> None:
     report = gap_report(TASK, untrained(), episodes(speed=1.0), seed=0)
-    assert report["horizons"] == [1, 10, 50]
-    assert report["replays"] == 3 + 3 + 2
+    assert report["horizons"] == [1, 10, 50] and report["replays"] == 3 + 3 + 2
     for kind in ("raw", "grounded"):
         for quantity in ("position_m", "velocity_m_s"):
             for figure in ("mean", "low", "high"):
@@ -72,8 +71,7 @@ def test_the_last_real_step_counts_and_the_one_after_does_not() -> None:
     raw = gap_report(TASK, untrained(), cut, seed=0)["raw"]["position_m"]
     # 50 steps fit into the first episode alone: the mean over one replay, which has no interval.
     assert raw["mean"][2] == pytest.approx(0.1 * 0.5 * 50 * TASK.timestep_s, rel=0.01)
-    assert raw["low"][2] is raw["high"][2] is None
-    assert raw["low"][1] < raw["mean"][1] < raw["high"][1]
+    assert raw["low"][2] is raw["high"][2] is None and raw["low"][1] < raw["mean"][1] < raw["high"][1]
 
 
 @pytest.mark.parametrize("horizon", [1, 10, 50])
@@ -94,9 +92,7 @@ def test_intervals_are_percentiles_of_means_over_resampled_episodes() -> None:
     torch.manual_seed(0)
     errors, episode = torch.rand(400, dtype=torch.float64), torch.arange(400)
     mean, low, high = _interval(errors, episode, np.random.default_rng(0))
-    assert low is not None
-    assert high is not None
-    assert mean == pytest.approx(float(errors.mean()))
+    assert low is not None and high is not None and mean == pytest.approx(float(errors.mean()))
     error = float(errors.std()) / 400**0.5
     assert (mean - low, high - mean) == pytest.approx((1.96 * error, 1.96 * error), rel=0.15)
     # What repeats within an episode tells nothing new.

@@ -84,8 +84,7 @@ def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
     episodes = PairedEpisodes.load(write(tmp_path / "pairs", sizes))
     merged = PairedEpisodes.load(write(tmp_path / "made_up", sizes, held_out=(1, 3), made_up=True))
     # The third and the fourth episode, which are terminated, lose their last step; the one of a step is kept.
-    assert episodes.lengths.tolist() == [7, 1, 12, 30, 5]
-    assert merged.lengths.tolist() == [7, 1, 11, 29, 5]
+    assert episodes.lengths.tolist() == [7, 1, 12, 30, 5] and merged.lengths.tolist() == [7, 1, 11, 29, 5]
     assert merged.terminated.nonzero().tolist() == [[2, 10], [3, 28]]
     assert merged.reward[2, :11].tolist() == [*(-label(2, step) for step in range(10)), -621.0]
     assert torch.equal(merged.windows.reward, merged.reward)
@@ -119,13 +118,11 @@ def episodes(root: Path) -> PairedEpisodes:
 
 def test_episodes_are_padded_at_the_end(episodes: PairedEpisodes) -> None:
     windows = episodes.windows
-    assert len(episodes) == 5
-    assert episodes.lengths.tolist() == list(LENGTHS)
+    assert len(episodes) == 5 and episodes.lengths.tolist() == list(LENGTHS)
     for episode, length in enumerate(LENGTHS):
         expected = torch.tensor([label(episode, step) for step in range(length)])
         for values in (episodes.target_state, windows.state, windows.next_state, windows.simulated_next):
-            assert torch.equal(values[episode, :length, 0], expected)
-            assert (values[episode, length:] == 0).all()
+            assert torch.equal(values[episode, :length, 0], expected) and (values[episode, length:] == 0).all()
         assert windows.mask[episode].tolist() == [1.0] * length + [0.0] * (30 - length)
     assert len(episodes.steps(windows.goal)) == sum(LENGTHS)
 
@@ -137,8 +134,7 @@ def test_rewards_are_as_recorded_and_what_ends_an_episode_is_marked(episodes: Pa
         assert torch.equal(windows.reward[episode, :length], expected)
         goes_on = [1.0] * (length - 1) + [0.0 if episode in (2, 3) else 1.0]
         assert windows.goes_on[episode].tolist() == goes_on + [0.0] * (30 - length)
-    assert torch.equal(windows.reward, episodes.reward)
-    assert windows.failed.nonzero().tolist() == [[3, 29]]
+    assert torch.equal(windows.reward, episodes.reward) and windows.failed.nonzero().tolist() == [[3, 29]]
 
 
 def test_only_the_last_second_before_a_bad_end_fails_soon(episodes: PairedEpisodes) -> None:
@@ -159,8 +155,7 @@ def test_a_split_is_by_episodes_and_by_the_seed(episodes: PairedEpisodes) -> Non
 
 def test_a_split_is_as_the_dataset_marks_it(tmp_path: Path) -> None:
     marked = PairedEpisodes.load(write(tmp_path / "marked", SIZES, held_out=(1, 3)))
-    assert marked.held_out is not None
-    assert marked.held_out.tolist() == [False, True, False, True, False]
+    assert marked.held_out is not None and marked.held_out.tolist() == [False, True, False, True, False]
     training, held_out = marked.split(0.9, seed=0)
     assert training.target_state[:, 0, 0].tolist() == [label(episode, 0) for episode in (0, 2, 4)]
     assert held_out.target_state[:, 0, 0].tolist() == [label(episode, 0) for episode in (1, 3)]
@@ -190,8 +185,7 @@ def test_windows_hold_every_step_equally_often(episodes: PairedEpisodes, length:
     count = 20_000
     windows, target_state = episodes.draw_windows(count, length)
     length = min(length, 30)
-    assert windows.mask.shape == (count, length)
-    assert torch.equal(target_state[..., 0], windows.state[..., 0])
+    assert windows.mask.shape == (count, length) and torch.equal(target_state[..., 0], windows.state[..., 0])
     labels = windows.state[..., 0]
     within = labels > 0
     assert within[windows.mask.bool()].all()

@@ -32,8 +32,7 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(every: int) -> None
         goal=goal.unsqueeze(1).expand(COUNT, STEPS, 2),
     ).windows
     hidden = grounding.hidden_before(windows, every)
-    assert hidden is not None
-    assert hidden.shape[:2] == (COUNT, -(-STEPS // every))
+    assert hidden is not None and hidden.shape[:2] == (COUNT, -(-STEPS // every))
     for index, first in enumerate(range(0, STEPS, every)):
         late = grounding.simulator(TASK, COUNT)
         late.start(states[first], rows, goal, hidden=hidden[:, index], previous_action=previous[:, first])

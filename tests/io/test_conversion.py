@@ -29,8 +29,7 @@ def test_take_scale_offset_and_clip_follow_each_other() -> None:
     spec = {"take": (2, 0), "scale": (2.0, 10.0), "offset": (1.0, -1.0), "clip": (-5.0, 20.0)}
     values, finite = convert(spec, [[1, 7, 3], [4, 7, 100], [-9, 7, 0]])
     # (3 · 2 + 1, 1 · 10 - 1), (201 cut to 20, 39 cut to 20), (1, -91 cut to -5)
-    assert values.tolist() == [[7, 9], [20, 20], [1, -5]]
-    assert values.dtype == np.float32
+    assert values.tolist() == [[7, 9], [20, 20], [1, -5]] and values.dtype == np.float32
     assert finite == [True] * 3
 
 
@@ -47,8 +46,7 @@ def test_recorded_next_states_are_described_as_the_states_unless_the_mapping_say
 
 def test_what_is_not_finite_is_not_clipped_but_rejected() -> None:
     values, finite = convert({"clip": (-1.0, 1.0)}, [5.0, NAN, np.inf, -0.5])
-    assert finite == [True, False, False, True]
-    assert values[[0, 3]].tolist() == [1, -0.5]
+    assert finite == [True, False, False, True] and values[[0, 3]].tolist() == [1, -0.5]
 
 
 def test_rows_are_rejected_where_time_or_an_end_is_not_finite() -> None:
@@ -107,16 +105,14 @@ def test_next_states_and_ends_are_derived_where_they_are_left_out() -> None:
     made.convert(Block({"f": np.zeros(2)}, "log"))
     columns = {column.name: column for column in made.columns}
     assert list(columns) == [STATE, NEXT_STATE, TERMINATED, TRUNCATED, DONE]
-    assert columns[NEXT_STATE].names == ("x",)
-    assert columns[NEXT_STATE].astra == {"unit": ["m"]}
+    assert columns[NEXT_STATE].names == ("x",) and columns[NEXT_STATE].astra == {"unit": ["m"]}
     assert columns[NEXT_STATE].meaning == "the state, one step later"
     ending = converter({STATE: {"fields": ("f",)}, TERMINATED: {"fields": ("f",)}}, terminal="stand_still")
     ending.convert(Block({"f": np.zeros(2)}, "log"))
     assert "where an episode terminates" in next(c.meaning for c in ending.columns if c.name == NEXT_STATE)
     whole = converter({STATE: {"fields": ("f",)}, NEXT_STATE: {"fields": ("f",)}})
     whole.convert(Block({"f": np.zeros(2)}, "log"))
-    assert [column.name for column in whole.columns][:2] == [STATE, NEXT_STATE]
-    assert len(whole.columns) == 5
+    assert [column.name for column in whole.columns][:2] == [STATE, NEXT_STATE] and len(whole.columns) == 5
 
 
 def test_values_are_called_as_their_fields_are_unless_the_mapping_says() -> None:

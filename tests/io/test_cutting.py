@@ -38,8 +38,7 @@ def rows(episodes: list[dict[str, Array]]) -> list[list[int]]:
 
 def test_the_next_state_is_the_next_row() -> None:
     (episode,) = cut(cutter(), x=[0.0, 1, 4, 9])
-    assert episode[STATE].tolist() == [0, 1, 4]
-    assert episode[NEXT_STATE].tolist() == [1, 4, 9]
+    assert episode[STATE].tolist() == [0, 1, 4] and episode[NEXT_STATE].tolist() == [1, 4, 9]
     assert episode[ACTION].tolist() == [0, 1, 2]
     assert episode[TRUNCATED].tolist() == episode[DONE].tolist() == [False, False, True]
     assert not episode[TERMINATED].any()
@@ -48,8 +47,7 @@ def test_the_next_state_is_the_next_row() -> None:
 def test_a_flag_ends_an_episode() -> None:
     cutting = cutter(split={"ends": ("end",)})
     episodes = cut(cutting, x=np.zeros(9), end=[0, 0, 0, 1, 0, 0, 1, 1, 0])
-    assert rows(episodes) == [[0, 1, 2], [4, 5]]
-    assert cutting.tally.split_points == {"end": 3}
+    assert rows(episodes) == [[0, 1, 2], [4, 5]] and cutting.tally.split_points == {"end": 3}
     # Row 7 and row 8 are alone: without a next state nothing is left of them.
     assert cutting.tally.last_rows == 4
 
@@ -95,8 +93,7 @@ def test_a_log_that_goes_on_after_the_end_makes_no_episodes_of_it(terminal: str)
     cutting = cutter(columns=columns, terminal=terminal)
     episodes = cut(cutting, x=np.arange(9.0), over=[0, 0, 1, 1, 1, 1, 0, 0, 1])
     wanted = [[0, 1], [6, 7]] if terminal == "drop" else [[0, 1, 2], [6, 7, 8]]
-    assert rows(episodes) == wanted
-    assert [bool(episode[TERMINATED][-1]) for episode in episodes] == [True, True]
+    assert rows(episodes) == wanted and [bool(episode[TERMINATED][-1]) for episode in episodes] == [True, True]
     assert cutting.tally.rows_after_end == 3
 
 
@@ -104,15 +101,13 @@ def test_episodes_of_one_step_with_a_next_state_are_kept() -> None:
     columns = {name: {"fields": (field,)} for name, field in ((STATE, "x"), (NEXT_STATE, "y"), (ACTION, "a"))}
     cutting = cutter(columns=columns | {TERMINATED: {"fields": ("over",)}}, min_steps=1)
     episodes = cut(cutting, x=np.arange(4.0), y=np.arange(4.0) + 1, over=[0, 1, 1, 1])
-    assert rows(episodes) == [[0, 1], [2], [3]]
-    assert cutting.tally.rows_after_end == 0
+    assert rows(episodes) == [[0, 1], [2], [3]] and cutting.tally.rows_after_end == 0
 
 
 def test_gaps_and_steps_back_in_time_begin_episodes() -> None:
     cutting = cutter(time="t", split={"gap_s": 0.5})
     episodes = cut(cutting, x=np.zeros(8), t=[0, 0.1, 0.2, 1.0, 1.1, 0.3, 0.4, 0.5])
-    assert rows(episodes) == [[0, 1], [3], [5, 6]]
-    assert cutting.tally.split_points == {"gap": 1, "back": 1}
+    assert rows(episodes) == [[0, 1], [3], [5, 6]] and cutting.tally.split_points == {"gap": 1, "back": 1}
     cutting.check()
 
 
@@ -121,8 +116,7 @@ def test_gaps_are_measured_between_the_rows_that_are_kept() -> None:
     nan, split = np.nan, {"gap_s": 0.5}
     x, t = [0, 0, nan, nan, 0, 0, 0, 0], [0, 0.1, 0.4, 0.7, 1.0, 1.1, 1.2, 1.3]
     cutting = cutter(time="t", split=split, not_finite="drop")
-    assert rows(cut(cutting, x=x, t=t)) == [[0], [4, 5, 6]]
-    assert cutting.tally.split_points == {"gap": 1}
+    assert rows(cut(cutting, x=x, t=t)) == [[0], [4, 5, 6]] and cutting.tally.split_points == {"gap": 1}
     cutting.check()
     alone = [0, nan, nan, 0.0]
     assert rows(cut(cutter(time="t", split=split, not_finite="drop"), x=alone, t=t[:4])) == []
@@ -184,8 +178,7 @@ def test_jumps_are_longer_than_their_bound() -> None:
     )
     # 0.499 m, then 0.51 m in both directions together, and 10 in a value that does not count.
     x = np.array([[0, 0, 0], [300, 399, 0], [300, 399, 9], [660, 760, 9], [660, 760, 1e4]])
-    assert rows(cut(cutting, x=x)) == [[0, 1], [3]]
-    assert cutting.tally.split_points == {"jump": 1}
+    assert rows(cut(cutting, x=x)) == [[0, 1], [3]] and cutting.tally.split_points == {"jump": 1}
 
 
 def test_a_whole_turn_of_a_heading_is_no_jump() -> None:
@@ -205,10 +198,8 @@ def test_a_whole_turn_of_a_heading_is_no_jump() -> None:
 def test_rejected_rows(not_finite: str, expected: list[list[int]], points: dict[str, int]) -> None:
     cutting = cutter(not_finite=not_finite)
     episodes = cut(cutting, x=[0, np.nan, np.inf, 3, 4, 5, 1e300])
-    assert rows(episodes) == expected
-    assert cutting.tally.rejected_rows == 3
-    assert cutting.tally.faults == "x in 3 rows, first log row 1"
-    assert cutting.tally.split_points == points
+    assert rows(episodes) == expected and cutting.tally.rejected_rows == 3
+    assert cutting.tally.faults == "x in 3 rows, first log row 1" and cutting.tally.split_points == points
 
 
 def test_a_rejected_row_that_ends_its_episode_is_no_gap_and_changes_no_rate() -> None:

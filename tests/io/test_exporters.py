@@ -180,8 +180,7 @@ def test_copies_of_a_recording_are_on_its_side_of_robomimics_masks(tmp_path: Pat
         )
     assert sorted(train + valid) == list(range(40))
     (recording,) = {episode % 10 for episode in valid}
-    assert sorted(valid) == [recording + 10 * number for number in range(4)]
-    assert held_out in (None, recording)
+    assert sorted(valid) == [recording + 10 * number for number in range(4)] and held_out in (None, recording)
 
 
 @pytest.mark.parametrize("has_goal", [True, False])
@@ -193,8 +192,7 @@ def test_minari_loads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_go
     monkeypatch.chdir(tmp_path)
     export(dataset, Path("minari/fake/random-v2"), format="minari")
     loaded = minari.load_dataset("fake/random-v2")
-    assert (loaded.total_episodes, loaded.total_steps) == (5, 55)
-    assert loaded.spec.dataset_id == "fake/random-v2"
+    assert (loaded.total_episodes, loaded.total_steps) == (5, 55) and loaded.spec.dataset_id == "fake/random-v2"
     for found, expected in zip(loaded.iterate_episodes(), dataset.episodes(), strict=True):
         values = expected.columns
         states = found.observations["observation"] if has_goal else found.observations

@@ -55,8 +55,7 @@ def check(recording: Path, mapping: str) -> None:
     try:
         import_dataset([recording], file, out=out)
     except AstraDataError as error:
-        assert str(error)
-        assert sorted(recording.parent.iterdir()) == before
+        assert str(error) and sorted(recording.parent.iterdir()) == before
     else:
         assert Dataset.open(out).verify() == []
 

@@ -29,8 +29,7 @@ def parts(folder: Path) -> list[Path]:
 
 def test_each_file_is_an_episode(tmp_path: Path) -> None:
     dataset, report = imported(tmp_path, parts(tmp_path / "logs"), PER_FILE)
-    assert dataset.lengths.tolist() == list(STEPS)
-    assert report.tally.split_points == {"file": 2}
+    assert dataset.lengths.tolist() == list(STEPS) and report.tally.split_points == {"file": 2}
     assert dataset.metadata["source"] == ["part_8.csv", "part_9.csv", "part_10.csv"]
 
 
@@ -46,8 +45,7 @@ def test_the_files_of_a_folder_or_archive_continue_one_another(tmp_path: Path) -
         assert len(dataset) == 1
         assert report.unused == ()  # all files are in it
     both, report = imported(tmp_path / "both", [folder, tmp_path / "logs.tar.gz"], ONE_LOG)
-    assert len(both) == 2
-    assert report.tally.split_points == {"file": 1}
+    assert len(both) == 2 and report.tally.split_points == {"file": 1}
 
 
 def with_times(tmp_path: Path, seconds: np.ndarray[Any, Any]) -> Tally:
@@ -58,8 +56,7 @@ def with_times(tmp_path: Path, seconds: np.ndarray[Any, Any]) -> Tally:
 
 def test_time_that_goes_back_begins_an_episode_and_is_told(tmp_path: Path) -> None:
     tally = with_times(tmp_path, np.arange(20) % 8 / 10)
-    assert tally.split_points == {"back": 2}
-    assert (tally.back_rows, tally.back_first) == (2, "log.npz row 8")
+    assert tally.split_points == {"back": 2} and (tally.back_rows, tally.back_first) == (2, "log.npz row 8")
 
 
 def test_rows_at_the_same_time_are_told_with_their_place(tmp_path: Path) -> None:

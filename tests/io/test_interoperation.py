@@ -110,8 +110,7 @@ def test_our_metadata_is_joined_again_after_lerobot_deleted_episodes(runs: Runs,
         assert (found.uid, found.metadata) == (expected.uid, expected.metadata)
         for name, values in expected.columns.items():
             np.testing.assert_array_equal(found.columns[name], values)
-    assert joined.schema == runs.dataset.schema
-    assert joined.description["parents"] == [runs.dataset.identity]
+    assert joined.schema == runs.dataset.schema and joined.description["parents"] == [runs.dataset.identity]
 
 
 def test_lerobot_trains_act_on_it(runs: Runs) -> None:

@@ -32,8 +32,7 @@ def test_the_mapping_fits_logs_of_the_same_form(tmp_path: Path) -> None:
             archive.addfile(info, io.BytesIO(content))
     report = import_dataset([tmp_path / "traj.tar.gz"], MAPPING, out=tmp_path / "out")
     dataset = Dataset.open(report.root)
-    assert dataset.lengths.tolist() == [1499, 499]
-    assert report.tally.split_points == {"jump": 1}
+    assert dataset.lengths.tolist() == [1499, 499] and report.tally.split_points == {"jump": 1}
     kept = np.delete(np.arange(2000), [1499, 1999])
     expected = (position * [0.001, 0.001, 1, 0.001, 0.001]).astype(np.float32)
     got = dataset.columns([STATE, NEXT_STATE, ACTION])

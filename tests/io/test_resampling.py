@@ -52,8 +52,7 @@ def test_jitter_neither_repeats_nor_skips_a_state(phase_ms: float, lead: int, la
     resampler, rows = sampled(20, odom, 1000 + phase_ms + 50.0 * np.arange(-3, 97))
     # The command of the same number came 150 ms before, less its phase.
     expected = [(k, k + 3 - lead) for k in range(97 + lead)]
-    assert rows[: len(expected)] == expected
-    assert resampler.unevenness() == ()
+    assert rows[: len(expected)] == expected and resampler.unevenness() == ()
 
 
 @pytest.mark.parametrize("phase_ms", [18.0, 32.0])
@@ -62,8 +61,7 @@ def test_jitter_moves_no_command_to_another_state(phase_ms: float) -> None:
     commands[1::3] += 12
     commands[2::3] -= 12
     resampler, rows = sampled(20, 50.0 * np.arange(100), commands)
-    assert {k - command for k, command in rows} == {0 if phase_ms < 25 else 1}
-    assert resampler.unevenness() == ()
+    assert {k - command for k, command in rows} == {0 if phase_ms < 25 else 1} and resampler.unevenness() == ()
 
 
 def test_a_state_that_falls_silent_is_held_for_as_long_as_it_may_be() -> None:
@@ -77,8 +75,7 @@ def test_a_pause_before_all_topics_are_there_ends_nothing(early_ms: float) -> No
     """A command alone, long before the states and the commands of a drive."""
     odom, commands = 2000 + 50.0 * np.arange(20), 2000 + 50.0 * np.arange(20)
     resampler, rows = sampled(20, odom, np.insert(commands, 0, early_ms))
-    assert rows == [(k, k + 1) for k in range(20)]
-    assert not resampler.silences
+    assert rows == [(k, k + 1) for k in range(20)] and not resampler.silences
 
 
 @pytest.mark.parametrize("late_ms", [2000.0, 7_200_000.0])
@@ -148,8 +145,7 @@ def test_the_gap_of_a_column_is_that_of_its_topics_alone(gap_s: float) -> None:
     odom = 50.0 * np.arange(41)
     _, rows = sampled(20, odom, 300.0 * np.arange(20), state_gap_s=gap_s)
     held = [k for k, _ in rows].count(40) - 1
-    assert held == gap_s * 1000 // 50
-    assert [k for k, _ in rows][: len(odom)] == list(range(41))
+    assert held == gap_s * 1000 // 50 and [k for k, _ in rows][: len(odom)] == list(range(41))
 
 
 @pytest.mark.parametrize(

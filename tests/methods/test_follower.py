@@ -27,8 +27,7 @@ def test_the_follower_reaches_the_goal_and_keeps_away_from_the_walls() -> None:
         closest = min(closest, float(maze.clearance(place.numpy().astype(np.float64)).min()))
         if reached.all():
             break
-    assert reached.all()
-    assert closest > 1.0
+    assert reached.all() and closest > 1.0
 
 
 def test_the_careful_kicker_scores_from_every_start_of_its_simulator() -> None:

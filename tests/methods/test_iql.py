@@ -164,8 +164,7 @@ def test_after_an_interruption_it_goes_on(
         learn(given, lambda done, note: stop(done, note) if done == 1.0 else None)
     spend(checkpoint)
     resumed, again = learn(given, watch)
-    assert seen == [1.0]
-    assert again["points"] == curve["points"]
+    assert seen == [1.0] and again["points"] == curve["points"]
     assert all(seconds < again[clock] < seconds + 500 for clock, seconds in SPENT.items())
     whole.save(tmp_path / "whole")
     resumed.save(tmp_path / "resumed")

@@ -67,8 +67,7 @@ def test_bounds_beyond_what_was_recorded_are_told(recipe: Path, least: float, la
     data, *warnings = shown.splitlines()[1 : 4 if expected else 3]
     assert data == "  finished  data"
     goals = "  warning   data: fake@data-1.0.0 has no observation.environment_state: goals are dr"
-    assert warnings[-1].startswith(goals)
-    assert len(warnings) == 1 + bool(expected)
+    assert warnings[-1].startswith(goals) and len(warnings) == 1 + bool(expected)
     assert all(line.startswith(f"  warning   data: {expected}") for line in warnings[:-1])
 
 

@@ -43,8 +43,7 @@ def test_the_recipe_runs_until_a_policy_is_tested_in_the_arm(folder: Path) -> No
 def test_the_puck_is_pushed_at_one_height_until_it_falls() -> None:
     """In the environment; and in the simulator by what the gripper would overlap."""
     task = task_named(f"{FETCH}/push.py:TASK")
-    assert check_task(task) == []
-    assert task.robot is not None
+    assert check_task(task) == [] and task.robot is not None
     robot = task.robot()
     robot.reset(seed=0)  # type: ignore[call-arg]
     for _ in range(60):

@@ -73,8 +73,7 @@ def test_held_out_errors_say_how_much_data_is_enough(cart: Path) -> None:
     until = ("label", "pair", "subset", "ground")
     text = 'methods = ["nas"]\n[sweep]\npercent = [50, 100]\n'
     folder, keys = made(cart, "sizes", text, lambda key: key.split("/")[0] in until)
-    assert "subset/percent_050/seed_0" in keys
-    assert len(Dataset.open(folder / "subset/percent_050/seed_0")) == 4
+    assert "subset/percent_050/seed_0" in keys and len(Dataset.open(folder / "subset/percent_050/seed_0")) == 4
     experiment = load_experiment(cart / "sizes.toml", cart / "runs")
     page = write_errors(experiment, Selection.of(experiment.recipe))
     assert page is not None
@@ -107,8 +106,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     assert labeled() == ("stale", "made from another dataset than cart-logs@data-1.0.0")
     set_aside(tmp_path / "runs/again", "label/seed_0")
     made(tmp_path, "again", 'methods = ["nas"]\n', lambda key: key.startswith("label"))
-    assert labeled() == ("finished", "")
-    assert len(Dataset.open(tmp_path / "runs/again/label/seed_0")) == 4
+    assert labeled() == ("finished", "") and len(Dataset.open(tmp_path / "runs/again/label/seed_0")) == 4
     # Data that lack nothing are linked to.
     whole = subset(Dataset.open(tmp_path / "runs/again/label/seed_0"), percent=100, out=tmp_path / "whole")
     path = path.rename(tmp_path / "linked.toml")
@@ -116,8 +114,7 @@ def test_other_data_of_the_same_name_are_labeled_anew(cart: Path, tmp_path: Path
     experiment = load_experiment(path, tmp_path / "runs")
     (item,) = [item for item in plan(experiment.recipe, path, experiment.folder) if item.key == "label/seed_0"]
     item.call(progress=silent)
-    assert (experiment.folder / "label/seed_0").is_symlink()
-    assert condition(item, experiment).is_finished
+    assert (experiment.folder / "label/seed_0").is_symlink() and condition(item, experiment).is_finished
     # What was made of it since is no other; what was made of another is.
     link = experiment.folder / "label/seed_0"
     older = shutil.copytree(whole, tmp_path / "older")

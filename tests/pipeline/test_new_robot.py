@@ -61,8 +61,7 @@ def test_a_new_robot_runs_by_the_words_of_its_page(tmp_path: Path, monkeypatch: 
     for name in (name for name in tests if name.startswith("test_")):
         tests[name]()
     command(lines[3].removeprefix("astra-data "))
-    assert "--row astra_plus" in lines[6]
-    assert places(task_named("my_cart.py:TASK")) == {"meta"}
+    assert "--row astra_plus" in lines[6] and places(task_named("my_cart.py:TASK")) == {"meta"}
 
 
 def test_a_recipe_names_task_data_methods_and_seeds_alone(tmp_path: Path) -> None:

@@ -54,8 +54,7 @@ def test_a_recipe_may_augment_what_it_collects(tmp_path: Path) -> None:
     assert items["augment/seed_7"].inputs == ("collect/seed_7",)
     assert items["pair/seed_7"].inputs == ("augment/seed_7",)
     call = items["augment/seed_7"].call
-    assert isinstance(call, partial)
-    assert call.keywords["seed"] == 7
+    assert isinstance(call, partial) and call.keywords["seed"] == 7
     assert call.keywords["dataset"] == tmp_path / "collect/seed_7"
     plain = plan(load(tmp_path, HEAD), tmp_path / "r.toml", tmp_path)
     assert not [item for item in plain if item.key.startswith("augment")]

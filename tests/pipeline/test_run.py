@@ -369,8 +369,7 @@ def test_what_was_begun_with_other_settings_is_refused_alike(recipe: Path, tmp_p
     with pytest.raises(BadInputError):
         run(recipe, root=tmp_path)
     partial = tmp_path / "r/train/astra/.seed_0.partial"
-    assert partial.is_dir()
-    assert changed(recipe, HEAD + "[train]\ntries = 9\n") == ["train"]
+    assert partial.is_dir() and changed(recipe, HEAD + "[train]\ntries = 9\n") == ["train"]
     found = check(recipe, root=tmp_path)
     assert found[TRAIN].why.endswith(f"or remove {partial}") and found[PLUS[0]].state == "missing"
     shutil.rmtree(partial)
@@ -413,8 +412,7 @@ def test_a_sweep_goes_on_point_by_point_and_makes_shared_artifacts_once(
     times = {line["method"]: line["wall_seconds"] for line in lines(folder)}
     assert times["nas"] == "" and float(times["follower"]) > 0
     text = SWEEP.replace("[50, 150]", "[25, 150]")
-    assert changed(recipe, text) == []
-    assert "collect" in changed(recipe, text.replace("150]", "200]"))
+    assert changed(recipe, text) == [] and "collect" in changed(recipe, text.replace("150]", "200]"))
 
 
 def test_finished_points_are_logged(recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

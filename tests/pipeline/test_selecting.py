@@ -40,8 +40,7 @@ def test_the_recipe_says_how_unless_the_call_does(folder: Path, monkeypatch: pyt
     assert select(folder).episodes == 100
     recipe = folder / "recipe.json"
     recipe.write_text(json.dumps(json.loads(recipe.read_text()) | {"select": {"episodes": 9}}))
-    assert select(folder).episodes == 9
-    assert select(folder, episodes=8).episodes == 8
+    assert select(folder).episodes == 9 and select(folder, episodes=8).episodes == 8
 
 
 def test_a_choice_that_is_there_is_kept_and_another_set_aside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,8 +65,7 @@ def test_a_choice_among_other_policies_is_made_again(folder: Path, monkeypatch: 
     monkeypatch.setattr("astra_data.pipeline.stages.select.judged_success", lambda *_: 0.5)
     assert len(select(folder, rows=["nas"]).candidates) == 3
     shutil.rmtree(folder / "train/nas/seed_2")
-    assert len(select(folder, rows=["nas"]).candidates) == 2
-    assert (folder / "set_aside/1/select").is_dir()
+    assert len(select(folder, rows=["nas"]).candidates) == 2 and (folder / "set_aside/1/select").is_dir()
 
 
 def test_a_run_in_use_and_a_judge_without_groundings_are_refused(folder: Path) -> None:

@@ -57,8 +57,7 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
     (tmp_path / "quickstart.toml").unlink()
     with pytest.raises(BadInputError, match=r"robot\.py exists and differs"):
         copy_recipe("quickstart", tmp_path)
-    assert changed.read_text() == "TASK = None\n"
-    assert not (tmp_path / "quickstart.toml").exists()
+    assert changed.read_text() == "TASK = None\n" and not (tmp_path / "quickstart.toml").exists()
 
 
 def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
@@ -66,8 +65,7 @@ def test_the_command_line_lists_and_copies(tmp_path: Path) -> None:
     assert listed[0].strip() == "Start here" and listed[2].split()[:3] == ["quickstart", "3", "minutes"]
     names = [line.split()[0] for line in listed if line.strip()]
     assert [names.count(recipe.name) for recipe in shipped_recipes()] == [1] * len(shipped_recipes())
-    assert max(map(len, listed)) <= 80
-    assert "ros2_base" in "\n".join(listed).partition("Mappings")[2]
+    assert max(map(len, listed)) <= 80 and "ros2_base" in "\n".join(listed).partition("Mappings")[2]
     copied = CliRunner().invoke(app, ["recipes", "copy", "quickstart", str(tmp_path)])
     assert copied.output == f"finished: 3 files; astra-data run {tmp_path}/quickstart.toml\n"
     assert (tmp_path / "quickstart.toml").is_file()

@@ -46,8 +46,7 @@ def test_it_acts_as_the_artifacts_put_together_by_hand(row: str, run: Path) -> N
     for _ in range(3):
         state, goal = torch.randn(2, 29), torch.randn(2, 2)
         action = loaded.act(state, goal)
-        assert action.shape == (2, 2)
-        assert torch.equal(action, by_hand.act(state, goal))
+        assert action.shape == (2, 2) and torch.equal(action, by_hand.act(state, goal))
 
 
 def test_files_of_the_users_are_found_from_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

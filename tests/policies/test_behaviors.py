@@ -35,8 +35,7 @@ def test_a_watch_foresees_the_clearance_of_a_second() -> None:
     toward, along = [0.0, 1.0], [1.0, 0.0]
     clearance = WallWatch(TASK, 0.2).clearance(believed(STARTS[1:2]), np.array([[toward, along]]))
     # 0.25 m/s for five steps of 0.192 s, on a grid of 0.05 m.
-    assert clearance.shape == (1, 2)
-    assert clearance[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)
+    assert clearance.shape == (1, 2) and clearance[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)
 
 
 def test_commands_that_are_watched_keep_clear_of_walls() -> None:
@@ -59,8 +58,7 @@ def test_commands_are_held_and_repeat_with_the_seed() -> None:
     state = believed(torch.zeros(5, 2))
     commands = torch.stack([first.act(state, state[:, :2]) for _ in range(8)])
     assert torch.equal(commands, torch.stack([second.act(state, state[:, :2]) for _ in range(8)]))
-    assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4])
-    assert not torch.equal(commands[3], commands[4])
+    assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4]) and not torch.equal(commands[3], commands[4])
 
 
 def commands_of(behavior: RandomCommands, steps: int) -> Tensor:
@@ -72,8 +70,7 @@ def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_befo
     behavior = StressCommands(3, (1, 1))
     behavior.start(range(200), seed=0)
     commands = commands_of(behavior, 20)
-    assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200))
-    assert (commands[0] != 0).all()
+    assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200)) and (commands[0] != 0).all()
     is_reversed = (commands[1:] == -commands[:-1]).all(-1)
     assert 0.45 < float(is_reversed.float().mean()) < 0.55
     new = commands[1:][~is_reversed]

@@ -47,8 +47,7 @@ def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, gr
     for kind, used in kinds.items():
         assert data_starts(TASK, WorldConfig(), episodes, used) is None
         world = built(WorldConfig(), used)
-        assert type(world.simulator) is kind
-        assert type(world.simulator.simulator) is PointMass
+        assert type(world.simulator) is kind and type(world.simulator.simulator) is PointMass
         assert (world.world, world.num_envs) == (WorldConfig(), 4)
         drawn = torch.get_rng_state()
         world.step(torch.zeros(4, 2))
@@ -88,8 +87,7 @@ def test_recorded_starts_come_with_the_history_before_them(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     starts = data_starts(TASK, FROM_DATA, episodes, grounding)
-    assert starts is not None and starts.hidden is not None
-    assert len(starts.state) == len(starts.hidden) == 700
+    assert starts is not None and starts.hidden is not None and len(starts.state) == len(starts.hidden) == 700
     windows, model = episodes.windows, grounding.model
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
     hidden = torch.zeros(1, 8)

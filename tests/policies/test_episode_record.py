@@ -21,8 +21,7 @@ def test_what_happens_after_the_end_does_not_count() -> None:
         ]
     ):
         record.add(torch.full((3, 2), float(step + 1)), torch.tensor(reward), success, failed, contact)
-    assert record.active.tolist() == [False, False, True]
-    assert record.total_steps == 3 + 3 + 2
+    assert record.active.tolist() == [False, False, True] and record.total_steps == 3 + 3 + 2
     outcome = record.outcome()
     assert outcome.to_json() == {
         "success": [1.0, 0.0, 0.0],

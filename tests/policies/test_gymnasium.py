@@ -51,8 +51,7 @@ def test_failures_are_told_apart_from_successes() -> None:
         *_, terminated, _, infos = env.step(commands)
         if terminated.any():
             break
-    assert terminated.tolist() == [False, True]
-    assert infos["final_info"]["failed"].tolist() == [False, True]
+    assert terminated.tolist() == [False, True] and infos["final_info"]["failed"].tolist() == [False, True]
     assert not infos["failed"].any() and not infos["final_info"]["success"].any()
 
 
@@ -104,13 +103,11 @@ def test_the_vector_env_speaks_as_gymnasiums_own() -> None:
             if terminated.any():
                 rows = np.flatnonzero(terminated)
                 final = infos["final_info"]
-                assert final["success"][rows].all()
-                assert not infos["success"][rows].any()
+                assert final["success"][rows].all() and not infos["success"][rows].any()
                 assert (rewards[rows] > 9).all()
                 np.testing.assert_array_equal(infos["_final_obs"], terminated)
                 np.testing.assert_array_equal(final["_success"], terminated)
-                assert infos["final_obs"][rows[0]].shape == (8,)
-                assert infos["final_obs"].dtype == object
+                assert infos["final_obs"][rows[0]].shape == (8,) and infos["final_obs"].dtype == object
                 assert all(infos["final_obs"][row] is None for row in np.flatnonzero(~terminated))
                 successes += len(rows)
         assert successes == 2

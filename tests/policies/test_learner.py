@@ -89,8 +89,7 @@ def test_resumed_it_does_what_an_uninterrupted_one_does() -> None:
     assert resumed.steps == 48 and resumed.share == 0.75
     found += [resumed.iterate(), resumed.iterate()]
     assert str(found) == str(expected)  # NaN is never equal
-    assert torch.equal(resumed.layer.weight, whole.layer.weight)
-    assert torch.equal(resumed.hidden, whole.hidden)
+    assert torch.equal(resumed.layer.weight, whole.layer.weight) and torch.equal(resumed.hidden, whole.hidden)
 
 
 def test_where_the_episodes_cannot_go_on_new_ones_begin() -> None:
@@ -121,8 +120,7 @@ def test_episodes_end_by_themselves_or_by_the_horizon(length: float, horizon: in
     for step in range(1, 9):
         expired, done = take(rows)
         over = step % 4 == 0
-        assert done.tolist() == [over] * 2
-        assert expired.tolist() == [over and expires] * 2
+        assert done.tolist() == [over] * 2 and expired.tolist() == [over and expires] * 2
         assert rows.first.tolist() == [over] * 2
         # What an episode before this one did and remembered is gone.
         assert rows.previous_action.squeeze(-1).tolist() == [float(not over)] * 2
@@ -131,15 +129,13 @@ def test_episodes_end_by_themselves_or_by_the_horizon(length: float, horizon: in
     assert rows.figures() == {"success": success, "episode_steps": 4.0, "episodes": 4.0, "reward": 1.0}
     take(rows)
     figures = rows.figures()
-    assert figures["episodes"] == 0
-    assert math.isnan(figures["success"]) and math.isnan(figures["episode_steps"])
+    assert figures["episodes"] == 0 and math.isnan(figures["success"]) and math.isnan(figures["episode_steps"])
 
 
 def test_at_random_ages_not_all_expire_at_once() -> None:
     rows = Noisy(GoToZero(1000), 1, horizon=10, is_staggered=True)
     expired = [int(take(rows)[0].sum()) for _ in range(20)]
-    assert min(expired) > 60 and max(expired) < 140
-    assert expired[:10] == expired[10:]
+    assert min(expired) > 60 and max(expired) < 140 and expired[:10] == expired[10:]
 
 
 def curve(*successes: float | None) -> list[dict[str, float | None]]:

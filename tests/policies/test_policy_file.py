@@ -25,8 +25,7 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     saved.save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors")
     assert (loaded.dataset, loaded.content_hash) == ("toy@data-1.0.0", "abc")
-    assert loaded.simulation == simulation
-    assert loaded.policy.shape == policy.shape
+    assert loaded.simulation == simulation and loaded.policy.shape == policy.shape
     assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
     step = torch.randn(4, 3), torch.randn(4, 2), torch.randn(4, 8)
     for one, other in zip(loaded.policy.remember(*step), policy.remember(*step), strict=True):
@@ -41,8 +40,7 @@ def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
     student = Student(AdaptiveShape(3, 2, hidden_sizes=(16, 8), extrinsics_size=4, history_length=44))
     PolicyFile(student, None, "toy@data-1.0.0", "abc").save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors").policy
-    assert isinstance(loaded, Student)
-    assert loaded.shape == student.shape
+    assert isinstance(loaded, Student) and loaded.shape == student.shape
     step = torch.randn(4, 3), torch.randn(4, 2), torch.randn_like(student.initial_hidden(4))
     for one, other in zip(loaded.remember(*step), student.remember(*step), strict=True):
         assert torch.equal(one, other)

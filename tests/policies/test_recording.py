@@ -37,6 +37,5 @@ def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated()
     behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, 2))
     for last, truncated in ((True, ~ends), (False, torch.zeros(2, dtype=torch.bool))):
         row = _step(env, behavior, ends, last=last)
-        assert torch.equal(row[TERMINATED], ends)
-        assert torch.equal(row[TRUNCATED], truncated)
+        assert torch.equal(row[TERMINATED], ends) and torch.equal(row[TRUNCATED], truncated)
         assert torch.equal(row[DONE], ends | truncated)

@@ -77,24 +77,20 @@ def test_it_is_trained_again_until_it_does(tmp_path: Path) -> None:
         notes.append(note.partition("  ")[0])
 
     command, curve, seeds = restarted(tmp_path, [-1.0, 0.9, 1.0], progress, tries=3)
-    assert (command, seeds) == (0.9, SEEDS[:2])
-    assert [one["success"] for one in curve["tries"]] == [0.0, 1.0]
+    assert (command, seeds) == (0.9, SEEDS[:2]) and [one["success"] for one in curve["tries"]] == [0.0, 1.0]
     # Forward at 3.75 m/s goals from 1 to 2 m are reached in 3 to 6 steps; backward none in all 40.
     assert curve["tries"][0]["episode_steps"] == 40 and 3 < curve["tries"][1]["episode_steps"] < 6
     assert shares == sorted(shares) and max(shares) == pytest.approx(2 / 3)
-    assert sorted(set(notes)) == ["try 1 of 3", "try 2 of 3"]
-    assert not (tmp_path / "try_1").exists()
+    assert sorted(set(notes)) == ["try 1 of 3", "try 2 of 3"] and not (tmp_path / "try_1").exists()
 
 
 def test_of_those_that_do_not_the_best_is_kept(tmp_path: Path) -> None:
     # At 0.4 m/s, -0.44 of the range, goals up to 1.6 m are in reach within the 4 s of an episode.
     command, curve, seeds = restarted(tmp_path, [-1.0, -0.44, -0.9], tries=3)
-    assert (command, seeds) == (-0.44, SEEDS)
-    assert 0.4 < curve["tries"][1]["success"] < 0.8
+    assert (command, seeds) == (-0.44, SEEDS) and 0.4 < curve["tries"][1]["success"] < 0.8
 
 
 def test_all_tries_cost_time(tmp_path: Path) -> None:
     command, curve, _ = restarted(tmp_path, [-0.44, -1.0, -0.9], tries=3, clocks=True)
-    assert command == -0.44
-    assert (curve["wall_seconds"], curve["cpu_seconds"]) == (2 + 4 + 6, 1 + 2 + 3)
+    assert command == -0.44 and (curve["wall_seconds"], curve["cpu_seconds"]) == (2 + 4 + 6, 1 + 2 + 3)
     assert "wall_seconds" not in restarted(tmp_path, [-1.0, 1.0], tries=2)[1]

@@ -41,8 +41,7 @@ def test_learns_to_go_to_a_target(memory: int, monkeypatch: pytest.MonkeyPatch) 
     learner = sac(GoToZero(16), 100, horizon=20, memory=memory, **settings)
     assert distance_after(learner.policy, 10) > 0.5
     metrics = train(learner)
-    assert distance_after(learner.policy, 10) < 0.15
-    assert learner.steps == 100 * 16
+    assert distance_after(learner.policy, 10) < 0.15 and learner.steps == 100 * 16
     assert metrics[-1]["reward"] > metrics[0]["reward"]
 
 
@@ -70,8 +69,7 @@ def test_where_the_episodes_cannot_go_on_its_replay_does_not_either() -> None:
     learner.iterate()
     again.load_state_dict(learner.state_dict(), again.env.reset(), goes_on=False)
     kept, cut = (torch.as_tensor(one.state_dict()["replay"]["expired"]) for one in (learner, again))
-    assert torch.equal(cut[:-1], kept[:-1])
-    assert cut[-1].all() and not kept[-1].any()
+    assert torch.equal(cut[:-1], kept[:-1]) and cut[-1].all() and not kept[-1].any()
 
 
 @pytest.mark.parametrize(

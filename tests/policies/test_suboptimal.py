@@ -63,17 +63,14 @@ def test_ppo_stops_after_its_steps(tmp_path: Path) -> None:
 
     trained, metadata = suboptimal_by_ppo(MAZE, steps=250, seed=7, folder=tmp_path, num_threads=1, progress=progress)
     (ppo,) = Counting.made
-    assert shares == pytest.approx([0.4, 0.8, 1.0])
-    assert notes[0].endswith("reward per step 0.250")
+    assert shares == pytest.approx([0.4, 0.8, 1.0]) and notes[0].endswith("reward per step 0.250")
     assert (ppo.horizon, ppo.seed, ppo.config) == (MAZE.objective.horizon, 7, PpoConfig(total_steps=250))
     assert type(trained.policy) is ActorCritic and trained.policy.memory is None
     assert (trained.observed, trained.simulation, trained.dataset) == ("abstract", None, None)
     assert trained.policy.shape.observation_size == 8
     assert not any(parameter.requires_grad for parameter in trained.policy.parameters())
-    assert metadata["trained_steps"] == 300
-    assert metadata["learner"]["num_envs"] == 2
-    assert metadata["learner"]["hidden_sizes"] == [64, 64]
-    assert metadata["learner"]["total_steps"] == 250
+    assert metadata["trained_steps"] == 300 and metadata["learner"]["num_envs"] == 2
+    assert metadata["learner"]["hidden_sizes"] == [64, 64] and metadata["learner"]["total_steps"] == 250
     assert metadata["spent"].keys() == {"wall_seconds", "cpu_seconds", "finished_at"}
 
 
@@ -88,8 +85,7 @@ def test_it_goes_on_from_its_checkpoint(
         suboptimal_by_ppo(task, **given, progress=stop_past(0.7))
     _, metadata = suboptimal_by_ppo(task, **given, progress=silent)
     assert [one.went_on_from for one in Counting.made] == [0, 100]
-    assert Counting.made[-1].goes_on == episodes_go_on
-    assert metadata["trained_steps"] == 300
+    assert Counting.made[-1].goes_on == episodes_go_on and metadata["trained_steps"] == 300
     # What is finished is not trained again.
     suboptimal_by_ppo(task, **given, progress=silent)
     assert Counting.made[-1].steps == Counting.made[-1].went_on_from == 300
@@ -116,11 +112,9 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
         num_threads=1,
         progress=lambda share, note: shares.append(share),
     )
-    assert metadata["trained_steps"] == trained
-    assert shares[0] == pytest.approx(max(100 / steps, 10 / 50))
+    assert metadata["trained_steps"] == trained and shares[0] == pytest.approx(max(100 / steps, 10 / 50))
     assert shares[-1] == 1.0
     assert seeds == [derive(3, f"trial {100 * (count + 1)}") for count in range(len(seeds))]
     assert type(policy.policy) is SoftActor and policy.observed == "full"
     config = Counting.made[0].config
-    assert isinstance(config, SacConfig)
-    assert (config.total_steps, config.discount) == (steps, 0.99)
+    assert isinstance(config, SacConfig) and (config.total_steps, config.discount) == (steps, 0.99)

@@ -62,8 +62,7 @@ def test_the_learner_that_is_named_has_the_settings_ppo_by_default() -> None:
     assert type(read.validate_python({})) is PpoTrainConfig
     assert type(read.validate_python({"learner": "ppo", "rollout_steps": 9})) is PpoTrainConfig
     sac = read.validate_python({"learner": "sac", "burn_in": 3})
-    assert (type(sac), sac.num_envs) == (SacTrainConfig, 32)
-    assert read.validate_python(sac) is sac
+    assert (type(sac), sac.num_envs) == (SacTrainConfig, 32) and read.validate_python(sac) is sac
     with pytest.raises(ValidationError, match="burn_in"):
         read.validate_python({"burn_in": 3})
 
@@ -126,8 +125,7 @@ def test_a_mastered_training_ends_early_and_only_its_penalties_grow(
     assert learner.paces == [1.0] * slow + [6.0] * (len(scales) - slow)
     shares = [point["share"] for point in curve["points"]]
     tenths = [*range(1, slow + 1), *([slow + 6, 10] if slow < 10 else [])]
-    assert shares == pytest.approx([tenth / 10 for tenth in tenths])
-    assert [share for share, _ in notes] == shares
+    assert shares == pytest.approx([tenth / 10 for tenth in tenths]) and [share for share, _ in notes] == shares
     assert [point["steps"] for point in curve["points"]] == [*range(1, len(scales) + 1)]
     told = f"success of training episodes {success:.2f}"
     if task is WALKER:

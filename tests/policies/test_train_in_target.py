@@ -58,6 +58,5 @@ def test_settings_for_the_target_are_laid_over_those_of_the_training(
     assert options == {"observed": observed, "data_start_share": 0.25, "device": "cpu", "num_threads": 2}
     assert starts[0][:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert torch.equal(starts[1], given.episodes.steps(given.episodes.windows.goal))
-    assert (trained.simulation, trained.observed) == (None, observed)
-    assert str(trained.policy) == "policy"
+    assert (trained.simulation, trained.observed) == (None, observed) and str(trained.policy) == "policy"
     assert (trained.dataset, trained.content_hash) == ("toy@data-1.0.0", "0")

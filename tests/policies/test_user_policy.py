@@ -24,8 +24,7 @@ def test_it_acts_in_batches_within_the_bounds_and_remembers_nothing() -> None:
     assert action.dtype == torch.float32
     torch.testing.assert_close(action, torch.tensor([[0.2, -0.4], [0.6, 1.0]]))
     location, scale = policy.policy(features)
-    assert torch.equal(location, action) and not scale.any()
-    assert policy.name == "Doubling"
+    assert torch.equal(location, action) and not scale.any() and policy.name == "Doubling"
 
 
 @pytest.mark.parametrize(

@@ -72,8 +72,7 @@ def test_an_interval_takes_judges_as_the_sampling_unit_and_needs_three() -> None
     found = choice_of(Judged(judge="nas", episodes=100, candidates=candidates), None, measured={})
     assert found is not None
     three, two = (found.judged.estimate(one) for one in sorted(found.candidates, key=lambda one: one.seed))
-    assert three == summarize([0.1, 0.9, 0.5], limit=1.0, trials=100)
-    assert (two.low, two.high) == (None, None)
+    assert three == summarize([0.1, 0.9, 0.5], limit=1.0, trials=100) and (two.low, two.high) == (None, None)
 
 
 def test_a_choice_is_worth_its_regret() -> None:
@@ -84,8 +83,7 @@ def test_a_choice_is_worth_its_regret() -> None:
 
 def test_predictions_are_compared_row_by_row() -> None:
     found = choice(("a", 0, 0.9, 0.7), ("a", 1, 0.1, 0.2), ("b", 0, 0.5, 0.9)).calibration
-    assert found["a"] == pytest.approx((2, 0.05, 0.15))
-    assert found["b"] == pytest.approx((1, -0.4, 0.4))
+    assert found["a"] == pytest.approx((2, 0.05, 0.15)) and found["b"] == pytest.approx((1, -0.4, 0.4))
 
 
 def test_what_is_not_tested_is_worth_nothing_known() -> None:
@@ -161,8 +159,7 @@ def test_rounds_share_the_trials_and_so_do_their_candidates() -> None:
 
 def test_the_field_is_as_wide_as_the_trials_allow() -> None:
     assert least_trials(1) == 0 and least_trials(2) == 2 * LEAST_TRIALS
-    assert least_trials(5) == LEAST_TRIALS * (5 + 3 + 2)
-    assert widest_field(90, 0) == widest_field(90, 3) == 1
+    assert least_trials(5) == LEAST_TRIALS * (5 + 3 + 2) and widest_field(90, 0) == widest_field(90, 3) == 1
     assert widest_field(90, 20) == 5 and widest_field(3, 1000) == 3
     for field, trials in product(range(2, 20), range(4, 150)):
         if trials < least_trials(field):

@@ -59,8 +59,7 @@ def test_numbers_are_found_by_method_place_and_size() -> None:
     assert found.values("astra", "success", TESTED, 20) == {0: 0.0}
     assert (found.percents, found.seeds, found.tested()) == ([20, 100], [0, 1], ["astra"])
     summary = found.score_of("astra")
-    assert summary and (summary.value, summary.seeds) == (0.75, 2)
-    assert found.summary("astra", "failed") is None
+    assert summary and (summary.value, summary.seeds) == (0.75, 2) and found.summary("astra", "failed") is None
     assert found.table[found.table["where"] == SIMULATED]["value"].tolist() == [0.25]
 
 
@@ -100,11 +99,9 @@ def test_merging_loses_nothing_and_says_what_it_replaces() -> None:
     )
     second = results(line("astra", 1, success=0.75), line("astra", 2, success=1.0), rows=("astra",))
     merged = merge([first, second])
-    assert merged.rows == ("astra", "nas")
-    assert merged.values("astra", "success") == {0: 0.25, 1: 0.75, 2: 1.0}
+    assert merged.rows == ("astra", "nas") and merged.values("astra", "success") == {0: 0.25, 1: 0.75, 2: 1.0}
     assert merged.values("nas", "success") == {0: 1.0} and merged.errors == first.errors
-    assert replaced(first, second) == ["astra seed 1 (success 0.5, now 0.75)"]
-    assert replaced(first, first) == []
+    assert replaced(first, second) == ["astra seed 1 (success 0.5, now 0.75)"] and replaced(first, first) == []
 
 
 @pytest.mark.parametrize(
@@ -135,8 +132,7 @@ def test_errors_are_averaged_over_seeds_where_all_know_them() -> None:
     )
     means = found.mean_errors()
     assert means.loc[("nas", "grounded", "x_m", 1)].tolist() == [1.5, 0.75, 3.0]
-    assert set(means.index.get_level_values("horizon")) == {1}
-    assert found.groundings() == ["astra", "nas"]
+    assert set(means.index.get_level_values("horizon")) == {1} and found.groundings() == ["astra", "nas"]
 
 
 @pytest.mark.parametrize(("horizons", "expected"), [((1, 10, 50), 10), ((1, 5, 20), 5), ((20, 50), 20)])

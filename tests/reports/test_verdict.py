@@ -63,8 +63,7 @@ def test_a_method_that_did_not_learn_its_own_simulator_is_the_reason_to_deploy_n
     target = FLOOR | {"nas": (0.19,) * 3, "astra": (0.1,) * 3}
     simulated = {"nas": (0.9,) * 3, "astra": (0.03,) * 3}
     found = verdict_of(results(target, simulated, {"astra": -2.7}))
-    assert found.row is None and found.command("runs/r") is None
-    assert "Deploy none yet" in found.text
+    assert found.row is None and found.command("runs/r") is None and "Deploy none yet" in found.text
     assert "ASTRA did not learn its own simulator (0.03)" in found.text
     assert "-2.70" in words(found) and "`episodes` of `[collect]`" in words(found)
     learned = verdict_of(results(target, simulated, {"astra": 0.95}))
@@ -172,8 +171,7 @@ def test_a_run_ends_with_its_verdict_the_page_and_the_command_that_deploys(
     page.touch()
     show_made(tmp_path, None)
     first, verdict, best, floor, interval, *others = capsys.readouterr().out.splitlines()
-    assert first == f"finished: {tmp_path}"
-    assert re.match(rf"  best +ASTRA: success {success:.2f} \[", best)
+    assert first == f"finished: {tmp_path}" and re.match(rf"  best +ASTRA: success {success:.2f} \[", best)
     assert re.match(r"  floor +Direct transfer .*: success 0.05 \[", floor)
     assert re.match(rf"  interval +ASTRA less Direct transfer: {success - 0.05:.2f} \[", interval)
     assert all("select" not in line for line in (verdict, *others))

@@ -115,8 +115,7 @@ def test_a_planted_fault_is_the_one_finding(
     alter, severity, episodes, what, advice = case
     found = check_up(write_logs(tmp_path / "logs", alter), "walks").findings
     assert len(found) == 1, found
-    assert (found[0].severity, found[0].episodes) == (severity, episodes)
-    assert what in found[0].what
+    assert (found[0].severity, found[0].episodes) == (severity, episodes) and what in found[0].what
     assert advice in found[0].advice
 
 
@@ -128,8 +127,7 @@ def test_warnings_come_first_and_findings_are_recorded(tmp_path: Path) -> None:
     checkup = check_up(write_logs(tmp_path / "logs", two))
     assert [finding.severity for finding in checkup.findings] == ["warning", "note"]
     record = checkup.record()
-    assert record["dataset"] == "logs@data-1.0.0"
-    assert record["findings"][0]["episodes"] == [3, 4]
+    assert record["dataset"] == "logs@data-1.0.0" and record["findings"][0]["episodes"] == [3, 4]
     assert set(record["findings"][1]) == set(Finding.__dataclass_fields__)
 
 

@@ -40,8 +40,7 @@ def drop_last_row(name: str) -> Callable[[Path], None]:
 
 def test_a_whole_dataset_has_no_faults(tmp_path: Path) -> None:
     report = check(write_fake(tmp_path / "set").root)
-    assert (report.faults, report.notes) == ([], [])
-    assert (report.episodes, report.frames) == (5, 55)
+    assert (report.faults, report.notes) == ([], []) and (report.episodes, report.frames) == (5, 55)
 
 
 def test_a_copy_without_its_description_is_not_whole(tmp_path: Path) -> None:
@@ -161,8 +160,7 @@ def test_all_faults_are_told_but_few_of_a_kind(tmp_path: Path) -> None:
     pq.write_table(table, root / DATA)
     faults = check(root).faults
     assert sum(fault.startswith("frame_index is 2 in episode") for fault in faults) == MOST
-    assert "frame_index: and 7 more of this kind" in faults
-    assert "timestamp: and 7 more of this kind" in faults
+    assert "frame_index: and 7 more of this kind" in faults and "timestamp: and 7 more of this kind" in faults
 
 
 def test_columns_that_differ_from_the_declared_are_told(tmp_path: Path) -> None:
@@ -194,8 +192,7 @@ def test_a_plain_dataset_is_checked_without_our_metadata(tmp_path: Path) -> None
         path.unlink()
     (root / "meta/other.json").write_text("{}")
     report = check(root)
-    assert report.faults == []
-    assert "a plain LeRobot dataset" in report.notes[0]
+    assert report.faults == [] and "a plain LeRobot dataset" in report.notes[0]
     assert "meta/other.json does not belong to it" in report.notes
     alter(DATA, "next.done", 9, True)(root)
     report = check(root)
@@ -229,8 +226,7 @@ def test_only_the_first_findings_of_a_kind_are_shown_and_all_are_counted() -> No
         "files: and 3 more of this kind",
         "one episode is missing",
     ]
-    assert report.fault_count == MOST + 4
-    assert report.notes == ["a note"]
+    assert report.fault_count == MOST + 4 and report.notes == ["a note"]
 
 
 @pytest.fixture
@@ -300,8 +296,7 @@ def test_rows_and_episodes_without_each_other_are_found(plain: Path, tmp_path: P
     shutil.copytree(plain, other)
     shutil.copy(plain / DATA, other / "data/chunk-000/file-001.parquet")
     faults = check(other).faults
-    assert "meta/episodes lacks episode 5" in faults
-    assert "total_episodes is 5, expected 10" in faults
+    assert "meta/episodes lacks episode 5" in faults and "total_episodes is 5, expected 10" in faults
     assert "episodes 0 and 5 have the same uid 13" in faults
     table = pq.read_table(plain / DATA)
     pq.write_table(table.slice(0, 50), plain / DATA)
@@ -328,8 +323,7 @@ def test_lerobot_reads_the_same_windows(tmp_path: Path, monkeypatch: pytest.Monk
         for one in fake_episodes():
             counted = {**one.columns, "observation.count": one.columns["mode"]}
             out.add(Episode(one.uid, counted, one.metadata))
-    assert compared(tmp_path / "set", monkeypatch) == []
-    assert usual == datasets.config.HF_DATASETS_CACHE
+    assert compared(tmp_path / "set", monkeypatch) == [] and usual == datasets.config.HF_DATASETS_CACHE
 
 
 @LEROBOT

@@ -35,9 +35,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def assert_saved(root: Path, episodes: int) -> None:
     saved = Dataset.open(root)
-    assert saved.verify() == []
-    assert check(root).faults == []
-    assert saved.uids.tolist() == list(range(episodes))
+    assert saved.verify() == [] and check(root).faults == [] and saved.uids.tolist() == list(range(episodes))
     for number, episode in enumerate(saved.episodes()):
         assert episode.metadata["task"] == killed_lerobot.task(number)
         recorded = killed_lerobot.values(number)
@@ -49,8 +47,7 @@ def assert_saved(root: Path, episodes: int) -> None:
             DONE: last,
             RECORDED_TASK: np.full(len(episode), number % 2),
         }
-        assert len(episode) == killed_lerobot.length(number) - 1
-        assert episode.columns.keys() == expected.keys()
+        assert len(episode) == killed_lerobot.length(number) - 1 and episode.columns.keys() == expected.keys()
         for name, values in expected.items():
             kept = values.astype(np.float32) if values.dtype == np.float64 else values
             np.testing.assert_array_equal(episode.columns[name], kept)
@@ -70,8 +67,7 @@ def test_every_saved_episode_of_a_killed_writer_is_recovered(
 ) -> None:
     report = check(killed / case)
     found = "\n".join(report.faults)
-    assert all(fault in found for fault in faults)
-    assert bool(found) == bool(faults)
+    assert all(fault in found for fault in faults) and bool(found) == bool(faults)
     before = {path: path.read_bytes() for path in (killed / case).rglob("*") if path.is_file()}
     repaired = repair(killed / case, out=tmp_path / "saved")
     assert (repaired.episodes, repaired.frames) == (
@@ -94,8 +90,7 @@ def test_of_a_file_that_was_cut_the_whole_row_groups_are_recovered(killed: Path,
     try:
         repaired = repair(root, out=tmp_path / "saved")
     except CorruptDatasetError as error:
-        assert share == 0.05
-        assert "no whole row group" in str(error)
+        assert share == 0.05 and "no whole row group" in str(error)
         return
     assert abs(repaired.episodes - 25 * share) < 3
     assert f"{25 - repaired.episodes} of the 25 episodes that meta/info.json counts are lost" in repaired.notes
@@ -117,8 +112,7 @@ def test_episodes_with_wrong_values_are_left_out(tmp_path: Path) -> None:
     assert "2 of the 5 episodes" in notes
     saved = Dataset.open(tmp_path / "saved")
     assert (saved.reference, saved.description["stage"]) == ("fake@data-1.1.0", "repair")
-    assert saved.verify() == []
-    assert check(saved.root).faults == []
+    assert saved.verify() == [] and check(saved.root).faults == []
     whole = [episode for number, episode in enumerate(fake_episodes()) if number not in (0, 3)]
     for found, expected in zip(saved.episodes(), whole, strict=True):
         assert (found.uid, found.metadata) == (expected.uid, dict(sorted(expected.metadata.items())))
@@ -240,8 +234,7 @@ def test_metadata_is_joined_by_uid(tmp_path: Path) -> None:
     joined = Dataset.open(tmp_path / "joined")
     assert (joined.metadata, joined.order) == (original.metadata, original.order)
     assert joined.description["environment"] == {"id": "Fake-v0"}
-    assert joined.description["parents"] == [original.identity]
-    assert joined.reference == "fake@data-1.1.0"
+    assert joined.description["parents"] == [original.identity] and joined.reference == "fake@data-1.1.0"
     other = write_fake(tmp_path / "other", description={**DESCRIPTION, "name": "other"})
     repair(edited, out=tmp_path / "merged", like=[original, other])
     merged = Dataset.open(tmp_path / "merged")
@@ -363,27 +356,22 @@ def test_each_has_the_metadata_of_its_own_dataset(tmp_path: Path, other: Dataset
     fake = write_fake(tmp_path / "set")
     joined = join(stored(other, fake), COLUMNS, [fake, other])
     # The fake dataset's episode 4 comes later, and is the one with a new uid.
-    assert [episode.uid for episode in joined[:3]] == [4, 99, 13]
-    assert joined[0].metadata == {"floor": "carpet"}
-    assert joined[1].metadata == {"source_episode": 4}
-    assert joined[3].uid not in (4, 99, *fake.uids.tolist())
-    assert joined[3].metadata["merged_uid"] == 4
-    assert all(episode.is_known for episode in joined)
+    assert [episode.uid for episode in joined[:3]] == [4, 99, 13] and joined[0].metadata == {"floor": "carpet"}
+    assert joined[1].metadata == {"source_episode": 4} and joined[3].uid not in (4, 99, *fake.uids.tolist())
+    assert joined[3].metadata["merged_uid"] == 4 and all(episode.is_known for episode in joined)
 
 
 def test_sources_of_copies_follow_their_new_uids(tmp_path: Path, other: Dataset) -> None:
     fake = write_fake(tmp_path / "set")
     joined = join(stored(fake, other), COLUMNS, [fake, other])
-    assert joined[-1].metadata == {"source_episode": joined[-2].uid}
-    assert joined[-2].uid != 4
+    assert joined[-1].metadata == {"source_episode": joined[-2].uid} and joined[-2].uid != 4
 
 
 def test_the_same_episode_again_has_another_uid_the_same_in_every_run(tmp_path: Path) -> None:
     fake = write_fake(tmp_path / "set")
     first, again = (join(stored(fake, fake, fake), COLUMNS, [fake]) for _ in range(2))
     uids = [episode.uid for episode in first]
-    assert len(set(uids)) == 3 * len(fake)
-    assert min(uids) >= 0 and max(uids) < 2**63
+    assert len(set(uids)) == 3 * len(fake) and min(uids) >= 0 and max(uids) < 2**63
     assert uids == [episode.uid for episode in again]
 
 

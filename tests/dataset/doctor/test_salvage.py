@@ -49,9 +49,7 @@ def test_what_is_intact_is_read(tmp_path: Path, damage: Callable[[Path], object]
     root = write_fake(tmp_path / "set").root
     damage(root)
     uids, notes = salvaged(root)
-    assert uids == [UIDS[index] for index in left]
-    assert len(notes) == 1
-    assert note in notes[0]
+    assert uids == [UIDS[index] for index in left] and len(notes) == 1 and note in notes[0]
 
 
 @pytest.mark.parametrize(
@@ -115,8 +113,7 @@ def test_without_meta_episodes_the_rows_tell_which_episode_follows(tmp_path: Pat
     deface(root / DATA, 1, "action")
     uids, notes = salvaged(root)
     # Whether episode 0 went on in the rows that are lost, nothing tells.
-    assert uids == UIDS[2:]
-    assert notes[-1] == "left out episodes 0 to 1: rows that belong there cannot be read"
+    assert uids == UIDS[2:] and notes[-1] == "left out episodes 0 to 1: rows that belong there cannot be read"
 
 
 def test_a_file_that_comes_twice_costs_no_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,8 +120,7 @@ CARDS = sorted((Path(__file__).parents[3] / "dataset_cards").glob("*.md"))
 @pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
 def test_a_card_says_what_the_hub_reads_and_names_every_column(path: Path) -> None:
     card = DatasetCard.load(path)
-    assert card.data.license == "apache-2.0"
-    assert "LeRobot" in card.data.tags
+    assert card.data.license == "apache-2.0" and "LeRobot" in card.data.tags
     assert f"# {path.stem}\n" in card.text
     task = TASKS.get(path.stem.removesuffix("-random-seed0"))
     names = [STATE, ACTION, NEXT_STATE]
@@ -139,5 +138,4 @@ def test_a_card_has_the_words_of_its_notes_and_its_figure(path: Path) -> None:
     if path.stem.startswith("fetch"):  # whose states have no positions by name
         assert not figure.exists() and figure.name not in text
         return
-    assert f"]({figure.name})" in text
-    assert figure.read_bytes().startswith(b"\x89PNG")
+    assert f"]({figure.name})" in text and figure.read_bytes().startswith(b"\x89PNG")

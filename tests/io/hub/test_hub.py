@@ -30,13 +30,11 @@ def test_what_is_pulled_is_what_was_pushed(hub: Hub, fake: Dataset, home: Path) 
     assert pushed == "hf://datasets/me/it@data-1.0.0"
     assert (sorted(told), told[-1]) == (told, (1.0, "data-1.0.0"))
     repo = hub.repos["me/it"]
-    assert not repo.private
-    assert repo.history == ["initial commit", "Add fake@data-1.0.0"]
+    assert not repo.private and repo.history == ["initial commit", "Add fake@data-1.0.0"]
     assert repo.tags == {"v3.0": repo.head, "data-1.0.0": repo.head}
     assert b'LeRobotDataset("me/it", revision="data-1.0.0")' in repo.commits[repo.head]["README.md"]
     pulled = pull("me/it")
-    assert pulled.root == home / "fake/data-1.0.0"
-    assert contents(pulled.root) == contents(fake.root)
+    assert pulled.root == home / "fake/data-1.0.0" and contents(pulled.root) == contents(fake.root)
 
 
 def test_every_version_keeps_its_tag_and_main_shows_the_newest(hub: Hub, fake: Dataset, tmp_path: Path) -> None:
@@ -122,8 +120,7 @@ def test_a_public_repository_does_not_get_what_is_to_be_private(hub: Hub, fake: 
     hub.repos["me/it"] = Repository()
     with pytest.raises(BadInputError, match=r"me/it exists already and is public, .*Nothing was uploaded"):
         push(fake.root, "me/it", private=True)
-    assert hub.repos["me/it"].history == ["initial commit"]
-    assert not hub.large
+    assert hub.repos["me/it"].history == ["initial commit"] and not hub.large
     hub.repos["me/it"].private = True
     push(fake.root, "me/it", private=True)
     assert "data-1.0.0" in hub.repos["me/it"].tags

@@ -160,8 +160,7 @@ def test_a_listing_that_leads_out_of_the_folder_fetches_nothing(shared: Path, tm
         (shared / "SHA256SUMS").write_text(f"{sums}{digest}  {path}\n")
         with pytest.raises(SharingError, match=r"cannot be trusted.*Nothing was downloaded"):
             pull(source(shared), out=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    assert not hidden(tmp_path / "out")
+    assert not (tmp_path / "out").exists() and not hidden(tmp_path / "out")
 
 
 @pytest.mark.parametrize(("key", "value"), [("name", "../../away"), ("name", ".."), ("name", 3), ("version", "9.0.0")])
@@ -212,8 +211,7 @@ def test_whole_files_are_not_fetched_again_and_others_are(
 
     monkeypatch.setattr(sharing, "fetch", watched)
     pulled = pull(source(shared), out=tmp_path / "out")
-    assert contents(pulled.root) == contents(fake.root)
-    assert DATA in fetched and "meta/info.json" not in fetched
+    assert contents(pulled.root) == contents(fake.root) and DATA in fetched and "meta/info.json" not in fetched
     assert not hidden(tmp_path / "out")
 
 
@@ -322,9 +320,7 @@ def test_a_push_names_where_it_put_the_version_and_how_far_it_is(fake: Dataset, 
     seen: list[float] = []
     place = f"file://{tmp_path}/shared"
     source = push(fake.root, place, progress=lambda fraction, note: seen.append(fraction))
-    assert source == f"{place}/fake@data-1.0.0"
-    assert seen == sorted(seen)
-    assert (seen[0], seen[-1]) == (0.0, 1.0)
+    assert source == f"{place}/fake@data-1.0.0" and seen == sorted(seen) and (seen[0], seen[-1]) == (0.0, 1.0)
     files = contents(tmp_path / "shared/fake/data-1.0.0")
     assert files.keys() == contents(fake.root).keys() | {"README.md", "README-coverage.png", "SHA256SUMS"}
 
@@ -334,8 +330,7 @@ def test_a_second_push_sends_nothing(fake: Dataset, tmp_path: Path) -> None:
     before = contents(tmp_path / "shared")
     seen: list[float] = []
     push(fake.root, f"file://{tmp_path}/shared", progress=lambda fraction, note: seen.append(fraction))
-    assert not seen
-    assert contents(tmp_path / "shared") == before
+    assert not seen and contents(tmp_path / "shared") == before
 
 
 def test_notes_are_in_the_card_and_their_faults_are_told_before_anything_is_sent(fake: Dataset, tmp_path: Path) -> None:

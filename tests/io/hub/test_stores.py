@@ -70,8 +70,7 @@ def changed(root: Path) -> Dataset:
 def test_what_is_pulled_is_what_was_pushed(any_place: str, fake: Dataset, home: Path) -> None:
     assert push(fake.root, any_place) == f"{any_place}/fake@data-1.0.0"
     pulled = pull(f"{any_place}/fake")
-    assert pulled.root == home / "fake/data-1.0.0"
-    assert contents(pulled.root) == contents(fake.root)
+    assert pulled.root == home / "fake/data-1.0.0" and contents(pulled.root) == contents(fake.root)
     assert os.listdir(home / "fake") == ["data-1.0.0"]
     filesystem, path = fsspec.core.url_to_fs(f"{any_place}/fake/data-1.0.0")
     assert "# fake" in filesystem.cat_file(f"{path}/README.md").decode()

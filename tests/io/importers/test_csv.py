@@ -50,8 +50,7 @@ def test_cells_are_numbers_flags_or_nothing(tmp_path: Path) -> None:
     mapping = ImportMapping.model_validate({"name": "n", "task": "t", "fps": 1, "columns": columns})
     source = Source(tmp_path / "log.csv", None, tmp_path / "log.csv")
     (block,) = csv.read(source, mapping)
-    assert block.values["whole"].tolist() == [2**53 + 1, -2]
-    assert block.values["float"].tolist() == [0.5, 1000.0]
+    assert block.values["whole"].tolist() == [2**53 + 1, -2] and block.values["float"].tolist() == [0.5, 1000.0]
     assert block.values["flag"].tolist() == [1.0, 0.0]
     np.testing.assert_array_equal(block.values["gap"], [1.0, np.nan])
 
@@ -64,8 +63,7 @@ def test_lines_that_are_empty_are_counted(tmp_path: Path, end: str) -> None:
     timed = 'time = "t"\nnot_finite = "drop"\n' + TORN
     _, report = imported(tmp_path, path, timed)
     tally = report.tally
-    assert tally.faults == "x in 1 row, log.csv line 7"
-    assert tally.back_first == "log.csv line 12"
+    assert tally.faults == "x in 1 row, log.csv line 7" and tally.back_first == "log.csv line 12"
     assert tally.torn_first == "log.csv line 15"
     path.write_bytes(path.read_bytes().replace(b"nan", b"oops"))
     with pytest.raises(BadInputError, match=r"log\.csv line 7: field 'x': expected numbers, .*, got 'oops'"):
@@ -176,8 +174,7 @@ def test_files_of_one_recording_are_joined_by_time(tmp_path: Path) -> None:
     assert dataset.metadata["source"] == ["other/state.csv", "other/state.csv", "run1_state.csv"]
     # Commands 20 to 29, of 1.32 to 1.77 s, are lost: 1.27 s holds until 1.4, and the next is of 1.82 s.
     assert before.columns["observation.state"][[0, -1], 0].tolist() == [4, 13]
-    assert after.columns["observation.state"][0, 0] == 19
-    assert after.columns["action"][:2].tolist() == [31, 33]
+    assert after.columns["observation.state"][0, 0] == 19 and after.columns["action"][:2].tolist() == [31, 33]
     assert len(dataset.description["config"]["recordings"]) == 4
 
 

@@ -38,8 +38,7 @@ def test_d4rl_needs_no_mapping(tmp_path: Path) -> None:
     got = dataset.columns([STATE, ACTION, REWARD, TERMINATED, TRUNCATED, NEXT_STATE, GOAL])
     for name, field in zip(got, [*list(fields)[:5], "next_observations", "infos/goal"], strict=True):
         np.testing.assert_array_equal(got[name], fields[field], err_msg=name)
-    assert report.tally.split_points == {"end": 1}
-    assert dataset.info["fps"] == 20
+    assert report.tally.split_points == {"end": 1} and dataset.info["fps"] == 20
 
 
 def test_without_next_observations_episodes_lose_their_last_row(tmp_path: Path) -> None:
@@ -79,12 +78,10 @@ def test_robomimic_needs_no_mapping(tmp_path: Path) -> None:
                 data[f"{name}/{field}"] = values[:, None] if field.endswith("gripper") else values
         file["mask/train"] = [b"demo_0"]
     dataset, report = imported(tmp_path, tmp_path / "lift.hdf5", None, name="lift", task="lift the cube")
-    assert dataset.lengths.tolist() == [4, 5, 6]
-    assert dataset.info["fps"] == 20
+    assert dataset.lengths.tolist() == [4, 5, 6] and dataset.info["fps"] == 20
     for spec in dataset.specs([STATE, NEXT_STATE]):
         assert spec.names == ("eef_pos_0", "eef_pos_1", "eef_pos_2", "gripper")
-    assert report.tally.split_points == {"source": 2}
-    assert dataset.metadata["source_row"] == [0, 0, 0]
+    assert report.tally.split_points == {"source": 2} and dataset.metadata["source_row"] == [0, 0, 0]
     for episode, demo in zip(dataset.episodes(), ("demo_0", "demo_2", "demo_10"), strict=True):
         fields = demos[demo]
         state = np.column_stack([fields["obs/eef_pos"], fields["obs/gripper"]]).astype(np.float32)
@@ -115,8 +112,7 @@ def test_d3rlpy_needs_no_mapping(tmp_path: Path) -> None:
         file.create_dataset("num_episodes", data=len(episodes))
         file.create_dataset("version", data="2.1")
     dataset, report = imported(tmp_path, tmp_path / "hopper.h5", None, name="hopper", fps=20)
-    assert dataset.lengths.tolist() == [3, 2, *[1] * 9]
-    assert report.tally.split_points == {"source": 10}
+    assert dataset.lengths.tolist() == [3, 2, *[1] * 9] and report.tally.split_points == {"source": 10}
     for number, (found, episode) in enumerate(zip(dataset.episodes(), episodes, strict=True)):
         state, steps = episode["observations"], len(found)
         np.testing.assert_array_equal(found.columns[STATE], state[:steps])
@@ -172,8 +168,7 @@ def test_dones_that_stay_set_end_an_episode_once(tmp_path: Path) -> None:
                 file[f"data/{demo}/{field}"] = np.zeros((5, 2))
             file[f"data/{demo}/dones"] = np.array([0, 0, 1, 1, 1])
     dataset, report = imported(tmp_path, tmp_path / "lift.hdf5", None, name="lift", fps=20)
-    assert dataset.lengths.tolist() == [3, 3]
-    assert report.tally.short_rows == 4
+    assert dataset.lengths.tolist() == [3, 3] and report.tally.short_rows == 4
 
 
 @pytest.mark.parametrize("link", [h5py.ExternalLink("secret.h5", "/"), h5py.SoftLink("/kept")])
@@ -257,8 +252,7 @@ def test_commands_among_observations_are_left_out_and_the_success_of_a_demonstra
 def test_a_success_that_only_some_demonstrations_have_is_left_out_and_told(tmp_path: Path) -> None:
     path = write_demos(tmp_path / "isaac.hdf5", [True, None], actions=(2,), obs__x=(3,))
     dataset, report = imported(tmp_path, path, None, name="isaac", fps=20)
-    assert dataset.successes() is None
-    assert "without the attribute success, which 1 of 2 have\n" in str(report)
+    assert dataset.successes() is None and "without the attribute success, which 1 of 2 have\n" in str(report)
 
 
 def test_demonstrations_without_observations_are_refused(tmp_path: Path) -> None:
@@ -275,8 +269,7 @@ def test_only_what_the_file_holds_is_taken(tmp_path: Path) -> None:
         file["group/x"] = np.zeros((4, 2))
         file.create_dataset("claimed", (10**9,), "f8", chunks=(1000,))
         datasets = stored_datasets(h5py, file)
-        assert sorted(datasets) == ["claimed", "group/x"]
-        assert unpacked_bytes({"x": datasets["group/x"]}) == 64
+        assert sorted(datasets) == ["claimed", "group/x"] and unpacked_bytes({"x": datasets["group/x"]}) == 64
         check_storage({"x": datasets["group/x"]}, "a.hdf5")
         with pytest.raises(BadInputError, match=r"a.hdf5: field 'claimed' claims the shape"):
             check_storage(datasets, "a.hdf5")

@@ -23,8 +23,7 @@ def test_the_last_value_is_held_at_every_row(tmp_path: Path, write: Any) -> None
     dataset, report = imported(tmp_path, write(tmp_path / "log.mcap", messages), MAPPING)
     poses = [(t, m["position"]["x"]) for topic, t, m in messages if topic == "/pose"]
     turns = [(t, m["turn"]) for topic, t, m in messages if topic == "/command"]
-    assert len(dataset) == 2
-    assert report.tally.split_points == {"source": 1}
+    assert len(dataset) == 2 and report.tally.split_points == {"source": 1}
     first, second = dataset.episodes()
     # From the first command to when the pose of 2 s may be held no longer, and from the pose of 3 s on.
     ends = ((0.13, 2.35), (3.0, 4.96))
@@ -143,8 +142,7 @@ def test_a_pause_of_all_topics_ends_the_episode_with_its_last_message(
     dataset, report = imported(tmp_path, write_json(tmp_path / "log.mcap", drives), MAPPING)
     assert dataset.lengths.tolist() == [4, 4] and report.tally.rows == 10
     turns = dataset.columns([ACTION])[ACTION].tolist()
-    assert turns == [0.0, 1.0, 2.0, 3.0] * 2
-    assert not caplog.messages
+    assert turns == [0.0, 1.0, 2.0, 3.0] * 2 and not caplog.messages
 
 
 def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
@@ -155,8 +153,7 @@ def test_a_topic_that_alone_is_silent_is_named_with_the_remedy(
     imported(tmp_path, path, MAPPING)
     [warning] = caplog.messages
     assert "log.mcap: /command is silent for over 0.35 s (split.gap_s) 3 times while others are not" in warning
-    assert "latched = true" in warning
-    assert "That is right if the robot stops by itself" in warning
+    assert "latched = true" in warning and "That is right if the robot stops by itself" in warning
 
 
 def drive(begin: float, end: float) -> list[tuple[str, float, dict[str, Any]]]:

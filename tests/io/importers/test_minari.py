@@ -16,8 +16,7 @@ def test_every_value_of_a_goal_dataset_arrives(tmp_path: Path, data_format: str)
     made = episodes(is_dict=True)
     path = write_minari(tmp_path / "minari", made, data_format=data_format)
     dataset, report = imported(tmp_path, path, None, name="ant", fps=10)
-    assert dataset.lengths.tolist() == list(LENGTHS)
-    assert report.tally.split_points == {"source": 1}
+    assert dataset.lengths.tolist() == list(LENGTHS) and report.tally.split_points == {"source": 1}
     for got, episode in zip(dataset.episodes(), made, strict=True):
         parts = episode["observations"]
         state = np.concatenate([parts["achieved_goal"], parts["observation"]], axis=1).astype(np.float32)

@@ -51,10 +51,8 @@ def test_every_kind_of_number_and_list_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got["matrix"], matrix)
     np.testing.assert_array_equal(got["half"], [0.5, 1.5, -2.0])
     np.testing.assert_array_equal(got["flag"], [True, False, True])
-    assert got["flag"].dtype == bool
-    assert got["gait"].tolist() == ["walk", "run", "walk"]
-    assert got["level"].tolist() == [3, 1, 3]
-    assert np.diff(got["time"]).tolist() == [20_000, 20_000]
+    assert got["flag"].dtype == bool and got["gait"].tolist() == ["walk", "run", "walk"]
+    assert got["level"].tolist() == [3, 1, 3] and np.diff(got["time"]).tolist() == [20_000, 20_000]
     assert got["exact"].tolist() == [1.25, 2.5, -3.75]
     np.testing.assert_array_equal(got["lost"], [1.0, np.nan, 3.0])
 

@@ -31,8 +31,7 @@ def test_every_value_arrives(tmp_path: Path, name: str) -> None:
     tally = report.tally
     assert (report.episodes, report.frames, tally.rows) == (3, sum(STEPS), sum(LENGTHS))
     assert (tally.split_points, tally.last_rows, tally.rejected_rows) == ({"field": 2}, 2, 0)
-    assert dataset.description["split_points"] == {"field": 2}
-    assert dataset.metadata["source_row"] == [0, 6, 15]
+    assert dataset.description["split_points"] == {"field": 2} and dataset.metadata["source_row"] == [0, 6, 15]
     assert dataset.metadata["source"] == [name] * 3
 
 

@@ -31,14 +31,12 @@ def test_the_target_encoder_comes_closer_to_the_source(aligned: Path) -> None:
     metrics = json.loads((aligned / "metrics.json").read_text())
     assert {"git_commit", "packages", "machine"} <= metrics.keys()
     first, last = metrics["points"]
-    assert (first["step"], last["step"]) == (100, 200)
-    assert 0 < last["held_out_error"] < first["held_out_error"]
+    assert (first["step"], last["step"]) == (100, 200) and 0 < last["held_out_error"] < first["held_out_error"]
     for point in (first, last):
         assert point["held_out_error"] == pytest.approx(point["mmd"] + point["latent_rmse"] ** 2)
     assert last["mmd"] == metrics["mmd"]
     encoder = load_target_encoder(aligned / "target_encoder.safetensors")
-    assert encoder.encoder.latent_size == 16
-    assert float(encoder.latent_r2) == pytest.approx(metrics["latent_r2"])
+    assert encoder.encoder.latent_size == 16 and float(encoder.latent_r2) == pytest.approx(metrics["latent_r2"])
     assert metrics["deployed"] == ("target" if metrics["latent_r2"] >= 0.9 else "source")
 
 

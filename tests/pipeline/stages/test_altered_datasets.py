@@ -94,8 +94,7 @@ def test_nothing_altered_is_read(damage: str, copied: Path) -> None:
     change(copied)
     with pytest.raises(CorruptDatasetError, match=sentence) as caught:
         list(opened(copied).episodes())
-    assert "\n" not in str(caught.value)
-    assert "Restore it from a copy" in str(caught.value)
+    assert "\n" not in str(caught.value) and "Restore it from a copy" in str(caught.value)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

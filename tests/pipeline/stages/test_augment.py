@@ -70,10 +70,8 @@ def copies(source: Dataset, dataset: Dataset) -> Iterator[tuple[Episode, Episode
 
 def test_episodes_are_as_many_as_asked_and_none_is_lost(collected: Path, augmented: Path) -> None:
     source, dataset = Dataset.open(collected), Dataset.open(augmented)
-    assert len(dataset) == CONFIG.episodes
-    assert dataset.verify() == []
-    assert dataset.description["version"] == "1.1.0"
-    assert dataset.description["parents"] == [source.identity]
+    assert len(dataset) == CONFIG.episodes and dataset.verify() == []
+    assert dataset.description["version"] == "1.1.0" and dataset.description["parents"] == [source.identity]
     assert dataset.description["seeds"] == source.description["seeds"] | {"augment": 1}
     assert dataset.description["copies"] == CONFIG.episodes - len(source)
     assert dataset.features == source.features
@@ -91,9 +89,7 @@ def test_no_copy_of_a_held_out_episode_exists(collected: Path, augmented: Path) 
     told = [facts(dataset, index) for index in range(len(dataset))]
     held_out = {int(uid) for uid, fact in zip(dataset.uids, told, strict=True) if fact["held_out"]}
     sources = {fact["source_episode"] for fact in told} - {None}
-    assert len(held_out) == 2
-    assert held_out < set(Dataset.open(collected).uids.tolist())
-    assert sources
+    assert len(held_out) == 2 and held_out < set(Dataset.open(collected).uids.tolist()) and sources
     assert not sources & held_out
 
 
@@ -217,8 +213,7 @@ def test_a_share_is_held_out_at_least_one_unless_it_is_none(share: float, count:
     held_out, copies = shares(held_out_share=share)
     assert held_out.sum() == count
     usable = ~held_out & (np.arange(10) != 3)
-    assert (copies[usable] == 3).all()
-    assert (shares(held_out_share=share, copies=2)[1][usable] == 2).all()
+    assert (copies[usable] == 3).all() and (shares(held_out_share=share, copies=2)[1][usable] == 2).all()
     assert (len({tuple(shares(seed, held_out_share=share)[0]) for seed in range(9)}) > 1) == (share > 0)
 
 
@@ -254,8 +249,7 @@ def test_whole_numbers_outcomes_and_goals_are_not_moved() -> None:
 
 def test_a_uid_that_is_taken_is_not_given_again() -> None:
     taken = {5, 6, 2**63 - 1, 0}
-    assert [_free_uid(uid, taken) for uid in (9, 5, 5, 2**63 - 1)] == [9, 7, 8, 1]
-    assert len(taken) == 8
+    assert [_free_uid(uid, taken) for uid in (9, 5, 5, 2**63 - 1)] == [9, 7, 8, 1] and len(taken) == 8
 
 
 def test_copies_differ_from_what_they_are_of() -> None:

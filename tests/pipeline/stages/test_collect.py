@@ -28,15 +28,13 @@ TINY = CollectConfig(episodes=3, max_steps=15)
 
 def test_episodes_are_whole_and_their_steps_follow_each_other(collected: Path) -> None:
     dataset = Dataset.open(collected)
-    assert dataset.reference == f"{TASK}-random-seed0@data-1.0.0"
-    assert len(dataset) == COLLECT.episodes
+    assert dataset.reference == f"{TASK}-random-seed0@data-1.0.0" and len(dataset) == COLLECT.episodes
     for index, episode in enumerate(dataset.episodes()):
         columns = episode.columns
         np.testing.assert_array_equal(columns[NEXT_STATE][:-1], columns[STATE][1:])
         assert np.abs(columns[ACTION]).max() <= 1.0
         ended = columns[TERMINATED] | columns[TRUNCATED]
-        assert ended[-1]
-        assert not ended[:-1].any()
+        assert ended[-1] and not ended[:-1].any()
         np.testing.assert_array_equal(columns[DONE], ended)
         assert columns[TERMINATED][-1] == (len(episode) < COLLECT.max_steps)
         assert dataset.metadata["success"][index] == columns[SUCCESS].any()
@@ -61,8 +59,7 @@ def test_the_seed_decides_everything_and_the_threads_nothing(task: str, tmp_path
         hashes.append(Dataset.open(out).content_hash)
         files = [path for path in sorted(out.rglob("*")) if path.is_file() and path.name != "dataset.json"]
         contents.append([path.read_bytes() for path in files])
-    assert hashes[0] == hashes[1] != hashes[2]
-    assert contents[0] == contents[1] != contents[2]
+    assert hashes[0] == hashes[1] != hashes[2] and contents[0] == contents[1] != contents[2]
 
 
 @pytest.mark.usefixtures("batches_of_two")
@@ -230,8 +227,7 @@ def test_after_interruptions_the_policy_is_not_trained_again(
     assert notes_until("training", 3) == 3
     with pytest.raises(BadInputError, match="left an unfinished recording; resume it"):
         collect(name, config, seed=0, out=out, progress=silent, resume=False)
-    assert notes_until("target steps/s", 1) == 1
-    assert notes_until("target steps/s", 1) == 0
+    assert notes_until("target steps/s", 1) == 1 and notes_until("target steps/s", 1) == 0
     collect(name, config, seed=0, out=out, progress=silent)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
     policy = "meta/astra/policy.safetensors"
@@ -286,8 +282,7 @@ def test_a_saved_policy_acts(task: str, trained: Path, grounded: Path, aligned: 
     collect(task, by_source, seed=0, out=tmp_path / "source", progress=silent)
     assert (Dataset.open(tmp_path / "source").columns([ACTION])[ACTION][0] != actions[0]).any()
     # Drawn, not the mean: alike starts would give alike commands.
-    assert np.abs(np.diff(actions, axis=0)).min() > 0
-    assert np.abs(actions).max() <= 1.0
+    assert np.abs(np.diff(actions, axis=0)).min() > 0 and np.abs(actions).max() <= 1.0
 
 
 def test_a_policy_that_is_missing_or_does_not_fit_is_told(task: str, trained: Path, tmp_path: Path) -> None:

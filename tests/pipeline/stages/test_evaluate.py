@@ -91,14 +91,12 @@ def check_outcome(outcome: dict[str, list[float]], position: Tensor) -> None:
     """Check the lists of one world against each other and against the paths."""
     assert outcome.keys() == {"success", "failed", "wall_contact", "steps", "return"}
     assert all(len(values) == CONFIG.episodes for values in outcome.values())
-    assert position.shape[0] == CONFIG.episodes
-    assert position.shape[2] == 2
+    assert position.shape[0] == CONFIG.episodes and position.shape[2] == 2
     for episode in range(CONFIG.episodes):
         steps = int(outcome["steps"][episode])
         assert 1 <= steps <= HORIZON
         ended = outcome["success"][episode] + outcome["failed"][episode]
-        assert ended in ((0, 1) if steps == HORIZON else (1,))
-        assert 0 <= outcome["wall_contact"][episode] <= 1
+        assert ended in ((0, 1) if steps == HORIZON else (1,)) and 0 <= outcome["wall_contact"][episode] <= 1
         assert math.isfinite(outcome["return"][episode])
         assert torch.isfinite(position[episode, : steps + 1]).all()
         assert position[episode, steps + 1 :].isnan().all()
@@ -129,8 +127,7 @@ def test_a_policy_is_tested_in_both_worlds_and_with_both_encoders(
     assert follower["raw"].keys() == follower["target"].keys()
     check_outcome(follower["target"], followed["target.position"])
     for name in ("start", "goal"):
-        assert torch.equal(followed[name], paths[name])
-        assert len(paths[name].unique(dim=0)) == CONFIG.episodes
+        assert torch.equal(followed[name], paths[name]) and len(paths[name].unique(dim=0)) == CONFIG.episodes
     assert torch.equal(followed["start"], followed["target.position"][:, 0])
     assert torch.equal(paths["start"], paths["target.position"][:, 0])
 
@@ -169,15 +166,13 @@ def test_simulators_that_all_rows_share_begin_and_reward_alike(
     transferred, _ = make(task, "direct_transfer", tmp_path / "direct_transfer", inputs)
     assert transferred["raw"] == transferred["simulated"] != transferred["grounded"]
     follower, _ = make(task, "follower", tmp_path / "follower", {"reference": grounded})
-    assert "simulated" not in follower
-    assert min(follower["raw"]["return"]) > max(transferred["raw"]["return"])
+    assert "simulated" not in follower and min(follower["raw"]["return"]) > max(transferred["raw"]["return"])
 
 
 def test_longer_legs_change_the_target_alone(task: str, tmp_path: Path) -> None:
     usual, paths = make(task, "follower", tmp_path / "usual")
     longer, others = make(task, "follower", tmp_path / "longer", config=CONFIG.model_copy(update={"leg_scale": 1.25}))
-    assert (usual["leg_scale"], longer["leg_scale"]) == (1.0, 1.25)
-    assert longer["raw"] == usual["raw"]
+    assert (usual["leg_scale"], longer["leg_scale"]) == (1.0, 1.25) and longer["raw"] == usual["raw"]
     assert torch.equal(others["goal"], paths["goal"])
     assert not torch.equal(others["target.position"][:, 10], paths["target.position"][:, 10])
 

@@ -28,8 +28,7 @@ def test_of_a_reward_that_abstract_states_tell_whole_nothing_is_left_to_correct(
         model = load_history_model(out / "grounding.safetensors")
         assert model.shape.corrects_reward == (row == "astra")
         scales[row] = float(model.reward_std[-1])
-    assert scales["astra_printed"] > 0.01
-    assert scales["astra"] == pytest.approx(1e-3)
+    assert scales["astra_printed"] > 0.01 and scales["astra"] == pytest.approx(1e-3)
 
 
 def make(task: str, dataset: Path, out: Path, method: str = "astra", progress: Progress = silent) -> bytes:
@@ -56,13 +55,11 @@ def test_the_artifact_is_complete(task: str, grounded: Path) -> None:
         "settings": None,
     }
     metrics = json.loads((grounded / "metrics.json").read_text())
-    assert metrics["parameters"] > 1000
-    assert {"git_commit", "packages", "machine"} <= metrics.keys()
+    assert metrics["parameters"] > 1000 and {"git_commit", "packages", "machine"} <= metrics.keys()
     (epoch,) = metrics["epochs"]
     heads = {f"{figure}_{head}" for figure in ("loss", "r2") for head in ("latent", "reward", "state")}
     assert epoch.keys() == {"step", "held_out_error", "latent_std", "latent_rank"} | heads
-    assert epoch["step"] == GROUND.updates
-    assert 1.0 <= epoch["latent_rank"] <= GROUND.latent_size
+    assert epoch["step"] == GROUND.updates and 1.0 <= epoch["latent_rank"] <= GROUND.latent_size
     gap = json.loads((grounded / "gap.json").read_text())
     assert gap["horizons"] == [1, 10, 50]
     for kind in ("raw", "grounded"):

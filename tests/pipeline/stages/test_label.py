@@ -69,8 +69,7 @@ def test_what_the_log_lacks_is_what_the_task_computes(tmp_path: Path) -> None:
     np.testing.assert_allclose(fast.columns[REWARD][-1], 10.4, atol=1e-5)
     assert labeled.metadata["success"] == [False, True] and labeled.metadata["failed"] == [False, False]
     assert labeled.metadata["return"] == pytest.approx([0.5, 10 + 0.4 * len(fast)], abs=1e-5)
-    assert labeled.description["dropped_steps"] == 10 - len(fast)
-    assert labeled.reference == "logs@data-2.0.0"
+    assert labeled.description["dropped_steps"] == 10 - len(fast) and labeled.reference == "logs@data-2.0.0"
     assert notes[-1] == f"1 successes, 0 failures in {10 + len(fast)} steps"
 
 
@@ -172,8 +171,7 @@ def test_whoever_lasts_to_the_horizon_succeeds(tmp_path: Path) -> None:
     assert not fell.columns[SUCCESS].any() and fell.metadata["failed"]
     for over in ({}, {TERMINATED: lasted.columns[TRUNCATED]}):
         told = with_outcomes(task, Episode(0, dict(long.columns) | over | {SUCCESS: lasted.columns[SUCCESS]}, {}), 0)
-        assert told.metadata["success"] and not told.metadata["failed"]
-        assert not told.columns[TERMINATED].any()
+        assert told.metadata["success"] and not told.metadata["failed"] and not told.columns[TERMINATED].any()
         assert told.columns[TRUNCATED].tolist() == [False] * 9 + [True]
 
 

@@ -58,8 +58,7 @@ def test_all_else_stays_and_the_parent_is_recorded(collected: Path, paired: Path
     steps = after.description["pairs_per_second"] * after.description["wall_seconds"]
     assert steps == pytest.approx(after.lengths.sum())
     assert after.description["simulated_pairs_per_second"] > after.description["pairs_per_second"]
-    assert after.description["machine"] == before.description["machine"]
-    assert after.order == before.order
+    assert after.description["machine"] == before.description["machine"] and after.order == before.order
     assert after.metadata == before.metadata
     for one, other in zip(before.episodes(), after.episodes(), strict=True):
         assert one.uid == other.uid
@@ -164,8 +163,7 @@ def test_a_simulator_that_does_not_fit_is_refused(
 ) -> None:
     with pytest.raises(BadInputError, match=told) as caught:
         pair(simulator, PairConfig(), dataset=collected, out=tmp_path / "out", progress=silent)
-    assert "\n" not in str(caught.value)
-    assert list(tmp_path.iterdir()) == []
+    assert "\n" not in str(caught.value) and list(tmp_path.iterdir()) == []
 
 
 def test_data_of_another_rate_are_refused(collected: Path, tmp_path: Path) -> None:

@@ -64,8 +64,7 @@ def test_the_artifact_is_complete(task: str, grounded: Path, trained: Path) -> N
     figures = {"steps", "share", "success", "episode_steps", "episodes", "reward", "std"}
     assert curve["points"][0].keys() == figures
     policy = PolicyFile.load(trained / "policy.safetensors")
-    assert policy.dataset == "antmaze-short-random-seed0@data-2.0.0"
-    assert policy.policy.memory is None
+    assert policy.dataset == "antmaze-short-random-seed0@data-2.0.0" and policy.policy.memory is None
     assert policy.simulation == Simulation(WorldConfig(reward="predicted", data_start_share=0.5))
 
 
@@ -82,8 +81,7 @@ def test_after_an_interruption_it_goes_on(
     assert not out.exists()
     seen: list[float] = []
     resumed = make(task, method, paired, grounding, out, progress=lambda done, note: seen.append(done))
-    assert seen == pytest.approx([5 / 6, 1.0])
-    assert resumed == expected
+    assert seen == pytest.approx([5 / 6, 1.0]) and resumed == expected
     policy = PolicyFile.load(out / "policy.safetensors")
     plain, limit = WorldConfig(data_start_share=0.5), command_limit(TASKS[task], PairedEpisodes.load(paired))
     assert policy.simulation == Simulation(plus(plain, limit) if method == "astra_plus" else plain)

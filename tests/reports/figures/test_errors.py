@@ -35,11 +35,9 @@ def test_open_loop_error_is_logarithmic_and_draws_a_shared_raw_simulator_once() 
     assert figure is not None
     (axes,) = figure.axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-    assert axes.get_ylabel() == "position error (m)"
-    assert legend(figure) == ["no grounding", "NAS", "ASTRA"]
+    assert axes.get_ylabel() == "position error (m)" and legend(figure) == ["no grounding", "NAS", "ASTRA"]
     assert np.asarray(axes.lines[0].get_xydata()).tolist() == [[1.0, 1.0], [10.0, 2.0]]
-    assert len(axes.collections) == 3
-    assert open_loop_error(results({}), SCENE) is None
+    assert len(axes.collections) == 3 and open_loop_error(results({}), SCENE) is None
 
 
 def test_raw_simulators_that_differ_are_all_drawn_and_units_follow_from_the_names() -> None:
@@ -96,14 +94,12 @@ def test_validity_draws_a_dot_per_policy_in_its_methods_color() -> None:
     assert figure is not None
     raw, grounded = figure.axes
     titles = [axes.get_title(loc="left") for axes in (raw, grounded)]
-    assert titles == ["Raw simulator", "Grounded simulator"]
-    assert legend(figure) == ["NAS", "ASTRA+"]
+    assert titles == ["Raw simulator", "Grounded simulator"] and legend(figure) == ["NAS", "ASTRA+"]
     equal, nas, astra = raw.lines
     assert equal.get_linestyle() == "--"
     assert [np.asarray(axis).tolist() for axis in nas.get_data()] == [[1.0, 2.0], [3.0, 4.0]]
     assert [line.get_color() for line in (nas, astra)] == [method_color("nas"), method_color("astra_plus")]
-    assert nas.get_marker() != astra.get_marker()
-    assert len(grounded.lines) == 2
+    assert nas.get_marker() != astra.get_marker() and len(grounded.lines) == 2
     assert png(figure).startswith(b"\x89PNG")
     nowhere = found.model_copy(update={"tested_in": "simulators"})
     assert predictive_validity(nowhere, SCENE) is None

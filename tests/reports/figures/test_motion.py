@@ -220,10 +220,8 @@ def test_simulator_and_target_are_sent_the_same_commands_from_the_same_place(
     task = TASKS["nao-navigation"]
     replay = replay_commands(task)
     steps = len(replay.time_s)
-    assert replay.time_s[0] == pytest.approx(task.timestep_s)
-    assert replay.command.shape == (steps, 2)
-    assert replay.simulated.shape == (steps, 4)
-    assert replay.target.shape == (8, steps, 4)
+    assert replay.time_s[0] == pytest.approx(task.timestep_s) and replay.command.shape == (steps, 2)
+    assert replay.simulated.shape == (steps, 4) and replay.target.shape == (8, steps, 4)
     start = task.maze.cell_center(*task.maze.start)
     # 0.8 of 0.25 m/s for ten control steps of 0.192 s, and back again in the end.
     way = replay.simulated[:, :2] - replay.simulated[0, :2]

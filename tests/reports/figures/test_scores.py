@@ -44,8 +44,7 @@ def test_bars_show_mean_interval_seeds_and_the_own_simulator(scene: Scene) -> No
     (axes,) = figure.axes
     # The number of a bar stands beside its name: a diamond at 1.00 is not taken for what it says.
     labels = [text.get_text() for text in axes.get_yticklabels()]
-    assert labels == ["Direct transfer (floor)   0.00", "ASTRA+   0.03"]
-    assert not axes.texts
+    assert labels == ["Direct transfer (floor)   0.00", "ASTRA+   0.03"] and not axes.texts
     assert [patch.get_width() for patch in axes.patches] == pytest.approx([0.0, 0.03])  # type: ignore[attr-defined]
     summary = found.score_of("astra_plus")
     assert summary is not None
@@ -54,8 +53,7 @@ def test_bars_show_mean_interval_seeds_and_the_own_simulator(scene: Scene) -> No
     (diamond,) = [of for of in axes.lines if of.get_marker() == "D"]
     assert np.asarray(diamond.get_xydata()).tolist() == [[1.0, 1.0]]
     assert axes.get_xlim() == (0.0, 1.0) and axes.get_xlabel() == "success rate in the target"
-    assert "in its own simulator" in legend(figure)
-    assert score_bars("return")(found, scene) is None
+    assert "in its own simulator" in legend(figure) and score_bars("return")(found, scene) is None
 
 
 def test_seeds_without_interval_and_scores_without_limit(scene: Scene) -> None:

@@ -29,8 +29,7 @@ def test_every_row_has_its_own_color_and_a_plus_row_its_base_rows_darker() -> No
     assert len({method_color(row) for row in ROWS}) == len(ROWS)
     for base in (*METHODS, "my_own"):
         light, dark = to_rgb(method_color(base)), to_rgb(method_color(f"{base}_plus"))
-        assert sum(dark) < sum(light)
-        assert dark == pytest.approx([0.68 * channel for channel in light], abs=0.01)
+        assert sum(dark) < sum(light) and dark == pytest.approx([0.68 * channel for channel in light], abs=0.01)
     assert method_color("my_own") == method_color("my_own")
 
 
@@ -40,8 +39,7 @@ def test_drawing_leaves_the_callers_settings_alone_and_needs_no_display(
     monkeypatch.delenv("DISPLAY", raising=False)
     before = dict(matplotlib.rcParams)
     image = png(bars("nas"))
-    assert image.startswith(b"\x89PNG")
-    assert dict(matplotlib.rcParams) == before
+    assert image.startswith(b"\x89PNG") and dict(matplotlib.rcParams) == before
 
 
 def test_a_palette_keeps_the_colors_of_methods() -> None:
@@ -63,7 +61,5 @@ def test_only_visited_cells_are_colored() -> None:
     shown = image.get_array()
     assert isinstance(shown, np.ma.MaskedArray)
     np.testing.assert_array_equal(shown.mask, counts == 0)
-    assert image.origin == "lower"
-    assert (axes.get_xlim(), axes.get_ylim()) == ((-1.0, 1.0), (0.0, 3.0))
-    assert axes.get_xlabel() == "x position (m)"
-    assert png(figure).startswith(b"\x89PNG")
+    assert image.origin == "lower" and (axes.get_xlim(), axes.get_ylim()) == ((-1.0, 1.0), (0.0, 3.0))
+    assert axes.get_xlabel() == "x position (m)" and png(figure).startswith(b"\x89PNG")
