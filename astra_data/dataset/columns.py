@@ -78,24 +78,23 @@ class Column:
 
     def __post_init__(self) -> None:
         """Validate the column."""
-        faults = []
-        if "/" in self.name or not 1 <= len(self.name.encode(errors="replace")) <= MOST_NAME_BYTES:
-            faults.append(f"the name must have 1 to {MOST_NAME_BYTES} bytes, without '/'")
-        if self.dtype not in DTYPES:
-            faults.append(f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}")
-        if not 1 <= self.size <= MOST_VALUES:
-            faults.append(f"size {self.size}, expected 1 to {MOST_VALUES}")
-        if self.names is not None and len(self.names) != self.size:
-            faults.append(f"{len(self.names)} names for {self.size} values")
-        for key, words in (self.astra or {}).items():
-            if key not in ("unit", "frame", "role"):
-                faults.append(f"astra has {key!r}, expected unit, frame, role")
-            elif len(words) != self.size:
-                faults.append(f"{len(words)} words in astra's {key} for {self.size} values")
-        if unknown := sorted(set((self.astra or {}).get("role", [])) - set(ROLES)):
-            faults.append(f"unknown role {', '.join(unknown)}, expected {', '.join(ROLES)}")
-        words = (self.astra or {}).get("role", [])
-        faults = faults or [
+        size, names, astra = self.size, self.names, self.astra or {}
+        words = astra.get("role", [])
+        unknown = ", ".join(sorted(set(words) - set(ROLES)))
+        is_named = "/" not in self.name and 1 <= len(self.name.encode(errors="replace")) <= MOST_NAME_BYTES
+        checks = {
+            f"the name must have 1 to {MOST_NAME_BYTES} bytes, without '/'": is_named,
+            f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}": self.dtype in DTYPES,
+            f"size {size}, expected 1 to {MOST_VALUES}": 1 <= size <= MOST_VALUES,
+            f"{len(names or ())} names for {size} values": names is None or len(names) == size,
+            **{f"astra has {key!r}, expected unit, frame, role": key in ("unit", "frame", "role") for key in astra},
+            **{
+                f"{len(each)} words in astra's {key} for {size} values": len(each) == size
+                for key, each in astra.items()
+            },
+            f"unknown role {unknown}, expected {', '.join(ROLES)}": not unknown,
+        }
+        faults = [fault for fault, holds in checks.items() if not holds] or [
             f"role {role} at index {group.start}, expected {ROLES[role]} indices of it side by side"
             for role, group in self.roles
             if words[group] != [role] * ROLES[role]
@@ -148,13 +147,13 @@ class Column:
 
     def faults(self, values: Array) -> list[str]:
         """List how the dtype and shape of `values` differ from the column's; empty if they fit."""
-        faults = []
-        if values.dtype != self.dtype:
-            faults.append(f"{self.name}: dtype {values.dtype}, expected {self.dtype}")
-        if values.shape[1:] != (() if self.size == 1 else (self.size,)):
-            expected = "(T,)" if self.size == 1 else f"(T, {self.size})"
-            faults.append(f"{self.name}: shape {values.shape}, expected {expected}")
-        return faults
+        expected = "(T,)" if self.size == 1 else f"(T, {self.size})"
+        checks = {
+            f"{self.name}: dtype {values.dtype}, expected {self.dtype}": values.dtype == self.dtype,
+            f"{self.name}: shape {values.shape}, expected {expected}": values.shape[1:]
+            == (self.size,)[self.size == 1 :],
+        }
+        return [fault for fault, holds in checks.items() if not holds]
 
 
 OUTCOME_COLUMNS = (
@@ -199,19 +198,16 @@ class Episode:
         columns = {name: as_column(np.asarray(values, order="C")) for name, values in self.columns.items()}
         object.__setattr__(self, "metadata", metadata)
         object.__setattr__(self, "columns", columns)
-        faults = []
-        if type(self.uid) is not int or not 0 <= self.uid < 2**63:
-            faults.append(f"uid {self.uid!r}, expected an int in [0, 2^63)")
+        is_uid = type(self.uid) is int and 0 <= self.uid < 2**63
+        faults = [] if is_uid else [f"uid {self.uid!r}, expected an int in [0, 2^63)"]
         faults += [f"{name}: masked values, expected a value for every step" for name in masked]
-        faults += [fault for name, values in self.columns.items() for fault in _column_faults(name, values)]
+        faults += [fault for name, values in columns.items() for fault in _column_faults(name, values)]
         lengths = {name: len(values) for name, values in columns.items() if values.ndim}
-        if not columns:
-            faults.append("there are no columns")
-        elif len(set(lengths.values())) > 1:
+        if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
             faults.append(f"columns differ in their number of steps ({listed})")
-        elif 0 in lengths.values():
-            faults.append("there are no steps")
+        elif not columns or 0 in lengths.values():
+            faults.append("there are no steps" if columns else "there are no columns")
         for key, value in metadata.items():
             if not isinstance(value, Scalar):
                 faults.append(f"metadata {key}: {type(value).__name__}, expected float, int, bool or str")
@@ -247,8 +243,7 @@ def _column_faults(name: str, values: Array) -> list[str]:
 
 def in_blocks(episodes: Iterable[Episode], rows: int) -> Iterator[list[Episode]]:
     """Yield successive episodes in lists: each ends when it has `rows` steps, or with the last episode."""
-    block: list[Episode] = []
-    steps = 0
+    block, steps = list[Episode](), 0
     for episode in episodes:
         block.append(episode)
         steps += len(episode)

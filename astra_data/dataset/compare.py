@@ -41,29 +41,33 @@ def differences(a: Dataset, b: Dataset) -> Differences:
     shared = sorted({column.name for column in a.schema} & {column.name for column in b.schema})
     prints_a, prints_b = _fingerprints(a, shared), _fingerprints(b, shared)
     both = sorted(prints_a.keys() & prints_b.keys())
-    values = [uid for uid in both if prints_a[uid] != prints_b[uid]]
     metadata = {}
     for key in sorted(a.metadata.keys() | b.metadata.keys()):
-        ours, theirs = _metadata(a, key), _metadata(b, key)
-        if uids := [uid for uid in both if ours.get(uid) != theirs.get(uid)]:
+        ours, theirs = (
+            {u: repr(v) for u, v in zip(d.uids, d.metadata.get(key, [None] * len(d)), strict=True)} for d in (a, b)
+        )
+        if uids := [uid for uid in both if ours[uid] != theirs[uid]]:
             metadata[key] = uids
+    before, after = ({key: dataset.description[key] for key in _DESCRIBED} for dataset in (a, b))
     return Differences(
         schema=[*schema_differences(a, b), *_value_differences({"task": a.task}, {"task": b.task})],
         only_in_a=sorted(prints_a.keys() - prints_b.keys()),
         only_in_b=sorted(prints_b.keys() - prints_a.keys()),
-        values=values,
+        values=[uid for uid in both if prints_a[uid] != prints_b[uid]],
         metadata=metadata,
-        description=list(_value_differences(_provenance(a), _provenance(b), most=_SHOWN)),
+        description=list(_value_differences(before, after, most=_SHOWN)),
     )
 
 
 def schema_differences(a: Dataset, b: Dataset) -> list[str]:
     """List how the columns and fps of `b` differ from those of `a`, whatever the order of columns."""
-    ours, theirs = ({column.name: column for column in dataset.schema} for dataset in (a, b))
+    ours, theirs = (
+        {column.name: {**vars(column), "astra": column.astra or {}} for column in dataset.schema} for dataset in (a, b)
+    )
     found = [f"column {name}: only in {a.reference}" for name in ours if name not in theirs]
     found += [f"column {name}: only in {b.reference}" for name in theirs if name not in ours]
     for name in (name for name in ours if name in theirs):
-        found += _value_differences(_facts(ours[name]), _facts(theirs[name]), f"column {name}: ")
+        found += _value_differences(ours[name], theirs[name], f"column {name}: ")
     return [*found, *_value_differences({"fps": a.info["fps"]}, {"fps": b.info["fps"]})]
 
 
@@ -73,37 +77,21 @@ def world_differences(a: Dataset, b: Dataset) -> list[str]:
     return list(_value_differences(ours, theirs))
 
 
-def _facts(column: Column) -> dict[str, Any]:
-    return {**vars(column), "astra": column.astra or {}}
-
-
-def _provenance(dataset: Dataset) -> dict[str, Any]:
-    return {key: dataset.description[key] for key in _DESCRIBED}
-
-
 def _value_differences(
     a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "", *, most: int | None = None
 ) -> Iterator[str]:
     """Yield a sentence for each difference; of lists with more than `most` entries, these are counted."""
-
-    def is_long(value: object) -> bool:
-        return most is not None and isinstance(value, list) and len(value) > most
-
-    def shown(value: Any) -> str:  # noqa: ANN401 - JSON
-        return "nothing" if value is None else f"{len(value)} entries" if is_long(value) else repr(value)
-
     for key, before, after in changed_values(a, b, prefix):
+        long = [value for value in (before, after) if most and isinstance(value, list) and len(value) > most]
+        shown = [
+            "nothing" if value is None else f"{len(value)} entries" if value in long else repr(value)
+            for value in (before, after)
+        ]
         more = ""
-        if is_long(before) and is_long(after):
+        if len(long) == 2:
             known = set(map(repr, before))
             more = f", {sum(repr(entry) not in known for entry in after)} of them new"
-        yield f"{key}: {shown(before)}, then {shown(after)}{more}"
-
-
-def _metadata(dataset: Dataset, key: str) -> dict[int, str]:
-    """Return what the episodes that have `key` have there, by uid."""
-    values = zip(dataset.uids.tolist(), dataset.metadata.get(key, ()), strict=False)
-    return {uid: repr(value) for uid, value in values if value is not None}
+        yield f"{key}: {shown[0]}, then {shown[1]}{more}"
 
 
 def _fingerprints(dataset: Dataset, names: Sequence[str]) -> dict[int, list[object]]:
@@ -125,23 +113,20 @@ def lineage(dataset: Dataset) -> Ancestors:
 
     @cache
     def neighbors() -> Ancestors:
-        folders = [*sorted(root.parent.glob(f"*/{DATASET_PATH}"))]
+        folders = sorted(root.parent.glob(f"*/{DATASET_PATH}"))
         for run in (run for run in root.parents[1:3] if (run / RECORD).exists()):
             folders += [path for depth in ("*/*", "*/*/*") for path in sorted(run.glob(f"{depth}/{DATASET_PATH}"))]
-        listed = [_described(path.parents[2]) for path in folders]
-        return {key: found for one in reversed(listed) for key, found in one.items()}
+        return {key: found for path in reversed(folders) for key, found in _described(path.parents[2]).items()}
 
-    found: Ancestors = {}
     todo = [_key(dataset.identity)]
+    found: Ancestors = {todo[0]: (dataset.root, dataset.description)}
+    todo = _parents(found[todo[0]])
     while todo:
         key = todo.pop()
-        if key in found:
-            continue
-        at_home = _described(home_of({"name": key[0], "version": key[1]})) if found else None
-        found[key] = (
-            (dataset.root, dataset.description) if at_home is None else at_home.get(key) or neighbors().get(key)
-        )
-        todo += _parents(found[key])
+        if key not in found:
+            at_home = _described(home_of({"name": key[0], "version": key[1]}))
+            found[key] = at_home.get(key) or neighbors().get(key)
+            todo += _parents(found[key])
     return found
 
 
@@ -152,9 +137,8 @@ def hashes(ancestors: Ancestors) -> set[str]:
 
 def recordings_of(dataset: Dataset) -> NDArray[np.int64]:
     """Return the number of the recording that each episode is, or is a copy of, (E,), from 0 on."""
-    sources = dataset.metadata.get("source_episode", [None] * len(dataset))
-    numbers: dict[int, int] = {}
-    recorded = [uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True)]
+    sources, numbers = dataset.metadata.get("source_episode", [None] * len(dataset)), dict[int, int]()
+    recorded = (uid if source is None else source for uid, source in zip(dataset.uids, sources, strict=True))
     return np.array([numbers.setdefault(int(uid), len(numbers)) for uid in recorded])
 
 

@@ -25,16 +25,8 @@ from astra_data.dataset.plain import episodes_files, read_object, read_small_tab
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Valid names of datasets; they name folders, with some letters added, and file systems take 255."""
 VERSION = re.compile(r"[0-9]{1,9}\.[0-9]{1,9}\.[0-9]{1,9}")  # valid versions of datasets
-_DEFAULTS: dict[str, Any] = {
-    "name": None,
-    "version": "1.0.0",
-    "parents": [],
-    "stage": None,
-    "config": {},
-    "seeds": {},
-    "environment": {},
-    "simulator": {},
-}
+_DEFAULTS: dict[str, Any] = {"name": None, "version": "1.0.0", "parents": [], "stage": None}
+_DEFAULTS |= {"config": {}, "seeds": {}, "environment": {}, "simulator": {}}
 
 
 def full_name(description: Mapping[str, Any]) -> str:
@@ -44,11 +36,7 @@ def full_name(description: Mapping[str, Any]) -> str:
 
 def identity_of(description: Mapping[str, Any]) -> dict[str, str]:
     """Return name, version and hash, as the datasets made from one list it among their parents."""
-    return {
-        "name": description["name"],
-        "version": description["version"],
-        "hash": description["content_hash"],
-    }
+    return {"name": description["name"], "version": description["version"], "hash": description["content_hash"]}
 
 
 def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
@@ -72,43 +60,37 @@ def complete_description(description: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _faults(description: Mapping[str, Any]) -> list[str]:
-    name, version, stage = (description[key] for key in ("name", "version", "stage"))
-    faults = []
-    if not isinstance(name, str) or not NAME.fullmatch(name):
-        faults.append(f"name {name!r:.80}, expected up to 200 letters, digits, '.', '_' and '-'")
-    if not isinstance(version, str) or not VERSION.fullmatch(version):
-        faults.append(f"version {version!r:.80}, expected three numbers such as 1.0.0")
-    if not isinstance(stage, str) or not stage:
-        faults.append(f"stage {stage!r:.80}, expected the name of the stage that writes the dataset")
-    if not isinstance(parents := description["parents"], Sequence):
-        return [*faults, f"parents {parents!r:.80}, expected a list"]
-    faults += [
-        f"parent {parent!r:.80}, expected name, version and hash"
-        for parent in parents
-        if not isinstance(parent, Mapping) or sorted(parent) != ["hash", "name", "version"]
-    ]
-    objects = ("config", "seeds", "environment", "simulator")
-    return faults + [
-        f"{key} {description[key]!r:.80}, expected an object"
-        for key in objects
-        if not isinstance(description[key], Mapping)
-    ]
+    name, version, stage, parents = (description[key] for key in ("name", "version", "stage", "parents"))
+    checks = {
+        f"name {name!r:.80}, expected up to 200 letters, digits, '.', '_' and '-'": (
+            isinstance(name, str) and NAME.fullmatch(name)
+        ),
+        f"version {version!r:.80}, expected three numbers such as 1.0.0": (
+            isinstance(version, str) and VERSION.fullmatch(version)
+        ),
+        f"stage {stage!r:.80}, expected the name of the stage that writes the dataset": isinstance(stage, str)
+        and stage,
+        f"parents {parents!r:.80}, expected a list": isinstance(parents, Sequence),
+    }
+    for parent in parents if isinstance(parents, Sequence) else ():
+        is_one = isinstance(parent, Mapping) and sorted(parent) == ["hash", "name", "version"]
+        checks[f"parent {parent!r:.80}, expected name, version and hash"] = is_one
+    for key in ("config", "seeds", "environment", "simulator"):
+        checks[f"{key} {description[key]!r:.80}, expected an object"] = isinstance(description[key], Mapping)
+    return [fault for fault, holds in checks.items() if not holds]
 
 
 class ContentHash:
     """A running sha256 over the values of all columns, independent of their order and the files' encoding."""
 
     def __init__(self) -> None:
-        """Start without columns."""
         self._columns: dict[str, Any] = {}
         self._kinds: dict[str, str] = {}
 
     def update(self, name: str, values: Array) -> None:
         """Append `values` (n,) or (n, size), contiguous, to column `name`."""
-        if name not in self._columns:
-            self._columns[name] = hashlib.sha256()
-            self._kinds[name] = f"{values.dtype.name}{values.shape[1:]}"
-        self._columns[name].update(values.data)
+        self._kinds.setdefault(name, f"{values.dtype.name}{values.shape[1:]}")
+        self._columns.setdefault(name, hashlib.sha256()).update(values.data)
 
     def hexdigest(self) -> str:
         """Return the hash of all values so far."""
@@ -142,9 +124,8 @@ def permutation(uids: Iterable[int], seed: int) -> list[int]:
 def read_description(root: Path) -> dict[str, Any]:
     """Return meta/astra/dataset.json: the result of `complete_description`, the content hash, and more."""
     found = read_object(root / DATASET_PATH)
-    fault = found if isinstance(found, str) else "" if is_sealed(found) else "was altered"
-    if isinstance(found, str) or fault:
-        raise CorruptDatasetError(f"{DATASET_PATH} {fault}")
+    if isinstance(found, str) or not is_sealed(found):
+        raise CorruptDatasetError(f"{DATASET_PATH} {found if isinstance(found, str) else 'was altered'}")
     if faults := _faults({key: found.get(key) for key in _DEFAULTS}):
         raise CorruptDatasetError(f"{DATASET_PATH}: {'; '.join(faults)}")
     return found

@@ -36,7 +36,6 @@ class Order:
     def __init__(
         self, count: int, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False
     ) -> None:
-        """Start with the first batch of epoch 0; with `drop_last`, a smaller last batch is left out."""
         whole, rest = divmod(count, max(batch_size, 1))
         self._batches = whole + (rest > 0 and not drop_last)
         if batch_size < 1 or self._batches < 1:
@@ -81,8 +80,8 @@ class Order:
 class Samples(data.Dataset[Batch]):
     """Samples of the same shape, drawn one by one or in batches.
 
-    For `torch.utils.data.DataLoader` pass `collate_fn=Samples.collate`, because whole batches are drawn at
-    once; `batches` is faster.
+    For `torch.utils.data.DataLoader` pass a `collate_fn` that returns its argument, because whole batches are
+    drawn at once; `batches` is faster.
     """
 
     def __init__(self, first: Tensor, gather: Callable[[Tensor], Batch], device: torch.device) -> None:
@@ -103,11 +102,6 @@ class Samples(data.Dataset[Batch]):
         """Return the samples `index` (B,) as one batch, column name to (B, ...)."""
         first = take(self._first, torch.as_tensor(index, device=self._first.device))
         return {name: values.to(self._device) for name, values in self._gather(first).items()}
-
-    @staticmethod
-    def collate(batch: Any) -> Any:  # noqa: ANN401 - DataLoader expects a list
-        """Return `batch` unchanged: it is collated already."""
-        return batch
 
     def batches(self, batch_size: int, *, seed: int = 0, shuffle: bool = True, drop_last: bool = False) -> "Batches":
         """Draw batches; the arguments are those of `Order`."""
@@ -180,10 +174,6 @@ class Frames:
             device: torch device of the batches.
             memory_share: 0 to memory-map always.
             cache: folder of the raw files, by default $ASTRA_DATA_CACHE, or else ~/.cache/astra-data.
-
-        Raises:
-            BadInputError: a column or an episode does not exist, or an episode is listed twice.
-            CorruptDatasetError: a file cannot be read.
         """
         names = [column.name for column in dataset.schema] if names is None else names
         chosen = dataset.selected(episodes)
@@ -198,13 +188,11 @@ class Frames:
             starts = np.cumsum(lengths) - lengths
         columns = {name: torch.from_numpy(values) for name, values in arrays.items()}
         target = torch.device(device)
-        storage = target if _fits(columns, target) else torch.device("cpu")
-        return cls(
-            columns={name: values.to(storage) for name, values in columns.items()},
-            starts=torch.from_numpy(starts).to(storage),
-            lengths=torch.from_numpy(lengths).to(storage),
-            device=target,
-        )
+        size = sum(values.nbytes for values in columns.values())
+        fits = target.type != "cuda" or size <= torch.cuda.mem_get_info(target)[0] // 2
+        storage = target if fits else torch.device("cpu")
+        columns = {name: values.to(storage) for name, values in columns.items()}
+        return cls(columns, torch.from_numpy(starts).to(storage), torch.from_numpy(lengths).to(storage), target)
 
     def __len__(self) -> int:
         """Return the number of steps of all episodes."""
@@ -236,16 +224,9 @@ class Frames:
         }
         if faults := [fault for fault, is_one in checks.items() if is_one]:
             raise BadInputError(f"Windows: {'; '.join(faults)}.")
-        if padding == "edge":
-            first = _every(stride, self.starts - past, self.lengths)
-            return Samples(first, partial(self._padded, past, length), self.device)
-        views = {}
-        for name, values in self.columns.items():
-            # Row i holds steps i to i + L - 1, side by side as in memory.
-            size = values[0].numel()
-            views[name] = values.as_strided((len(values) - length + 1, length * size), (size, 1))
-        first = _every(stride, self.starts, (self.lengths - length + 1).clamp_min(0))
-        return Samples(first, partial(self._inside, views, length), self.device)
+        counts = self.lengths if is_edge else (self.lengths - length + 1).clamp_min(0)
+        first = _every(stride, self.starts - past, counts)
+        return Samples(first, partial(self._windows, past, length), self.device)
 
     def transitions(self) -> Samples:
         """Return single steps; the step's outcome is in its columns `next.*`."""
@@ -254,15 +235,7 @@ class Frames:
     def _rows(self, rows: Tensor) -> Batch:
         return {name: take(values, rows) for name, values in self.columns.items()}
 
-    def _inside(self, views: dict[str, Tensor], length: int, first: Tensor) -> Batch:
-        """Return the windows at rows `first` (B,), all inside their episode."""
-        shape = (len(first), length)
-        batch = {
-            name: take(values, first).view(*shape, *self.columns[name].shape[1:]) for name, values in views.items()
-        }
-        return batch | {IS_PAD: first.new_zeros(shape, dtype=torch.bool)}
-
-    def _padded(self, past: int, length: int, first: Tensor) -> Batch:
+    def _windows(self, past: int, length: int, first: Tensor) -> Batch:
         """Return the windows at rows `first` (B,), which may lie outside; step `past` is in the episode."""
         episode = torch.searchsorted(self.starts, first + past, right=True) - 1
         wanted = first[:, None] + torch.arange(length, device=first.device)
@@ -289,33 +262,25 @@ def take(values: Tensor, rows: Tensor) -> Tensor:
     return torch.from_numpy(values.numpy().take(rows.numpy(), axis=0))
 
 
-def _fits(columns: dict[str, Tensor], device: torch.device) -> bool:
-    """Return whether columns take at most half of the device's free memory."""
-    if device.type != "cuda":
-        return True
-    free, _ = torch.cuda.mem_get_info(device)
-    return sum(values.nbytes for values in columns.values()) <= free // 2
-
-
 def mapped_columns(dataset: Dataset, names: Sequence[str], cache: Path) -> dict[str, Array]:
     """Memory-map whole columns, (N, size) or (N,), from raw files in `cache`; missing files are written.
 
     The files are <cache>/<content hash>/<column>/values.npy. Changes of the arrays stay in this process. One
     process at a time writes a dataset's files; the others wait.
     """
-    specs = dataset.specs(names)
     parent = cache / dataset.content_hash
     parent.mkdir(parents=True, exist_ok=True)
     with held(parent, wait=True):
-        for column in specs:
+        for column in dataset.specs(names):
             if not (parent / column.name).exists():
                 _write_raw(dataset, column, parent / column.name)
     try:
         columns = {name: np.load(parent / name / "values.npy", mmap_mode="c") for name in names}
+        faults = list(dataset.alterations(columns, dataset.selected(None)))
     except (OSError, ValueError) as error:
-        raise CorruptDatasetError(f"{parent} was altered ({error}); delete it and try again.") from error
-    for fault in dataset.alterations(columns, dataset.selected(None)):
-        raise CorruptDatasetError(f"{parent} was altered ({fault}); delete it and try again.")
+        faults = [str(error)]
+    if faults:
+        raise CorruptDatasetError(f"{parent} was altered ({faults[0]}); delete it and try again.")
     return columns
 
 

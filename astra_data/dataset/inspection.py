@@ -1,7 +1,8 @@
-"""Summary of a dataset in one pass: episodes, histograms of values, a map of the robot's positions."""
+"""Summary of a dataset: episodes, histograms of values, a map of the robot's positions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -59,11 +60,8 @@ class Endings:
 
     def __str__(self) -> str:
         """Summarize them in a line."""
-        return f"{self.terminated} terminated, {self.cut_off} cut off" + (
-            f"; {self.made_up} next states of terminated episodes were made up: the state itself is used"
-            if self.made_up
-            else ""
-        )
+        made_up = f"; {self.made_up} next states of terminated episodes were made up: the state itself is used"
+        return f"{self.terminated} terminated, {self.cut_off} cut off{made_up if self.made_up else ''}"
 
 
 @dataclass(frozen=True)
@@ -82,77 +80,45 @@ class Inspection:
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
     """Summarize `dataset`, reading one episode at a time."""
-    spreads = _empty_spreads(dataset, dataset.schema)
-    maps = {role: _empty_map(spreads, role) for role in ("position", "vector")}
-    endings = Endings() if TERMINATED in dataset.features else None
-    for episode in dataset.episodes():
-        if endings is not None:
-            endings.add(episode.columns)
-        for spread in spreads:
-            _count(spread, episode.columns[spread.column.name])
-        for found in maps.values():
-            if found is not None:
-                planar, group = found
-                _visit(planar, episode.columns[STATE][:, group])
-    successes = dataset.successes()
+    ranges, successes = dataset.statistics(), dataset.successes()
     return Inspection(
         reference=dataset.reference,
         fps=int(dataset.info["fps"]),
         lengths=dataset.lengths,
         success=None if successes is None else sum(value is True for value in successes),
-        endings=endings,
-        spreads=tuple(spreads),
-        positions=maps["position"] and maps["position"][0],
-        velocities=maps["vector"] and maps["vector"][0],
+        endings=endings_of(dataset) if TERMINATED in dataset.features else None,
+        spreads=tuple(_spread(dataset, column, ranges[column.name]) for column in dataset.schema),
+        positions=visited(dataset),
+        velocities=visited(dataset, "vector"),
     )
+
+
+def _spread(dataset: Dataset, column: Column, ranges: Mapping[str, Any]) -> Spread:
+    low, high, mean = (np.array(ranges[key], np.float64) for key in ("min", "max", "mean"))
+    span, counts = np.where(high > low, high - low, 1.0), np.zeros((column.size, BINS), np.int64)
+    for block in dataset.blocks([column.name]):
+        bins = (as_rows(block[column.name]).astype(np.float64) - low) / span * BINS
+        flat = np.clip(bins, 0, BINS - 1).astype(np.int64) + BINS * np.arange(column.size)
+        counts += np.bincount(flat.ravel(), minlength=counts.size).reshape(counts.shape)
+    return Spread(column, low, high, mean, counts)
 
 
 def visited(dataset: Dataset, role: str = "position") -> Map | None:
     """Map the robot's positions, or another planar `role` of its state; None if the state has none."""
-    states = [column for column in dataset.schema if column.name == STATE]
-    found = _empty_map(_empty_spreads(dataset, states), role)
-    if found is None:
+    roles = [pair for column in dataset.schema if column.name == STATE for pair in column.roles]
+    group = next((group for found, group in roles if found == role), None)
+    if group is None:
         return None
-    planar, group = found
-    for episode in dataset.episodes([STATE]):
-        _visit(planar, episode.columns[STATE][:, group])
-    return planar
-
-
-def _empty_spreads(dataset: Dataset, columns: list[Column]) -> list[Spread]:
-    ranges = dataset.statistics()
-    spreads = []
-    for column in columns:
-        low, high, mean = (np.array(ranges[column.name][key], np.float64) for key in ("min", "max", "mean"))
-        spreads.append(Spread(column, low, high, mean, np.zeros((column.size, BINS), np.int64)))
-    return spreads
-
-
-def _count(spread: Spread, values: Array) -> None:
-    table = as_rows(values).astype(np.float64)
-    span = np.where(spread.high > spread.low, spread.high - spread.low, 1.0)
-    bins = np.clip((table - spread.low) / span * BINS, 0, BINS - 1).astype(np.int64)
-    flat = (bins + BINS * np.arange(spread.column.size)).ravel()
-    spread.counts[:] += np.bincount(flat, minlength=spread.counts.size).reshape(spread.counts.shape)
-
-
-def _empty_map(spreads: list[Spread], role: str) -> tuple[Map, slice] | None:
-    """Return an empty map for the first pair with `role` in the state, and the pair's indices."""
-    for spread in spreads:
-        for found, group in spread.column.roles if spread.column.name == STATE else ():
-            if found == role:
-                low, span = spread.low[group], spread.high[group] - spread.low[group]
-                cell = float(span.max()) / CELLS or 1.0
-                width, height = (max(1, int(cells)) for cells in np.ceil(span / cell - 1e-9))
-                return Map(np.zeros((height, width), dtype=np.int64), low, cell), group
-    return None
-
-
-def _visit(planar: Map, points: Array) -> None:
-    height, width = planar.counts.shape
-    cells = np.floor((points - planar.origin) / planar.cell + 1e-9)
-    x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
-    np.add.at(planar.counts, (y, x), 1)
+    ranges = dataset.statistics()[STATE]
+    low, high = (np.array(ranges[key], np.float64)[group] for key in ("min", "max"))
+    cell = float((high - low).max()) / CELLS or 1.0
+    width, height = (max(1, int(cells)) for cells in np.ceil((high - low) / cell - 1e-9))
+    counts = np.zeros((height, width), dtype=np.int64)
+    for block in dataset.blocks([STATE]):
+        cells = np.floor((block[STATE][:, group] - low) / cell + 1e-9)
+        x, y = cells.clip(0, [width - 1, height - 1]).astype(np.int64).T
+        np.add.at(counts, (y, x), 1)
+    return Map(counts, low, cell)
 
 
 def endings_of(dataset: Dataset) -> Endings:

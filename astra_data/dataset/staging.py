@@ -76,11 +76,7 @@ class StagedWriter:
         subset_seed: int = 0,
         resume: bool = False,
     ) -> None:
-        """Prepare to record as `DatasetWriter` does; with `resume`, continue what was interrupted.
-
-        Raises:
-            BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
-        """
+        """Prepare to record as `DatasetWriter` does; with `resume`, continue what was interrupted."""
         self._writer = DatasetWriter(
             root, columns, fps=fps, task=task, description=description, subset_seed=subset_seed
         )
@@ -177,7 +173,7 @@ class StagedWriter:
         place = max(self.staged, default=-1) + 1 if position is None else position
         if place in self.staged:
             raise BadInputError(f"Episode {episode.uid}: there is an episode {place} already.")
-        self._admission.check(episode)
+        self._admission.admit(episode, keep=False)
         path = self._path(place)
         partial = path.with_suffix(".partial")
         with self._keeping(), writing(path):
@@ -207,13 +203,8 @@ class StagedWriter:
         paths = sorted(self.folder.glob("*.arrow"))
         try:
             dataset = Dataset.open(self.root)
-            if not paths:
-                settings = read_object(self.folder / _SETTINGS)
-                before = settings.get("description") if isinstance(settings, dict) else None
-                described = before if isinstance(before, dict) else self._settings["description"]
-                return all(dataset.description.get(key) == value for key, value in described.items())
             staged = {episode.uid: path for path in paths for episode in [load_staged(path, self._columns)]}
-            for stored in dataset.episodes([column.name for column in self._columns]):
+            for stored in dataset.episodes([column.name for column in self._columns]) if staged else ():
                 if path := staged.pop(stored.uid, None):
                     one = load_staged(path, self._columns)
                     same = (np.array_equal(v, stored.columns[name]) for name, v in one.columns.items())
@@ -221,7 +212,10 @@ class StagedWriter:
                         return False
         except AstraDataError:
             return False
-        return not staged
+        settings = read_object(self.folder / _SETTINGS)
+        before = settings.get("description") if isinstance(settings, dict) else None
+        described = before if isinstance(before, dict) else self._settings["description"]
+        return not staged and (bool(paths) or described.items() <= dataset.description.items())
 
     def _path(self, position: int) -> Path:
         return self.folder / f"{position:06d}.arrow"

@@ -3,7 +3,7 @@
 import json
 import shutil
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -83,36 +83,29 @@ class DatasetWriter:
             description: see `complete_description`.
             subset_seed: of the permutation whose prefixes are the nested subsets.
             compression: of the data files, one of `format.COMPRESSIONS`.
-
-        Raises:
-            BadInputError: an argument, or an episode in `add`, is not what was expected; lists every fault.
         """
         given = [column.name for column in columns]
-        faults = [f"column {name} is given twice" for name in sorted(set(given)) if given.count(name) > 1]
-        faults += [
-            f"column {name}: is filled in by the writer, leave it out" for name in given if name in names.RESERVED
-        ]
-        if not given:
-            faults.append("no columns")
-        if type(fps) is not int or fps < 1:
-            faults.append(f"fps {fps!r}, expected a positive int")
-        if compression not in layout.COMPRESSIONS:
-            faults.append(f"compression {compression!r}, expected {' or '.join(layout.COMPRESSIONS)}")
-        if not isinstance(task, str) or not is_text(task):
-            faults.append(f"task {task!r}, expected text of valid characters")
-        if faults:
+        reserved = [name for name in given if name in names.RESERVED]
+        checks = {
+            **{f"column {name} is given twice": given.count(name) == 1 for name in sorted(given)},
+            **{f"column {name}: is filled in by the writer, leave it out": False for name in reserved},
+            "no columns": bool(given),
+            f"fps {fps!r}, expected a positive int": type(fps) is int and fps >= 1,
+            f"compression {compression!r}, expected {' or '.join(layout.COMPRESSIONS)}": (
+                compression in layout.COMPRESSIONS
+            ),
+            f"task {task!r}, expected text of valid characters": isinstance(task, str) and is_text(task),
+        }
+        if faults := [fault for fault, holds in checks.items() if not holds]:
             raise BadInputError(f"Dataset {root}: {'; '.join(faults)}.")
         self.root = root
         self._columns = {column.name: column for column in columns}
         self._stored = layout.stored_columns(columns)
         self._schema = layout.data_schema(self._stored)
-        self._fps = fps
-        self._task = task
+        self._fps, self._task, self._subset_seed, self._compression = fps, task, subset_seed, compression
         self._description = complete_description(description)
         self.made: dict[str, Any] = {}
         self.policy: Path | None = None
-        self._subset_seed = subset_seed
-        self._compression = compression
         self._hash = ContentHash()
         self._digests = {column.name: array("Q") for column in self._stored}
         self._frames = 0
@@ -218,19 +211,16 @@ class Admission:
         self._uids: set[int] = set()
         self.metadata_types: dict[str, type] = {}  # of each metadata key seen so far
 
-    def admit(self, episode: Episode) -> None:
-        """Accept `episode`, or refuse it with a BadInputError that lists every fault."""
-        self.check(episode)
-        self._uids.add(episode.uid)
-        self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
-
-    def check(self, episode: Episode) -> None:
-        """Refuse `episode` as `admit` does, without accepting it otherwise."""
+    def admit(self, episode: Episode, *, keep: bool = True) -> None:
+        """Accept `episode`, or refuse it with a BadInputError that lists every fault; `keep` it in mind."""
         if not isinstance(episode, Episode):
             kind = type(episode).__name__
             raise BadInputError(f"expected an Episode, made with Episode(uid, columns), got a {kind}")
         if faults := self._faults(episode):
             raise BadInputError(f"Episode {episode.uid}: {'; '.join(faults)}.")
+        if keep:
+            self._uids.add(episode.uid)
+            self.metadata_types |= {key: type(value) for key, value in episode.metadata.items()}
 
     def _faults(self, episode: Episode) -> list[str]:
         faults = [f"{name}: missing" for name in self._columns if name not in episode.columns]
@@ -256,14 +246,13 @@ def is_text(value: str) -> bool:
     return not any("\ud800" <= character <= "\udfff" for character in value)
 
 
-def _metadata_faults(key: str, value: Scalar) -> list[str]:
-    """List why a value of the metadata cannot be stored."""
+def _metadata_faults(key: str, value: Scalar) -> Iterator[str]:
+    """Yield why a value of the metadata cannot be stored."""
     if not isinstance(key, str) or not is_text(key) or not 0 < len(key) <= MOST_CHARACTERS:
-        return [f"metadata {key!r:.80}: expected a text of valid characters as its name"]
-    if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        return [f"metadata {key}: an integer of more than 64 bits"]
-    if isinstance(value, str) and len(value) > MOST_CHARACTERS:
-        return [f"metadata {key}: {len(value):,} characters, expected at most {MOST_CHARACTERS:,}"]
-    if isinstance(value, str) and not is_text(value):
-        return [f"metadata {key}: {value!r:.80} has characters that are not valid Unicode"]
-    return []
+        yield f"metadata {key!r:.80}: expected a text of valid characters as its name"
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield f"metadata {key}: an integer of more than 64 bits"
+    elif isinstance(value, str) and len(value) > MOST_CHARACTERS:
+        yield f"metadata {key}: {len(value):,} characters, expected at most {MOST_CHARACTERS:,}"
+    elif isinstance(value, str) and not is_text(value):
+        yield f"metadata {key}: {value!r:.80} has characters that are not valid Unicode"
