@@ -1,8 +1,4 @@
-"""New versions of a dataset with other episodes: subset, delete, filter and merge.
-
-Nothing is edited in place: every function streams the remaining episodes into a new dataset and returns its
-folder, which is `out`, or by default the new version's folder under `versions.home()`.
-"""
+"""New versions of a dataset with other episodes: subset, delete, filter and merge; nothing is edited in place."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -113,11 +109,7 @@ def filter_episodes(
     name: str | None = None,
     out: Path | None = None,
 ) -> Path:
-    """Write the episodes of `source` that meet all given conditions; bounds are inclusive.
-
-    Success is that of `Dataset.successes`, the return that of the episodes' metadata; episodes without one
-    do not meet conditions on it.
-    """
+    """Write the episodes of `source` that meet all conditions; bounds are inclusive, what is unknown meets none."""
     given = {"success": success, "min_return": min_return, "max_return": max_return}
     config = only_given(**given, min_length=min_length, max_length=max_length)
     if not config:
@@ -225,11 +217,7 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
 
 
 def _strata(source: Dataset, key: str, seed: int) -> dict[str, int]:
-    """Count the episodes per value of `key`.
-
-    A subset that was stratified in the same way passes its own counts on: with the subset's rounded shares
-    instead, a subset of it would differ from the same subset of the whole.
-    """
+    """Count the episodes per value of `key`; a subset stratified likewise hands on its own counts, not its shares."""
     config = source.description["config"]
     if (config.get("stratify"), config.get("seed")) == (key, seed):
         return dict(config["strata"])

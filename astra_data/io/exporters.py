@@ -32,12 +32,7 @@ _log = logging.getLogger(__name__)
 
 
 def export(dataset: Dataset, out: Path, *, format: str) -> None:
-    """Write `dataset` to `out` in the layout of the library `format`; rewards are 0 where it has none.
-
-    Raises:
-        BadInputError: the format is unknown, a column or a package that it needs is missing, or `out` exists.
-        DiskError: `out` cannot be written; nothing is left of it.
-    """
+    """Write `dataset` to a new `out`, in the layout of the library `format`; rewards are 0 where it has none."""
     if format not in EXPORTERS:
         raise BadInputError(f"format '{format}': unknown{did_you_mean(format, EXPORTERS)}")
     missing = [name for name in NEEDED if name not in dataset.features]
@@ -50,10 +45,7 @@ def export(dataset: Dataset, out: Path, *, format: str) -> None:
 
 
 def _d4rl(dataset: Dataset, path: Path, out: Path) -> None:
-    """Write observations (N, S), actions (N, A), rewards, terminals, timeouts (N,), next_observations (N, S).
-
-    The last step of every episode is a terminal or a timeout, since nothing else separates the episodes.
-    """
+    """Write flat arrays (N, ...); every episode ends in a terminal or a timeout: nothing else parts them."""
     fields = _fields(dataset, {name: field for name, field in D4RL.items() if name != TRUNCATED})
     columns = [values for *_, values in _episodes(dataset)]
     ends = np.cumsum(dataset.lengths) - 1
@@ -66,11 +58,7 @@ def _d4rl(dataset: Dataset, path: Path, out: Path) -> None:
 
 
 def _d3rlpy(dataset: Dataset, path: Path, out: Path) -> None:
-    """Write what d3rlpy's `ReplayBuffer.load` reads, version 2.1 of its layout.
-
-    Per episode i: observations_i (T, S + G), actions_i (T, A), rewards_i (T, 1) and terminated_i. Its
-    algorithms take one observation, so the goal, where there is one, follows the state.
-    """
+    """Write what d3rlpy's `ReplayBuffer.load` reads, version 2.1 of its layout; goals follow states in observations."""
     fields = _fields(dataset, D3RLPY | {TERMINATED: "infos/next.terminated"})
     with hdf5_file(path) as file:
         file["columns"] = list(D3RLPY.values())
@@ -88,10 +76,8 @@ def _d3rlpy(dataset: Dataset, path: Path, out: Path) -> None:
 def _robomimic(dataset: Dataset, path: Path, out: Path) -> None:
     """Write data/demo_i: actions (T, A), rewards, dones, truncated (T,), obs/state, next_obs/state (T, S).
 
-    `dones` is terminated alone: robomimic's learners do not bootstrap on it. Goals (T, G) are obs/goal and
-    next_obs/goal. mask/train and mask/valid follow the permutation of the nested subsets, by recordings with
-    all copies of them; mask/valid is what an augmentation held out, if it did. A dataset of few episodes has
-    only mask/train.
+    `dones` is terminated alone: robomimic's learners do not bootstrap on it. mask/train and mask/valid follow the
+    permutation of the nested subsets, by recordings with all copies of them, or what an augmentation held out.
     """
     observed = {STATE: "obs/state", NEXT_STATE: "next_obs/state", GOAL: "obs/goal"}
     fields = _fields(dataset, ROBOMIMIC | observed)
@@ -133,11 +119,9 @@ def _validation(dataset: Dataset) -> NDArray[np.bool_]:
 
 
 def _minari(dataset: Dataset, path: Path, out: Path) -> None:
-    """Write observations (T + 1, S), actions (T, A), rewards, terminations and truncations (T,) per episode.
+    """Write observations (T + 1, S), a dict where there are goals, actions (T, A), rewards and ends (T,) per episode.
 
-    With goals, observations are a dict of "observation" and "desired_goal" (T + 1, G). The end of `out` is
-    the id: its path in Minari's folder, or its name elsewhere. `minari.create_dataset_from_buffers`
-    would hold all episodes in memory, write into Minari's folder alone, and not notice a full disk.
+    `minari.create_dataset_from_buffers` would hold all episodes in memory, and not notice a full disk.
     """
     minari = optional("minari")
     from gymnasium.spaces import Box, Dict  # noqa: PLC0415 - only needed here
@@ -229,10 +213,7 @@ def _episodes(dataset: Dataset) -> Iterator[tuple[int, Episode, dict[str, Array]
 
 @contextmanager
 def hdf5_file(path: Path, *, track_order: bool = False) -> Iterator[Any]:
-    """Yield a new HDF5 file, written to `path` once it is whole: HDF5 itself crashes where a disk fails.
-
-    `track_order` lists groups in the order of their making instead of by name.
-    """
+    """Yield a new HDF5 file, written to `path` once it is whole: HDF5 itself crashes where a disk fails."""
     content = io.BytesIO()
     with optional("h5py").File(content, "w", track_order=track_order) as file:
         yield file

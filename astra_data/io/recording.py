@@ -197,14 +197,8 @@ def find_sources(
 ) -> list[Source]:
     """List the files of recordings in natural order (2 before 10), without hidden ones, named apart.
 
-    Args:
-        recordings: files, folders, or archives, whose members must be plain files inside of them.
-        file_format: of all of them.
-        suffixes: endings of the format's files in a folder or archive, in small letters; names may have
-            capitals.
-        mapping: says which files are joined.
-        max_bytes: the most bytes of values that may be taken from them, by default in proportion to their
-            sizes.
+    They are of `file_format`, with one of its `suffixes` in a folder or archive; `mapping` says which are joined, and
+    `max_bytes` how much is taken, by default in proportion to their sizes.
     """
     sources: list[Source] = []
     for recording in recordings:
@@ -254,10 +248,7 @@ def _found(recording: Path, suffixes: Sequence[str]) -> list[Source]:
 
 
 def other_files(recordings: Sequence[Path], suffixes: Sequence[str]) -> tuple[str, ...]:
-    """Name the files in folders and archives that `find_sources` leaves out by their endings.
-
-    Mappings and texts for people are none of them.
-    """
+    """Name the files in folders and archives that `find_sources` leaves out by their endings, mappings apart."""
     beside = (*suffixes, ".toml", ".md")
     inside = [source for path in recordings if path.is_dir() or is_archive(path) for source in _inside(path)]
     names = [name for name in map(str, inside) if not name.lower().endswith(beside)]
@@ -338,10 +329,7 @@ def row_count(origin: str, fields: Sequence[str], shapes: Mapping[str, tuple[int
 
 
 def _joined(sources: Sequence[Source], names: Sequence[str]) -> list[Source]:
-    """Group files that are parts of one recording: those in a folder whose names end with `names`.
-
-    What precedes that end is the same for all files of a recording: `run3_state.csv`, `run3_control.csv`.
-    """
+    """Group files of one folder that are parts of one recording: names that end with `names` and else are the same."""
     groups: dict[tuple[str, str], dict[str, Source]] = {}
     for source in sources:
         path = PurePosixPath(source.path if source.member is None else f"{source.path}/{source.member.name}")

@@ -1,13 +1,9 @@
 """Rows at fps of the messages of asynchronous topics.
 
-From the time when every topic has sent a message, a row is taken every 1 / fps seconds; each value is the
-topic's last one at that time (zero-order hold). A topic that is silent for longer than `split.gap_s`, or the
-`gap_s` of its column, ends the episode, and the next begins when all have sent a message again; where all are
-silent for as long, it ends with the last message.
-
-Where a state comes as often as rows, or a whole number of times as often, rows are taken midway between its
-messages and those of the commands: jitter changes no row, and a state meets the command that is in force for
-most of its step.
+From the time when every topic has sent a message, a row is taken every 1 / fps seconds, of each topic's last one
+(zero-order hold). A topic that is silent for longer than `split.gap_s`, or the `gap_s` of its column, ends the
+episode. Where a state comes a whole number of times as often as rows, these are taken midway between its messages
+and the commands': jitter changes no row, and a state meets the command that is in force for most of its step.
 """
 
 import math
@@ -49,10 +45,7 @@ class Resampler:
         moments: Mapping[str, ArrayLike],
         topic_of: Mapping[str, str] | None = None,
     ) -> None:
-        """Sample the fields of `mapping` from the file `origin`, with the times of messages by topic, in ns.
-
-        `topic_of` gives the topic of each field where names do not.
-        """
+        """Sample the fields of `mapping` from the file `origin`; `topic_of` gives each one's topic where names do not."""
         self._origin, self._fps = origin, mapping.fps
         of = topic_of or {field: field.partition(":")[0] for field in mapping.all_fields}
         self.topics: dict[str, list[str]] = {}
@@ -92,10 +85,7 @@ class Resampler:
         self._lossy = self._commands.keys() | {of[field] for field in mapping.flag_fields}
 
     def rows(self, messages: Iterable[tuple[str, int, Any, bool]]) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
-        """Yield whether a row begins an episode, whether it does since time goes back, and each topic's message.
-
-        Messages have a topic, a time in ns, what they hold, and whether the clock was set back before them.
-        """
+        """Yield whether a row begins an episode, whether it does since time goes back, and each topic's message."""
         time = 0
         for topic, time, message, goes_back in messages:
             # A pause: all topics that are not latched are silent for too long.
@@ -132,11 +122,7 @@ class Resampler:
                 yield f"{note}: set latched = true if it is sent on change, or a longer gap_s"
 
     def unevenness(self) -> tuple[str, ...]:
-        """Return a line for each topic that many rows repeat, or of which many messages are in no row.
-
-        Of a topic without commands, flags and outcomes, messages may be in no row, as where fps is lower than
-        its rate; if it is observed, uneven steps are named.
-        """
+        """Return a line for each topic that many rows repeat, or of which many messages are in no row."""
         notes = []
         for topic in sorted(self._expiring & self._periods.keys()):
             rate = 1e9 / self._periods[topic]
@@ -224,11 +210,7 @@ class Resampler:
 
 
 def usual_periods(moments: Mapping[str, NDArray[np.int64]], gap_ns: int) -> dict[str, float]:
-    """Return the mean step between the messages of each topic that has two steps or more up to `gap_ns`.
-
-    Steps that are far longer than the median are left out, as of lost messages, unless they are most of the
-    time, as of messages that come in bursts.
-    """
+    """Return the mean step of each topic that has two steps or more up to `gap_ns`, without those of lost messages."""
     periods = {}
     for topic, times in moments.items():
         steps = np.diff(np.unique(times))
@@ -248,10 +230,7 @@ def _messages_per_row(ratio: float) -> int:
 
 
 def uneven_steps(topic: str, rate: float, fps: int) -> str:
-    """Return a warning if `fps` is no whole fraction of the `rate` of `topic` in Hz, with better ones.
-
-    Few odd steps, or steps that are odd by little, do not matter; nor do fewer messages than rows.
-    """
+    """Return a warning if `fps` is no whole fraction of the `rate` of `topic` in Hz, with better ones."""
     whole = round(rate)
     if whole and abs(rate / whole - 1) < _WHOLE:
         rate = whole

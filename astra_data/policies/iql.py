@@ -1,13 +1,9 @@
 """Implicit Q-learning (Kostrikov et al. 2022) from recorded episodes.
 
-As in their Algorithm 1 the critics come first, from single transitions, for they do not depend on the policy;
-then the policy is extracted by advantage-weighted regression, from windows of consecutive steps, so that a
-recurrent policy learns with its memory. The critics see no history: the recorded random commands are held for
-a while, and critics that know the last command learn little about any other. Once they are finished, each
-recorded step has one weight for good.
-
-Every update seeds torch from (seed, update), so a run resumed from a checkpoint gives the same result as an
-uninterrupted one.
+As in their Algorithm 1 the critics come first, from single transitions; then the policy is extracted by
+advantage-weighted regression, from windows, so that a recurrent policy learns with its memory. The critics see no
+history: recorded random commands are held for a while, and critics that know the last one learn little of others.
+Every update seeds torch from (seed, update), so that a resumed run gives the same result.
 """
 
 import copy
@@ -88,12 +84,7 @@ class Experience:
     terminated: Tensor  # (E, T) bool, the task ended there: no bootstrapping; not set by time-outs
 
     def draw(self, count: int, length: int, burn_in: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """Draw windows of `length` steps from torch's global generator.
-
-        Returns their places in the columns, episodes (count, 1) and steps (count, length), and which steps to
-        learn from, (count, length) bool: all but the first `burn_in` of a window that begins within its
-        episode.
-        """
+        """Draw places of windows, episodes (count, 1) and steps (count, length), and which to learn from."""
         episodes, steps, learned = draw_steps(self.lengths, count, length)
         learned &= steps < self.lengths[episodes]
         learned &= (torch.arange(steps.shape[1], device=steps.device) >= burn_in) | (steps[:, :1] == 0)
@@ -238,11 +229,7 @@ class Iql:
 
 
 def transitions(experience: Experience, config: IqlConfig) -> Transitions:
-    """Return the transitions (N,) of `experience` with n-step returns and the observation n steps later.
-
-    n is `config.return_steps`. Steps with fewer recorded steps after them are left out, unless the task ended
-    there.
-    """
+    """Return the transitions (N,) of `experience` with returns of `config.return_steps` and the observation then."""
     count, lengths = config.return_steps, experience.lengths[:, None]
     step = torch.arange(experience.reward.shape[1], device=lengths.device).expand_as(experience.reward)
     reward = (experience.reward * config.reward_scale) * (step < lengths)

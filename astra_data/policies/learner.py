@@ -52,11 +52,7 @@ class Learner(ABC):
         seed: int,
         is_staggered: bool = True,
     ) -> None:
-        """Start all rows, with the policy's memory `hidden` (B, H).
-
-        `parts` are all else that learning changes. Episodes are truncated after `horizon` steps; where it
-        `is_staggered`, they begin at random ages, so that rows do not all reach it at once.
-        """
+        """Start all rows, with the policy's memory `hidden` (B, H); `parts` are all else that learning changes."""
         self.env, self.horizon = env, horizon
         self.total_steps, self.rollout_steps, self.steps = total_steps, rollout_steps, 0
         self.share, self.pace, self.world_seconds = 0.0, 1.0, 0.0
@@ -93,11 +89,7 @@ class Learner(ABC):
         return Taken(step, executed, expired, done)
 
     def figures(self) -> dict[str, float]:
-        """Return figures on the steps since the last call.
-
-        They are the share of "success" among the "episodes" that ended, wherever in the task they began, and
-        their mean "episode_steps", NaN if none ended; the mean "reward" of a step.
-        """
+        """Return means on the steps since the last call: success and steps of the episodes that ended, the reward."""
         ended = self._finished or math.nan
         figures = {"success": self._succeeded / ended, "episode_steps": self._survived / ended}
         figures |= {"episodes": self._finished, "reward": self._rewarded / self._taken}
@@ -135,10 +127,7 @@ class Learner(ABC):
         return {name: part.state_dict() for name, part in self._parts.items()} | progress | {"rows": rows}
 
     def load_state_dict(self, state: dict[str, Any], observation: Tensor, *, goes_on: bool = True) -> None:
-        """Continue from `state`, once the environment is restored and returned `observation` (B, O).
-
-        Where its episodes do not go on, as those of robots that are where they are, new ones begin with it.
-        """
+        """Continue from `state`, once the environment is restored and returned `observation` (B, O), or start anew."""
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
         self.steps, self.share, self._iteration = state["steps"], state["share"], state["iteration"]
@@ -170,8 +159,7 @@ def is_mastered(points: Points) -> bool:
 def penalty_scale(points: Points) -> float:
     """Return the factor on penalties, from 0 to 1, after the `points` of a learning curve.
 
-    It grows while the simulator is mastered and falls as fast while not, so that caution does not cost
-    success; at full size from the start, penalties teach the robot to stand still.
+    It grows while the simulator is mastered and falls as fast while not: at full size at once, robots learn to stand.
     """
     scale, before = 0.0, 0.0
     for number, point in enumerate(points, 1):

@@ -1,9 +1,8 @@
 """Soft actor-critic on a batched environment (Haarnoja et al. 2018, arXiv 1812.05905).
 
-Where the policy has a memory, the critics share another one, and all learn from windows of recent steps,
-whose first steps only fill the memories; otherwise they learn from single steps. At the start of a
-window the policy's memory is the one stored while acting, since there it spans whole episodes (Kapturowski et
-al. 2019); that of the critics, which see only windows, is empty.
+Where the policy has a memory, the critics share another one, and all learn from windows of recent steps, whose
+first steps only fill the memories. At the start of a window the policy's memory is the one stored while acting
+(Kapturowski et al. 2019); that of the critics, which see only windows, is empty.
 """
 
 import copy
@@ -140,10 +139,7 @@ class Sac(Learner):
             torch._foreach_lerp_([*late], [*now], _TARGET_RATE)
 
     def _losses(self, steps: dict[str, Tensor], learned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the losses of critics, eq. 5, actor, eq. 7, and temperature, eq. 18.
-
-        They are means over the steps of windows (B, T + 1) that are `learned` (B, T) from.
-        """
+        """Return the losses of critics, eq. 5, actor, eq. 7, and temperature, eq. 18: means over `learned` (B, T)."""
         critics, temperature = self._critics, self._log_temperature.detach().exp()
         seen, first = (steps["observation"], steps["previous_action"]), steps["first"].float()
         acting = self.policy.remember_sequence(*seen, steps["hidden"][:, 0], first)
@@ -165,10 +161,7 @@ class Sac(Learner):
 
 
 class _Critics(nn.Module):
-    """Two action values, and the memory that both share, if the policy has one.
-
-    Layer normalization keeps them from diverging at this learning rate.
-    """
+    """Two action values, and the memory that both share; layer normalization keeps them from diverging."""
 
     def __init__(self, shape: PolicyShape) -> None:
         super().__init__()
@@ -198,11 +191,7 @@ class Replay:
     """A ring buffer of the last steps of B environments, in contiguous tensors."""
 
     def __init__(self, size: int, env: BatchedEnv, memory_size: int, device: torch.device) -> None:
-        """Hold the last `size` steps of `env`, the same number per row, with memories of `memory_size`.
-
-        `previous_action` and `hidden` are from before the step, zero at the start; `first` is where an episode
-        begins, and `expired` where time runs out.
-        """
+        """Hold the last `size` steps of `env`, the same number per row, with memories of `memory_size`."""
         self._rows = size // env.num_envs
         self._added = 0
         place = self._rows, env.num_envs
@@ -230,11 +219,9 @@ class Replay:
             self._columns["expired"][last] |= ~self._columns["terminated"][last]
 
     def windows(self, count: int, length: int, burn_in: int) -> tuple[dict[str, Tensor], Tensor]:
-        """Draw windows of `length` consecutive steps, plus one, by torch's global generator.
+        """Draw windows (count, length + 1, ...) of consecutive steps, and which to learn from, (count, length) bool.
 
-        Returns the columns (count, length + 1, ...), and which steps to learn from, (count, length) bool: not
-        those at the horizon, whose next observation is not kept, nor the first `burn_in` of a window before an
-        episode starts in it, which only warm up the memory.
+        Not those at the horizon, whose next observation is not kept, nor a `burn_in`, which only warms up the memory.
         """
         device = self._columns["reward"].device
         oldest = self._added - len(self)

@@ -55,11 +55,7 @@ class DataStarts:
 
 
 def policy_observation(objective: Objective, state: Tensor, goal: Tensor, latent: Tensor | None) -> Tensor:
-    """Assemble a policy's observation (..., O): the latent (..., Z) if there is one, then state and goal.
-
-    The latent is scaled from its length of sqrt(Z) to about one. At its own length it drowns the rest: PPO
-    then hardly learns to use the position. The objective is given B states at a time.
-    """
+    """Assemble a policy's observation (..., O): the latent (..., Z), if any, scaled to about 1, then state and goal."""
     seen = objective.observe(state.flatten(0, -2), goal.flatten(0, -2)).unflatten(0, state.shape[:-1])
     return seen if latent is None else torch.cat([latent / latent.shape[-1] ** 0.5, seen], dim=-1)
 
@@ -68,14 +64,8 @@ class SimulatorEnv:
     """A batched environment over an abstract simulator.
 
     Rewards: "abstract", the task's own on abstract states; "predicted", the target's as R_pred predicts it
-    (Algorithm 2); "priced", the task's own minus the predicted cost of failures, times `RISK_WEIGHT`.
-    Where the abstract state itself decides the step (goal reached, ball out, body fallen, a wall touched that
-    must not be), "predicted" pays the task's own reward as well. All randomness comes from torch's global
-    generator.
-
-    Attributes:
-        failed: which episodes failed in the last step, (B,) bool.
-        penalty_scale: factor on the price of failures; 1 but where the training ramps it up.
+    (Algorithm 2); "priced", the task's own minus the predicted cost of failures, times `RISK_WEIGHT`. Where the
+    abstract state itself decides the step, "predicted" pays the task's own reward as well.
     """
 
     def __init__(
@@ -88,11 +78,7 @@ class SimulatorEnv:
         draws_failures: bool = False,
         shows_parameters: bool = False,
     ) -> None:
-        """Set the task in `simulator`, raw or grounded.
-
-        With `draws_failures`, episodes fail at random with the predicted probability, as judges' do; with
-        `shows_parameters`, observations end with the normalized parameters of a simulator that varies.
-        """
+        """Set the task in `simulator`, raw or grounded; failures may be drawn as predicted, and parameters be shown."""
         self.objective = objective
         self.simulator = simulator
         self.world, self.starts, self.draws_failures = world, starts, draws_failures
@@ -193,11 +179,7 @@ _LEAST_RATIO = 1.5  # of the rates of failures above and below the limit
 
 @torch.no_grad()
 def command_limit(task: Task, episodes: PairedEpisodes) -> float:
-    """Return 1, the largest velocity command along an axis, if failures are more frequent above it.
-
-    Each step counts with the mean length of the commands up to it over `RISK_STEPS`; diagonal ones may be √2
-    long. `NO_LIMIT` if the recorded rate of failures above 1 is less than 1.5 times that below.
-    """
+    """Return 1, the largest velocity command along an axis, if failures are more frequent above, else `NO_LIMIT`."""
     if task.plane is None:
         return NO_LIMIT
     windows = episodes.windows
@@ -263,9 +245,6 @@ def training_env(
     starts: DataStarts | None = None,
     shows_parameters: bool = False,
 ) -> SimulatorEnv:
-    """Build the environment: the task in the raw, varied or grounded simulator.
-
-    Without `starts`, see `data_starts`, all episodes start where the task does.
-    """
+    """Build the environment: the task in the raw, varied or grounded simulator, with `starts` of data or its own."""
     simulator = _used(grounding, simulation.world).simulator(task, num_envs, device, variation=simulation.variation)
     return SimulatorEnv(task.objective, simulator, simulation.world, starts=starts, shows_parameters=shows_parameters)

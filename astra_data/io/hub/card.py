@@ -54,20 +54,9 @@ class Notes(Config):
 
 
 def write_card(dataset: Dataset, out: Path, notes: Notes, *, source: str | None = None) -> list[Path]:
-    """Write the card of `dataset` to `out` and, if the dataset has planar positions, their figure beside it.
+    """Write the card of a verified `dataset` to `out` and, where it has planar positions, their figure beside it.
 
-    Args:
-        dataset: any of which every value was verified, for the card states the hash of all of them.
-        out: the Markdown file, which is not replaced by another; the figure, `<stem>-coverage.png`, is.
-        notes: the part of the card that a person writes.
-        source: where it is shared, as `pull` takes it; if None, the card shows how to open a folder.
-
-    Returns:
-        the files written.
-
-    Raises:
-        BadInputError: `out` is there already, with other contents.
-        DiskError: `out` cannot be written.
+    Return the files; `notes` are by hand, `source` is where it is shared. Refuse an `out` of other contents.
     """
     positions = visited(dataset)
     figure = None if positions is None else out.with_name(f"{out.stem}-coverage.png")

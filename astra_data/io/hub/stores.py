@@ -1,7 +1,4 @@
-"""The places where datasets are shared: a repository on the Hugging Face Hub, or a folder at any URL.
-
-Both hold a dataset's own files and SHA256SUMS, which lists them all as `sha256sum` does, under the tag of each version.
-"""
+"""The places where datasets are shared: a repository on the Hub, or a folder at any URL, with files and SHA256SUMS."""
 
 import json
 import os
@@ -61,12 +58,7 @@ def make_sums(root: Path) -> str:
 
 
 def parse_sums(text: str, source: str) -> dict[str, str]:
-    """Read SHA256SUMS: file path to sha256.
-
-    Raises:
-        SharingError: a line is malformed, or a path is not one of a dataset, such as a script or one that
-            leads out of the folder; lists every fault.
-    """
+    """Read SHA256SUMS: file path to sha256; a SharingError lists malformed lines and paths of no dataset."""
     sums: dict[str, str] = {}
     faults = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -127,11 +119,7 @@ class RemoteFolder:
     """Of the version, for messages."""
 
     def facts(self, path: str) -> dict[str, Any]:
-        """Return what the file system knows of a file, such as its "size"; empty if it is not there.
-
-        Raises:
-            SharingError: it is a link, a device or a pipe, or the place cannot be reached.
-        """
+        """Return what the file system knows of a file, such as its "size"; empty without one; refuse links, pipes."""
         with explained(self.name):
             try:
                 facts = dict(self.filesystem.info(f"{self.path}/{path}"))
@@ -322,10 +310,7 @@ class UrlStore:
         return RemoteFolder(self._filesystem, f"{self._path}/{version.tag}", f"{self.url}/{version.tag}")
 
     def upload(self, dataset: Dataset, card: Path, progress: Progress) -> None:
-        """Upload `dataset` and its card: SHA256SUMS first, and `layout.DATASET_PATH` last, which marks it as complete.
-
-        The next push of the same files repeats an interrupted one. Raise BadInputError if the folder holds others.
-        """
+        """Upload `dataset` and its card, `layout.DATASET_PATH`, which marks it as complete, last; replace no other."""
         remote = self.folder(Version.parse(dataset.description["version"]))
         sums = (card / SUMS_PATH).read_bytes()
         files = {path: dataset.root / path for path in dataset_files(dataset.root)}
