@@ -45,7 +45,7 @@ class Resampler:
         moments: Mapping[str, ArrayLike],
         topic_of: Mapping[str, str] | None = None,
     ) -> None:
-        """Sample the fields of `mapping` from the file `origin`; `topic_of` gives each one's topic where names do not."""
+        """Sample the fields of `mapping` from the file `origin`; `topic_of` gives topics where names do not."""
         self._origin, self._fps = origin, mapping.fps
         of = topic_of or {field: field.partition(":")[0] for field in mapping.all_fields}
         self.topics: dict[str, list[str]] = {}
