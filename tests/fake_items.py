@@ -9,6 +9,7 @@ from pathlib import Path
 from astra_data.core.durable import held
 from astra_data.core.errors import MissingStageError
 from astra_data.core.progress import Progress
+from astra_data.pipeline.executors import Event
 
 
 def touch(path: Path, needs: tuple[Path, ...], *, progress: Progress) -> None:
@@ -54,18 +55,16 @@ class Record:
     def __init__(self) -> None:
         self.events: list[tuple[str, str]] = []
 
-    def started(self, key: str) -> None:
-        self.events.append(("started", key))
-
-    def progressed(self, key: str, fraction: float, note: str) -> None:
-        self.events.append((f"{fraction} {note}", key))
-
-    def finished(self, key: str, seconds: float) -> None:
-        assert seconds >= 0
-        self.events.append(("finished", key))
-
-    def failed(self, key: str) -> None:
-        self.events.append(("failed", key))
+    def __call__(self, key: str, event: Event) -> None:
+        match event:
+            case tuple():
+                told = f"{event[0]} {event[1]}"
+            case float():
+                assert event >= 0
+                told = "finished"
+            case _:
+                told = "started" if event is None else "failed"
+        self.events.append((told, key))
 
 
 def fill_the_disk(*, progress: Progress) -> None:

@@ -19,7 +19,7 @@ from astra_data.core.artifact import finished_folder
 from astra_data.core.durable import file_digest
 from astra_data.core.errors import AstraDataError, BadInputError
 from astra_data.dataset.description import read_description
-from astra_data.pipeline.executors import EXECUTORS, Item, Watcher
+from astra_data.pipeline.executors import EXECUTORS, Item, Watch
 from astra_data.pipeline.stages.registry import STAGES, Stage
 
 ARTIFACTS = ("dataset", "policy", "grounding", "target_encoder", "reference", "initial")
@@ -33,16 +33,16 @@ class FakeStages:
         self.asked: dict[str, dict[str, Any]] = {}
         self.failing: set[str] = set()
 
-    def run_here(self, items: Collection[Item], *, watch: Watcher, prepare: Callable[[], object], **_: object) -> None:
+    def run_here(self, items: Collection[Item], *, watch: Watch, prepare: Callable[[], object], **_: object) -> None:
         """Run items as an executor does, one after another."""
         for item in items:
-            watch.started(item.key)
+            watch(item.key, None)
             try:
-                item.call(progress=lambda share, note, key=item.key: watch.progressed(key, share, note))
+                item.call(progress=lambda share, note, key=item.key: watch(key, (share, note)))
             except AstraDataError as error:
-                watch.failed(item.key)
+                watch(item.key, error)
                 raise type(error)(f"{item.key}: {error}") from None
-            watch.finished(item.key, 1.0)
+            watch(item.key, 1.0)
 
 
 class _Fake:

@@ -1,7 +1,6 @@
 """Arguments of several commands, options from the models of settings, and what several commands do."""
 
 import ast
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, wraps
@@ -63,12 +62,6 @@ def _stage(name: str | None) -> str | None:
     return name
 
 
-def _device(name: str) -> str:
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
-        raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{name}'")
-    return name
-
-
 DatasetName = Annotated[
     str, typer.Argument(metavar="DATASET", help="A folder, name@data-1.2.0, or a name (for its highest version).")
 ]
@@ -99,7 +92,7 @@ Methods = Annotated[
     list[str] | None, typer.Option("--method", metavar="ROW", help="Run only this row; may be repeated.")
 ]
 Seeds = Annotated[list[int] | None, typer.Option("--seed", help="Run only this seed of the recipe; may be repeated.")]
-Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …", callback=_device)]
+Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …")]
 Jobs = Annotated[
     int | None,
     typer.Option(

@@ -65,12 +65,7 @@ _PLACES: dict[str, str] = {}
 
 
 def add_method(name: str, place: str) -> None:
-    """Add a method of the user's to `METHODS`, until this process ends.
-
-    Args:
-        name: of its rows.
-        place: "file.py:METHOD" or "package.module:METHOD", whose code is run.
-    """
+    """Add a method of the user's at "file.py:METHOD" or "package.module:METHOD" to `METHODS`; its code is run."""
     file, is_file, attribute = place.partition(".py:")
     found = f"{Path(f'{file}.py').resolve()}:{attribute}" if is_file else place
     if (known := _PLACES.get(name)) == found:

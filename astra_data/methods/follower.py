@@ -25,16 +25,13 @@ def careful(task: Task, goal: Tensor) -> Act:
 
 @dataclass(frozen=True)
 class CarefulFollower:
-    """Descend the distance to the goal, along paths away from the walls, a little below full speed.
-
-    Attributes:
-        maze: the maze. margin: distance from the walls that paths keep where they can, in cells of the maze.
-        speed: of the faster axis, in units of commands.
-    """
+    """Descend the distance to the goal, along paths away from the walls, a little below full speed."""
 
     maze: Maze
     margin: float = 0.4
+    """Distance from the walls that paths keep where they can, in cells of the maze."""
     speed: float = 0.85
+    """Of the faster axis, in units of commands."""
 
     def fields(self, goals: Tensor) -> Tensor:
         """Return the cost of going from each fine cell to each of `goals` (B, 2), (B, height, width)."""

@@ -20,16 +20,12 @@ which may learn less from the same number of steps."""
 
 @dataclass(frozen=True)
 class Table:
-    """A table of settings in a recipe, which one method or several read.
-
-    Attributes:
-        name: its key in recipes. model: of its content.
-        default: the settings where a recipe has no such table; None for those of the model.
-    """
+    """A table of settings in a recipe, which one method or several read."""
 
     name: str
     model: type[Config]
     default: Config | None = None
+    """The settings where a recipe has no such table; None for those of the model."""
 
     @property
     def usual(self) -> Config:
@@ -43,10 +39,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Method:
-    """A method, which is one row of the results.
+    """A method, which is one row of the results: `name` in recipes and folders, `title` in tables and figures.
 
     Attributes:
-        name: in recipes and folders. title: in tables and figures.
         color: in figures, as "#rrggbb"; one of the spare colors where empty.
         role: set for rows that the others are compared with.
         fit: what it learns about the simulator from pairs; None where the simulator stays raw.
@@ -55,7 +50,7 @@ class Method:
         initial: the method from whose policy its own training starts, if any.
         grounded_as: the method whose grounding and alignment it uses; its own where empty.
         grounding: the class of what its fit returns, where this is none of the package's.
-        table: its settings in a recipe, if it has any. configures: the stage that takes them.
+        table: its settings in a recipe. configures: the stage that takes them.
         planar: whether it is for tasks in a maze only.
     """
 

@@ -78,8 +78,7 @@ def condition(item: Item, experiment: Experiment, *, verify: bool = False) -> Co
 def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, str]:
     """Return which finished artifacts of `items`, each after those it reads, to make again: key to reason.
 
-    Those are the damaged and the stale ones, and what was made from them. Of all, the sizes are compared, of
-    what an item to make reads, every byte.
+    Those are the damaged and the stale ones, and what was made from them. Every byte of what they read is compared.
     """
     known = {item.key: item for item in items}
     absent = {key for key, item in known.items() if item.stage in ALWAYS_NEW or not experiment.has(key)}
@@ -142,13 +141,7 @@ def _digest(key: str, experiment: Experiment) -> str | None:
 
 
 def data_condition(recipe: Recipe) -> Condition | None:
-    """Return the condition of a recipe's `data`; None if it has none, or has yet to pull it.
-
-    Raises:
-        BadInputError: there are no such data, their columns are not those of the task, they were paired, or
-            none is left to train on where some are held out, in the smallest size of a sweep.
-        CorruptDatasetError: a file of theirs cannot be read.
-    """
+    """Return the condition of a recipe's `data`, which fit its task; None if it has none, or has yet to pull it."""
     if recipe.data is None or is_address(recipe.data):
         return None
     try:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from astra_data.core.naming import stage_of_key
 from astra_data.core.progress import Progress as Notes
-from astra_data.pipeline.executors import Watcher
+from astra_data.pipeline.executors import Event, Watch
 
 SLOW_STAGES = ("ground", "train", "align")
 """Stages that take most of a run: until it is known how long their items take, no time left is shown."""
@@ -22,9 +22,7 @@ _BAR_WIDTH = 20
 
 
 @contextmanager
-def display(
-    keys: Collection[str], console: Console, then: Callable[[str], object] = lambda _: None
-) -> Iterator[Watcher]:
+def display(keys: Collection[str], console: Console, then: Callable[[str], object] = lambda _: None) -> Iterator[Watch]:
     """Show the progress of the items of these `keys` on `console`; call `then` with each that has finished.
 
     Where lines are too long for the terminal, names and notes are cut off, never bar, share and time left.
@@ -74,19 +72,17 @@ class TimeEstimate:
         self._running: dict[str, tuple[float, float]] = {}  # when each began, and its share done
         self._took: list[tuple[str, float]] = []
 
-    def started(self, key: str) -> None:
-        """Begin an item."""
-        self._waiting.remove(key)
-        self._running[key] = (self._clock(), 0.0)
-
-    def progressed(self, key: str, share: float) -> None:
-        """Go on with an item, of which a share is done."""
-        self._running[key] = (self._running[key][0], share)
-
-    def finished(self, key: str, seconds: float) -> None:
-        """End an item that took so long."""
-        del self._running[key]
-        self._took.append((key, seconds))
+    def add(self, key: str, event: Event) -> None:
+        """Count what happened to an item."""
+        match event:
+            case None:
+                self._waiting.remove(key)
+                self._running[key] = (self._clock(), 0.0)
+            case tuple():
+                self._running[key] = (self._running[key][0], event[0])
+            case float():
+                del self._running[key]
+                self._took.append((key, event))
 
     def left_of(self, key: str) -> float | None:
         """Return the seconds that a running item has left; None while nothing is known of it."""
@@ -118,9 +114,9 @@ def shown(key: str) -> Iterator[Notes]:
     """Show the progress of one job of this process on standard error; yield its progress callback."""
     began = time.perf_counter()
     with display([key], Console(stderr=True)) as watch:
-        watch.started(key)
-        yield partial(watch.progressed, key)
-        watch.finished(key, time.perf_counter() - began)
+        watch(key, None)
+        yield lambda fraction, note: watch(key, (fraction, note))
+        watch(key, time.perf_counter() - began)
 
 
 class _PlainDisplay:
@@ -130,22 +126,21 @@ class _PlainDisplay:
         self._total, self._console, self._then = len(keys), console, then
         self._finished, self._tenths = 0, dict.fromkeys(keys, 0)
 
-    def started(self, key: str) -> None:
-        self._print(f"{key}  started")
-
-    def progressed(self, key: str, fraction: float, note: str) -> None:
-        tenths = int(10 * fraction)
-        if tenths > self._tenths[key]:
-            self._tenths[key] = tenths
-            self._print(f"{key}  {10 * tenths} %  {note}")
-
-    def finished(self, key: str, seconds: float) -> None:
-        self._finished += 1
-        self._print(f"{key}  finished in {seconds:.1f} s  ({self._finished} of {self._total})")
-        self._then(key)
-
-    def failed(self, key: str) -> None:
-        self._print(f"{key}  failed")
+    def __call__(self, key: str, event: Event) -> None:
+        match event:
+            case None:
+                self._print(f"{key}  started")
+            case tuple():
+                tenths = int(10 * event[0])
+                if tenths > self._tenths[key]:
+                    self._tenths[key] = tenths
+                    self._print(f"{key}  {10 * tenths} %  {event[1]}")
+            case float():
+                self._finished += 1
+                self._print(f"{key}  finished in {event:.1f} s  ({self._finished} of {self._total})")
+                self._then(key)
+            case _:
+                self._print(f"{key}  failed")
 
     def _print(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -163,22 +158,18 @@ class _LiveDisplay(_PlainDisplay):
         self._whole = progress.add_task(text, total=self._total, note="", left=self._estimate.left)
         self._tasks: dict[str, TaskID] = {}
 
-    def started(self, key: str) -> None:
-        self._estimate.started(key)
-        left = partial(self._estimate.left_of, key)
-        self._tasks[key] = self._progress.add_task(key, total=1.0, note="starting", left=left)
-
-    def progressed(self, key: str, fraction: float, note: str) -> None:
-        self._estimate.progressed(key, fraction)
-        self._progress.update(self._tasks[key], completed=fraction, note=note)
-
-    def finished(self, key: str, seconds: float) -> None:
-        self._progress.remove_task(self._tasks.pop(key))
-        self._estimate.finished(key, seconds)
-        super().finished(key, seconds)
-        text = f"{self._finished} of {self._total} finished"
-        self._progress.update(self._whole, completed=self._finished, description=text)
-
-    def failed(self, key: str) -> None:
-        if key in self._tasks:
-            self._progress.update(self._tasks[key], note="failed")
+    def __call__(self, key: str, event: Event) -> None:
+        self._estimate.add(key, event)
+        match event:
+            case None:
+                left = partial(self._estimate.left_of, key)
+                self._tasks[key] = self._progress.add_task(key, total=1.0, note="starting", left=left)
+            case tuple():
+                self._progress.update(self._tasks[key], completed=event[0], note=event[1])
+            case float():
+                self._progress.remove_task(self._tasks.pop(key))
+                super().__call__(key, event)
+                text = f"{self._finished} of {self._total} finished"
+                self._progress.update(self._whole, completed=self._finished, description=text)
+            case _ if key in self._tasks:
+                self._progress.update(self._tasks[key], note="failed")

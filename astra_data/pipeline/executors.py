@@ -10,7 +10,7 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import Thread, current_thread, main_thread
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -38,27 +38,26 @@ Note = tuple[float, str]
 """The fraction of an item that is done, and a remark."""
 Outcome = float | AstraDataError
 """How long an item took, in s, or how it failed."""
+Event = Outcome | Note | None
+"""What happened to an item: it ended, or went on, or None: it started."""
+Watch = Callable[[str, Event], None]
+"""Is called with the key of an item and what happened to it."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One artifact to make.
-
-    Attributes:
-        key: its name and its path in the run's folder: `<stage>/[<method>/]seed_<seed>`, or `report`.
-        inputs: keys of the artifacts that it reads.
-        call: makes it; called as `call(progress=...)` in another process, so it must be picklable.
-        is_threaded: whether `call` also takes `num_threads` and runs faster with more of them.
-        device: torch device that it computes on.
-        settings: what it is made with beside its inputs, as JSON.
-    """
+    """One artifact to make, in another process: `call` is picklable and takes `progress`."""
 
     key: str
+    """Its name and its path in the run's folder: `<stage>/[<method>/]seed_<seed>`, or `report`."""
     inputs: tuple[str, ...]
+    """Keys of the artifacts that it reads."""
     call: Callable[..., object]
     is_threaded: bool = False
+    """Whether `call` also takes `num_threads` and runs faster with more of them."""
     device: str = "cpu"
     settings: Mapping[str, Any] = field(default_factory=dict)
+    """What it is made with beside its inputs, as JSON."""
 
     @property
     def stage(self) -> str:
@@ -71,29 +70,17 @@ class Item:
         return self.device.startswith("cuda")
 
 
-class Watcher(Protocol):
-    """Is notified of the progress of items."""
-
-    def started(self, key: str) -> None:
-        """An item has started."""
-
-    def progressed(self, key: str, fraction: float, note: str) -> None:
-        """A `fraction` in [0, 1] of an item is done."""
-
-    def finished(self, key: str, seconds: float) -> None:
-        """An item has finished, after so many seconds of wall-clock time."""
-
-    def failed(self, key: str) -> None:
-        """An item has failed, perhaps before it started; the run stops."""
-
-
 def run_in_order(
-    items: Collection[Item], jobs: int | None, begin: Callable[[Item], object], wait: Callable[[], Collection[str]]
+    items: Collection[Item],
+    jobs: int | None,
+    watch: Watch,
+    begin: Callable[[Item], object],
+    events: Callable[[], Iterable[tuple[str, Event]]],
 ) -> None:
     """Begin each item, in order of preference, as soon as its inputs are finished, at most `jobs` at a time.
 
-    Inputs that are not among the items count as finished. `begin` starts an item and returns at once; `wait`
-    returns the keys of the items that have finished since, possibly none.
+    Inputs that are not among the items count as finished. `begin` returns at once; `events` returns what has
+    happened since, by key. The error of an item that failed is raised.
     """
     keys = [item.key for item in items]
     order = TopologicalSorter({item.key: set(item.inputs).intersection(keys) for item in items})
@@ -104,16 +91,19 @@ def run_in_order(
         while ready and running != jobs:
             begin(known[ready.pop(0)])
             running += 1
-        for key in wait():
-            order.done(key)
-            running -= 1
+        for key, event in events():
+            watch(key, event)
+            if isinstance(event, AstraDataError):
+                raise event
+            if isinstance(event, float):
+                order.done(key)
+                running -= 1
 
 
 def pickled(item: Item, prepare: Callable[[], object] | None, num_threads: int = 1) -> bytes:
     """Return the work of `item` for `run_item`; if it steps the target's physics, by so many threads.
 
-    The call is unpickled after `prepare`: it may hold settings of a class in a file of the user's, which only
-    `prepare` runs.
+    The call is unpickled after `prepare`, which runs the user's file that defines classes of its settings.
     """
     call = partial(item.call, num_threads=num_threads) if item.is_threaded else item.call
     return pickle.dumps((prepare, pickle.dumps(call)))
@@ -122,12 +112,12 @@ def pickled(item: Item, prepare: Callable[[], object] | None, num_threads: int =
 def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -> Outcome:
     """Run the `work` of an item in this process; return its wall-clock time in s, or its error.
 
-    The global generators of Python, numpy and torch are seeded by its key: by stage, row and seed. What it
-    prints goes to `log`, which is removed if that is nothing. At most ten notes a second are sent.
+    The global generators of Python, numpy and torch are seeded by its key. What it prints goes to `log`, which
+    is removed if that is nothing.
     """
     began = time.perf_counter()
-    try:
-        with _printing_to(log):
+    with _printing_to(log):
+        try:
             prepare, call = pickle.loads(work)
             if prepare:
                 prepare()
@@ -138,12 +128,15 @@ def run_item(key: str, work: bytes, log: Path, send: Callable[[Note], object]) -
             if torch := sys.modules.get("torch"):  # its import takes long
                 torch.manual_seed(seed)
             made(progress=reporter(send))
-    except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
-        expected = error if isinstance(error, AstraDataError) else disk_error(error)
-        if expected:
-            return type(expected)(f"{key}: {expected}")
-        last = traceback.format_exception_only(error)[-1].strip()
-        return AstraDataError(f"{key} crashed: {last} (traceback: {log})")
+            sys.stdout.flush()
+        except Exception as error:  # noqa: BLE001 - reported by the run, whatever it is
+            if not isinstance(error, AstraDataError):
+                with suppress(OSError):
+                    traceback.print_exc()
+            if expected := error if isinstance(error, AstraDataError) else disk_error(error):
+                return type(expected)(f"{key}: {expected}")
+            last = traceback.format_exception_only(error)[-1].strip()
+            return AstraDataError(f"{key} crashed: {last} (traceback: {log})")
     return time.perf_counter() - began
 
 
@@ -166,8 +159,9 @@ def _printing_to(log: Path) -> Iterator[None]:
     log.parent.mkdir(parents=True, exist_ok=True)
 
     def flush() -> None:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for printed in (sys.stdout, sys.stderr):
+            with suppress(OSError):
+                printed.flush()
 
     flush()
     before = os.dup(1), os.dup(2)
@@ -176,19 +170,11 @@ def _printing_to(log: Path) -> Iterator[None]:
             os.dup2(file.fileno(), stream)
     try:
         yield
-        flush()
-    except AstraDataError:
-        raise
-    except Exception:
-        with suppress(OSError):
-            traceback.print_exc()
-        raise
     finally:
-        with suppress(OSError):
-            flush()
-        for stream, own in zip((1, 2), before, strict=True):
-            os.dup2(own, stream)
-            os.close(own)
+        flush()
+        for number, stream in enumerate(before, 1):
+            os.dup2(stream, number)
+            os.close(stream)
         if not log.stat().st_size:
             log.unlink()
 
@@ -197,7 +183,7 @@ def execute(
     items: Collection[Item],
     *,
     logs: Path,
-    watch: Watcher,
+    watch: Watch,
     jobs: int | None = None,
     prepare: Callable[[], object] | None = None,
     address: str | None = None,
@@ -207,13 +193,10 @@ def execute(
     Those that step the target's physics share the cores. When an item fails, at Ctrl-C or SIGTERM, or when
     this process is killed, the others are stopped; their last checkpoints stay.
 
-    Items are in order of preference; inputs that are not among them count as finished. What an item prints
-    goes to `<key>.txt` in `logs`. By default there is a job per core, or `CUDA_JOBS` where an item wants a
-    GPU. `prepare` is called in the process of an item before it.
+    What an item prints goes to `<key>.txt` in `logs`. `prepare` is called in the process of an item before it.
 
     Raises:
-        AstraDataError: an item failed; its own error, with its key before the message, or where its
-            traceback is when it crashed.
+        AstraDataError: an item's own error, after its key, or where its traceback is when it crashed.
         KeyboardInterrupt: at Ctrl-C or SIGTERM.
     """
     jobs = jobs or (CUDA_JOBS if any(item.wants_gpu for item in items) else cores())
@@ -221,126 +204,94 @@ def execute(
     workers: list[_Worker] = []
 
     def begin(item: Item) -> None:
-        if not (idle := [worker for worker in workers if worker.key is None]):
-            workers.append(_Worker())
-            idle = workers[-1:]
+        if (worker := next((one for one in workers if one.key is None), None)) is None:
+            workers.append(worker := _Worker())
         num_threads = max(1, cores() // min(jobs, counts[item.stage]))
-        idle[0].begin(item.key, pickled(item, prepare, num_threads), logs / f"{item.key}.txt")
-        watch.started(item.key)
+        worker.begin(item.key, pickled(item, prepare, num_threads), logs / f"{item.key}.txt")
 
-    def finished() -> list[str]:
+    def events() -> list[tuple[str, Event]]:
         busy = {worker.connection: worker for worker in workers if worker.key}
         ready = wait(list(busy))
-        keys = [worker.read(watch) for connection, worker in busy.items() if connection in ready]
-        return [key for key in keys if key]
+        return [worker.read() for connection, worker in busy.items() if connection in ready]
 
-    signals = (signal.SIGINT, signal.SIGTERM)
+    # Python tells no other thread of signals. A shell that starts a run in the background has it ignore SIGINT.
+    signals = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         for number in signals:
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    # Also where a shell that started the run in the background has it ignore SIGINT.
-    with _handled(signals, interrupt):
-        try:
-            run_in_order(items, jobs, begin, finished)
-        finally:
-            for worker in workers:
-                worker.terminate()
-            for worker in workers:
-                worker.stop()
-
-
-@contextmanager
-def _handled(
-    numbers: Collection[signal.Signals], handler: Callable[[int, FrameType | None], None] | signal.Handlers
-) -> Iterator[None]:
-    """Handle signals so within the block, where this is the main thread: Python tells no other of them."""
-    ours = numbers if current_thread() is main_thread() else ()
-    before = [signal.signal(number, handler) for number in ours]
+    before = {number: signal.signal(number, interrupt) for number in signals}
     try:
-        yield
+        run_in_order(items, jobs, watch, begin, events)
     finally:
-        for number, earlier in zip(ours, before, strict=True):
-            signal.signal(number, earlier)
-
-
-def _settle(key: str, outcome: Outcome, watch: Watcher) -> None:
-    """Tell `watch` how an item ended; raise its error."""
-    if isinstance(outcome, AstraDataError):
-        watch.failed(key)
-        raise outcome
-    watch.finished(key, outcome)
+        for worker in workers:
+            worker.process.terminate()
+        for worker in workers:
+            worker.stop()
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class _Worker:
-    """A process that runs one item after another."""
+    """A process that runs one item after another: the one of `key`, if it is busy."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,))
-        # Ctrl-C reaches every process of the terminal; children ignore it and are stopped by this one.
-        with _handled([signal.SIGINT], signal.SIG_IGN):
-            self._process.start()
-        theirs.close()
         self.key: str | None = None
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs,))
+        # Ctrl-C reaches every process of the terminal; children ignore it and are stopped by this one.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        self.process.start()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        theirs.close()
 
     def begin(self, key: str, work: bytes, log: Path) -> None:
         self.key = key
-        # A process that died while it was idle is noticed by `read`.
-        with suppress(BrokenPipeError):
+        with suppress(BrokenPipeError):  # `read` notices a process that died while it was idle
             self.connection.send((key, work, log))
 
-    def read(self, watch: Watcher) -> str | None:
-        """Pass on one message; return the item's key if it finished."""
+    def read(self) -> tuple[str, Event]:
         assert self.key is not None
         key = self.key
         try:
-            message = self.connection.recv()
+            event = self.connection.recv()
         except (EOFError, ConnectionResetError):
-            message = AstraDataError(f"{key} {self._death()}")
-        if isinstance(message, tuple):
-            watch.progressed(key, *message)
-            return None
-        self.key = None
-        _settle(key, message, watch)
-        return key
-
-    def _death(self) -> str:
-        self._process.join()
-        code = self._process.exitcode or 0
-        if code >= 0:
-            return f"ended its process with exit code {code}"
-        reason = ", often for want of memory" if -code == signal.SIGKILL else ""
-        return f"was stopped by {signal.Signals(-code).name}{reason}"
-
-    def terminate(self) -> None:
-        self._process.terminate()
+            self.process.join()
+            code = self.process.exitcode or 0
+            how = f"ended its process with exit code {code}"
+            if code < 0:
+                reason = ", often for want of memory" if -code == signal.SIGKILL else ""
+                how = f"was stopped by {signal.Signals(-code).name}{reason}"
+            event = AstraDataError(f"{key} {how}")
+        if isinstance(event, Outcome):
+            self.key = None
+        return key, event
 
     def stop(self) -> None:
-        self._process.join(5)
-        if self._process.exitcode is None:
-            self._process.kill()
-            self._process.join()
+        self.process.join(5)
+        if self.process.exitcode is None:
+            self.process.kill()
+            self.process.join()
         self.connection.close()
 
 
 def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a forked process would have the parent's handler
-    Thread(target=_exit_with_parent, daemon=True).start()
-    while True:
-        key, work, log = connection.recv()
-        connection.send(run_item(key, work, log, connection.send))
-
-
-def _exit_with_parent() -> None:
-    """Exit when the parent process dies, so that nothing works in a folder that is no longer locked."""
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os._exit(1)
+
+    def exit_with_parent() -> None:  # so that nothing works in a folder that is no longer locked
+        parent.join()
+        os._exit(1)
+
+    Thread(target=exit_with_parent, daemon=True).start()
+    while True:
+        key, work, log = connection.recv()
+        connection.send(None)
+        connection.send(run_item(key, work, log, connection.send))
 
 
 GPU_SHARE = 0.5
@@ -356,19 +307,15 @@ def execute_on_cluster(
     items: Collection[Item],
     *,
     logs: Path,
-    watch: Watcher,
+    watch: Watch,
     jobs: int | None = None,
     prepare: Callable[[], object] | None = None,
     address: str | None = None,
 ) -> None:
     """Run `items` as `execute` does, each as a task with one core of the Ray cluster at `address`.
 
-    That is such as ray://head:10001 or head:6379; by default one of this machine starts and stops with the
-    run. A task runs in this process's working folder and with its module search path.
-
-    Raises:
-        BadInputError: Ray is not installed, no cluster answers, or it lacks the GPU that an item wants.
-        AstraDataError: as `execute`, or the connection to the cluster was lost.
+    By default one of this machine starts and stops with the run. A task runs in this process's working folder and
+    with its module search path.
     """
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
@@ -391,27 +338,22 @@ def execute_on_cluster(
         begun = task.options(num_gpus=share).remote(item.key, pickled(item, prepare), log, here, mailbox)
         running[begun] = item.key
 
-    def finished() -> list[str]:
+    def events() -> Iterator[tuple[str, Event]]:
         done, _ = ray.wait(list(running), timeout=SECONDS_BETWEEN_NOTES)
-        for key, note in ray.get(mailbox.take.remote()):
-            if note is None:
-                watch.started(key)
-            else:
-                watch.progressed(key, *note)
+        yield from ray.get(mailbox.take.remote())
         for begun in done:
+            key = running.pop(begun)
             try:
-                outcome = ray.get(begun)
+                yield key, ray.get(begun)
             except ray.exceptions.RayError as error:
-                outcome = AstraDataError(f"{running[begun]} was lost with its worker: {_first_line(error)}")
-            _settle(running[begun], outcome, watch)
-        return [running.pop(begun) for begun in done]
+                yield key, AstraDataError(f"{key} was lost with its worker: {_first_line(error)}")
 
     try:
         if any(item.wants_gpu for item in items) and not ray.cluster_resources().get("GPU"):
             raise BadInputError(f"the Ray cluster at {address} has no GPU: use --device cpu")
         mailbox = ray.remote(num_cpus=0)(_Mailbox).remote()
         task = ray.remote(num_cpus=1, max_retries=0)(_work)
-        run_in_order(items, jobs, begin, finished)
+        run_in_order(items, jobs, watch, begin, events)
     except (ray.exceptions.RayError, ConnectionError) as error:
         raise AstraDataError(f"the Ray cluster at {address} was lost: {_first_line(error)}") from None
     finally:
@@ -448,16 +390,13 @@ def _work(key: str, work: bytes, log: Path, here: tuple[Path, list[str]], mailbo
     try:
         os.chdir(folder)
     except OSError as error:
-        return AstraDataError(
-            f"{key}: {platform.node()} cannot use {folder}, which all machines of the cluster must share: "
-            f"{error.strerror}"
-        )
+        where = f"{platform.node()} cannot use {folder}, which all machines of the cluster must share"
+        return AstraDataError(f"{key}: {where}: {error.strerror}")
     # A worker runs one task after another, so some may be in its search path already.
     sys.path.extend(place for place in modules if place not in sys.path)
 
     def send(note: Note | None) -> None:
-        # Waits, so that every note has arrived when the task ends.
-        ray.get(mailbox.put.remote(key, note))
+        ray.get(mailbox.put.remote(key, note))  # waits, so that every note has arrived when the task ends
 
     send(None)
     return run_item(key, work, log, send)

@@ -41,13 +41,7 @@ _MOST_KEYS, _MOST_LETTERS = 3, 60
 
 @dataclass(frozen=True)
 class Experiment:
-    """A recipe and where its artifacts are.
-
-    Attributes:
-        recipe: with what it takes from its base.
-        path: the recipe's file. folder: of its artifacts.
-        base: the experiment that this one is based on, if any.
-    """
+    """A recipe, with what it takes from its base, its file, and the folder of its artifacts."""
 
     recipe: Recipe
     path: Path
@@ -203,11 +197,7 @@ class Experiment:
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
-    """Read the recipe at `path`, whose artifacts are in a folder of its name in `root`.
-
-    Raises:
-        RecipeError: it, or the recipe that it is based on, has faults, or they do not fit each other.
-    """
+    """Read the recipe at `path`, whose artifacts are in a folder of its name in `root`, and its base."""
     tables = read_tables(path)
     folder = root / path.stem
     if "based_on" not in tables:

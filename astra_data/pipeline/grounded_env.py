@@ -30,14 +30,9 @@ OPTIONS = ("data_start_share", "episode_steps")
 
 
 def grounded(run: str | Path, row: str, seed: int = 0, percent: int | None = None, **options: Any) -> SingleEnv:
-    """Build the environment of one robot in which a row of a run is trained.
+    """Build the environment of one robot in which a row of a run is trained; "direct_transfer" for the raw one.
 
-    Args:
-        run: the folder of a run, such as "runs/cart", made at least until `ground`.
-        row: a row that is trained in a simulator; "direct_transfer" for the raw one.
-        seed: one of the recipe's seeds: that of the data and the grounding.
-        percent: the size of the dataset, where the recipe sweeps over sizes.
-        options: those of `OPTIONS` that are not to be as in the recipe, see `TrainConfig`.
+    `seed` is that of the data and the grounding; `options` are those of `OPTIONS` not to be as in the recipe.
     """
     env, _, training = _world(run, settings_of(run), row, seed, percent, num_envs=1, **options)
     return SingleEnv(SeededSimulatorEnv(env), training.simulated_steps)
@@ -72,15 +67,6 @@ def evaluate_policy(
 
     It is shown what the row's environment shows; the latent, if the row has one, comes from the row's
     encoder, in the target from the aligned one. Starts and goals are those of the rows of this seed.
-
-    Args:
-        run: the folder of a run, such as "runs/cart".
-        row: the row in whose environment it was trained.
-        policy: has `act(observation) -> action`, see `ActingPolicy`.
-        out: the folder to write.
-        seed: one of the recipe's seeds.
-        percent: the size of the dataset, where the recipe sweeps over sizes.
-        progress: called with the fraction done.
     """
     settings = settings_of(run)
     env, simulation, training = _world(run, settings, row, seed, percent, num_envs=1)

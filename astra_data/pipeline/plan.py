@@ -101,8 +101,7 @@ def plan(
 ) -> tuple[Item, ...]:
     """Return every artifact of the `recipe` at `path`, each after those it reads, seed after seed.
 
-    They are made at `folder / key`, for the points of a `selection`, by default all. The report copies its
-    results to the folder `publish`, if any, and adds to the files `published`.
+    The report copies its results to the folder `publish`, if any, and adds to the files `published`.
     """
     selection = selection or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())

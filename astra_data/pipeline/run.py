@@ -5,6 +5,7 @@ has one line per finished point.
 """
 
 import csv
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from io import StringIO
@@ -60,22 +61,12 @@ def run(
     address: str | None = None,
     trackio: str | None = None,
 ) -> Path:
-    """Make every artifact of a recipe that is not finished yet; return the recipe's folder.
+    """Make every artifact of a recipe that is not finished yet; return the recipe's folder, which is in `root`.
 
-    Where it grounds, the page of held-out errors is written there.
-
-    Args:
-        recipe_path: the recipe.
-        methods: the recipe's rows to make and to report; by default all.
-        seeds: seeds of the recipe; by default all.
-        percents: sizes of the recipe; by default all.
-        root: folder with the recipe's folder.
-        jobs: number of items at a time; by default one per core, or two on a CUDA device.
-        device: torch device of the networks.
-        until: the last stage to run, by default all.
-        engine: what runs the items, a name in `EXECUTORS`.
-        address: of a Ray cluster; by default one of this machine is started.
-        trackio: project of trackio to which each finished point is logged, if any.
+    Of its rows, seeds and sizes, those given are made, by default all, up to the stage `until`. There are `jobs`
+    items at a time, by default one per core, or two on a CUDA device, run by an `engine` in `EXECUTORS`, Ray's at an
+    `address`. Each finished point is logged to a project of `trackio`, if one is given. Where it grounds, the page
+    of held-out errors is written, too.
 
     Raises:
         RecipeError: the recipe has faults, or differs from the one that made the existing artifacts.
@@ -97,9 +88,9 @@ def run(
     wanted = stages - experiment.borrowed
     part = Selection.of(experiment.recipe, methods, seeds, percents)
     log = _tracked(trackio, experiment.folder.name) if trackio else lambda _: None
-    table = _PointTable(experiment, part.points(), log)
     planned = plan(experiment.recipe, recipe_path, experiment.folder, part, device=device)
     items = [item for item in planned if item.stage in wanted]
+    table = part.points(), log
     make(experiment, items, planned, jobs=jobs, device=device, engine=engine, address=address, table=table)
     if "ground" in wanted:
         write_errors(experiment, part)
@@ -130,13 +121,9 @@ def run_stage(
     device: str = "cpu",
     publish: bool = False,
 ) -> Path:
-    """Make the artifacts of one stage of a recipe, of some `methods` and `seeds` only where given.
+    """Make the artifacts of one stage of a recipe, as `run` does; what it reads is finished.
 
     With `publish`, the results of the report are added to the published ones.
-
-    Raises:
-        MissingStageError: an artifact that the stage reads is not finished.
-        RecipeError, BadInputError, AstraDataError: as `run`.
     """
     check_stage(stage)
     experiment = load_experiment(recipe_path, root)
@@ -164,12 +151,7 @@ def run_stage(
 def check(recipe_path: Path, *, root: Path = RUNS, verify: bool = False) -> dict[str, Condition]:
     """Validate a recipe without running it; return each planned artifact and its condition.
 
-    A task of the user's own is walked through, as by `check_task`. With `verify`, every byte of the artifacts
-    is read; otherwise their sizes are compared.
-
-    Raises:
-        RecipeError: the recipe has faults.
-        BadInputError: its task has faults; lists them all. Or its data are not the task's.
+    With `verify`, every byte of the artifacts is read; otherwise their sizes are compared.
     """
     experiment = load_experiment(recipe_path, root)
     _check_task(experiment)
@@ -191,19 +173,13 @@ def check_device(device: str, engine: str = "processes", address: str | None = N
         raise BadInputError(f"unknown engine '{engine}'{did_you_mean(engine, EXECUTORS)}")
     if address is not None and engine != "ray":
         raise BadInputError("--address is for --engine ray: leave it out, or add that")
-    try:
-        wanted = torch.device(device)
-    except RuntimeError:
-        wanted = None
-    if wanted is None or wanted.type not in {"cpu", "cuda"}:
+    if not (wanted := re.fullmatch(r"cpu|cuda(:(\d+))?", device)):
         raise BadInputError(f"expected a device such as cpu, cuda or cuda:1, got '{device}'")
-    if engine == "ray":
-        # Ray gives each task its own GPU, which is the only one that it sees.
-        if wanted.index:
-            raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
-        return
-    found = torch.cuda.device_count()
-    if wanted.type == "cuda" and (wanted.index or 0) >= found:
+    index = int(wanted[2] or 0)
+    # Ray gives each task its own GPU, which is the only one that it sees.
+    if engine == "ray" and index:
+        raise BadInputError(f"expected device cpu or cuda on a cluster, got '{device}'")
+    if engine != "ray" and device != "cpu" and index >= (found := torch.cuda.device_count()):
         raise BadInputError(f"device '{device}' is not available: torch finds {found} CUDA devices")
 
 
@@ -216,14 +192,12 @@ def make(
     device: str = "cpu",
     engine: str = "processes",
     address: str | None = None,
-    table: "_PointTable | None" = None,
+    table: tuple[Collection[RunPoint], Callable[[dict[str, Any]], object]] | None = None,
 ) -> None:
     """Make those of an experiment's `items` that are not finished yet, damaged or stale.
 
-    A task of the user's own is walked through before. What is made again is set aside, with a line that says
-    why and where.
-
-    The `items` stand after those they read, which are among `planned`; `table` is kept up to date.
+    What is made again is set aside. The `items` stand after those they read, which are among `planned`. Of a `table`
+    of points, those that finish are shown, logged, and written with all others.
     """
     check_device(device, engine, address)
     recipe, folder = experiment.recipe, experiment.folder
@@ -232,28 +206,33 @@ def make(
         _check_task(experiment, "cpu" if engine == "ray" else device)
         clean(folder)
         again = to_make_again(items, experiment)
-        items = [
-            item for item in items if item.key in again or item.stage in ALWAYS_NEW or not experiment.has(item.key)
-        ]
+        items = [one for one in items if one.key in again or one.stage in ALWAYS_NEW or not experiment.has(one.key)]
         if [item.stage for item in items] == ["report"] and _is_reported(items[0]):
             items = []
         data = data_condition(recipe) if any(item.stage == "label" for item in items) else None
         _check_inputs(experiment, items, planned)
         experiment.link_borrowed()
         console = Console()
-        lines = [f"warning: data: {warning}" for warning in (data.warnings if data else ())]
-        lines += [
-            f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}" for key, reason in again.items()
-        ]
-        for line in lines:
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        show = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+        for warning in data.warnings if data else ():
+            show(f"warning: data: {warning}")
+        for key, reason in again.items():
+            show(f"{key} is recreated: {reason}; the old one is in {set_aside(folder, key)}")
         write_file(folder / RECORD, recipe.model_dump_json(indent=2) + "\n")
         record_code(folder, digests_of(recipe.task, recipe.own_methods))
         experiment.write_made_with(items)
+        points, log = table or ((), lambda _: None)
         if table:
-            table.write()
-        then = partial(table.finished, console) if table else lambda _: None
-        with display([item.key for item in items], console, then) as watch:
+            _write_points(experiment)
+
+        def finished(key: str) -> None:
+            for point in (one for one in points if one.key == key):
+                lines, headline = _write_points(experiment), recipe.headline
+                done = f"{sum(one in lines for one in points)} of {len(points)} points"
+                show(f"{key}  done {headline.text(lines[point][headline.measure])}  ({done})")
+                log(lines[point])
+
+        with display([item.key for item in items], console, finished) as watch:
             EXECUTORS[engine](
                 items,
                 jobs=jobs,
@@ -266,10 +245,8 @@ def make(
 
 def _is_reported(item: Item) -> bool:
     """Return whether the report is there already, made of what it would be made of."""
-    call = item.call
-    if not isinstance(call, partial) or call.keywords["publish"] is not None:
-        return False
-    return is_current(*call.args, **call.keywords)
+    call: Any = item.call
+    return call.keywords["publish"] is None and is_current(*call.args, **call.keywords)
 
 
 def _prepare(own_methods: dict[str, UserMethod]) -> None:
@@ -283,13 +260,8 @@ def _check_inputs(experiment: Experiment, items: Collection[Item], planned: Coll
     """Check that every input of `items` is made by one of them, or finished, intact and not stale."""
     made, known = {item.key for item in items}, {item.key: item for item in planned}
     # The report uses the seeds that are finished, and itself lists rows without any.
-    reads = [
-        key
-        for item in items
-        for key in item.inputs
-        if key not in made and (item.stage not in ALWAYS_NEW or experiment.has(key))
-    ]
-    for key in dict.fromkeys(reads):
+    reads = [key for item in items for key in item.inputs if item.stage not in ALWAYS_NEW or experiment.has(key)]
+    for key in dict.fromkeys(key for key in reads if key not in made):
         stage, root = stage_of_key(key), experiment.folder.parent
         # The values of datasets are compared whenever they are read.
         found = condition(known[key], experiment, verify=not STAGES[stage].makes_dataset)
@@ -325,64 +297,38 @@ def _selected(items: tuple[Item, ...], stage: str, methods: Sequence[str]) -> li
     return [item for item in selected if not rows or row_of_key(item.key) in rows]
 
 
-class _PointTable:
-    """The finished points of a recipe, in `sweep.csv`; the line of a finished point does not change."""
+def _write_points(experiment: Experiment) -> dict[RunPoint, dict[str, Any]]:
+    """Write the lines of all points that are finished now, if there are any, to `sweep.csv`, and return them."""
+    points = Selection.of(experiment.recipe).points()
+    lines = {one: _line(experiment, one) for one in points if (experiment.folder / one.key).is_dir()}
+    if lines:
+        text = StringIO()
+        writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines.values())
+        write_file(experiment.folder / POINTS, text.getvalue())
+    return lines
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        shown: Collection[RunPoint],
-        log: Callable[[dict[str, Any]], object] = lambda _: None,
-    ) -> None:
-        """Look at all points of the recipe; show and `log` those of this run."""
-        self.experiment, self.folder, self.shown, self._log = experiment, experiment.folder, shown, log
-        self._points = Selection.of(experiment.recipe).points()
-        self._lines: dict[RunPoint, dict[str, Any]] = {}
 
-    def write(self) -> dict[RunPoint, dict[str, Any]]:
-        """Write the lines of all points that are finished now, if there are any, and return them."""
-        for point in self._points:
-            if point not in self._lines and (self.folder / point.key).is_dir():
-                self._lines[point] = self._line(point)
-        lines = {point: self._lines[point] for point in self._points if point in self._lines}
-        if lines:
-            text = StringIO()
-            writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(lines.values())
-            write_file(self.folder / POINTS, text.getvalue())
-        return lines
-
-    def finished(self, console: Console, key: str) -> None:
-        """Show and log the point whose evaluation has finished; of other items, nothing."""
-        if not (points := [point for point in self.shown if point.key == key]):
-            return
-        line, headline = self.write()[points[0]], self.experiment.recipe.headline
-        done = sum(one in self._lines for one in self.shown)
-        text = f"{key}  done {headline.text(line[headline.measure])}  ({done} of {len(self.shown)} points)"
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
-        self._log(line)
-
-    def _line(self, point: RunPoint) -> dict[str, Any]:
-        evaluation = read_json(Evaluation, self.folder / point.key / EVALUATION)
-        means = evaluation.outcomes.means()
-        stages = {key: stage_of_key(key) for key in sorted(set(_needed(point.key, self.experiment.items)))}
-        timed = [self.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
-        # The artifacts that a point was made of may have been deleted since.
-        is_complete = all(file.is_file() for file in timed)
-        seconds = [read_json(Artifact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
-        simulated = evaluation.simulated
-        return {
-            "method": point.method,
-            "percent": WHOLE if point.percent is None else point.percent,
-            "seed": point.seed,
-            **{measure: means[measure] for measure in ("success", "steps", "return", "failed")},
-            "simulated_success": None if simulated is None else simulated.means()["success"],
-            "dataset_version": evaluation.dataset_version,
-            "dataset_hash": evaluation.dataset_hash,
-            "commit": evaluation.git_commit,
-            "wall_seconds": round(sum(seconds), 3) if is_complete else None,
-        }
+def _line(experiment: Experiment, point: RunPoint) -> dict[str, Any]:
+    evaluation = read_json(Evaluation, experiment.folder / point.key / EVALUATION)
+    means, simulated = evaluation.outcomes.means(), evaluation.simulated
+    stages = {key: stage_of_key(key) for key in sorted(set(_needed(point.key, experiment.items)))}
+    timed = [experiment.folder / key / TIMED[stage] for key, stage in stages.items() if stage in TIMED]
+    # The artifacts that a point was made of may have been deleted since.
+    is_complete = all(file.is_file() for file in timed)
+    seconds = [read_json(Artifact, file).wall_seconds or 0.0 for file in timed] if is_complete else []
+    return {
+        "method": point.method,
+        "percent": WHOLE if point.percent is None else point.percent,
+        "seed": point.seed,
+        **{measure: means[measure] for measure in ("success", "steps", "return", "failed")},
+        "simulated_success": None if simulated is None else simulated.means()["success"],
+        "dataset_version": evaluation.dataset_version,
+        "dataset_hash": evaluation.dataset_hash,
+        "commit": evaluation.git_commit,
+        "wall_seconds": round(sum(seconds), 3) if is_complete else None,
+    }
 
 
 def _needed(key: str, items: Mapping[str, Item]) -> Iterator[str]:

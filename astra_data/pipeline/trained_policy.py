@@ -25,11 +25,7 @@ from astra_data.worlds.user_code import found_near
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A policy that a run has trained, and what goes with it.
-
-    `settings` are those of the run's recipe, `files` those that make up the policy, by the stage that wrote
-    them, `file` is what that of `train` holds, `dataset` what it was learned from, if that is still there.
-    """
+    """A policy that a run has trained, with its files by their stages, and its dataset, if that is still there."""
 
     settings: dict[str, Any]
     files: dict[str, Path]
@@ -72,20 +68,13 @@ def trained_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | N
 
 
 def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None = None) -> RunningPolicy:
-    """Load the policy of a row, with the encoder that its run tests it with, if it has one.
+    """Load the policy of a row of the run in a folder, with the encoder that its run tests it with, if it has one.
 
-    Call `start` before the first `command`.
-
-    Args:
-        run: the folder of a run, such as "runs/quickstart".
-        row: a row of its recipe, such as "astra_plus".
-        seed: one of its seeds.
-        percent: the size of the dataset, where the recipe sweeps over sizes.
+    Call `start` before the first `command`. `percent` is the dataset's size, where the recipe sweeps over sizes.
 
     Raises:
-        BadInputError: the run has no such row or seed, the row trains no policy, an artifact of it is not
-            there, was altered or made from another than lies there now, or the code of the task or of the
-            row's method changed since the run was made.
+        BadInputError: the run has no such policy, an artifact of it is not there, was altered or made from another
+            than lies there now, or the code of the task or the method changed since.
 
     Example:
         >>> from astra_data import load_policy

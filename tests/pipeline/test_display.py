@@ -4,16 +4,17 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from astra_data.core.errors import AstraDataError
 from astra_data.pipeline.display import TimeEstimate, display, shown
 
 
 def test_without_a_terminal_there_are_plain_lines() -> None:
     file = StringIO()
     with display(["collect/seed_0", "pair/seed_0"], Console(file=file, width=20)) as watch:
-        watch.started("collect/seed_0")
+        watch("collect/seed_0", None)
         for percent in (1, 11, 12, 35):
-            watch.progressed("collect/seed_0", percent / 100, "8 k steps/s [x]")
-        watch.finished("collect/seed_0", 1.26)
+            watch("collect/seed_0", (percent / 100, "8 k steps/s [x]"))
+        watch("collect/seed_0", 1.26)
     assert file.getvalue().splitlines() == [
         "collect/seed_0  started",
         "collect/seed_0  10 %  8 k steps/s [x]",
@@ -26,11 +27,11 @@ def test_in_a_terminal_finished_items_become_lines_above_the_running_ones() -> N
     file = StringIO()
     keys = ["train/nas/seed_0", "train/nas/seed_1"]
     with display(keys, Console(file=file, width=120, force_terminal=True, no_color=True)) as watch:
-        watch.started("train/nas/seed_0")
-        watch.progressed("train/nas/seed_0", 0.5, "success 0.83")
-        watch.finished("train/nas/seed_0", 3.0)
-        watch.started("train/nas/seed_1")
-        watch.progressed("train/nas/seed_1", 0.25, "success 0.84 [x]")
+        watch("train/nas/seed_0", None)
+        watch("train/nas/seed_0", (0.5, "success 0.83"))
+        watch("train/nas/seed_0", 3.0)
+        watch("train/nas/seed_1", None)
+        watch("train/nas/seed_1", (0.25, "success 0.84 [x]"))
     assert "train/nas/seed_0  finished in 3.0 s" in file.getvalue()
     whole, running = file.getvalue().rpartition("1 of 2 finished")[2].splitlines()[:2]
     assert "50%" in whole
@@ -41,8 +42,8 @@ def test_in_80_columns_bar_share_and_time_left_stay() -> None:
     file, key = StringIO(), "train/direct_transfer_task_reward_plus/percent_100/seed_0"
     note = "31 k steps/s  success 0.83  return 12.1  made of very many words"
     with display([key], Console(file=file, width=80, force_terminal=True, no_color=True)) as watch:
-        watch.started(key)
-        watch.progressed(key, 0.5, note)
+        watch(key, None)
+        watch(key, (0.5, note))
     *_, line = (line for line in file.getvalue().splitlines() if "train/direct" in line)
     assert len(line.rstrip()) <= 80
     assert re.search(r"train/direct\S*… .*━{9}.* 50% 0:00:00 31 k.*…", line)
@@ -52,23 +53,23 @@ def test_the_time_left_counts_work_not_items() -> None:
     now = [0.0]
     keys = ["collect/seed_0", "train/nas/seed_0", "train/nas/seed_1", "evaluate/nas/seed_0"]
     estimate = TimeEstimate(keys, clock=lambda: now[0])
-    estimate.started("collect/seed_0")
+    estimate.add("collect/seed_0", None)
     now[0] = 5.0
-    estimate.finished("collect/seed_0", 5.0)
+    estimate.add("collect/seed_0", 5.0)
     assert estimate.left() is None  # nothing is known of what takes longest
-    estimate.started("train/nas/seed_0")
+    estimate.add("train/nas/seed_0", None)
     assert estimate.left() is None and estimate.left_of("train/nas/seed_0") is None
     now[0] = 25.0
-    estimate.progressed("train/nas/seed_0", 0.1)  # 200 s in all
+    estimate.add("train/nas/seed_0", (0.1, ""))  # 200 s in all
     assert estimate.left_of("train/nas/seed_0") == pytest.approx(180)
     assert estimate.left() == pytest.approx(180 + 200)
-    estimate.started("train/nas/seed_1")
+    estimate.add("train/nas/seed_1", None)
     assert estimate.left() == pytest.approx(200)  # two at a time, and not before the longer one ends
     now[0] = 125.0
-    estimate.finished("train/nas/seed_0", 120.0)
-    estimate.progressed("train/nas/seed_1", 0.5)
-    estimate.started("evaluate/nas/seed_0")
-    estimate.progressed("evaluate/nas/seed_0", 0.0)
+    estimate.add("train/nas/seed_0", 120.0)
+    estimate.add("train/nas/seed_1", (0.5, ""))
+    estimate.add("evaluate/nas/seed_0", None)
+    estimate.add("evaluate/nas/seed_0", (0.0, ""))
     assert estimate.left() == pytest.approx(100)
 
 
@@ -76,7 +77,7 @@ def test_the_time_left_counts_work_not_items() -> None:
 def test_an_item_may_fail_before_it_has_begun(is_terminal: bool) -> None:
     console = Console(file=StringIO(), force_terminal=is_terminal)
     with display(["train/nas/seed_0"], console) as watch:
-        watch.failed("train/nas/seed_0")
+        watch("train/nas/seed_0", AstraDataError())
 
 
 def test_one_job_is_shown_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:

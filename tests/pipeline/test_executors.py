@@ -34,8 +34,8 @@ class Workshop:
         self.running.append(item.key)
         self.most = max(self.most, len(self.running))
 
-    def wait(self) -> Collection[str]:
-        return [self.running.pop(0)]
+    def events(self) -> Collection[tuple[str, float]]:
+        return [(self.running.pop(0), 1.0)]
 
 
 def no_call() -> None:
@@ -47,7 +47,7 @@ def test_items_begin_when_their_inputs_are_finished_and_a_job_is_free(jobs: int 
     names = {"last": ("a", "b", "c"), "a": ("outside",), "b": (), "c": ()}
     items = [Item(key, inputs, no_call) for key, inputs in names.items()]
     workshop = Workshop()
-    run_in_order(items, jobs, workshop.begin, workshop.wait)
+    run_in_order(items, jobs, Record(), workshop.begin, workshop.events)
     assert workshop.begun == ["a", "b", "c", "last"]
     assert workshop.most == most
 

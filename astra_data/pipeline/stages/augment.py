@@ -3,13 +3,11 @@
 The robot's dynamics do not depend on where it is and which way it faces, so a moved episode is one that the
 robot could have recorded, with three exceptions:
 
-* Walls. A robot that was stopped by a wall would not be stopped elsewhere. So only stretches of an episode
-  that keep clear of the walls are copied, and the copies keep clear of them too.
-* The goal belongs to the maze and is not moved: every copy gets a goal of its own, drawn as the task draws
-  it. The task computes the copy's rewards and ends; a copy ends where it reaches its goal. A ball is moved
-  with its robot; the step that ended its episode is not copied, for where the ball was may have ended it.
-* Commands. Where commands are clipped to ±1 m/s along each axis, a command that is rotated out of that square
-  is no longer what the robot did; such rotations are drawn again.
+* Walls: only stretches of an episode that keep clear of them are copied, and the copies keep clear of them too.
+* The goal belongs to the maze: every copy gets a goal of its own, drawn as the task draws it, which computes the
+  copy's rewards and ends. A ball is moved with its robot; where it was may have ended its episode, so that step
+  is not copied.
+* Commands: where they are clipped along each axis, rotations out of that square are drawn again.
 
 Held-out episodes are chosen first and never copied. Pairing comes later, so that pairs are exact.
 """
@@ -93,16 +91,8 @@ def augment(
 
     Every episode's metadata says whether it is `held_out`; a copy's also `source_episode` (uid),
     `augmentation_first_step` (of the source) and the map from it, p ↦ R(`augmentation_rotation_rad`) p +
-    (`augmentation_x_m`, `augmentation_y_m`).
-
-    Args:
-        task: computes rewards and ends of copies; by default the one that the dataset was collected for.
-        config: settings.
-        dataset: folder of the dataset, not paired.
-        seed: of all randomness; the same seed gives the same bytes.
-        name: of the new dataset, by default that of `dataset`, whose next version it is.
-        out: its folder, by default its place at home.
-        progress: called with the fraction done.
+    (`augmentation_x_m`, `augmentation_y_m`). By default `task`, which computes rewards and ends of copies, is the one
+    that the dataset was collected for, and the new version is at home.
 
     Raises:
         BadInputError: the task has no maze; the dataset does not fit it, was paired or augmented, has

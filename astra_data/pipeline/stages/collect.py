@@ -106,17 +106,10 @@ def collect(
     name: str | None = None,
     resume: bool = True,
 ) -> Path:
-    """Record episodes in the target; return the dataset's folder.
+    """Record episodes in the target; return the dataset's folder, by default its place at home.
 
-    Args:
-        task: see `task_named`.
-        config: what to collect.
-        seed: of everything random.
-        out: the dataset's folder, by default its place at home.
-        progress: called with the fraction done.
-        num_threads: of the physics, by default one per core; the outcome is the same with any number.
-        name: of the dataset, by default made of task, behavior and seed.
-        resume: keep the finished episodes of an interrupted call and record the rest.
+    The outcome is the same with any `num_threads` of the physics. By default the `name` is made of task, behavior
+    and seed. `resume` keeps the finished episodes of an interrupted call and records the rest.
 
     Raises:
         BadInputError: the task is unknown, `out` exists, or an artifact of the behavior is missing.

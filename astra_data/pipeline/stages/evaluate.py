@@ -64,21 +64,11 @@ def evaluate(
 ) -> None:
     """Test a row and write its figures and paths to `out`.
 
-    Starts, goals and headings depend on the seed alone, so they are the same for every method.
-
-    Args:
-        task: see `task_named`.
-        method: a row.
-        config: the recipe's `[evaluate]`.
-        policy: what `train` made, for a row that trains; or a policy in its place.
-        grounding: what `ground` made for it, for a row that grounds.
-        target_encoder: what `align` made for it, for a row that aligns.
-        reference: the grounding of the reference simulator, if there is one.
-        recorded: the dataset whose range of commands those of the policy are compared with.
-        seed: of all randomness.
-        out: the folder to write.
-        progress: called with the fraction done.
-        num_threads: of the physics, by default one per core; the outcome is the same with any number.
+    Starts, goals and headings depend on the seed alone, so they are the same for every method, and with any
+    `num_threads` of the physics. `policy` is what `train` made, or a policy in its place, `grounding` what `ground`
+    made and `target_encoder` what `align` made, for a row that trains, grounds, aligns; `reference` is the grounding
+    of the reference simulator, if there is one, and `recorded` the dataset with whose commands the policy's are
+    compared.
 
     Raises:
         BadInputError: an input is missing, malformed or of another grounding, or `out` exists.

@@ -34,18 +34,9 @@ def ground(
     device: str = "cpu",
     progress: Progress = silent,
 ) -> None:
-    """Fit a method's grounding to a paired dataset; write it with its diagnostics and gap report to `out`.
+    """Fit a method's grounding to a paired `dataset`; write it with its diagnostics and gap report to `out`.
 
-    Args:
-        task: see `task_named`.
-        method: a row.
-        config: the recipe's `[ground]`.
-        settings: the method's own table of the recipe, if it has one.
-        dataset: paired.
-        seed: of all randomness.
-        out: the folder to write.
-        device: torch device.
-        progress: called with the fraction done.
+    `settings` are the method's own, if it has any.
 
     Raises:
         BadInputError: the method does not ground, the dataset is not paired, `out` was begun with other

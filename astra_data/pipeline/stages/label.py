@@ -50,20 +50,11 @@ def label(
     """Add the columns of goals and outcomes that a dataset lacks; return the new folder.
 
     Goals are drawn by the objective, one an episode. Episodes end where the goal is reached: later steps are
-    dropped. An episode that its log ends as terminated, without a success, is a failure.
-
-    Args:
-        task: see `task_named`.
-        data: with states, actions and next states; a folder, a name, or an address to pull it from.
-        seed: of the goals.
-        name: of the new dataset, by default that of `data`, whose next version it is.
-        out: its folder, by default its place at home. Where `data` lacks nothing, it becomes a link to that.
-        progress: called with the fraction done.
+    dropped. An episode that its log ends as terminated, without a success, is a failure. `data` is a folder, a
+    name, or an address to pull it from. Where it lacks nothing, `out` becomes a link to it.
 
     Raises:
-        BadInputError: the dataset lacks states or actions, or these are not those of the task; or there is
-            nothing to label and no `out`.
-        CorruptDatasetError: the dataset is incomplete.
+        BadInputError: states, actions or next states are not those of the task, or nothing is to be labeled.
         SharingError: it cannot be pulled.
 
     Example:

@@ -56,17 +56,10 @@ def pair(
 ) -> Path:
     """Add the columns `abstract.*` to `dataset`, vectorized over its steps; return the new folder.
 
-    Args:
-        simulator: a task, for its abstract simulator, or `path.py:MySimulator`; see `pairing_named`.
-        config: settings.
-        dataset: folder of the dataset.
-        name: of the new dataset, by default that of `dataset`, whose next version it is.
-        out: its folder, by default its place at home.
-        progress: called with the fraction done.
+    `simulator` is a task, for its abstract simulator, or `path.py:MySimulator`.
 
     Raises:
         BadInputError: the simulator is not in the state that it was reset to, or does not fit the dataset.
-        CorruptDatasetError: `dataset` is incomplete.
 
     Example:
         >>> from pathlib import Path
@@ -155,11 +148,10 @@ def pair_steps(
     tolerance: float,
     first_step: int = 0,
 ) -> tuple[dict[str, Array], float]:
-    """Reset `batch` to φ(s) of each of N target steps and step it with the recorded action.
+    """Reset `batch`, of B simulators, to φ(s) of N target steps and step it with the actions, B at a time.
 
-    Take target states (N, S), actions (N, A) and next states (N, S); `batch` has B simulators, and the N
-    steps are taken B at a time. Return the `abstract.*` columns (N, X), and the largest difference between
-    φ(s) and the reset simulator. `first_step` is the number of the first of these steps, for messages.
+    Take states (N, S), actions (N, A) and next states (N, S); `first_step` is the number of the first, for messages.
+    Return the `abstract.*` columns (N, X), and the largest difference between φ(s) and the reset simulator.
     """
     abstract = checked_abstraction(pairing, state)
     landed = np.empty_like(abstract)

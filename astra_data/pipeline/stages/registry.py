@@ -25,26 +25,20 @@ from astra_data.reports.choice import SELECTED
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of the pipeline.
-
-    Attributes:
-        name: in recipes, folders and on the command line.
-        run: makes one artifact. `pipeline.plan` gives it what its parameters name.
-        each: the unit that it makes one artifact for: a seed; a size of a seed's dataset; a grounding, a
-            policy, an aligned grounding or a row, each per dataset; or the recipe.
-        reads: the stages whose artifacts it may read.
-        config: the type of its table in a recipe; None where it has no settings.
-        asked_by: the key of recipes without which the stage is left out; None if all have it.
-        result: the file of its artifacts that other stages read; None for datasets and the report.
-    """
+    """One step of the pipeline: `run` makes one artifact, and `plan` gives it what its parameters name."""
 
     name: str
     run: Callable[..., object]
     each: Literal["seed", "size", "grounding", "policy", "alignment", "row", "recipe"]
+    """What it makes one artifact for; all but the seed, its sizes and the recipe once per dataset."""
     reads: tuple[str, ...] = ()
+    """The stages whose artifacts it may read."""
     config: Any = None
+    """The type of its table in a recipe; None where it has no settings."""
     asked_by: str | None = None
+    """The key of recipes without which the stage is left out; None if all have it."""
     result: str | None = None
+    """The file of its artifacts that other stages read; None for datasets and the report."""
 
     @property
     def makes_dataset(self) -> bool:
@@ -58,17 +52,15 @@ _OF_GROUNDING = (*_OF_DATASET, "ground")
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
-        Stage("collect", collect, "seed", config=CollectConfig, asked_by="collect"),
+        Stage("collect", collect, "seed", (), CollectConfig, "collect"),
         Stage("label", label, "seed", asked_by="data"),
-        Stage("augment", augment, "seed", ("collect", "label"), AugmentConfig, asked_by="augment"),
+        Stage("augment", augment, "seed", ("collect", "label"), AugmentConfig, "augment"),
         Stage("pair", pair, "seed", ("collect", "label", "augment"), PairConfig),
         Stage("subset", subset, "size", ("pair",)),
         Stage("ground", ground, "grounding", _OF_DATASET, GroundConfig, result=GROUNDING),
         Stage("train", train, "policy", _OF_GROUNDING, AnyTrainConfig, result=POLICY),
         Stage("align", align, "alignment", _OF_GROUNDING, AlignConfig, result=TARGET_ENCODER),
-        Stage(
-            *("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig), asked_by="select", result=SELECTED
-        ),
+        Stage("select", select, "recipe", (*_OF_GROUNDING, "train"), SelectConfig, "select", SELECTED),
         Stage("evaluate", evaluate, "row", ("train", "ground", "align"), EvaluateConfig, result=EVALUATION),
         Stage("report", report, "recipe", ("evaluate",), ReportConfig),
     )

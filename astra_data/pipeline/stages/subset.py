@@ -10,12 +10,7 @@ from astra_data.dataset.reader import Dataset
 def subset(dataset: Path, *, percent: int, of: int | None = None, out: Path, progress: Progress = silent) -> Path:
     """Write `percent` per cent of `of` episodes of `dataset` to `out`, as a dataset of its own.
 
-    The dataset's stored permutation decides which episodes are taken; `percent` may exceed 100, which is by
-    default all of them.
-
-    Raises:
-        BadInputError: `dataset` has fewer episodes, or `out` exists.
-        CorruptDatasetError: `dataset` is incomplete or was altered.
+    Its stored permutation decides which are taken; `percent` may exceed 100, which is by default all of them.
     """
     source = Dataset.open(dataset)
     name = f"{source.description['name']}-percent{percent:03d}"

@@ -36,21 +36,10 @@ def train(
     progress: Progress = silent,
     num_threads: int | None = None,
 ) -> None:
-    """Learn the policy of a row and write it with its learning curve to `out`.
+    """Learn the policy of the row `method` on a paired `dataset`; write it with its learning curve to `out`.
 
-    Args:
-        task: see `task_named`.
-        method: a row.
-        config: the recipe's `[train]`.
-        settings: the method's own table of the recipe, if it has one.
-        dataset: paired.
-        grounding: what `ground` made for this method, if it grounds.
-        initial: what `train` made for the method whose policy this one starts from, if any.
-        seed: of all randomness.
-        out: the folder to write.
-        device: torch device.
-        progress: called with the fraction done.
-        num_threads: of the target's physics, for methods that train in the target.
+    It needs the folder that `ground` made for the method, if that grounds, and as `initial` the one that `train`
+    made for the method whose policy it starts from, if any. `settings` are the method's own.
 
     Raises:
         BadInputError: the method has no policy to train, needs an artifact and got none, or `out` was begun
