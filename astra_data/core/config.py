@@ -4,6 +4,7 @@ import json
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
@@ -36,6 +37,15 @@ def in_order(ends: tuple[float, float]) -> tuple[float, float]:
     if ends[0] > ends[1]:
         raise ValueError(f"expected the lower end first, got {list(ends)}")
     return ends
+
+
+@contextmanager
+def as_fault(place: str = "") -> Iterator[None]:
+    """Raise a BadInputError of the block as validators do, as a ValueError."""
+    try:
+        yield
+    except BadInputError as error:
+        raise ValueError(f"{place}{error}") from None
 
 
 def choice(name: str) -> str:

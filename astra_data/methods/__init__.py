@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from astra_data.core.config import Config
+from astra_data.core.config import Config, did_you_mean
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import PLUS, base_method, is_plus
 from astra_data.grounding.encoder import ENCODERS
@@ -55,7 +55,6 @@ METHODS: dict[str, Method] = {
     )
 }
 """By name. Recipes list the methods' tables, and results the settings in them, in this order."""
-
 
 ENTRY_POINTS = "astra_data.methods"
 """The group of entry points under which installed packages offer methods."""
@@ -154,7 +153,7 @@ def method_named(row: str) -> Method:
     if name not in METHODS and (place := offered_methods().get(name)):
         add_method(name, place)
     if name not in METHODS:
-        raise BadInputError(f"unknown method '{row}'; known: {', '.join(METHODS)}, each also with {PLUS}")
+        raise BadInputError(f"unknown method '{row}'{did_you_mean(name, METHODS)}")
     return METHODS[name]
 
 

@@ -1,13 +1,11 @@
-"""The condition of a run's artifacts and data: whether each is finished, missing, damaged or stale, and why.
+"""The condition of a run's artifacts and data: finished, missing, damaged (not what its manifest says), or stale.
 
-An artifact is damaged if it is not what its manifest says, or a dataset that cannot be opened; it is stale if
-it was made from something else than what lies there now, or was made or begun with other settings.
+Stale is what was made from something else than what lies there now, or was made or begun with other settings.
 """
 
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -82,50 +80,36 @@ def to_make_again(items: Collection[Item], experiment: Experiment) -> dict[str, 
     """
     known = {item.key: item for item in items}
     absent = {key for key, item in known.items() if item.stage in ALWAYS_NEW or not experiment.has(key)}
-    reasons: dict[str, str] = {}
-
-    def check(keys: Collection[str], *, verify: bool) -> None:
-        found = {key: condition(known[key], experiment, verify=verify) for key in keys}
+    reasons, verified, to_check = dict[str, str](), set[str](), known.keys() - absent
+    while to_check:
+        found = {key: condition(known[key], experiment, verify=bool(verified)) for key in to_check}
         reasons.update({key: f"{of.state} ({of.why})" for key, of in found.items() if not of.is_finished})
-
-    check(known.keys() - absent, verify=False)
-    verified: set[str] = set()
-    while True:
         for item in items:
             source = next((key for key in item.inputs if key in reasons), None)
             if source and item.key not in absent:
                 reasons.setdefault(item.key, f"made from {source}")
         made = absent | reasons.keys()
-        read = {key for item in items if item.key in made for key in item.inputs if key in known}
-        if not (read := read - made - verified):
-            # In the order of the items, as they are told.
-            return {key: reasons[key] for key in known if key in reasons}
-        verified |= read
-        check(read, verify=True)
+        to_check = {key for item in items if item.key in made for key in item.inputs if key in known} - made - verified
+        verified |= to_check
+    return {key: reasons[key] for key in known if key in reasons}
 
 
 def _replaced(item: Item, experiment: Experiment, made_from: Mapping[str, str]) -> str:
     """Return which of the artifacts that `item` is made from it was not made from."""
-    if item.stage == "label" and (data := _other_data(experiment.place(item.key), experiment.recipe.data)):
-        return f"made from another dataset than {data}"
+    data = experiment.recipe.data
+    if item.stage == "label" and data and not is_address(data):
+        with suppress(AstraDataError):
+            named, made = open_dataset(data), read_description(experiment.place(item.key))
+            known = {made["content_hash"], *(parent["hash"] for parent in made["parents"])}
+            # What was made of it since, and has its name, is no other.
+            if not known & hashes(lineage(named)):
+                return f"made from another dataset than {named.reference}"
     for key in item.inputs:
         # A choice is among the policies that the recipe has now.
         if item.key == "select" and key not in made_from:
             return f"made without {key}"
         if experiment.has(key) and _digest(key, experiment) not in (None, *made_from.values()):
             return f"made from another {key}"
-    return ""
-
-
-def _other_data(labeled: Path, data: str | None) -> str:
-    """Return the reference of the dataset that a recipe names, if another one was labeled."""
-    if data is None or is_address(data):
-        return ""
-    with suppress(AstraDataError):
-        named, made = open_dataset(data), read_description(labeled)
-        known = {made["content_hash"], *(parent["hash"] for parent in made["parents"])}
-        # What was made of it since, and has its name, is no other.
-        return "" if known & hashes(lineage(named)) else named.reference
     return ""
 
 
@@ -155,34 +139,23 @@ def data_condition(recipe: Recipe) -> Condition | None:
         )
     task = task_named(recipe.task)
     check_fits(source, task)
-    if any(method_named(row).grounds for row in recipe.methods):
-        _check_division(recipe, source)
-    warnings = (*differing_bounds(task.limits, source), *remarks(source, task))
+    grounds = any(method_named(row).grounds for row in recipe.methods)
+    if grounds and not any(source.metadata.get("held_out", ())):
+        name, recordings = source.reference, len(set(recordings_of(source)))
+        if recipe.sweep.percent:
+            smallest = min(recipe.sweep.percent)
+            name, recordings = f"{smallest} % of {name}", min(recordings, share(smallest, len(source)))
+        divided(name, recordings, recipe.ground.held_out_share, seed=0)  # refuses to hold out all
+    warnings = (*_differing_bounds(task.limits, source), *remarks(source, task))
     return Condition("finished", warnings=warnings)
 
 
-def _check_division(recipe: Recipe, source: Dataset) -> None:
-    """Refuse data of which grounding would hold out all, unless they say which are held out."""
-    if any(source.metadata.get("held_out", ())):
-        return
-    name, recordings = source.reference, len(set(recordings_of(source)))
-    if recipe.sweep.percent:
-        smallest = min(recipe.sweep.percent)
-        name, recordings = f"{smallest} % of {name}", min(recordings, share(smallest, len(source)))
-    divided(name, recordings, recipe.ground.held_out_share, seed=0)
-
-
-def differing_bounds(limits: Commands, source: Dataset) -> list[str]:
-    """Return a line for each axis whose bounds go beyond the commands in `source`, or are of another size.
-
-    A policy will ask for the former, and neither a correction nor a predicted reward knows what follows; the
-    latter are in other units.
-    """
-    statistics = source.statistics()
+def _differing_bounds(limits: Commands, source: Dataset) -> list[str]:
+    """Return a line for each axis whose bounds go beyond the commands in `source`, or are in other units."""
+    statistics, lines = source.statistics(), list[str]()
     if isinstance(statistics, str):
         return []
     least, largest = (np.asarray(statistics[ACTION][end], float) for end in ("min", "max"))
-    lines = []
     for (name, (low, high)), lowest, highest in zip(limits.items(), least, largest, strict=True):
         known = f"{name} may be {low:.4g} to {high:.4g}, recorded is {lowest:.4g} to {highest:.4g}: "
         if highest - lowest > TIMES * (high - low):

@@ -88,27 +88,23 @@ class Experiment:
     def link_borrowed(self) -> None:
         """Link the folders of borrowed stages to the base's."""
         for stage in STAGES:
-            link = self.folder / stage
+            link, source = self.folder / stage, self.maker(stage).folder.name
             if self._is_link(stage):
                 link.unlink()
-            if stage not in self.borrowed:
-                continue
-            source = self.maker(stage).folder
-            if link.exists() or link.is_symlink():
+            if stage in self.borrowed and (link.exists() or link.is_symlink()):
                 raise RecipeError(
-                    f"{link} is in the way: {self.path} is based on {source.name}, whose {stage} it uses; "
+                    f"{link} is in the way: {self.path} is based on {source}, whose {stage} it uses; "
                     f"give the recipe another name, or remove {link}"
                 )
-            link.symlink_to(Path("..") / source.name / stage)
+            if stage in self.borrowed:
+                link.symlink_to(Path("..") / source / stage)
 
     def write_made_with(self, items: Collection[Item]) -> None:
         """Write down what `items` are made with, before they are begun."""
         for item in items:
             if item.stage not in ALWAYS_NEW:
-                write_file(self._made_with(item.key), json.dumps(item.settings, indent=1) + "\n")
-
-    def _made_with(self, key: str) -> Path:
-        return self.folder / MADE_WITH / f"{key}.json"
+                file = self.folder / MADE_WITH / f"{item.key}.json"
+                write_file(file, json.dumps(item.settings, indent=1) + "\n")
 
     @cached_property
     def _outdated(self) -> dict[str, str]:
@@ -117,19 +113,14 @@ class Experiment:
         for key, item in self.items.items():
             if item.stage in ALWAYS_NEW | self.borrowed or not self._made(key):
                 continue
-            read = next((found[made] for made in item.inputs if made in found), "")
-            if changed := self._changed(item) or read:
+            changed, file = "", self.folder / MADE_WITH / f"{key}.json"
+            if file.is_file():
+                advice = f"restore it from a copy, or remove it with {self.folder / key}"
+                before = read_written(dict[str, Any], file, by="a run", advice=advice)
+                changed = _changes(before, item.settings, self.recipe)
+            if changed := changed or next((found[made] for made in item.inputs if made in found), ""):
                 found[key] = changed
         return found
-
-    def _changed(self, item: Item) -> str:
-        """Return which settings of an artifact are others than it was made or begun with."""
-        file = self._made_with(item.key)
-        if not file.is_file():
-            return ""
-        advice = f"restore it from a copy, or remove it with {self.folder / item.key}"
-        before = read_written(dict[str, Any], file, by="a run", advice=advice)
-        return changes(before, item.settings, self.recipe)
 
     def check_unchanged(self) -> None:
         """Refuse settings and code that differ from those of existing artifacts, finished or not."""
@@ -160,10 +151,7 @@ class Experiment:
         return self.path.parent / "results"
 
     def published(self) -> list[Path]:
-        """Return the files of published results that those of this recipe are added to.
-
-        They are its own and, if it borrows the evaluations, the base's, as far as they are there.
-        """
+        """Return the published results that are there of this recipe and, if it borrows evaluations, of its base."""
         names = dict.fromkeys((self.maker("evaluate").path.stem, self.path.stem))
         files = [file for name in names if (file := self.results / f"{name}.json").exists()]
         for file in files:
@@ -192,31 +180,31 @@ class Experiment:
 
         before, now = (dict[str, Any](of) for of in (found.settings, self.recipe.settings))
         old, new = ({*((of.get("sweep") or {}).get("percent") or [None])} for of in (before, now))
-        text = changes(compared(before), compared(now), self.recipe)
+        text = _changes(compared(before), compared(now), self.recipe)
         return text or ("" if new <= old else "sweep changed")
 
 
 def load_experiment(path: Path, root: Path) -> Experiment:
     """Read the recipe at `path`, whose artifacts are in a folder of its name in `root`, and its base."""
-    tables = read_tables(path)
-    folder = root / path.stem
-    if "based_on" not in tables:
-        return Experiment(validated(tables, Recipe, str(path)), path, folder)
-    name = tables["based_on"]
-    known = sorted({file.stem for file in path.parent.glob("*.toml")} - {path.stem})
-    if name not in known:
-        raise RecipeError(f"{path}: based_on: unknown recipe '{name}'{did_you_mean(str(name), known)}")
-    base_path = path.with_name(f"{name}.toml")
-    base_tables = read_tables(base_path)
-    if "based_on" in base_tables:
-        raise RecipeError(f"{path}: based_on: expected a recipe that is not based on another, got '{name}'")
-    base = Experiment(validated(base_tables, Recipe, str(base_path)), base_path, root / base_path.stem)
-    recipe = validated(_laid_over(base_tables, tables), Recipe, str(path))
-    _check_fit(recipe, base, path)
-    return Experiment(recipe, path, folder, base)
+    tables, base = read_tables(path), None
+    if "based_on" in tables:
+        name = tables["based_on"]
+        known = sorted({file.stem for file in path.parent.glob("*.toml")} - {path.stem})
+        if name not in known:
+            raise RecipeError(f"{path}: based_on: unknown recipe '{name}'{did_you_mean(str(name), known)}")
+        base_path = path.with_name(f"{name}.toml")
+        below = read_tables(base_path)
+        if "based_on" in below:
+            raise RecipeError(f"{path}: based_on: expected a recipe that is not based on another, got '{name}'")
+        base = Experiment(validated(below, Recipe, str(base_path)), base_path, root / base_path.stem)
+        tables = _laid_over(below, tables)
+    recipe = validated(tables, Recipe, str(path))
+    if base:
+        _check_fit(recipe, base, path)
+    return Experiment(recipe, path, root / path.stem, base)
 
 
-def changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) -> str:
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) -> str:
     """Say which tables and files differ between what an artifact was made with and would be made with.
 
     Settings that did not exist then have their defaults, as they took effect.
@@ -224,26 +212,18 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], recipe: Recipe) -
     texts = []
     for name in dict.fromkeys((*before, *now)):
         old, new = before.get(name), now.get(name)
-        if old == new:
-            continue
         if name == "code":
-            old, new = old or {}, new or {}
-            files = [file for file in dict.fromkeys((*old, *new)) if old.get(file) != new.get(file)]
-            texts += [f"{file} changed" for file in files]
+            texts += [f"{file} changed" for file, _, _ in changed_values(old or {}, new or {})]
             continue
         if isinstance(old, dict) and isinstance(config := getattr(recipe, name, None), Config):
             with suppress(RecipeError):
                 old = validated(old, type(config), name).model_dump(mode="json")
         if old != new:
-            texts.append(f"{name} ({_change(old, new)}) changed in the recipe")
+            are_tables = isinstance(old, dict) and isinstance(new, dict)
+            values = changed_values(old or {}, new or {}) if are_tables else [("", old, new)]
+            found = [f"{f'{key}: ' if key else ''}{_shown(one)}, now {_shown(other)}" for key, one, other in values]
+            texts.append(f"{name} ({first_few(found, _MOST_KEYS)}) changed in the recipe")
     return " and ".join(texts)
-
-
-def _change(before: object, now: object) -> str:
-    if not isinstance(before, dict) or not isinstance(now, dict):
-        return f"{_shown(before)}, now {_shown(now)}"
-    found = [f"{key}: {_shown(old)}, now {_shown(new)}" for key, old, new in changed_values(before, now)]
-    return first_few(found, _MOST_KEYS)
 
 
 def _shown(value: object) -> str:
@@ -263,15 +243,12 @@ def _outermost(places: Collection[Path], root: Path) -> list[Path]:
 
 def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of a recipe over those of its base; `data` and `[collect]` replace each other."""
-    other = {"data": "collect", "collect": "data"}
-    replaced = {other[key] for key in other.keys() & above.keys()} - above.keys()
-    below = {key: value for key, value in below.items() if key not in replaced}
-
-    def both(key: str) -> Any:  # noqa: ANN401 - any value of a recipe
-        old, new = below[key], above[key]
-        return old | new if isinstance(old, dict) and isinstance(new, dict) else new
-
-    return below | {key: both(key) if key in below else value for key, value in above.items()}
+    replaced = {"data": "collect", "collect": "data"}
+    found = {key: value for key, value in below.items() if replaced.get(key) not in above}
+    for key, new in above.items():
+        old = below.get(key)
+        found[key] = old | new if isinstance(old, dict) and isinstance(new, dict) else new
+    return found
 
 
 def _check_fit(recipe: Recipe, base: Experiment, path: Path) -> None:

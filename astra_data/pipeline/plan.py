@@ -5,10 +5,8 @@
                                       │   (all seeds of ground and train) ── (select)
                                       └── (rows without grounding train on the pairs alone)
 
-A row named `<method>_plus` is `<method>` trained with the plus settings; it shares the
-grounding and the alignment of `<method>`. A recipe with `data` labels that, and collects nothing. Where a
-recipe sweeps over sizes, what comes before is made of the largest once, `subset` makes each size of it,
-and everything from ground on is made for each.
+`<method>_plus` shares the grounding and the alignment of `<method>`. Where a recipe sweeps over sizes, what comes
+before is made of the largest once, `subset` makes each size of it, and all from ground on is made for each.
 """
 
 import inspect
@@ -105,14 +103,10 @@ def plan(
     """
     selection = selection or Selection.of(recipe)
     items = list(_Plan(recipe, folder, selection, device).items())
-    report, keys = STAGES["report"], tuple(point.key for point in selection.points())
+    keys = tuple(point.key for point in selection.points())
+    rows, seeds, percents = selection.methods, selection.seeds, selection.percents
     reported = Reported(
-        name=path.stem,
-        task=recipe.task,
-        methods=selection.methods,
-        seeds=selection.seeds,
-        settings=in_full(recipe),
-        percents=selection.percents,
+        name=path.stem, task=recipe.task, methods=rows, seeds=seeds, percents=percents, settings=in_full(recipe)
     )
     if recipe.select and len(selection.seeds) > 1:
         of = benches(reported, judge_of(recipe.select.judge, recipe.methods))
@@ -122,16 +116,9 @@ def plan(
             settings = {"select": recipe.select.model_dump(mode="json")}
             items.append(Item("select", inputs, call, settings=settings))
             keys += ("select",)
-    call = partial(
-        report.run,
-        reported,
-        root=folder,
-        command=_command(recipe, path, selection),
-        publish=publish,
-        published=published,
-        config=recipe.report,
-    )
-    return (*items, Item("report", keys, call))
+    command = _command(recipe, path, selection)
+    to: dict[str, Any] = {"root": folder, "command": command, "publish": publish, "published": published}
+    return (*items, Item("report", keys, partial(STAGES["report"].run, reported, **to, config=recipe.report)))
 
 
 def stages_until(last: str | None) -> set[str]:
@@ -199,7 +186,6 @@ class _Plan:
         parameters = inspect.signature(stage.run).parameters
         artifacts = self._artifacts(stage, seed, percent, name)
         keys = {parameter: artifacts[parameter] for parameter in parameters if parameter in ARTIFACTS}
-        settings = recipe.settings_of(name, stage.name) if name else None
         # The dataset that the policy of a row was trained on, if it is one.
         of_policy = method is not None and method.trains_without_target
         recorded = self._artifacts(STAGES["train"], seed, percent, name)["dataset"] if of_policy else None
@@ -208,7 +194,7 @@ class _Plan:
             "simulator": recipe.task,
             "method": name,
             "config": recipe.config_of(stage.name),
-            "settings": settings,
+            "settings": recipe.settings_of(name, stage.name) if name else None,
             "seed": seed,
             "percent": percent,
             "of": recipe.collect and recipe.collect.episodes,
@@ -232,8 +218,7 @@ class _Plan:
     def _settings(self, stage: Stage, name: str, given: Mapping[str, Any]) -> dict[str, JsonValue]:
         """Return what an artifact is made with, as JSON: settings, and digests of the user's code by files.
 
-        A task of the user's is named by its file, whose digest tells it from others. Of data in a folder,
-        digests tell; of recorded episodes, any task with the same target is the same.
+        Of data in a folder, digests tell; of recorded episodes, any task with the same target is the same.
         """
         recipe, method = self.recipe, base_method(name)
         names = {"task": recipe.task} | {own: given.method for own, given in recipe.own_methods.items()}
@@ -269,23 +254,15 @@ class _Plan:
         artifacts = {"dataset": artifact_key(last.name, "", seed, size) if last else None}
         if not name:
             return artifacts
-        base = base_method(name)
-        method, reference = method_named(base), reference_of(self.recipe.methods) or base
-
-        def made(by: str, of: str | None) -> str | None:
-            return artifact_key(by, of, seed, percent) if of else None
-
-        return artifacts | {
-            "policy": made("train", name if method.trains else None),
-            "grounding": made("ground", _grounding(base)),
-            "target_encoder": made("align", grounded_as(base) if method.aligns else None),
-            "reference": made("ground", _grounding(reference)),
-            "initial": made("train", method.initial),
+        method, reference = method_named(name), reference_of(self.recipe.methods) or name
+        made = {
+            "policy": ("train", name if method.trains else None),
+            "grounding": ("ground", grounded_as(name) if method.grounds else None),
+            "target_encoder": ("align", grounded_as(name) if method.aligns else None),
+            "reference": ("ground", grounded_as(reference) if method_named(reference).grounds else None),
+            "initial": ("train", method.initial),
         }
-
-
-def _grounding(base: str) -> str | None:
-    return grounded_as(base) if method_named(base).grounds else None
+        return artifacts | {key: artifact_key(by, of, seed, percent) if of else None for key, (by, of) in made.items()}
 
 
 def _command(recipe: Recipe, path: Path, selection: Selection) -> str:

@@ -17,8 +17,8 @@ from pydantic import (
     model_validator,
 )
 
-from astra_data.core.config import Config, Seed, did_you_mean, load_tables, read_written
-from astra_data.core.errors import BadInputError, RecipeError
+from astra_data.core.config import Config, Seed, as_fault, load_tables, read_written
+from astra_data.core.errors import RecipeError
 from astra_data.core.naming import PLUS, RECORD, base_method, is_plus
 from astra_data.dataset.edit import share
 from astra_data.dataset.format import INFO_PATH
@@ -36,42 +36,25 @@ _FILLED: Any = Field(default_factory=dict, validate_default=True)
 """A table that a recipe leaves out is read as an empty one."""
 
 
-def stage_field(stage: Stage) -> tuple[Any, Any]:
+def _stage_field(stage: Stage) -> tuple[Any, Any]:
     """Return the type and the default of a stage's table."""
     if stage.name == "collect":
         return stage.config | None, _FILLED
     if stage.name == "align":
-        # It would be judged on what grounding trained on.
-        return Annotated[stage.config, _agreeing("ground", "held_out_share")], _FILLED
+        return Annotated[stage.config, BeforeValidator(_held_out_as_ground)], _FILLED
     if stage.name == "select":
         return stage.config | None, Field(default=None, exclude_if=lambda table: table is None)
     return (stage.config | None, None) if stage.asked_by else (stage.config, _FILLED)
 
 
-def method_field(table: Table) -> tuple[Any, Any]:
-    """Return the type and the default of a method's table."""
-    return Annotated[table.model, BeforeValidator(table.over_usual)], table.usual
-
-
-def _agreeing(table: str, key: str) -> BeforeValidator:
-    """Return what takes `key` from `table`, and refuses another value of it."""
-
-    def read(overrides: object, info: ValidationInfo) -> object:
-        other = info.data.get(table)
-        if other is None or not isinstance(overrides, dict):
-            return overrides
-        expected = getattr(other, key)
-        if (asked := overrides.get(key, expected)) != expected:
-            raise ValueError(f"{key}: expected that of [{table}], {expected!r}, got {asked!r}")
-        return {key: expected} | overrides
-
-    return BeforeValidator(read)
-
-
-class _UserMethod(BaseModel):
-    model_config = ConfigDict(extra="allow")
-
-    method: str
+def _held_out_as_ground(table: object, info: ValidationInfo) -> object:
+    """Hold out what `[ground]` does: an alignment would be judged on what grounding trained on."""
+    if "ground" not in info.data or not isinstance(table, dict):
+        return table
+    share = info.data["ground"].held_out_share
+    if (asked := table.get("held_out_share", share)) != share:
+        raise ValueError(f"held_out_share: expected that of [ground], {share!r}, got {asked!r}")
+    return {"held_out_share": share} | table
 
 
 class _Record(BaseModel):
@@ -80,7 +63,7 @@ class _Record(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     task: str
-    own_methods: dict[str, _UserMethod] = {}
+    own_methods: dict[str, UserMethod] = {}
     sweep: dict[str, JsonValue] = {}
 
 
@@ -92,7 +75,10 @@ def recorded_settings(folder: Path) -> dict[str, Any]:
 
 def read_tables(path: Path) -> dict[str, Any]:
     """Return the tables of a recipe; files of the user's, and data in a folder, are looked up beside it."""
-    tables = tables_of(path)
+    if os.path.isdir(path):  # of a name that is too long, too, `load_tables` tells
+        _refuse_folder(path)
+    tables = load_tables(path)
+    refuse_mapping(tables, path)
     task, data = tables.get("task"), tables.get("data")
     if isinstance(task, str):
         tables["task"] = place_beside(task, path.parent)
@@ -103,21 +89,11 @@ def read_tables(path: Path) -> dict[str, Any]:
     return tables
 
 
-def tables_of(path: Path) -> dict[str, Any]:
-    """Return the tables of the file of a recipe as they are."""
-    if os.path.isdir(path):  # of a name that is too long, too, `load_tables` tells
-        _refuse_folder(path)
-    tables = load_tables(path)
-    refuse_mapping(tables, path)
-    return tables
-
-
 def _refuse_folder(path: Path) -> None:
     """Refuse a run or a dataset; name the recipe that made it, if that is known."""
     whole = path.absolute()
     run = next((folder for folder in (whole, *whole.parents) if (folder / RECORD).is_file()), None)
-    kind = "a run" if run == whole else "a dataset" if (path / INFO_PATH).is_file() else ""
-    if kind:
+    if kind := "a run" if run == whole else "a dataset" if (path / INFO_PATH).is_file() else "":
         made_by = f", {run.name}.toml" if run else ""
         raise RecipeError(f"{path} is {kind}: expected the recipe that made it{made_by}")
 
@@ -181,20 +157,15 @@ class Recipe(Config):
         method = METHODS[name]
         if method.table is None or method.configures != stage:
             return None
-        if name in self.own_methods:
-            return self.own_methods[name].settings(name)
-        table: Any = getattr(self, method.table.name)
-        settings: Config = table
-        return settings
+        own = self.own_methods.get(name)
+        return own.settings(name) if own else getattr(self, method.table.name)
 
     def config_of(self, stage: str) -> Config | None:
         """Return the settings of a stage; None where it has none."""
-        if stage == "collect" and self.largest != WHOLE:
-            episodes = share(self.largest, self.collect.episodes)
-            collect: Config = self.collect
-            return collect.model_copy(update={"episodes": episodes})
         config: Config | None = getattr(self, stage, None)
-        return config
+        if stage != "collect" or config is None or self.largest == WHOLE:
+            return config
+        return config.model_copy(update={"episodes": share(self.largest, self.collect.episodes)})
 
     @model_validator(mode="before")
     @classmethod
@@ -211,19 +182,15 @@ class Recipe(Config):
     @field_validator("task")
     @classmethod
     def _is_known_task(cls, task: str) -> str:
-        try:
+        with as_fault():
             task_named(task)
-        except BadInputError as error:
-            raise ValueError(str(error)) from None
         return task
 
     @field_validator("own_methods")
     @classmethod
     def _add_own_methods(cls, methods: dict[str, UserMethod]) -> dict[str, UserMethod]:
-        try:
+        with as_fault():
             add_all(methods)
-        except BadInputError as error:
-            raise ValueError(str(error)) from None
         return methods
 
     @field_validator("methods")
@@ -232,30 +199,38 @@ class Recipe(Config):
         if "own_methods" not in info.data:
             return rows  # told already
         for row in rows:
-            try:
+            with as_fault():
+                if is_plus(row) and not method_named(row).in_simulator:
+                    fault = "trains nothing in a simulator, so plus settings have no effect: leave out"
+                    raise ValueError(f"'{row}' {fault} {PLUS}")
                 method_named(row)
-            except BadInputError:
-                unknown = f"unknown method '{row}'{did_you_mean(base_method(row), METHODS)}"
-                raise ValueError(unknown) from None
-            if is_plus(row) and not method_named(row).in_simulator:
-                raise ValueError(
-                    f"'{row}' trains nothing in a simulator, so plus settings have no effect: leave out {PLUS}"
-                )
         return rows
 
     @model_validator(mode="after")
-    def _fits_the_learner_and_judges(self) -> Self:
+    def _fits_together(self) -> Self:
         if self.train.learner != "ppo" and "rma" in map(base_method, self.methods):
             raise ValueError(f"methods: rma: expected train.learner 'ppo', got '{self.train.learner}'")
         collects_by = self.collect and self.collect.behavior
         if collects_by == "suboptimal_sac" and not task_named(self.task).objective.is_lasting:
             raise ValueError(f"collect: good episodes of {self.task} are short: use 'suboptimal_ppo'")
+        if self.augment and self.sweep.percent:
+            raise ValueError(
+                "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one of the two"
+            )
+        for name, values in {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}.items():
+            if len(set(values)) < len(values):
+                raise ValueError(f"expected each of {name} once, got {list(values)}")
+        if self.collect is None and self.largest > WHOLE:
+            raise ValueError(f"sweep.percent: expected at most {WHOLE} % of data, got {self.largest}")
+        for percent in self.sweep.percent if self.collect else ():
+            if not share(percent, self.collect.episodes):
+                raise ValueError(
+                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes are none: expected more"
+                )
         if self.select is None:
             return self
-        try:
+        with as_fault("select.judge: "):
             judge_of(self.select.judge, self.methods)
-        except BadInputError as error:
-            raise ValueError(f"select.judge: {error}") from None
         if len(self.seeds) < 2:
             raise ValueError(
                 "select: expected two seeds or more, got 1 (judges are of other seeds): remove [select], or add a seed"
@@ -290,27 +265,6 @@ class Recipe(Config):
             raise ValueError(f"{self.task} has no maze, which these need: {', '.join(faults)}; leave them out")
         return self
 
-    @model_validator(mode="after")
-    def _has_no_repeats_and_no_empty_size(self) -> Self:
-        if self.augment and self.sweep.percent:
-            raise ValueError(
-                "sweep.percent: counts recorded episodes, but [augment] adds copies of these: leave out one of the two"
-            )
-        axes = {"methods": self.methods, "seeds": self.seeds, "sweep.percent": self.sweep.percent}
-        for name, values in axes.items():
-            if len(set(values)) < len(values):
-                raise ValueError(f"expected each of {name} once, got {list(values)}")
-        if self.collect is None:
-            if self.largest > WHOLE:
-                raise ValueError(f"sweep.percent: expected at most {WHOLE} % of data, got {self.largest}")
-            return self
-        for percent in self.sweep.percent:
-            if not share(percent, self.collect.episodes):
-                raise ValueError(
-                    f"sweep.percent: {percent} % of {self.collect.episodes} episodes are none: expected more"
-                )
-        return self
-
     @property
     def largest(self) -> int:
         """The largest size, in per cent of the episodes: as much is collected."""
@@ -323,11 +277,12 @@ def with_tables(base: type[Recipe], stages: Iterable[Stage], methods: Iterable[T
     Further keys: `based_on`, the recipe that provides the settings not given here and the artifacts that do
     not change; and `sweep`.
     """
-    fields: dict[str, Any] = {stage.name: stage_field(stage) for stage in stages if stage.config}
+    fields: dict[str, Any] = {stage.name: _stage_field(stage) for stage in stages if stage.config}
     about = "The recipe of the settings that are not given here, and of the artifacts that do not change."
     fields["based_on"] = (str | None, Field(default=None, description=about))
     fields["sweep"] = (SweepConfig, SweepConfig())
-    fields |= {table.name: method_field(table) for table in methods}
+    for table in methods:
+        fields[table.name] = (Annotated[table.model, BeforeValidator(table.over_usual)], table.usual)
     return create_model(base.__name__, __base__=base, __module__=base.__module__, **fields)
 
 

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from shutil import copy2
-from typing import Any
 
 from astra_data.core.artifact import finished_folder, read_manifest
 from astra_data.core.config import only_given, validated
@@ -17,7 +16,7 @@ from astra_data.pipeline.run import set_aside
 from astra_data.pipeline.stages.evaluate import EvaluateConfig
 from astra_data.pipeline.stages.select import SelectConfig, benches, digests, judge_in
 from astra_data.pipeline.stages.select import select as judge_all
-from astra_data.pipeline.trained_policy import settings_of, task_of, trained_policy
+from astra_data.pipeline.trained_policy import settings_of, trained_policy
 from astra_data.pipeline.user_code import add_all
 from astra_data.policies.episodes import in_target, started
 from astra_data.reports.choice import (
@@ -25,7 +24,6 @@ from astra_data.reports.choice import (
     PSEUDO_TRIALS,
     SELECTED,
     TRIALS,
-    Candidate,
     Judged,
     TrialRound,
     TrialsFile,
@@ -54,13 +52,11 @@ def select(
     """Judge every trained policy of a run, as the stage `select` does; write `select` in the run's folder.
 
     A choice that is there is kept if it was made of the same with the same settings, and otherwise set aside.
-    Candidates are `rows`, by default all with policies of abstract states; judges and `episodes` are by
-    default as the recipe says.
     """
     folder, settings = Path(run), settings_of(run)
     add_all(settings.get("own_methods", {}))
-    asked: dict[str, Any] = settings.get("select") or {}
-    config = validated(asked | only_given(judge=judge, episodes=episodes), SelectConfig, f"{folder}: select")
+    asked = (settings.get("select") or {}) | only_given(judge=judge, episodes=episodes)
+    config = validated(asked, SelectConfig, f"{folder}: select")
     recipe = Reported(
         name=folder.name,
         task=settings["task"],
@@ -70,12 +66,11 @@ def select(
         percents=tuple(settings.get("sweep", {}).get("percent", ())),
     )
     with alone_in(folder):
-        kept = read_judged(folder) if _is_current(folder, recipe, config) else None
-        if kept is None:
+        if not _is_current(folder, recipe, config) or read_judged(folder) is None:
             judge_all(recipe, config, root=folder, progress=progress)
-            kept = read_judged(folder)
-    assert kept is not None
-    return kept
+        judged = read_judged(folder)
+    assert judged is not None
+    return judged
 
 
 def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
@@ -85,11 +80,10 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
         raise BadInputError(f"{out} belongs to {out.resolve().parent}, which this run is based on: run select there")
     if not out.is_dir():
         return False
-    judge = judge_in(recipe, config)
-    read = digests([bench.finished(folder) for bench in benches(recipe, judge)], folder)
-    manifest, settings = read_manifest(out), out / "config.json"
+    read = digests([bench.finished(folder) for bench in benches(recipe, judge_in(recipe, config))], folder)
+    manifest = read_manifest(out)
     same = manifest is not None and manifest.made_from == read and not manifest.faults(out, verify=False)
-    if same and settings.read_text() == config.model_dump_json(indent=1):
+    if same and (out / "config.json").read_text() == config.model_dump_json(indent=1):
         return True
     aside = set_aside(folder, FOLDER)
     if (aside / TRIALS).is_file():
@@ -111,10 +105,9 @@ def choose_by_trials(
     """Spend so many episodes in the target on the candidates of a run; write `select/trials.json`.
 
     Candidates of a round meet the same starts and goals, others than those of `evaluate`. An interrupted call
-    goes on with the next candidate. The best `field` predicted are tried, by default as many as the trials
-    are enough for; those of a size in `percent`, where the recipe sweeps over sizes.
+    goes on with the next candidate. The best `field` predicted are tried, by default as many as is possible.
     """
-    folder, task = Path(run), task_of(run)
+    folder, task = Path(run), str(settings_of(run)["task"])
     if not task_named(task).has_target:
         raise BadInputError(f"{folder}: expected a task with a target, got {task}: leave out --trials")
     least = least_trials(max(2, field or 2))
@@ -129,10 +122,8 @@ def choose_by_trials(
         raise BadInputError(f"expected --percent to be a size of the run ({sizes}), got {percent or 'none'}")
     candidates = judged.ranked(percent)
     if not 2 <= (asked := field or len(candidates)) <= len(candidates):
-        raise BadInputError(
-            f"expected two candidates or more to try, of the {len(candidates)} that were judged, got "
-            f"{asked}: give another --field, or more rows"
-        )
+        of = f"of the {len(candidates)} that were judged, got {asked}"
+        raise BadInputError(f"expected two candidates or more to try, {of}: give another --field, or more rows")
     field = field or widest_field(len(candidates), trials)
     begun = TrialsFile(trials=trials, field=field, percent=percent, pseudo_trials=PSEUDO_TRIALS)
     path = folder / FOLDER / TRIALS
@@ -143,15 +134,8 @@ def choose_by_trials(
                     f"{path}: expected trials with {name} = {now}, found {there.spent} made with {was}: "
                     f"use the same settings, or move {path.parent} away"
                 )
-    with alone_in(folder):
-        return _halve(folder, judged, candidates, there or begun, part(progress, 0.5, 1.0))
-
-
-def _halve(
-    folder: Path, judged: Judged, candidates: list[Candidate], begun: TrialsFile, progress: Progress
-) -> TrialsFile:
-    """Go on with what was begun; of what is finished, nothing is tried again."""
-    rounds = list(begun.rounds)
+    begun, shown = there or begun, part(progress, 0.5, 1.0)
+    rounds = list(begun.rounds)  # of which nothing is tried again
 
     def attempt(number: int, those: tuple[int, ...], each: int) -> list[int]:
         named = [(candidates[one].row, candidates[one].seed) for one in those]
@@ -168,14 +152,14 @@ def _halve(
             rounds[number] = rounds[number].model_copy(update={"tried": tried})
             now = begun.model_copy(update={"rounds": rounds})
             _write(folder, judged, now)
-            progress(now.spent / begun.trials, f"{row}, seed {seed}: {sum(success)} of {each}")
+            shown(now.spent / begun.trials, f"{row}, seed {seed}: {sum(success)} of {each}")
         return [sum(one.success) for one in rounds[number].tried]
 
-    priors = [one.lower for one in candidates]
-    found = halve(priors, begun.trials, attempt, field=begun.field)
-    first = candidates[found.chosen]
-    done = begun.model_copy(update={"rounds": rounds, "chosen": (first.row, first.seed), "mean": found.mean})
-    _write(folder, judged, done)
+    with alone_in(folder):
+        found = halve([one.lower for one in candidates], begun.trials, attempt, field=begun.field)
+        first = candidates[found.chosen]
+        done = begun.model_copy(update={"rounds": rounds, "chosen": (first.row, first.seed), "mean": found.mean})
+        _write(folder, judged, done)
     return done
 
 

@@ -85,16 +85,8 @@ def load_policy(run: str | Path, row: str, *, seed: int = 0, percent: int | None
     return trained_policy(run, row, seed=seed, percent=percent).running()
 
 
-def task_of(run: str | Path) -> str:
-    """Return the task that a run's recipe names."""
-    return str(settings_of(run)["task"])
-
-
 def settings_of(run: str | Path) -> dict[str, Any]:
-    """Return the settings of a run's recipe, as it recorded them.
-
-    Files of the user's that it names are looked up in the run's folder and those above it, and else here.
-    """
+    """Return the settings of a run's recipe; the user's files are looked up in its folder and above, and else here."""
     folder = Path(run)
     if not (folder / RECORD).is_file():
         raise BadInputError(f"{run}: expected the folder of a run (with {RECORD}): make it with astra-data run")
@@ -110,12 +102,11 @@ def _files(settings: dict[str, Any], folder: Path, row: str, seed: int, percent:
     own_methods = settings.get("own_methods", {})
     add_all(own_methods)
     files = {"train": folder / artifact_key("train", row, seed, percent) / POLICY}
-    if not files["train"].is_file():
-        rows, seeds = settings.get("methods", [row]), settings.get("seeds", [seed])
-        if row not in rows:
-            raise BadInputError(f"the run has no row '{row}'{did_you_mean(row, rows)}")
-        if seed not in seeds:
-            raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")
+    rows, seeds = settings.get("methods", [row]), settings.get("seeds", [seed])
+    if not files["train"].is_file() and row not in rows:
+        raise BadInputError(f"the run has no row '{row}'{did_you_mean(row, rows)}")
+    if not files["train"].is_file() and seed not in seeds:
+        raise BadInputError(f"the run has no seed {seed}; its seeds: {', '.join(map(str, seeds))}")
     method, base = method_named(row), grounded_as(row)
     if not method.trains:
         raise BadInputError(f"{row} has no trained policy: it is written by hand")

@@ -8,7 +8,7 @@ import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.files import load_grounding, load_target_encoder
-from astra_data.pipeline.trained_policy import load_policy, settings_of, task_of, trained_policy
+from astra_data.pipeline.trained_policy import load_policy, settings_of, trained_policy
 from astra_data.policies.running_policy import PolicyFile, running
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.user_code import code_digest
@@ -58,7 +58,7 @@ def test_files_of_the_users_are_found_from_everywhere(tmp_path: Path, monkeypatc
         (tmp_path / name).touch()
     monkeypatch.chdir(run)
     found = settings_of(run)
-    assert found["task"] == task_of(run) == f"{tmp_path}/cart.py:TASK"
+    assert found["task"] == settings_of(run)["task"] == f"{tmp_path}/cart.py:TASK"
     assert found["own_methods"] == {"damped": {"method": f"{tmp_path}/damped.py:METHOD", "gain": 2.0}}
 
 

@@ -14,7 +14,7 @@ from astra_data.core.naming import CODE
 from astra_data.pipeline.experiment import load_experiment
 from astra_data.pipeline.grounded_env import grounded
 from astra_data.pipeline.run import run
-from astra_data.pipeline.trained_policy import load_policy, task_of
+from astra_data.pipeline.trained_policy import load_policy, settings_of
 from astra_data.pipeline.user_code import check_unchanged
 from astra_data.robots import registry
 
@@ -137,7 +137,7 @@ def test_no_policy_is_of_another_method(made: Path) -> None:
     edit(made / "mine.py", "METHOD = ", "EXTRA = METHOD = ")
     with pytest.raises(BadInputError, match=f"^{made}/mine.py changed since .* was made: restore that version"):
         load_policy(made / "runs/rail", "mine")
-    assert task_of(made / "runs/rail") == f"{made}/rail.py:TASK"
+    assert settings_of(made / "runs/rail")["task"] == f"{made}/rail.py:TASK"
 
 
 @pytest.mark.parametrize("text", ["", '{"task": 3}'])
@@ -145,6 +145,6 @@ def test_a_damaged_record_is_told(text: str, made: Path) -> None:
     record = made / "runs/rail" / CODE
     record.write_text(text)
     with pytest.raises(BadInputError, match=r"rail/code\.json is not what a run writes: .*; restore it"):
-        task_of(made / "runs/rail")
+        settings_of(made / "runs/rail")["task"]
     record.unlink()
-    task_of(made / "runs/rail")
+    settings_of(made / "runs/rail")["task"]

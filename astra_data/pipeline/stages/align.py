@@ -65,20 +65,14 @@ def align(
     episodes = PairedEpisodes.load(dataset, device)
     training, held_out = episodes.split(config.held_out_share, seed)
     torch.manual_seed(derive(seed, "alignment"))
-    encoder = TargetEncoder(
-        episodes.target_state.shape[-1],
-        model.shape.goal_size,
-        model.shape.action_size,
-        embedding_size=model.shape.embedding_size,
-        latent_size=model.shape.latent_size,
-        position_octaves=model.shape.position_octaves,
-        encoder=model.shape.encoder,
-    ).to(device)
+    shape = model.shape
+    alike = {name: getattr(shape, name) for name in ("embedding_size", "latent_size", "position_octaves", "encoder")}
+    encoder = TargetEncoder(episodes.target_state.shape[-1], shape.goal_size, shape.action_size, **alike).to(device)
     # Where φ drops the robot's place, latents must not depend on where it came from.
     encoder.set_scales(
         training.steps(training.target_state), training.steps(training.windows.goal), training.dropped_place
     )
-    bandwidths = torch.tensor(_BANDWIDTHS, device=device) * model.shape.latent_size**0.5
+    bandwidths = torch.tensor(_BANDWIDTHS, device=device) * shape.latent_size**0.5
     grounding_digest = file_digest(grounding_file)
     settings_text = as_json(**episodes.named, grounding_sha256=grounding_digest, seed=seed, align=config)
     made_from = {"dataset": episodes.content_hash, "grounding": grounding_digest}

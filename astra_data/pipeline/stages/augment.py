@@ -13,11 +13,11 @@ Held-out episodes are chosen first and never copied. Pairing comes later, so tha
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, model_validator
 
 from astra_data.core.config import AtOnce, Config, Count, NotNegative
 from astra_data.core.errors import BadInputError
@@ -28,7 +28,7 @@ from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.versions import next_version, open_dataset
 from astra_data.robots.registry import TASKS, task_named
-from astra_data.worlds.plane.relocation import Copy, Relocation, Rotations
+from astra_data.worlds.plane.relocation import Relocation, Rotations
 from astra_data.worlds.task import Task
 from astra_data.worlds.user_code import is_user_code
 
@@ -62,19 +62,13 @@ class AugmentConfig(Config):
     tries: Count = 100
     """Rotations to draw for a copy before giving up, with 64 places for each."""
 
-    @field_validator("episodes")
-    @classmethod
-    def _excludes_copies(cls, episodes: int | None, info: ValidationInfo) -> int | None:
-        if episodes is not None and info.data.get("copies") is not None:
+    @model_validator(mode="after")
+    def _changes_something(self) -> Self:
+        if self.episodes is not None and self.copies is not None:
             raise ValueError("expected either copies or episodes, got both")
-        return episodes
-
-    @field_validator("translations")
-    @classmethod
-    def _changes_something(cls, translations: bool, info: ValidationInfo) -> bool:
-        if not translations and info.data.get("rotations") == "none":
+        if not self.translations and self.rotations == "none":
             raise ValueError("expected rotations or translations, got neither")
-        return translations
+        return self
 
 
 def augment(
@@ -111,17 +105,11 @@ def augment(
     world = _task_of(source, task)
     plane = world.planar
     _check(source, world)
-    relocation = Relocation(
-        world,
-        rotations=config.rotations,
-        translations=config.translations,
-        margin_m=plane.wall_reach_m if config.margin_m is None else config.margin_m,
-        min_steps=config.min_steps,
-        tries=config.tries,
-    )
+    margin_m = plane.wall_reach_m if config.margin_m is None else config.margin_m
+    how = {name: getattr(config, name) for name in ("rotations", "translations", "min_steps", "tries")}
+    relocation = Relocation(world, margin_m=margin_m, **how)
     held_out, copies = _shares(source, relocation, config, seed)
-    taken = set(source.uids.tolist())
-    placed, lost, moving = 0, 0, _moving(source)
+    taken, placed, lost, moving = set(source.uids.tolist()), 0, 0, _moving(source)
     with next_version(
         source,
         "episodes",
@@ -133,17 +121,24 @@ def augment(
     ) as writer:
         for index, episode in enumerate(source.episodes()):
             if held_out[index] or config.keep_originals:
-                metadata = {**episode.metadata, "held_out": bool(held_out[index])}
-                writer.add(Episode(episode.uid, episode.columns, metadata))
+                told = {**episode.metadata, "held_out": bool(held_out[index])}
+                writer.add(Episode(episode.uid, episode.columns, told))
             for copy in range(copies[index]):
-                rng = generator(seed, f"augment {episode.uid} {copy}")
-                copied = relocation.copied(episode, moving, rng)
+                copied = relocation.copied(episode, moving, generator(seed, f"augment {episode.uid} {copy}"))
                 if copied is None:
                     lost += 1
                     continue
                 purpose = f"{source.content_hash} {config.model_dump_json()} {episode.uid} {copy}"
-                uid = _free_uid(derive(seed, purpose), taken)
-                writer.add(_episode(uid, episode.uid, copied))
+                columns, change, kept = copied
+                metadata = outcome_of(columns) | {
+                    "held_out": False,
+                    "source_episode": episode.uid,
+                    "augmentation_first_step": int(kept.start),
+                    "augmentation_rotation_rad": change.rotation_rad,
+                    "augmentation_x_m": change.shift_m[0],
+                    "augmentation_y_m": change.shift_m[1],
+                }
+                writer.add(Episode(_free_uid(derive(seed, purpose), taken), columns, metadata))
                 placed += 1
             progress((index + 1) / len(source), f"{placed} copies, no place for {lost}")
         if copies.any() and not placed:
@@ -174,9 +169,8 @@ def _check(source: Dataset, world: Task) -> None:
     columns = {column.name: column for column in source.schema}
     faults = [f"no column {name}" for name in _OUTCOMES if name not in columns]
     for expected in world.state_columns:
-        found = columns.get(expected.name)
-        if found is None or found.size != expected.size:
-            size = "none" if found is None else str(found.size)
+        size = columns[expected.name].size if expected.name in columns else "none"
+        if size != expected.size:
             faults.append(f"{expected.name}: expected {expected.size} values per step, got {size}")
     if ABSTRACT_STATE in columns:
         faults.append(f"{ABSTRACT_STATE}: it has been paired; augment its parent, then pair")
@@ -221,24 +215,6 @@ def _shares(
         copies[usable] = each
         copies[training[usable[training]][:more]] += 1
     return held_out, copies
-
-
-def _episode(uid: int, source: int, copied: Copy) -> Episode:
-    """Return a copy of the episode `source` with what is told of it."""
-    columns, change, steps = copied
-    return Episode(
-        uid,
-        columns,
-        outcome_of(columns)
-        | {
-            "held_out": False,
-            "source_episode": source,
-            "augmentation_first_step": int(steps.start),
-            "augmentation_rotation_rad": change.rotation_rad,
-            "augmentation_x_m": change.shift_m[0],
-            "augmentation_y_m": change.shift_m[1],
-        },
-    )
 
 
 def _free_uid(uid: int, taken: set[int]) -> int:

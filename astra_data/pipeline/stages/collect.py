@@ -34,7 +34,6 @@ from astra_data.worlds.task import Task
 
 _TRAINING_SHARE = 0.8
 """Share of the progress bar for training the suboptimal policy."""
-
 _NUM_ENVS = 200
 """Episodes recorded in one batch."""
 _SAC_STEPS, _SAC_EPISODE_STEPS = 300_000, 500
@@ -49,8 +48,7 @@ class CollectConfig(Config):
     behavior: Literal["random", "stress", "policy", "suboptimal_ppo", "suboptimal_sac"] = "random"
     """"random": commands drawn from U[-1, 1] per axis, each held for a while. "stress": commands at the
     bounds that often reverse, to provoke failures. "policy": a saved policy. "suboptimal_ppo",
-    "suboptimal_sac": a policy trained in the target and stopped early. Policies sample their actions, as in
-    training."""
+    "suboptimal_sac": a policy trained in the target and stopped early. Policies sample their actions."""
     episodes: Count = 200
     """Number of episodes: with `least_steps` the maximum."""
     least_steps: Count | None = Field(default=None, exclude_if=lambda steps: steps is None)
@@ -137,10 +135,8 @@ def collect(
         behavior, metadata = _behavior(world, config, seed, writer, num_threads, training)
         if config.random_share:
             behavior = MixedBehavior(behavior, _random(world, config, RandomCommands), config.random_share)
-        stopwatch = Stopwatch(metadata.get("spent"))
-        recording = part(progress, share, 1.0)
-        trained = time.perf_counter()
-        steps = _record(world, config, behavior, seed, writer, num_threads, recording)
+        stopwatch, trained = Stopwatch(metadata.get("spent")), time.perf_counter()
+        steps = _record(world, config, behavior, seed, writer, num_threads, part(progress, share, 1.0))
         if config.least_steps:
             _keep(config.least_steps, writer)
         rate = steps / (time.perf_counter() - trained)
@@ -186,24 +182,13 @@ def _record(
         if writer.staged.keys() >= set(rows):
             continue
         batch_seed = derive(seed, f"episodes from {first}") if first else seed
-        env = world.target(
-            len(rows),
-            seed=derive(batch_seed, "collect"),
-            start_anywhere=world.plane is not None if config.start is None else config.start == "anywhere",
-            num_threads=num_threads,
-        )
+        anywhere = world.plane is not None if config.start is None else config.start == "anywhere"
+        drawn = derive(batch_seed, "collect")
+        env = world.target(len(rows), seed=drawn, start_anywhere=anywhere, num_threads=num_threads)
         env.reset()
         behavior.start(rows, batch_seed)
-        steps += record(
-            world,
-            env,
-            behavior,
-            rows,
-            writer,
-            max_steps=config.max_steps,
-            seed=seed,
-            progress=part(progress, rows.start / config.episodes, rows.stop / config.episodes),
-        )
+        shown = part(progress, rows.start / config.episodes, rows.stop / config.episodes)
+        steps += record(world, env, behavior, rows, writer, max_steps=config.max_steps, seed=seed, progress=shown)
     return steps
 
 

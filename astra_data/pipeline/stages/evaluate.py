@@ -1,8 +1,7 @@
-"""Evaluate: run a policy in the target environment and in simulators.
+"""Evaluate: run a policy in the target environment, if the task has one, and in simulators.
 
-The simulators are the one that it was trained in, and two that are the same for all policies, to measure how
-well each predicts the target: the raw simulator, and a grounded one as reference. These two give the task's
-own reward. Of a task without a target, there are the simulators alone.
+These are the one that it was trained in, and two that are the same for all policies, to measure how well each
+predicts the target: the raw simulator, and a grounded one as reference. These two give the task's own reward.
 """
 
 import json
@@ -119,23 +118,35 @@ def evaluate(
             simulators[name] = SimulatorEnv(world.objective, made.simulator(world, config.episodes))
     asked = None if recorded is None else RecordedRange.of(recorded, world.limits)
     tested_in = "target" if world.has_target else "grounded" if "grounded" in simulators else "raw"
-    results: dict[str, Any] = {
-        "task": world.name,
-        "method": method,
-        "seed": seed,
-        "episodes": config.episodes,
-        "leg_scale": config.leg_scale,
-        **origin(),
-        **row.facts,
-    }
+    about = {"task": world.name, "method": method, "seed": seed, "episodes": config.episodes}
+    results: dict[str, Any] = {**about, "leg_scale": config.leg_scale, **origin(), **row.facts}
     tensors: dict[str, Tensor] = {}
     if world.has_target:
-        figures, tensors = _tested_in_target(world, row, config, seed, asked, num_threads, progress)
-        results |= figures
+        drawn = derive(seed, "evaluation")
+        options: dict[str, Any] = {"leg_scale": config.leg_scale, "num_threads": num_threads, "progress": progress}
+        tested = {
+            kind: in_target(
+                world, robot, config.episodes, drawn, **options, asked=asked if kind == row.headline else None
+            )
+            for kind, robot in row.robots.items()
+        }
+        if row.is_policy:
+            outcomes = {kind: episodes.outcome.to_json() for kind, episodes in tested.items()}
+            measures = [score.measure for score in world.objective.scores]
+            results["encoders"] = {kind: {one: fmean(of[one]) for one in measures} for kind, of in outcomes.items()}
+        headline = tested[row.headline]
+        results |= {"target": headline.outcome.to_json(), "target_steps_per_second": headline.rate}
+        tensors = {"target.position": headline.outcome.position} | headline.start_goal
+        if world.photograph is not None:
+            tensors["target.state"] = headline.filmed
     else:
         results |= {"tested_in": tested_in, "encoder": "source"}
-    figures, paths = _tested_in_simulators(world, row.begin, simulators, tested_in, seed, asked)
-    results, tensors = results | figures, tensors | paths
+    for name, simulator in simulators.items():
+        drawn, counted = derive(seed, "simulated evaluation"), asked if name == tested_in else None
+        outcome, start_goal = in_simulator(simulator, row.begin, world.objective.horizon, drawn, counted)
+        results[name] = outcome.to_json()
+        tensors |= start_goal if name == tested_in else {}
+        tensors |= {f"{name}.position": outcome.position} if name in ("simulated", tested_in) else {}
     if asked is not None:
         results["beyond_recorded"] = asked.share
     with finished_folder(out, made_from=made_from) as folder:
@@ -176,79 +187,12 @@ def _policy(task: Task, loaded: PolicyFile | None, files: Mapping[str, Path], co
         robots["target"] = partial(started, aligned, aligned.act)
         headline = config.encoder or ("target" if encoder.is_deployed else "source")
     facts: dict[str, Any] = {"policy": trained.policy.name} if isinstance(trained.policy, UserPolicy) else {}
-    identity = {"dataset_version": trained.dataset, "dataset_hash": trained.content_hash}
+    facts |= {"encoder": headline, "dataset_version": trained.dataset, "dataset_hash": trained.content_hash}
     simulators = {}
     if trained.simulation is not None:
         simulators["simulated"] = training_env(task, trained.simulation, grounding, num_envs=config.episodes)
-    return _Row(
-        partial(started, source, source.act_in_simulator),
-        robots,
-        headline,
-        simulators,
-        shown_abstract=trained.observed == "abstract",
-        is_policy=True,
-        facts={**facts, "encoder": headline, **identity},
-    )
-
-
-def _tested_in_target(
-    task: Task,
-    row: _Row,
-    config: EvaluateConfig,
-    seed: int,
-    asked: RecordedRange | None,
-    num_threads: int | None,
-    progress: Progress,
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Test a row with each of its encoders; return the figures, and the headline's paths and starts."""
-    tested = {
-        kind: in_target(
-            task,
-            robot,
-            config.episodes,
-            derive(seed, "evaluation"),
-            leg_scale=config.leg_scale,
-            num_threads=num_threads,
-            progress=progress,
-            asked=asked if kind == row.headline else None,
-        )
-        for kind, robot in row.robots.items()
-    }
-    headline = tested[row.headline]
-    figures: dict[str, Any] = {}
-    if row.is_policy:
-        measures = [score.measure for score in task.objective.scores]
-        outcomes = {kind: episodes.outcome.to_json() for kind, episodes in tested.items()}
-        figures["encoders"] = {
-            kind: {measure: fmean(of[measure]) for measure in measures} for kind, of in outcomes.items()
-        }
-    figures |= {"target": headline.outcome.to_json(), "target_steps_per_second": headline.rate}
-    tensors = {"target.position": headline.outcome.position} | headline.start_goal
-    if task.photograph is not None:
-        tensors["target.state"] = headline.filmed
-    return figures, tensors
-
-
-def _tested_in_simulators(
-    task: Task,
-    begin: Begin,
-    simulators: Mapping[str, SimulatorEnv],
-    tested_in: str,
-    seed: int,
-    asked: RecordedRange | None,
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Test a row in each simulator; return the figures, and paths and starts of those that are drawn."""
-    figures: dict[str, Any] = {}
-    tensors: dict[str, Tensor] = {}
-    for name, simulator in simulators.items():
-        counted = asked if name == tested_in else None
-        outcome, start_goal = in_simulator(
-            simulator, begin, task.objective.horizon, derive(seed, "simulated evaluation"), counted
-        )
-        figures[name] = outcome.to_json()
-        tensors |= start_goal if name == tested_in else {}
-        tensors |= {f"{name}.position": outcome.position} if name in ("simulated", tested_in) else {}
-    return figures, tensors
+    begin, is_abstract = partial(started, source, source.act_in_simulator), trained.observed == "abstract"
+    return _Row(begin, robots, headline, simulators, is_abstract, is_policy=True, facts=facts)
 
 
 def _careful_in_target(task: Task, goal: Tensor) -> Act:

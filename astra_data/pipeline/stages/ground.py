@@ -63,7 +63,10 @@ def ground(
         stopwatch = Stopwatch()
         grounding, metrics = fitted(fit(fitting))
         figures = made | stopwatch.spent() | metrics
-        _check_figures(figures)
+        try:
+            Metrics.model_validate(figures)  # a fit of the user's may return others under the names of reports
+        except ValidationError as error:
+            raise BadInputError(f"the figures of fit: {faults_of(error)}: give them other names") from None
         progress(1.0, "gap report")
         save_grounding(folder / GROUNDING, grounding, episodes)
         written = load_grounding(folder / GROUNDING, device)  # what policies are trained in
@@ -85,11 +88,3 @@ def _derived(figures: Mapping[str, Any]) -> str:
     if failures := figures.get("failure_model"):
         parts.append(f"failure model {'with' if failures['latent'] else 'without'} latent")
     return ", ".join(parts) or "fitted"
-
-
-def _check_figures(figures: Mapping[str, Any]) -> None:
-    """Check that reports can read them; a fit of the user's may return others under the same names."""
-    try:
-        Metrics.model_validate(figures)
-    except ValidationError as error:
-        raise BadInputError(f"the figures of fit: {faults_of(error)}: give them other names") from None

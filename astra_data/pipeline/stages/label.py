@@ -64,20 +64,16 @@ def label(
     """
     world, source = task_named(task), opened(data)
     check_fits(source, world)
-    more = [
-        column
-        for column in ((world.goal,) if world.goal else ()) + OUTCOME_COLUMNS
-        if column.name not in source.features
-    ]
+    more = [one for one in (world.goal, *OUTCOME_COLUMNS) if one and one.name not in source.features]
     for warning in remarks(source, world):
         _log.warning(warning)
-    if not more and out is not None:
+    if not more:
+        if out is None:
+            raise BadInputError(f"{source.reference} already has goals and outcomes: there is nothing to label")
         refuse_existing(out)
         make_folder(out.parent)
         out.symlink_to(source.root.resolve())
         return out
-    if not more:
-        raise BadInputError(f"{source.reference} already has goals and outcomes: there is nothing to label")
     steps = successes = failures = at_goal = 0
     with next_version(
         source,
@@ -94,15 +90,15 @@ def label(
             steps += len(labeled)
             successes += bool(labeled.metadata["success"])
             failures += bool(labeled.metadata["failed"])
-            at_goal += SUCCESS not in episode.columns and _failed_at_its_goal(world, labeled, seed)
+            if SUCCESS not in episode.columns and labeled.metadata["failed"]:
+                after = _abstracted(world, labeled.columns[NEXT_STATE][-1:])
+                at_goal += bool(judged(world.objective, "reached", after, _goals(world, labeled, seed)[-1:]))
             progress(number / len(source), f"{successes} successes, {failures} failures in {steps:,} steps")
         writer.made = {"dropped_steps": int(source.lengths.sum()) - steps}
     if at_goal:
-        _log.warning(
-            "%s",
-            f"{source.reference}: {at_goal} episodes terminate at their goal and are labeled as failures, "
-            f"because {TERMINATED} does not say why: also import {SUCCESS} if they ended on arrival",
-        )
+        fault = f"{at_goal} episodes terminate at their goal and are labeled as failures, because {TERMINATED}"
+        advice = f"also import {SUCCESS} if they ended on arrival"
+        _log.warning("%s", f"{source.reference}: {fault} does not say why: {advice}")
     return writer.root
 
 
@@ -130,16 +126,11 @@ def remarks(source: Dataset, task: Task) -> list[str]:
 
 
 def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
-    """Return the episode with goals and outcomes, up to its first success.
-
-    What it has of them is kept.
-    """
+    """Return the episode with goals and outcomes, up to its first success; what it has of them is kept."""
     given = episode.columns
     before, after = (_abstracted(task, given[key]) for key in (STATE, NEXT_STATE))
     goal = _goals(task, episode, seed)
-    over = torch.zeros(len(episode), dtype=torch.bool)
-    if TERMINATED in given:
-        over = torch.from_numpy(given[TERMINATED])
+    over = torch.from_numpy(given.get(TERMINATED, np.zeros(len(episode), bool)))
     missed = judged(task.objective, "missed", after, goal)
     reached = judged(task.objective, "reached", after, goal) & ~over
     success = torch.from_numpy(given[SUCCESS]) if SUCCESS in given else reached.clone()
@@ -155,22 +146,11 @@ def with_outcomes(task: Task, episode: Episode, seed: int) -> Episode:
     length = int(terminated.argmax()) + 1 if terminated.any() else len(episode)
     truncated = np.zeros(len(episode), bool)
     truncated[length - 1] = not terminated[length - 1]
-    computed: dict[str, Array] = {
-        **({GOAL: as_column(goal.numpy())} if task.goal else {}),
-        REWARD: reward.astype(np.float32),
-        SUCCESS: success.numpy(),
-    }
-    columns = computed | dict(given) | {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
+    columns: dict[str, Array] = {GOAL: as_column(goal.numpy())} if task.goal else {}
+    columns |= {REWARD: reward.astype(np.float32), SUCCESS: success.numpy(), **given}
+    columns |= {TERMINATED: terminated, TRUNCATED: truncated, DONE: terminated | truncated}
     kept = {key: values[:length] for key, values in columns.items()}
     return Episode(episode.uid, kept, dict(episode.metadata) | outcome_of(kept))
-
-
-def _failed_at_its_goal(task: Task, labeled: Episode, seed: int) -> bool:
-    """Whether an episode failed in a step that reached the goal."""
-    if not labeled.metadata["failed"]:
-        return False
-    after = _abstracted(task, labeled.columns[NEXT_STATE][-1:])
-    return bool(judged(task.objective, "reached", after, _goals(task, labeled, seed)[-1:]))
 
 
 def _abstracted(task: Task, states: Array) -> Tensor:
@@ -189,12 +169,10 @@ def _goals(task: Task, episode: Episode, seed: int) -> Tensor:
 
 def check_fits(source: Dataset, task: Task) -> None:
     """Check that a dataset has the states and actions of a task."""
-    faults = []
-    if (fps := source.info["fps"]) != task.fps:
-        faults.append(
-            f"has {fps} steps per second, expected the {task.fps} of {task.name}, whose timestep_s is "
-            f"{task.timestep_s:g}"
-        )
+    faults, fps = [], source.info["fps"]
+    if fps != task.fps:
+        expects = f"expected the {task.fps} of {task.name}, whose timestep_s is {task.timestep_s:g}"
+        faults.append(f"has {fps} steps per second, {expects}")
     for expected in (task.state, task.action):
         faults += column_faults(source, expected, task.name)
     goal_size = task.goal.size if task.goal else 0

@@ -81,9 +81,8 @@ def pair(
         ABSTRACT_SIMULATED_NEXT_STATE: "where the abstract simulator lands, reset to abstract.state",
     }
     added = [replace(pairing.abstract_state, name=name, meaning=text) for name, text in meanings.items()]
-    steps, simulating, reset_error = 0, 0.0, 0.0
+    steps, simulating, reset_error, farthest = 0, 0.0, 0.0, np.zeros(added[0].size)
     jumps = {unit: np.zeros(added[0].size, np.int64) for unit in TURNS}
-    farthest = np.zeros(added[0].size)
     with next_version(
         source,
         "columns",
@@ -96,13 +95,9 @@ def pair(
     ) as writer:
         for episodes in in_blocks(source.episodes(), _BLOCK):
             before = time.perf_counter()
-            state, action, next_state = (
-                as_rows(np.concatenate([episode.columns[name] for episode in episodes]))
-                for name in (STATE, ACTION, NEXT_STATE)
-            )
-            paired, error = pair_steps(
-                pairing, batch, state, action, next_state, tolerance=config.reset_tolerance, first_step=steps
-            )
+            columns = [np.concatenate([one.columns[name] for one in episodes]) for name in (STATE, ACTION, NEXT_STATE)]
+            tolerance = config.reset_tolerance
+            paired, error = pair_steps(pairing, batch, *map(as_rows, columns), tolerance=tolerance, first_step=steps)
             simulating += time.perf_counter() - before
             reset_error = max(reset_error, error)
             apart = paired[ABSTRACT_NEXT_STATE] - paired[ABSTRACT_SIMULATED_NEXT_STATE]
@@ -124,13 +119,13 @@ def pair(
             "pairs_per_second": steps / spent["wall_seconds"],
             "simulated_pairs_per_second": steps / simulating,
         }
+    units = list(pairing.abstract_state.units)
+    for entry, unit in enumerate(units):
+        if unit in ("", "1") and is_angle(_name(pairing, entry)):
+            units[entry] = "rad" if farthest[entry] <= LARGEST else "deg"
     for unit, half in (("rad", "π"), ("deg", "180°")):
-        wrapped = [
-            f"{_name(pairing, entry)} in {rows} of {steps} rows"
-            for entry, rows in enumerate(jumps[unit])
-            if rows and _angle_unit(pairing, entry, farthest[entry]) == unit
-        ]
-        if wrapped:
+        jumped = [entry for entry, rows in enumerate(jumps[unit]) if rows and units[entry] == unit]
+        if wrapped := [f"{_name(pairing, entry)} in {jumps[unit][entry]} of {steps} rows" for entry in jumped]:
             _log.warning(
                 f"{pairing.id} lands more than {half} from where the robot was: {', '.join(wrapped)}; "
                 "a heading that wraps: make cos and sin of it in φ"
@@ -167,8 +162,7 @@ def pair_steps(
         if not float(difference.max()) <= tolerance:
             row, entry = divmod(int(difference.argmax()), wanted.shape[1])
             raise BadInputError(
-                f"the simulator, reset to φ(s) of step {first_step + rows[row]}, has "
-                f"{_name(pairing, entry)} = "
+                f"the simulator, reset to φ(s) of step {first_step + rows[row]}, has {_name(pairing, entry)} = "
                 f"{float(shown[row, entry]):.6g}, expected {float(wanted[row, entry]):.6g} "
                 f"(tolerance {tolerance:g}): check its reset_to and the abstraction"
             )
@@ -179,8 +173,7 @@ def pair_steps(
         if not np.isfinite(reached).all():
             row, entry = np.argwhere(~np.isfinite(reached))[0]
             raise BadInputError(
-                f"the simulator, stepped from φ(s) of step {first_step + rows[row]}, gives "
-                f"{_name(pairing, entry)} = "
+                f"the simulator, stepped from φ(s) of step {first_step + rows[row]}, gives {_name(pairing, entry)} = "
                 f"{reached[row, entry]}: expected finite states from its step"
             )
         landed[first : first + size] = reached[: len(state) - first]
@@ -195,14 +188,6 @@ def pair_steps(
 def _name(pairing: Pairing, entry: int) -> str:
     names = pairing.abstract_state.names
     return names[entry] if names else f"value {entry}"
-
-
-def _angle_unit(pairing: Pairing, entry: int, farthest: float) -> str:
-    """Return the unit of an abstract state, where it has none that of an angle up to `farthest`."""
-    unit = pairing.abstract_state.units[entry]
-    if unit in ("", "1") and is_angle(_name(pairing, entry)):
-        return "rad" if farthest <= LARGEST else "deg"
-    return unit
 
 
 def _check(source: Dataset, pairing: Pairing) -> None:

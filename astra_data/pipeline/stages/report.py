@@ -5,12 +5,13 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from hashlib import sha256
+from itertools import product
 from pathlib import Path
 
 from pydantic import Field, field_validator
 
 from astra_data.core.artifact import finished_folder, read_manifest
-from astra_data.core.config import Config, Share
+from astra_data.core.config import Config, Share, as_fault
 from astra_data.core.durable import file_digest, write_file
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import artifact_key
@@ -24,7 +25,6 @@ from astra_data.reports.results import Results, merge, read_results, replaced, r
 from astra_data.reports.runs import Reported, read_run
 from astra_data.reports.verdict import verdict_of
 from astra_data.robots.registry import task_named
-from astra_data.worlds.task import Task
 
 JSON, PAGE, HTML = "results.json", "results.md", "results.html"
 _log = logging.getLogger(__name__)
@@ -35,24 +35,19 @@ class ReportConfig(Config):
 
     trajectory_methods: tuple[str, ...] = ()
     """Methods whose trajectories are drawn; all if none of these is reported."""
-
     trajectory_episodes: int = Field(default=12, ge=1)
     """Episodes to draw per method and world: the first ones of its first seed."""
-
     paper_success: dict[str, Share] = Field(default_factory=dict)
     """Method → the paper's success rate, shown next to ours."""
-
     compare: tuple[str, ...] = ("astra",)
     """Methods to compare with every method trained the same way, each with and without the plus settings."""
 
     @field_validator("trajectory_methods", "paper_success", "compare")
     @classmethod
     def _name_known_methods[R: (tuple[str, ...], dict[str, float])](cls, rows: R) -> R:
-        try:
+        with as_fault():
             for row in rows:
                 method_named(row)
-        except BadInputError as error:
-            raise ValueError(str(error)) from None
         return rows
 
 
@@ -70,10 +65,6 @@ def report(
 
     They name `command` as their origin, and are added to the files `published`. `publish` is a folder for
     copies of results.json, .md and the figures, named after the recipe.
-
-    Raises:
-        MissingStageError: no method has an evaluation.
-        BadInputError: an artifact is malformed, or methods differ in task, episodes, robot or data.
     """
     from astra_data.reports.figures.catalog import FIGURES, drawn
     from astra_data.reports.figures.style import Scene
@@ -83,12 +74,22 @@ def report(
         method_named(row)
     task = task_named(recipe.task)
     made_from = _digests(recipe, root, command, config)
-    found = _added_to(published, _read(recipe, root, command, task, config))
+    found = read_run(
+        replace(recipe, task=task.name),  # not where its file is
+        root=root,
+        command=command,
+        scores=task.objective.scores,
+        paper_success={row: value for row, value in config.paper_success.items() if row in recipe.methods},
+        compare=config.compare,
+        stand_in=task.facts.get("stand_in"),
+        timestep_s=task.timestep_s,
+    )
+    found = _added_to(published, found)
     progress(0.5, f"{len(found.tested())} methods, {len(found.seeds)} seeds")
     scene = Scene(root, task, config.trajectory_methods, config.trajectory_episodes)
     images = drawn(found, scene)
     progress(0.9, f"{len(images)} figures")
-    sections = sections_of(found, _shown(root))
+    sections = sections_of(found, f"runs/{root.name}" if root.is_absolute() else str(root))  # as commands name it
     with finished_folder(root / "report", replace=True, made_from=made_from) as folder:
         write_file(folder / JSON, results_json(found))
         write_file(folder / PAGE, markdown(found.recipe, sections, {name: f"{name}.png" for name in images}))
@@ -104,19 +105,6 @@ def report(
         write_file(publish / f"{recipe.name}.json", results_json(found))
         write_file(publish / f"{recipe.name}.md", markdown(found.recipe, sections, shown))
     progress(1.0, verdict_of(found).text.replace("**", ""))
-
-
-def _read(recipe: Reported, root: Path, command: str, task: Task, config: ReportConfig) -> Results:
-    return read_run(
-        replace(recipe, task=task.name),  # not where its file is
-        root=root,
-        command=command,
-        scores=task.objective.scores,
-        paper_success={row: value for row, value in config.paper_success.items() if row in recipe.methods},
-        compare=config.compare,
-        stand_in=task.facts.get("stand_in"),
-        timestep_s=task.timestep_s,
-    )
 
 
 def _added_to(published: Sequence[Path], found: Results) -> Results:
@@ -141,18 +129,9 @@ def is_current(recipe: Reported, *, root: Path, command: str, config: ReportConf
 
 def _digests(recipe: Reported, root: Path, command: str, config: ReportConfig) -> dict[str, str]:
     """Return the digest of each evaluation that is finished, of a choice, and of settings and version."""
-    keys = [
-        artifact_key("evaluate", row, seed, percent)
-        for row in recipe.methods
-        for percent in recipe.percents or (None,)
-        for seed in recipe.seeds
-    ]
+    points = product(recipe.methods, recipe.percents or (None,), recipe.seeds)
+    keys = [artifact_key("evaluate", row, seed, percent) for row, percent, seed in points]
     read = {key: root / key / EVALUATION for key in keys} | {FOLDER: root / FOLDER / SELECTED}
     settings = json.dumps([asdict(recipe), command, config.model_dump(), origin()], sort_keys=True, default=str)
     digests = {key: file_digest(file) for key, file in read.items() if file.exists()}
     return digests | {"settings": sha256(settings.encode()).hexdigest()}
-
-
-def _shown(root: Path) -> str:
-    """Return the folder of a run as commands name it: a relative one as it is, else by its name alone."""
-    return f"runs/{root.name}" if root.is_absolute() else str(root)

@@ -1,11 +1,9 @@
-"""Select: choose among a recipe's policies without the target, by simulators of other episodes.
-
-A judge is the grounding of another seed, which has episodes of its own; its failure model ends episodes.
-"""
+"""Select: choose among a recipe's policies without the target, by groundings of other seeds, the judges."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 from astra_data.core.artifact import check_made_from, finished_folder
@@ -70,20 +68,14 @@ class Bench:
 
     def finished(self, root: Path) -> "Bench":
         """Return those whose artifacts are in a run's folder."""
-
-        def has_grounding(key: str | None) -> bool:
-            return key is None or (root / key / GROUNDING).is_file()
-
-        entries = [one for one in self.entries if (root / one.policy / POLICY).is_file()]
-        judges = {seed: key for seed, key in self.judges.items() if has_grounding(key)}
-        return Bench(self.percent, tuple(one for one in entries if has_grounding(one.grounding)), judges)
+        grounded = {None} | {key for key in self.keys if (root / key / GROUNDING).is_file()}
+        trained = [one for one in self.entries if (root / one.policy / POLICY).is_file()]
+        judges = {seed: key for seed, key in self.judges.items() if key in grounded}
+        return Bench(self.percent, tuple(one for one in trained if one.grounding in grounded), judges)
 
 
 def judge_of(judge: str | None, rows: Sequence[str]) -> str:
-    """Return the method whose groundings judge the policies of `rows`.
-
-    By default that is the reference or, without it, the first row that grounds its simulator.
-    """
+    """Return the method whose groundings judge `rows`, by default the reference, or the first that grounds."""
     grounding = (row for row in rows if method_named(row).grounds)
     asked = judge or reference_of(rows) or next(grounding, None)
     if asked is None or not method_named(asked).grounds:
@@ -100,23 +92,14 @@ def judge_in(recipe: Reported, config: SelectConfig) -> str:
 
 def benches(recipe: Reported, judge: str) -> list[Bench]:
     """Return who is judged by whom, at each size; policies that do not act on abstract states are not."""
-    rows = [row for row in recipe.methods if method_named(row).trains_without_target]
-    able = {row: grounded_as(row) if method_named(row).grounds else None for row in rows}
-    found = []
-    for percent in recipe.percents or (None,):
-        judges = {seed: artifact_key("ground", judge, seed, percent) for seed in recipe.seeds}
-        entries = [
-            Entry(
-                row,
-                seed,
-                percent,
-                artifact_key("train", row, seed, percent),
-                artifact_key("ground", grounded_as(row), seed, percent) if method_named(row).grounds else None,
-            )
-            for row, base in able.items()
-            for seed in recipe.seeds
-        ]
-        found.append(Bench(percent, tuple(entries), judges))
+    rows, found = [row for row in recipe.methods if method_named(row).trains_without_target], []
+    for size in recipe.percents or (None,):
+        judges = {seed: artifact_key("ground", judge, seed, size) for seed in recipe.seeds}
+        entries = []
+        for row, seed in product(rows, recipe.seeds):
+            grounding = artifact_key("ground", grounded_as(row), seed, size) if method_named(row).grounds else None
+            entries.append(Entry(row, seed, size, artifact_key("train", row, seed, size), grounding))
+        found.append(Bench(size, tuple(entries), judges))
     return found
 
 
@@ -130,14 +113,20 @@ def digests(of: list[Bench], root: Path) -> dict[str, str]:
 def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Path, progress: Progress = silent) -> None:
     """Try every finished policy of a recipe in groundings of other seeds; write `root`/select, ranked.
 
-    Where a recipe has `data`, all seeds share their episodes, and the page says so. Policies of a size are
-    judged by groundings of that size. An interrupted call goes on with the next policy.
-
+    Policies of a size are judged by groundings of that size. An interrupted call goes on with the next policy.
     """
     judge = judge_in(recipe, config)
     contests = [bench.finished(root) for bench in benches(recipe, judge)]
     for bench in contests:
-        _check(bench, recipe, root, judge)
+        size = f" at {bench.percent} %" if bench.percent else ""
+        if not bench.entries:
+            named = ", ".join(recipe.methods)
+            raise BadInputError(f"{root}: found no policy of {named}{size}: run the recipe until train first")
+        if len(bench.judges) < 2:
+            raise BadInputError(
+                f"{root}: expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}: "
+                "groundings of other episodes judge a policy: add seeds to the recipe and run it"
+            )
     made_from, stopwatch = digests(contests, root), Stopwatch()
     total, found = sum(len(bench.entries) for bench in contests), list[Candidate]()
     settings_text = config.model_dump_json(indent=1)
@@ -160,27 +149,10 @@ def select(recipe: Reported, config: SelectConfig = SelectConfig(), *, root: Pat
                 found.append(Candidate(row=entry.row, seed=entry.seed, percent=entry.percent, success=success))
                 note = f"{entry.row}, seed {entry.seed}: {found[-1].predicted:.2f}"
                 progress(len(found) / total * 0.99, note)
-        judged = Judged(
-            judge=judge,
-            episodes=config.episodes,
-            shares_episodes=recipe.settings.get("data") is not None,
-            candidates=found,
-            **origin() | stopwatch.spent(),
-        )
+        shares, made = recipe.settings.get("data") is not None, origin() | stopwatch.spent()
+        judged = Judged(judge=judge, episodes=config.episodes, shares_episodes=shares, candidates=found, **made)
         begun.unlink()
         (folder / SELECTED).write_text(judged.model_dump_json(indent=1))
         (folder / "select.md").write_text(select_page(recipe.name, judged))
     first = judged.ranked(judged.percents[-1])[0]
     progress(1.0, f"{first.row}, seed {first.seed}: {first.lower:.2f} in the lower quartile of its judges")
-
-
-def _check(bench: Bench, recipe: Reported, root: Path, judge: str) -> None:
-    size = f" at {bench.percent} %" if bench.percent else ""
-    if not bench.entries:
-        named = ", ".join(recipe.methods)
-        raise BadInputError(f"{root}: found no policy of {named}{size}: run the recipe until train first")
-    if len(bench.judges) < 2:
-        raise BadInputError(
-            f"{root}: expected groundings of {judge} for two seeds or more{size}, found {len(bench.judges)}: "
-            "groundings of other episodes judge a policy: add seeds to the recipe and run it"
-        )

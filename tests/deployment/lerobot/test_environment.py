@@ -10,7 +10,7 @@ import pytest
 
 from astra_data import Dataset
 from astra_data.core.errors import BadInputError
-from astra_data.pipeline.trained_policy import load_policy, task_of
+from astra_data.pipeline.trained_policy import load_policy, settings_of
 
 FIRST_SEED = 7
 
@@ -32,7 +32,7 @@ def test_lerobots_own_command_runs_a_policy_and_records_it(
     options = {
         "env.discover_packages_path": "astra_data.deployment.lerobot",
         "env.type": "astra_data",
-        "env.task": task_of(run),
+        "env.task": settings_of(run)["task"],
         "policy.path": run.with_name("policy"),
         "eval.n_episodes": 2,
         "eval.batch_size": 2,
@@ -68,7 +68,7 @@ def episode(run: Path, seed: int) -> tuple[bool, list[float]]:
 
 
 def test_it_takes_rate_and_sizes_from_the_task(environment: Any, run: Path) -> None:
-    config = environment.AstraDataEnv(task=task_of(run))
+    config = environment.AstraDataEnv(task=settings_of(run)["task"])
     sizes = {name: feature.shape for name, feature in config.features.items()}
     assert config.fps == 10
     assert sizes == {"observation.state": (2,), "observation.environment_state": (1,), "action": (1,)}
@@ -81,7 +81,7 @@ def test_it_takes_rate_and_sizes_from_the_task(environment: Any, run: Path) -> N
 
 
 def test_commands_are_in_their_units_and_the_horizon_ends_episodes(environment: Any, run: Path) -> None:
-    env = environment.AstraDataEnv(task=task_of(run)).create_envs(2)["astra_data"][0]
+    env = environment.AstraDataEnv(task=settings_of(run)["task"]).create_envs(2)["astra_data"][0]
     robot = env.envs[0].unwrapped
     assert (robot.action_space.low, robot.action_space.high) == (-1.0, 4.0)
     first, _ = env.reset(seed=[3, 3])
@@ -105,7 +105,7 @@ def test_commands_are_in_their_units_and_the_horizon_ends_episodes(environment: 
 
 
 def test_a_push_to_the_goal_is_a_success_and_one_that_tips_is_none(environment: Any, run: Path) -> None:
-    env = environment.AstraDataEnv(task=task_of(run)).create_envs(2)["astra_data"][0]
+    env = environment.AstraDataEnv(task=settings_of(run)["task"]).create_envs(2)["astra_data"][0]
     env.reset(seed=[0, 1])
     _, _, terminated, _, info = env.step(np.array([[2.9], [3.1]], np.float32))
     assert terminated.tolist() == [False, True]
