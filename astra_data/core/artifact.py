@@ -1,10 +1,4 @@
-"""Folders that stages make: not there until they are finished, and gone on with after an interruption.
-
-The manifest of one says which files it has, with their sizes and sha256, and what it was made from:
-
-    {"files": {"policy.safetensors": {"bytes": 13948, "sha256": "…"}, …},
-     "made_from": {"dataset": "<content hash>", "grounding": "<sha256 of grounding.safetensors>"}}
-"""
+"""Folders that stages make: not there until they are finished, and gone on with after an interruption."""
 
 import json
 import os
@@ -49,21 +43,10 @@ def finished_folder(
 ) -> Iterator[Path]:
     """Yield a working folder that becomes `out` when the block succeeds, without checkpoints of trainings.
 
-    After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than the
-    settings: the next call yields it again with its contents, so that training can resume from its last
-    checkpoint. With `replace` it begins empty instead; the older `out` is kept as `.<name>.old` until the new
-    one is in its place.
-
-    Args:
-        out: the finished folder.
-        replace: replace an existing `out`.
-        config: the settings as JSON, written to `config.json`; a working folder with others is refused.
-        made_from: for its manifest, see `write_manifest`; without it, none is written.
-
-    Raises:
-        BadInputError: `out` exists and `replace` is not set, was begun with other settings, or is being made
-            by another process.
-        DiskError: it cannot be written.
+    After a failure the working folder, `.<name>.partial` beside `out`, stays if it holds more than the settings:
+    the next call yields it again, so that training can resume from its last checkpoint. With `replace` it begins
+    empty instead; the older `out` is kept as `.<name>.old` until the new one is in its place. `config` is written
+    to `config.json`, and a folder that was begun with another is refused; `made_from` goes into the manifest.
     """
     partial, old = (out.parent / f".{out.name}.{state}" for state in ("partial", "old"))
     settings = partial / _SETTINGS
@@ -135,10 +118,6 @@ class Manifest:
             elif verify and file_digest(found[name]) != digest:
                 faults.append(f"{name} was altered")
         return faults
-
-    def foreign(self, folder: Path) -> list[str]:
-        """Return the files in `folder` that are not of the artifact."""
-        return [name for name in _files(folder) if name not in self.files]
 
 
 def check_intact(path: Path) -> None:

@@ -60,8 +60,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def save_state(checkpoint: Path, state: Nested, metadata: Mapping[str, Any]) -> None:
     """Write the state of a training and `metadata` (JSON values) to `checkpoint`, for `resumed`."""
     tensors: dict[str, Tensor] = {}
-    plain = _to_json(state, tensors)
-    save_tensors(checkpoint, tensors, {**metadata, "state": plain})
+    save_tensors(checkpoint, tensors, {**metadata, "state": _to_json(state, tensors)})
 
 
 @contextmanager
@@ -84,26 +83,17 @@ def resumed(checkpoint: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]
 def understood(
     path: Path, what: str, kinds: Collection[str], device: str
 ) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
-    """Yield the tensors (on `device`) and the metadata of `path`, from which the block builds `what`.
-
-    The metadata's "kind" is one of `kinds`.
-    """
+    """Yield the tensors (on `device`) and the metadata, of one of `kinds`, from which the block builds `what`."""
     tensors, metadata = load_tensors(path)
     kind = metadata.get("kind")
     if kind not in kinds:
         found = "a file without a kind" if kind is None else f"kind {kind}"
         raise BadInputError(f"{path}: expected {what} (kind {' or '.join(kinds)}), found {found}: run that stage again")
     # An infinite deviation is how networks leave out a part of their input.
-    not_finite = [
-        name
-        for name, tensor in tensors.items()
-        if (tensor.isnan() if name.endswith("_std") else ~tensor.isfinite()).any()
-    ]
-    if not_finite:
-        raise BadInputError(
-            f"{path}: expected finite weights, found NaN or infinity in {first_few(not_finite, 3)}: "
-            "run that stage again"
-        )
+    wrong = {name: one.isnan() if name.endswith("_std") else ~one.isfinite() for name, one in tensors.items()}
+    if any_wrong := [name for name, where in wrong.items() if where.any()]:
+        found = f"found NaN or infinity in {first_few(any_wrong, 3)}"
+        raise BadInputError(f"{path}: expected finite weights, {found}: run that stage again")
     moved = {name: tensor.to(device) for name, tensor in tensors.items()}
     try:
         yield moved, metadata

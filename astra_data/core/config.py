@@ -58,10 +58,7 @@ def _is_choice(part: int | str) -> bool:
 
 
 class Config(BaseModel):
-    """Settings of one component: frozen, without unknown keys and silent conversions.
-
-    An int is accepted as a float; nothing else is converted. The string under a field is its description.
-    """
+    """Settings of one component: frozen, without unknown keys; an int is accepted as a float, nothing else."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -124,10 +121,10 @@ def load_tables(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        place = re.search(r" \(at line (\d+).*\)$| \(at end of document\)$", str(error))
-        line = (place and place[1]) or str(text.count("\n") + 1)
-        fault = str(error)[: place.start()] if place else str(error)
-        raise RecipeError(f"{path}, line {line}: not valid TOML: {fault}") from None
+        fault, _, place = str(error).rpartition(" (at ")
+        found = re.match(r"line (\d+)", place)
+        at = found[1] if found else text.count("\n") + 1
+        raise RecipeError(f"{path}, line {at}: not valid TOML: {fault}") from None
     except ValueError as error:  # a number of more digits than Python takes
         raise RecipeError(f"{path} cannot be read as TOML: {error}") from None
     except RecursionError:
@@ -149,10 +146,9 @@ def validated[M: BaseModel](tables: Mapping[str, Any], model: type[M], origin: s
 
 def faults_of(error: ValidationError) -> str:
     """Return what is wrong in a file that no user writes by hand: where, and what was expected."""
-    all_of = error.errors(include_url=False)
-    faults = [f"{'.'.join(map(str, one['loc'])) or 'file'}: {one['msg']}" for one in all_of[:_MOST_FAULTS]]
-    more = len(all_of) - len(faults)
-    return "; ".join([*faults, f"and {more} more"] if more else faults)
+    faults = [f"{'.'.join(map(str, one['loc'])) or 'file'}: {one['msg']}" for one in error.errors(include_url=False)]
+    more = [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+    return "; ".join([*faults[:_MOST_FAULTS], *more])
 
 
 def read_written[T](kind: type[T], path: Path, *, by: str, advice: str) -> T:
@@ -195,8 +191,8 @@ def _fault(error: ErrorDetails, model: type[BaseModel]) -> str:
         choices = known.replace(", ", " or ")
         return f"{key}.{context['discriminator'].strip('()_')}: expected {choices}, got '{got}'"
     if kind == "missing":
-        return f"{key}: expected a value, but the key is missing"
-    if kind == "value_error":
+        message = "expected a value, but the key is missing"
+    if kind in ("missing", "value_error"):
         return f"{key}: {message}"
     if kind == "too_short":
         least, got = error["ctx"]["min_length"], error["ctx"]["actual_length"]

@@ -51,8 +51,7 @@ def writing(target: Path, *, place: bool = True) -> Iterator[None]:
 
 def disk_error(error: Exception) -> DiskError | None:
     """Return what to report of an error that nobody expected; None if it does not come from a disk."""
-    code = _code(error)
-    name = getattr(error, "filename", None)
+    code, name = _code(error), getattr(error, "filename", None)
     if code is None or not (name or code in _OF_THE_DISK):
         return None
     subject = os.fsdecode(name) if isinstance(name, str | bytes) else "a file"
@@ -66,30 +65,23 @@ def _report(fault: str, code: int) -> str:
 
 def _code(error: Exception) -> int | None:
     """Return the system's number of a fault, which HDF5 has in its text; None for errors of ours."""
-    if isinstance(error, AstraDataError):
-        return None
     if isinstance(error, OSError) and error.errno:
         return error.errno
-    found = re.search(r"\berrno = (\d+)", str(error))
+    found = None if isinstance(error, AstraDataError) else re.search(r"\berrno = (\d+)", str(error))
     return int(found[1]) if found else None
 
 
 def _is_about(error: Exception, target: Path) -> bool:
     """Return whether `error` names `target`, a folder that it is in, or a hidden file or folder of it."""
-    name = getattr(error, "filename", None)
-    if not isinstance(name, str | bytes):
+    if not isinstance(name := getattr(error, "filename", None), str | bytes):
         return False
-    path = Path(os.fsdecode(name))
-    hidden = str(target.parent / f".{target.name}.")
+    path, hidden = Path(os.fsdecode(name)), str(target.parent / f".{target.name}.")
     return path in (target, *target.parents) or target in path.parents or str(path).startswith(hidden)
 
 
 @contextmanager
 def held(folder: Path, *, wait: bool = False) -> Iterator[bool]:
-    """Hold the lock of `folder` until the process ends at the latest; yield whether it is held.
-
-    With `wait`, wait while another process holds it.
-    """
+    """Hold the lock of `folder`, with `wait` once no other process holds it; yield whether it is held."""
     handle = os.open(folder, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would wait for a writer
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -178,19 +170,26 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def hidden_folder(target: Path) -> Iterator[Path]:
-    """Yield an empty hidden folder beside `target`, which is removed when the block ends.
+    """Yield an empty hidden folder beside `target`, which is locked, and removed when the block ends.
 
-    After a kill it stays until the next call with the same target: the folder of a live process is locked.
-    If the block fails, folders made for `target` go, too. While this process is writing `target` already, it
-    raises a BadInputError.
+    If the block fails, folders made for `target` go, too. After a kill it stays until the next call.
     """
-    with writing(target), folder_for(target):
+    with writing(target), folder_for(target), ExitStack() as stack:
         sweep(target)
-        with _locked_folder(target) as folder:
+        for folder in _hidden_names(target):
             try:
-                yield folder
-            finally:
-                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir(parents=True)  # another process may have removed a folder that it had made
+            except FileExistsError:
+                message = f"{target} is being written right now; wait or choose another folder."
+                raise BadInputError(message) from None
+            # Between mkdir and lock another process's sweep may have locked or removed the folder.
+            with suppress(FileNotFoundError):
+                if stack.enter_context(held(folder)) and folder.exists():
+                    break
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
@@ -244,10 +243,9 @@ def sweep(target: Path) -> None:
 
 
 def clean(folder: Path) -> list[tuple[Path, str]]:
-    """Remove what killed processes left anywhere below `folder`; return each path and what became of it.
+    """Remove what killed processes left below `folder`; return each path and whether it is removed, in use or kept.
 
-    That is "removed"; "in use", where a live process writes it; or "kept", where the command that was killed
-    goes on with it.
+    What a live process writes is in use; what the command that was killed goes on with is kept.
     """
     found = []
     for parent, folders, files in os.walk(folder):
@@ -270,11 +268,9 @@ def begun_beside(target: Path) -> list[Path]:
 def _remove_dead(path: Path) -> bool:
     """Remove a hidden file or folder unless a live process holds it; return whether it is gone."""
     with suppress(OSError), held(path) as ours:
-        if not ours:
-            return False
-        if path.is_dir():
+        if ours and path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
-        else:
+        elif ours:
             path.unlink()
     return not path.exists()
 
@@ -284,26 +280,6 @@ def _hidden_names(target: Path) -> Iterator[Path]:
         yield target.parent / f".{target.name}.tmp-{os.getpid()}{f'-{attempt}' if attempt else ''}"
 
 
-@contextmanager
-def _locked_folder(target: Path) -> Iterator[Path]:
-    """Make a hidden folder beside `target` and hold its lock."""
-    for folder in _hidden_names(target):
-        try:
-            folder.mkdir(parents=True)  # another process may have removed a folder that it had made
-        except FileExistsError:
-            message = f"{target} is being written right now; wait or choose another folder."
-            raise BadInputError(message) from None
-        with ExitStack() as stack:
-            # Between mkdir and lock another process's sweep may have locked or removed the folder.
-            try:
-                ours = stack.enter_context(held(folder))
-            except FileNotFoundError:
-                continue
-            if ours and folder.exists():
-                yield folder
-                return
-
-
 def file_digest(path: Path) -> str:
     """Return the sha256 of the file at `path` in hex; it is read in pieces."""
     with path.open("rb") as file:
@@ -311,11 +287,7 @@ def file_digest(path: Path) -> str:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Return the files in `folder` and below, sorted, and those in folders elsewhere that links lead to.
-
-    Each is there once: by its own path if it lies below `folder`, else by the first link. Links to a folder
-    that holds `folder` are not followed.
-    """
+    """Return the files in `folder` and below, sorted, and those in folders elsewhere that links lead to, each once."""
     root, seen, found, todo = folder.resolve(), set[Path](), list[Path](), [folder]
     while todo:
         links: list[Path] = []

@@ -1,7 +1,4 @@
-"""Names of result rows, and of what the folder of a run holds: its record, and folders of seeds.
-
-A row is a method's name, or that name followed by `_plus`: the method trained with the plus settings.
-"""
+"""Names of result rows (methods, or `<method>_plus`: with the plus settings) and of what a run's folder holds."""
 
 import html
 import re
@@ -33,10 +30,7 @@ def base_method(row: str) -> str:
 
 
 def reference_of(rows: Iterable[str]) -> str | None:
-    """Return the method in whose grounded simulator all `rows` are tested: NAS, if it is among them.
-
-    None otherwise: each row is then tested in its own grounded simulator.
-    """
+    """Return the method in whose grounded simulator all `rows` are tested: NAS, if it is among them; else None."""
     return "nas" if "nas" in map(base_method, rows) else None
 
 
@@ -77,10 +71,7 @@ def printable(text: str) -> str:
 
 
 def in_lines(text: str) -> str:
-    """Return a message of several lines, each printable, all but the first indented.
-
-    No line of it can pass for a message of its own, whatever the names in it.
-    """
+    """Return a message of several lines, each printable; the indented ones cannot pass for messages of their own."""
     first, *others = text.split("\n")
     return "\n".join([printable(first), *(f"  {printable(line.removeprefix('  '))}" for line in others)])
 

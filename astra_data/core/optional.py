@@ -9,27 +9,12 @@ from typing import Any
 from astra_data.core.errors import BadInputError
 
 EXTRAS = {
-    "torch": "sim",
-    "mujoco": "sim",
-    "gymnasium": "sim",
-    "gymnasium_robotics": "sim",
-    "safetensors": "sim",
-    "scipy": "sim",
-    "matplotlib": "report",
-    "PIL": "report",
-    "pandas": "report",
-    "onnxruntime": "deploy",
-    "onnxscript": "deploy",
-    "lerobot": "lerobot",
-    "datasets": "lerobot",
-    "h5py": "hdf5",
-    "minari": "minari",
-    "mcap": "mcap",
-    "mcap_protobuf": "mcap",
-    "mcap_ros2": "mcap",
-    "ray": "ray",
-    "trackio": "trackio",
-    "rerun": "view",
+    **dict.fromkeys(("torch", "mujoco", "gymnasium", "gymnasium_robotics", "safetensors", "scipy"), "sim"),
+    **dict.fromkeys(("matplotlib", "PIL", "pandas"), "report"),
+    **dict.fromkeys(("onnxruntime", "onnxscript"), "deploy"),
+    **dict.fromkeys(("lerobot", "datasets"), "lerobot"),
+    **dict.fromkeys(("mcap", "mcap_protobuf", "mcap_ros2"), "mcap"),
+    **{"h5py": "hdf5", "minari": "minari", "ray": "ray", "trackio": "trackio", "rerun": "view"},
 }
 """Which extra brings each package."""
 _ROOT = Path(__file__).parents[2]
@@ -50,10 +35,7 @@ def missing_extra(error: ModuleNotFoundError) -> BadInputError | None:
 
 
 def how_to_install(extra: str) -> str:
-    """Return the command that installs an `extra`, for messages: in a checkout, by its project.
-
-    Elsewhere it names the packages themselves, as this one may have come from a file.
-    """
+    """Return the command that installs an `extra`: by its project in a checkout, elsewhere by its packages."""
     if (_ROOT / "pyproject.toml").is_file():
         return f"uv sync --extra {extra}"
     entries = (entry.partition(";") for entry in requires("astra-data") or ())

@@ -2,7 +2,9 @@
 
 import os
 import platform
+import re
 import subprocess
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -25,33 +27,28 @@ def package_versions() -> dict[str, str]:
     """Return the versions of Python and of the installed `PACKAGES`; cached."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return versions
 
 
 @cache
 def git_commit() -> str | None:
-    """Return the commit of the checkout that this process runs from, with "-dirty" if its code was changed.
+    """Return the commit of this process's checkout, with "-dirty" if its code was changed; None outside of one."""
+    # In a hook, Git's variables point at the repository of the hook.
+    free = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
 
-    Cached, because later commits are not the code that this process has loaded. None outside of a checkout.
-    """
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(ROOT), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=free).stdout.strip()
+
     if not (ROOT / ".git").exists():
         return None
     try:
-        head = _git("rev-parse", "--verify", "HEAD")
-        return f"{head}-dirty" if _git("status", "--porcelain", "--", *CODE) else head
+        head = git("rev-parse", "--verify", "HEAD")
+        return f"{head}-dirty" if git("status", "--porcelain", "--", *CODE) else head
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def _git(*arguments: str) -> str:
-    command = ["git", "-C", str(ROOT), *arguments]
-    # In a hook, Git's variables point at the repository of the hook.
-    free = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
-    return subprocess.run(command, capture_output=True, text=True, check=True, env=free).stdout.strip()
 
 
 def origin(device: str = "cpu") -> dict[str, Any]:
@@ -61,12 +58,12 @@ def origin(device: str = "cpu") -> dict[str, Any]:
 
 def machine(device: str = "cpu") -> dict[str, Any]:
     """Return the processor, its cores and the memory of this machine, and the GPU if `device` is one."""
-    return {
-        "cpu": _cpu_name(),
-        "cores": cores(),
-        "memory_gib": round(memory_bytes() / 2**30, 1),
-        "gpu": _gpu_name(device) if device.startswith("cuda") else None,
-    }
+    gpu = None
+    if device.startswith("cuda"):
+        import torch  # slow; only needed on GPUs
+
+        gpu = torch.cuda.get_device_name(device)
+    return {"cpu": _cpu_name(), "cores": cores(), "memory_gib": round(memory_bytes() / 2**30, 1), "gpu": gpu}
 
 
 def memory_bytes() -> int:
@@ -78,17 +75,8 @@ def memory_bytes() -> int:
 
 def _cpu_name() -> str:
     cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _gpu_name(device: str) -> str:
-    import torch  # slow; only needed on GPUs
-
-    return torch.cuda.get_device_name(device)
+    found = re.search(r"^model name\s*: (.*)", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else None
+    return found[1].strip() if found else platform.processor() or platform.machine()
 
 
 def cores() -> int:

@@ -1,8 +1,4 @@
-"""Independent random streams per purpose, derived from one seed.
-
-A stream depends on the seed and the purpose's name alone: adding a purpose changes no other stream, and the
-same seed gives the same numbers in every process and on every machine.
-"""
+"""Random streams per purpose, derived from one seed: each depends on the seed and the purpose's name alone."""
 
 import hashlib
 

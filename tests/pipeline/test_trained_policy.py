@@ -58,7 +58,7 @@ def test_files_of_the_users_are_found_from_everywhere(tmp_path: Path, monkeypatc
         (tmp_path / name).touch()
     monkeypatch.chdir(run)
     found = settings_of(run)
-    assert found["task"] == settings_of(run)["task"] == f"{tmp_path}/cart.py:TASK"
+    assert found["task"] == f"{tmp_path}/cart.py:TASK"
     assert found["own_methods"] == {"damped": {"method": f"{tmp_path}/damped.py:METHOD", "gain": 2.0}}
 
 
