@@ -243,7 +243,7 @@ def test_lasting_tasks_are_reported_by_survived_steps_and_return(
     page = (root / "report/results.md").read_text()
     assert "| method | survived steps in the target | 95 % interval | return in the target |" in page
     assert "| **ASTRA** | 250 ± 303 |" in page
-    assert images(root / "report") == {"steps", "return", "learning", "gap", "validity"}
+    assert images(root / "report") == {"steps", "return", "learning", "gap", "validity", "trajectories"}
     assert found.trainings[-1].score != [] and [10.0, 20.0] in [one.score for one in found.trainings]
 
 
