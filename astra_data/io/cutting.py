@@ -83,8 +83,8 @@ class Tally:
         empty = [name for name, (count, _) in self.not_finite.items() if count == rows]
         parts = [f"{first_few(empty, _SHOWN)} is empty in all {rows} rows: leave it out"] if empty else []
         for name, (count, place) in self.not_finite.items():
-            if count < rows:
-                parts.append(f"{name} in 1 row, {place}" if count == 1 else f"{name} in {count} rows, first {place}")
+            where = f"1 row, {place}" if count == 1 else f"{count} rows, first {place}"
+            parts += [f"{name} in {where}"] if count < rows else []
         return "; ".join(parts[:_SHOWN]) + (f" and {len(parts) - _SHOWN} more" if len(parts) > _SHOWN else "")
 
 
@@ -222,8 +222,7 @@ class Cutter:
         tally.rows += len(block) + block.torn
         tally.rejected_rows += int(rejected.sum()) + block.torn
         for name, mask in bad.items():
-            first = int(mask.argmax())
-            before, place = tally.not_finite.get(name) or (0, block.place(first))
+            before, place = tally.not_finite.get(name) or (0, block.place(int(mask.argmax())))
             tally.not_finite[name] = before + int(mask.sum()), place
         if block.torn:
             tally.torn_rows += block.torn
@@ -272,51 +271,47 @@ class Cutter:
 
     def _with_next_states(self, episode: dict[str, Array]) -> dict[str, Array]:
         """Add the state of the next row to each row, and drop the last or let it stand still."""
-        state = episode[STATE]
-        terminated = is_terminated(episode)
+        state, terminated, tally = episode[STATE], is_terminated(episode), self.tally
         if terminated and self._mapping.terminal == "stand_still":
             return episode | {NEXT_STATE: np.concatenate([state[1:], state[-1:]])}
-        self.tally.last_rows += 1
-        self.tally.last_terminated += terminated
+        tally.last_rows += 1
+        tally.last_terminated += terminated
         kept = {name: values[:-1].copy() for name, values in episode.items()}
-        steps = len(state) - 1
-        if steps and SUCCESS in kept:
+        is_handed = len(state) > 1 and terminated
+        if len(state) > 1 and SUCCESS in kept:
             # The row's state is the one that the step before leads to.
             kept[SUCCESS][-1] = episode[SUCCESS][-1] or (kept[SUCCESS][-1] and not terminated)
-        if steps and terminated:
+        if is_handed:
             kept[TERMINATED][-1] = True
-        if REWARD in kept and steps and terminated:
+        if REWARD in kept and is_handed:
             kept[REWARD][-1] += episode[REWARD][-1]
         elif REWARD in kept:
-            self.tally.last_reward += float(episode[REWARD][-1])
+            tally.last_reward += float(episode[REWARD][-1])
         return kept | {NEXT_STATE: state[1:]}
 
     def check(self) -> None:
         """Compare fps to the rates of files, on average and without pauses; tally these, and what float32 rounds."""
-        self.tally.notes += self.rounded()
+        tally, fps, time = self.tally, self._mapping.fps, self._mapping.time
+        tally.notes += self.rounded()
         timed = [(part.origin, spent) for part, spent in zip(self._parts, self._spent, strict=True) if spent.any()]
         if not timed:
             return
-        fps, spent = self._mapping.fps, np.array([spent for _, spent in timed])
+        spent = np.array([spent for _, spent in timed])
         rates = spent[:, 2:] / spent[:, :2]
         off = (np.abs(rates / fps - 1) > RATE_TOLERANCE).all(axis=1) & (spent[:, 2] >= _TIMED)
         named = [f"{timed[at][0]}: {rates[at, 1]:.4g} Hz" for at in np.flatnonzero(off)]
         seconds, usual_seconds, steps = spent.sum(axis=0)
-        pooled = steps / seconds, steps / usual_seconds
-        if all(abs(rate / fps - 1) > RATE_TOLERANCE for rate in pooled):
-            advice = "correct fps or time_scale, or resample the recording"
-            if self.tally.back_rows:
-                advice += (
-                    f"; time goes back in {self.tally.back_rows} rows, first in {self.tally.back_first}: "
-                    "sort them if they belong together"
-                )
+        if all(abs(steps / each / fps - 1) > RATE_TOLERANCE for each in (seconds, usual_seconds)):
+            advice = ["correct fps or time_scale, or resample the recording"]
+            if tally.back_rows:
+                back = f"time goes back in {tally.back_rows} rows, first in {tally.back_first}"
+                advice.append(f"{back}: sort them if they belong together")
             if named and len(timed) > 1:
-                advice += f"; {first_few(named, _SHOWN)}"
-            raise BadInputError(
-                f"'{self._mapping.time}' gives {pooled[0]:.4g} rows per second, but fps is {fps}: {advice}"
-            )
-        self.tally.notes += [f"{name}, {fps} Hz declared" for name in named]
-        self.tally.clock = str(self._clock)
+                advice.append(first_few(named, _SHOWN))
+            given = f"'{time}' gives {steps / seconds:.4g} rows per second, but fps is {fps}"
+            raise BadInputError(f"{given}: {'; '.join(advice)}")
+        tally.notes += [f"{name}, {fps} Hz declared" for name in named]
+        tally.clock = str(self._clock)
 
     def convert(self, block: Block) -> tuple[dict[str, Array], dict[str, Mask]]:
         """Return the columns of `block`, (n,) or (n, size), and the rows where fields are not finite."""
@@ -366,13 +361,11 @@ class Cutter:
         faults = []
         if sizes.get(NEXT_STATE) not in (None, sizes.get(STATE)):
             faults.append(f"{NEXT_STATE} has {sizes[NEXT_STATE]} values, {STATE} {sizes.get(STATE, 0)}")
-        for name in (REWARD, *MAPPED_FLAGS):
-            if sizes.get(name, 1) > 1:
-                faults.append(f"{name}: {sizes[name]} values, expected 1")
-        jump = self._mapping.split.jump
-        if jump and max(jump.values) >= sizes[jump.column]:
-            size = f"{jump.column} has {sizes[jump.column]} values, counted from 0"
-            faults.append(f"split.jump.values {list(jump.values)}: {size}")
+        flags = [name for name in (REWARD, *MAPPED_FLAGS) if sizes.get(name, 1) > 1]
+        faults += [f"{name}: {sizes[name]} values, expected 1" for name in flags]
+        if (jump := self._mapping.split.jump) and max(jump.values) >= (size := sizes[jump.column]):
+            where = f"{jump.column} has {size} values, counted from 0"
+            faults.append(f"split.jump.values {list(jump.values)}: {where}")
         return faults
 
 
@@ -394,12 +387,9 @@ def _complete(converted: dict[str, Column], terminal: str) -> tuple[Column, ...]
     if STATE in columns:
         following = next_state_of(columns[STATE])
         if recorded := columns.get(NEXT_STATE):
-            following = replace(
-                following,
-                names=recorded.names or following.names,
-                meaning=recorded.meaning or following.meaning,
-                astra={**(following.astra or {}), **(recorded.astra or {})} or None,
-            )
+            names, meaning = recorded.names or following.names, recorded.meaning or following.meaning
+            astra = {**(following.astra or {}), **(recorded.astra or {})} or None
+            following = replace(following, names=names, meaning=meaning, astra=astra)
         elif TERMINATED in columns and terminal == "stand_still":
             made_up = "; where an episode terminates, not recorded: the state itself"
             following = replace(following, meaning=f"{following.meaning}{made_up}")
@@ -427,13 +417,9 @@ def _transformed(values: Array, spec: ColumnMapping) -> Array:
         if len(numbers) not in (0, 1, values.shape[1]):
             raise BadInputError(f"{key} has {len(numbers)} numbers for {values.shape[1]} values")
     with np.errstate(over="ignore", invalid="ignore"):
-        if spec.scale:
-            values = values * np.array(spec.scale)
-        if spec.offset:
-            values = values + np.array(spec.offset)
-    if spec.clip is not None:
-        values = np.where(np.isfinite(values), np.clip(values, *spec.clip), values)
-    return values
+        values = values * np.array(spec.scale) if spec.scale else values
+        values = values + np.array(spec.offset) if spec.offset else values
+    return values if spec.clip is None else np.where(np.isfinite(values), np.clip(values, *spec.clip), values)
 
 
 def _cast(values: Array, column: Column) -> tuple[Array, Mask]:

@@ -32,7 +32,7 @@ NUMBERED = "{field}_{number}"
 MOST_COMPRESSED = 10_000  # larger than the compression ratio of any filter; beyond it, the values were never written
 
 
-def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py
+def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:
     """Map the path of each dataset below `group` to it; links into other files are not followed."""
     found: dict[str, Any] = {}
 
@@ -44,7 +44,7 @@ def stored_datasets(h5py: Any, group: Any) -> dict[str, Any]:  # noqa: ANN401 - 
     return found
 
 
-def refuse_links(h5py: Any, file: Any, origin: str) -> None:  # noqa: ANN401 - of h5py
+def refuse_links(h5py: Any, file: Any, origin: str) -> None:
     """Raise BadInputError if a file has links, which may lead into other files."""
     links: list[str] = []
 
@@ -73,7 +73,7 @@ def check_storage(datasets: Mapping[str, Any], origin: str) -> None:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
 
 
-def _is_written(dataset: Any) -> bool:  # noqa: ANN401 - of h5py
+def _is_written(dataset: Any) -> bool:
     """Return whether all values are in the file; others would be read as the fill value."""
     if dataset.chunks is None:
         return bool(dataset.size == 0 or dataset.id.get_storage_size() > 0)

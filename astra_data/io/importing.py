@@ -61,9 +61,8 @@ class ImportReport:
     tally: Tally
     wall_seconds: float
     unused: tuple[str, ...] = ()
-    """The files of which no episode was made."""
+    """The files of which no episode was made; `unread` are those of other endings than the format's."""
     unread: tuple[str, ...] = ()
-    """The files of folders and archives that have other endings than the format's."""
     left_out: tuple[str, ...] = ()
     """What is wrong with each file that was left out."""
     taken: str = ""
@@ -73,16 +72,21 @@ class ImportReport:
         tally = self.tally
         points = ", ".join(f"{reason} {count}" for reason, count in tally.split_points.items()) or "none"
         notes = [f"{first_few(files, 2)}: {note}" for note, files in tally.topics.items()] + tally.notes
-        last = {
-            f"{tally.last_terminated} of them terminated: the step before takes over how, and the reward": (
-                tally.last_terminated
-            ),
-            f"with the others a reward of {tally.last_reward:g} in sum": tally.last_reward,
-        }
-        lost = ", ".join(what for what, is_any in last.items() if is_any)
+        lost = []
+        if tally.last_terminated:
+            lost.append(f"{tally.last_terminated} of them terminated: the step before takes over how, and the reward")
+        if tally.last_reward:
+            lost.append(f"with the others a reward of {tally.last_reward:g} in sum")
+        rejected = f"rejected rows: {tally.rejected_rows}" + (f", {tally.faults}" if tally.not_finite else "")
+        if tally.torn_rows:
+            rejected += f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
+        last = f"last rows without a next state: {tally.last_rows} dropped" + (f" ({', '.join(lost)})" if lost else "")
+        last += f"; rows of episodes that were too short: {tally.short_rows}"
+        if tally.rows_after_end:
+            last += f"; terminated rows after the end, dropped: {tally.rows_after_end}"
+        made = f"{self.root}: {self.episodes} episodes, {self.frames} frames from {tally.rows} rows"
         lines = {
-            f"{self.root}: {self.episodes} episodes, {self.frames} frames from {tally.rows} rows in "
-            f"{self.wall_seconds:.1f} s": True,
+            f"{made} in {self.wall_seconds:.1f} s": True,
             f"taken without a mapping: {self.taken}": self.taken,
             f"fields left out: {first_few(tally.unused_fields, _LISTED)}": tally.unused_fields,
             f"split points: {points}": True,
@@ -96,18 +100,8 @@ class ImportReport:
             f"files of other endings, not read: {first_few(self.unread, _LISTED)}": self.unread,
             f"files that cannot be imported, left out: {len(self.left_out)}": self.left_out,
             "\n".join(f"  {fault}" for fault in self.left_out): self.left_out,
-            f"rejected rows: {tally.rejected_rows}"
-            + (f", {tally.faults}" if tally.not_finite else "")
-            + (
-                f"; cut off at the end of their files: {tally.torn_rows}, the first is {tally.torn_first}"
-                if tally.torn_rows
-                else ""
-            ): True,
-            f"last rows without a next state: {tally.last_rows} dropped{f' ({lost})' if lost else ''}; "
-            f"rows of episodes that were too short: {tally.short_rows}"
-            + (
-                f"; terminated rows after the end, dropped: {tally.rows_after_end}" if tally.rows_after_end else ""
-            ): True,
+            rejected: True,
+            last: True,
         }
         return "\n".join(line for line, is_shown in lines.items() if is_shown)
 
@@ -166,15 +160,15 @@ def import_dataset(
     cuts = episodes(sources, FORMATS[chosen], settings, cutter, left_out)
     first = next(cuts, None)
     if first is None:
-        if bad := [*(left_out or ()), *cutter.tally.bad_episodes]:
+        tally = cutter.tally
+        if bad := [*(left_out or ()), *tally.bad_episodes]:
             raise BadInputError("\n".join(bad))
-        refuse_rejected(cutter.tally, settings)
-        why = _why_none(cutter.tally, settings)
-        faults = f" ({cutter.tally.faults})" if cutter.tally.not_finite else ""
+        refuse_rejected(tally, settings)
+        faults = f" ({tally.faults})" if tally.not_finite else ""
         raise BadInputError(
-            f"{', '.join(map(str, recordings))}: no episodes, {why} (rows {cutter.tally.rows}, rejected "
-            f"{cutter.tally.rejected_rows}{faults}, last ones without a next state {cutter.tally.last_rows}, "
-            f"in episodes that were too short {cutter.tally.short_rows})"
+            f"{', '.join(map(str, recordings))}: no episodes, {_why_none(tally, settings)} (rows {tally.rows}, "
+            f"rejected {tally.rejected_rows}{faults}, last ones without a next state {tally.last_rows}, in episodes "
+            f"that were too short {tally.short_rows})"
         )
     description = {
         "name": settings.name,
@@ -216,10 +210,6 @@ def from_huggingface(table: "datasets.Dataset", mapping: Path | str, *, out: Pat
         table: the rows, in the order of time; `[split] field = "episode_index"` of the mapping cuts them.
         mapping: the file that says which columns become which.
         out: the dataset's folder, by default its place at home.
-
-    Raises:
-        BadInputError: the rows do not fit the mapping; nothing is written.
-        RecipeError: the mapping has faults.
     """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "rows.parquet"
@@ -235,13 +225,11 @@ def _standard(source: Source, file_format: str, options: Mapping[str, Any]) -> t
         raise BadInputError(f"{source}: {file_format} has no standard fields; pass --mapping FILE.toml{written}")
     with explained(source, module):
         keys = module.layout(source) | options
-    missing = [f"--{key}" for key in ("name", "fps") if key not in keys]
-    if missing:
+    if missing := [f"--{key}" for key in ("name", "fps") if key not in keys]:
         raise BadInputError(f"{source}: pass {' and '.join(missing)}, or --mapping FILE.toml")
-    remark = keys.pop("remark", "")
+    remark = [keys.pop("remark")] if "remark" in keys else []
     mapping = validated({"task": keys["name"]} | keys, ImportMapping, str(source))
-    taken = [f"{name} from {', '.join(column.fields)}" for name, column in mapping.columns.items()]
-    return mapping, "; ".join([*taken, *([remark] if remark else [])])
+    return mapping, "; ".join([f"{name} from {', '.join(c.fields)}" for name, c in mapping.columns.items()] + remark)
 
 
 def _why_none(tally: Tally, mapping: ImportMapping) -> str:
@@ -319,51 +307,49 @@ def _blocks(source: Source, module: ModuleType, mapping: ImportMapping) -> Itera
     """Yield the blocks of a file; where fields are (episodes, steps, ...), one for each episode."""
     with explained(source, module):
         for block in module.read(source, mapping):
-            origin = block.origin
-            shapes = [values.shape[1:] for values in map(np.asarray, block.values.values())]
-            several = [shape for shape in shapes if shape]
+            origin, shapes = block.origin, {name: np.shape(values)[1:] for name, values in block.values.items()}
+            several = [shape for shape in shapes.values() if shape]
             steps = several[0][0] if several else 1
             may_be = steps > 1 and {shape[:1] for shape in several} == {(steps,)}
-            if mapping.stacked and not (may_be and several == shapes):
+            are_all = len(several) == len(shapes)
+            if mapping.stacked and not (may_be and are_all):
                 raise BadInputError(
                     f"{origin}: stacked = true, but the fields' rows have the shapes "
-                    f"{', '.join(map(str, shapes))}; expected (steps, ...) with as many steps in each"
+                    f"{', '.join(map(str, shapes.values()))}; expected (steps, ...) with as many steps in each"
                 )
             if mapping.stacked is None and may_be:
-                has_matrix, are_all = max(map(len, several)) > 1, several == shapes
-                is_short, is_sure = len(block) < steps, has_matrix and are_all
+                has_matrix, is_short = max(map(len, several)) > 1, len(block) < steps
+                is_sure = has_matrix and are_all
                 # With single numbers among them, or without a matrix, only too few rows give them away.
                 is_odd = is_short and not block.starts and (has_matrix or are_all)
                 if (is_sure and is_short) or (len(shapes) > 1 and (is_sure or is_odd)):
-                    name, shape = next(each for each in zip(block.values, shapes, strict=True) if each[1])
+                    name, shape = next((name, shape) for name, shape in shapes.items() if shape)
                     raise BadInputError(
                         f"{origin}: {'all' if are_all else 'many'} fields have {steps} rows in each of their "
                         f"rows, such as {name} of shape {(len(block), *shape)}: set stacked = true in the "
                         f"mapping if these are the steps of {len(block)} episodes, else stacked = false"
                     )
-            if not mapping.stacked:
-                yield block
-                continue
-            for episode in range(len(block)):
+            for episode in range(len(block)) if mapping.stacked else ():
                 values = {field: np.asarray(stack)[episode] for field, stack in block.values.items()}
                 yield Block(values, f"{origin}/{episode}", starts=True, known=block.known)
+            if not mapping.stacked:
+                yield block
 
 
 def _all_faults(error: BadInputError, sources: Sequence[Source], module: ModuleType, mapping: ImportMapping) -> str:
-    """Return a line for each fault of the first of `sources` and the beginnings of others, with its files."""
-    faults = {sources[0]: str(error)}
-    for other in sources[1:]:
-        try:
-            with explained(other, module):
-                if hasattr(module, "check"):
-                    module.check(other, mapping)
-                else:
-                    next(_blocks(other, module, mapping), None)
-        except BadInputError as another:
-            faults[other] = str(another)
+    """Return a line for each fault of the first of `sources` and of the beginnings of others, with its files."""
     names: dict[str, list[str]] = {}
-    for at, fault in faults.items():
-        begins = str(at) if fault.startswith(str(at)) else ""
-        names.setdefault(fault.removeprefix(begins), []).append(begins)
-    lines = [f"{first_few([name for name in of if name], _NAMED)}{fault}" for fault, of in names.items()]
-    return "\n".join(lines)
+    for source in sources:
+        fault = str(error) if source is sources[0] else ""
+        try:
+            with explained(source, module):
+                if not fault and hasattr(module, "check"):
+                    module.check(source, mapping)
+                elif not fault:
+                    next(_blocks(source, module, mapping), None)
+        except BadInputError as another:
+            fault = str(another)
+        if fault:
+            of = names.setdefault(fault.removeprefix(str(source)), [])
+            of += [str(source)] if fault.startswith(str(source)) else []
+    return "\n".join(f"{first_few(of, _NAMED)}{fault}" for fault, of in names.items())

@@ -11,17 +11,13 @@ sorted.
 import json
 import struct
 from array import array
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator
-from heapq import heappop, heappush
 from io import SEEK_END, BytesIO
-from itertools import pairwise
 from mmap import ACCESS_READ, mmap
 from typing import IO, Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.errors import BadInputError
@@ -35,17 +31,14 @@ FEWEST = 10  # messages to a step back of the clock
 
 
 class McapFile:
-    """The messages of some topics of an MCAP file, in its order.
-
-    Attributes:
-        is_cut: whether messages may be missing at its end; known once it was read.
-        streams: topic to what gives the names under which one of its messages is yielded, by default its own.
-    """
+    """The messages of some topics of an MCAP file, in its order."""
 
     def __init__(self, source: Source, topics: Collection[str]) -> None:
         """Look at both ends of the file, and read its index if it has one."""
         self.is_cut = False
+        """Whether messages may be missing at its end; known once it was read."""
         self.streams: dict[str, Callable[[Any], list[str]]] = {}
+        """Topic to what gives the names under which one of its messages is yielded, by default its own."""
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
         self._source, self._wanted = source, topics
         self._channels: dict[int, Any] = {}
@@ -55,11 +48,11 @@ class McapFile:
         self._left = 0
         self._open()
 
-    def messages(self, *, checked: bool) -> Iterator[tuple[str, Any]]:
-        """Yield each message with its topic, in the order of the file; `checked` by its sums, or not."""
+    def messages(self) -> Iterator[tuple[str, Any]]:
+        """Yield each message with its topic, in the order of the file."""
         records = optional("mcap.records")
         wanted = {number: channel.topic for number, channel in self._channels.items()}
-        for record in self._records(checked=checked):
+        for record in self._records():
             if isinstance(record, records.Message):
                 if record.channel_id not in wanted:
                     raise BadInputError(f"{self._source}: no channel {record.channel_id}, which has messages")
@@ -129,23 +122,23 @@ class McapFile:
             self._chunks = [index for index in indexes if not (of := index.message_index_offsets) or wanted & of.keys()]
             self.check_topics()
 
-    def _records(self, *, checked: bool) -> Iterator[Any]:
-        """Yield the records of the data, those of chunks unpacked, and `checked` by their sums."""
+    def _records(self) -> Iterator[Any]:
+        """Yield the records of the data, those of chunks unpacked."""
         reading, records = optional("mcap.stream_reader"), optional("mcap.records")
         with self._source.open() as stream:
             self._left = self._source.most_unpacked
             if self._chunks is not None:
                 for index in self._chunks:
                     stream.seek(index.chunk_start_offset + _HEAD.size)
-                    yield from self._unpacked(records.Chunk.read(reading.ReadDataStream(stream)), checked)
+                    yield from self._unpacked(records.Chunk.read(reading.ReadDataStream(stream)))
                 return
             whole: Any = stream
             if self._whole_bytes is not None:  # 0 would be the whole file
                 whole = mmap(stream.fileno(), self._whole_bytes, access=ACCESS_READ) if self._whole_bytes else BytesIO()
             try:
-                for record in reading.StreamReader(whole, emit_chunks=True, validate_crcs=checked).records:
+                for record in reading.StreamReader(whole, emit_chunks=True, validate_crcs=True).records:
                     if isinstance(record, records.Chunk):
-                        yield from self._unpacked(record, checked)
+                        yield from self._unpacked(record)
                     elif isinstance(record, records.DataEnd):
                         self.is_cut = False
                         return
@@ -155,7 +148,7 @@ class McapFile:
                 if self._whole_bytes is None:
                     raise
 
-    def _unpacked(self, chunk: Any, checked: bool) -> Iterator[Any]:  # noqa: ANN401 - mcap's
+    def _unpacked(self, chunk: Any) -> Iterator[Any]:
         """Yield the records of a chunk, unpacked only as far as its header says and the limit allows."""
         reading, records = optional("mcap.stream_reader"), optional("mcap.records")
         if chunk.uncompressed_size > self._left:
@@ -175,7 +168,7 @@ class McapFile:
             raise BadInputError(f"{self._source}: chunks packed as {chunk.compression}, expected zstd or lz4")
         if len(data) != chunk.uncompressed_size:
             raise BadInputError(f"{self._source}: a chunk has another size than its header says: it is damaged")
-        if checked and chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
+        if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
             raise BadInputError(f"{self._source}: a chunk has another checksum than was written: it is damaged")
         stream, kinds = reading.ReadDataStream(BytesIO(data)), optional("mcap.opcode").Opcode
         while stream.count < len(data):
@@ -226,34 +219,8 @@ class McapMessage(NamedTuple):
     is_back: bool  # whether it is the first after the clock was set back
 
 
-class _Stretch:
-    """The times of messages before the clock goes back, or until the end of the file."""
-
-    def __init__(self) -> None:
-        self.times: defaultdict[str, array[int]] = defaultdict(lambda: array("Q"))
-        self.latest = self.late_ns = 0  # the largest of them, and how far they are out of order
-
-    def add(self, topic: str, time: int) -> None:
-        """Add a message."""
-        self.times[topic].append(time)
-        self.late_ns = max(self.late_ns, self.latest - time)
-        self.latest = max(self.latest, time)
-
-    @property
-    def earliest(self) -> int:
-        """The smallest of the times."""
-        return min(map(min, self.times.values()))
-
-    def __len__(self) -> int:
-        return sum(map(len, self.times.values()))
-
-
 class Timeline:
-    """The messages of an MCAP file by their times.
-
-    Attributes:
-        moments: topic to the times of its messages in ns, as `McapMessage.time`, in their order.
-    """
+    """The messages of an MCAP file by their times."""
 
     def __init__(self, file: McapFile, gap_s: float, pause_s: float) -> None:
         """Find out when messages come, by reading the file once.
@@ -264,54 +231,42 @@ class Timeline:
             pause_s: what is longer between messages ends an episode in any case.
         """
         self._file = file
-        self._stretches = self._survey(round(gap_s * 1e9))
+        times, topics, numbers = array("Q"), array("H"), dict[str, int]()
+        starts, highest = [0], dict[str, int]()
+        for topic, message in file.messages():
+            if message.log_time < highest.get(topic, 0) - round(gap_s * 1e9):
+                starts.append(len(times))
+                highest = {}
+            highest[topic] = max(message.log_time, highest.get(topic, 0))
+            times.append(message.log_time)
+            topics.append(numbers.setdefault(topic, len(numbers)))
         file.check_topics()
-        self._shifts = [0]  # what is added to the times of each stretch, so that it begins a pause after the one before
-        for before, stretch in pairwise(self._stretches):
+        if len(times) < FEWEST * (len(starts) - 1):
+            starts = [0]
+        self._times = np.array(times, np.int64)
+        """As in the file, but that each stretch begins a pause after the one before."""
+        for before, start, end in zip(starts, starts[1:], [*starts, len(times)][2:], strict=False):
             pause_ns = 2 * round(pause_s * 1e9) + 1
-            self._shifts.append(before.latest + self._shifts[-1] + pause_ns - stretch.earliest)
-        parts: defaultdict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for stretch, shift in zip(self._stretches, self._shifts, strict=True):
-            for topic, times in stretch.times.items():
-                parts[topic].append(np.sort(np.asarray(times, np.int64)) + shift)
-        self.moments = {topic: np.concatenate(each) for topic, each in parts.items()}
+            shift = self._times[before:start].max() + pause_ns - self._times[start:end].min()
+            self._times[start:end] += shift
+        self._order = np.argsort(self._times, kind="stable").tolist()
+        self._firsts = {self._order[start] for start in starts[1:]}
+        kinds = np.array(topics)
+        self.moments = {topic: np.sort(self._times[kinds == number]) for topic, number in numbers.items()}
+        """Topic to the times of its messages in ns, as `McapMessage.time`, in their order."""
 
     def messages(self) -> Iterator[McapMessage]:
         """Yield the messages, by their times, and in the file's order where these are equal.
 
-        Only those that may be out of order are held in memory.
+        Only those that are out of order are held in memory.
         """
-        held: list[tuple[int, int, str, Any]] = []
-        messages = enumerate(self._file.messages(checked=True))
-        for at, stretch in enumerate(self._stretches):
-            is_back, latest = at > 0, 0
-            for left in range(len(stretch) - 1, -1, -1):
-                number, (topic, message) = next(messages)
-                heappush(held, (message.log_time, number, topic, message))
-                latest = max(latest, message.log_time)
-                while held and (held[0][0] <= latest - stretch.late_ns or not left):
-                    time, _, topic, message = heappop(held)
-                    content = self._file.decoder(message.channel_id)(message.data)
-                    yield McapMessage(topic, time + self._shifts[at], time, content, is_back)
-                    is_back = False
-        next(messages, None)  # the sums at the end of the file
-
-    def _survey(self, gap_ns: int) -> list[_Stretch]:
-        stretches = [_Stretch()]
-        highest: dict[str, int] = {}
-        for topic, message in self._file.messages(checked=False):
-            time = message.log_time
-            if time < highest.get(topic, 0) - gap_ns:
-                stretches.append(_Stretch())
-                highest = {}
-            highest[topic] = max(time, highest.get(topic, 0))
-            stretches[-1].add(topic, time)
-        if sum(map(len, stretches)) >= FEWEST * (len(stretches) - 1):
-            return stretches
-        whole = _Stretch()
-        for stretch in stretches:
-            for topic, times in stretch.times.items():
-                whole.times[topic] += times
-        whole.latest = max(stretch.latest for stretch in stretches)
-        whole.late_ns = whole.latest - whole.earliest
-        return [whole]
+        held: dict[int, tuple[str, Any]] = {}
+        messages = enumerate(self._file.messages())
+        for number in self._order:
+            while number not in held:
+                at, each = next(messages)
+                held[at] = each
+            topic, message = held.pop(number)
+            content = self._file.decoder(message.channel_id)(message.data)
+            time = int(self._times[number])
+            yield McapMessage(topic, time, message.log_time, content, number in self._firsts)

@@ -172,9 +172,8 @@ def _format_of(recording: Path, suffixes: Mapping[str, Sequence[str]]) -> str:
     refuse_dataset(recording)
     if is_minari(recording):
         return "minari"
-    inside = [str(path) for path in files_below(recording)] if recording.is_dir() else []
-    if any(name.endswith(ZARR) for name in inside):
-        raise BadInputError(f"{recording}: {foreign(inside)}")
+    if any(str(path).endswith(ZARR) for path in files_below(recording)):
+        raise BadInputError(f"{recording}: {foreign(list(map(str, files_below(recording))))}")
     names = [str(source) for source in _found(recording, [""])]
     for name, endings in suffixes.items():
         if any(file.lower().endswith(tuple(endings)) for file in names):
@@ -197,21 +196,22 @@ def find_sources(
 ) -> list[Source]:
     """List the files of recordings in natural order (2 before 10), without hidden ones, named apart.
 
-    They are of `file_format`, with one of its `suffixes` in a folder or archive; `mapping` says which are joined, and
-    `max_bytes` how much is taken, by default in proportion to their sizes.
+    Args:
+        recordings: files, folders, or archives, whose members must be plain files inside of them.
+        file_format: of all of them.
+        suffixes: endings of the format's files in a folder or archive, in small letters.
+        mapping: says which files are joined.
+        max_bytes: the most bytes of values that are taken from them, by default in proportion to their sizes.
     """
     sources: list[Source] = []
     for recording in recordings:
-        if file_format == "minari":
-            if not is_minari(recording):
-                raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
-            found = [Source(recording, None, recording)]
-        elif is_archive(recording) and file_format not in IN_ARCHIVES:
+        if file_format == "minari" and not is_minari(recording):
+            raise BadInputError(f"{recording}: expected the folder of a Minari dataset, with data/ in it")
+        if is_archive(recording) and file_format not in IN_ARCHIVES:
             raise BadInputError(f"{recording}: {file_format} cannot be read from an archive: unpack it")
-        else:
-            if not recording.name.lower().endswith(tuple(suffixes)) and (hint := foreign([recording.name])):
-                raise BadInputError(f"{recording}: {hint}")
-            found = _found(recording, suffixes)
+        if not recording.name.lower().endswith(tuple(suffixes)) and (hint := foreign([recording.name])):
+            raise BadInputError(f"{recording}: {hint}")
+        found = [Source(recording, None, recording)] if file_format == "minari" else _found(recording, suffixes)
         if file_format == "mcap" and mapping and not mapping.split.files and len(found) > 1:
             raise BadInputError(
                 f"{recording}: split.files = false cannot join its {len(found)} MCAP files, each of which is "
@@ -248,12 +248,11 @@ def _found(recording: Path, suffixes: Sequence[str]) -> list[Source]:
 
 
 def other_files(recordings: Sequence[Path], suffixes: Sequence[str]) -> tuple[str, ...]:
-    """Name the files in folders and archives that `find_sources` leaves out by their endings, mappings apart."""
+    """Name the files in folders and archives that `find_sources` leaves out by their endings, but texts for people."""
     beside = (*suffixes, ".toml", ".md")
     inside = [source for path in recordings if path.is_dir() or is_archive(path) for source in _inside(path)]
     names = [name for name in map(str, inside) if not name.lower().endswith(beside)]
-    names = [n for n in names if PurePosixPath(n).name.lower().partition(".")[0] != "readme"]
-    return tuple(sorted(names, key=natural))
+    return tuple(sorted((n for n in names if not PurePosixPath(n).name.lower().startswith("readme")), key=natural))
 
 
 def refuse_dataset(place: Path) -> None:
@@ -297,13 +296,9 @@ def _members(archive: Path) -> list[tarfile.TarInfo]:
             members = list({member.name: member for member in opened if not member.isdir()}.values())
     except (tarfile.TarError, OSError, EOFError, ValueError, ArithmeticError) as error:
         raise BadInputError(f"{archive} cannot be read as an archive: {in_short(error)}") from error
-    faults = []
-    for member in members:
-        path = PurePosixPath(member.name)
-        if not member.isfile() or member.issparse():
-            faults.append(f"{member.name} is a link, a device or sparse")
-        elif path.is_absolute() or ".." in path.parts:
-            faults.append(f"{member.name} lies outside of the archive")
+    faults = [f"{m.name} is a link, a device or sparse" for m in members if not m.isfile() or m.issparse()]
+    outside = [m.name for m in members if PurePosixPath(m.name).is_absolute() or ".." in PurePosixPath(m.name).parts]
+    faults += [f"{name} lies outside of the archive" for name in outside]
     if faults:
         raise BadInputError(f"{archive}: expected plain files; {'; '.join(faults)}")
     return members

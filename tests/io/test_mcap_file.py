@@ -33,10 +33,10 @@ def write(path: Path, *, is_finished: bool = True, **options: Any) -> Path:
     return path
 
 
-def numbers(path: Path, *, checked: bool = True) -> tuple[list[int], bool]:
+def numbers(path: Path) -> tuple[list[int], bool]:
     """Return which messages are read, and whether the file is cut off."""
     file = McapFile(Source(path, None, path), ["/used"])
-    read = [message.log_time for _, message in file.messages(checked=checked)]
+    read = [message.log_time for _, message in file.messages()]
     file.check_topics()
     return read, file.is_cut
 
@@ -59,10 +59,10 @@ def test_no_more_is_unpacked_than_the_limit(
         monkeypatch.setattr("astra_data.io.recording.SMALL_BYTES", limit)
         file = McapFile(Source(path, None, path, most_bytes=0), ["/used", "/other"])
         if is_read:
-            assert len(list(file.messages(checked=True))) == LENGTH
+            assert len(list(file.messages())) == LENGTH
             continue
         with pytest.raises(BadInputError, match=r"once unpacked: if you trust it, pass a larger --max-bytes"):
-            list(file.messages(checked=True))
+            list(file.messages())
 
 
 @pytest.mark.parametrize("compression", PACKED)
@@ -91,7 +91,6 @@ def test_chunks_without_wanted_messages_are_not_read(tmp_path: Path) -> None:
             assert numbers(path) == (WANTED, False)
     with pytest.raises(BadInputError, match="has another checksum than was written"):
         numbers(path)
-    assert numbers(path, checked=False) == (WANTED, False)
 
 
 @pytest.mark.parametrize("form", ["usual", "without chunks"])
@@ -153,7 +152,7 @@ def test_an_encoding_that_cannot_be_read_is_told(tmp_path: Path) -> None:
         writer.add_message(used, 0, bytes(8), 0)
         writer.finish()  # type: ignore[no-untyped-call]
     file_of = McapFile(Source(path, None, path), ["/used"])
-    [(_, message)] = file_of.messages(checked=True)
+    [(_, message)] = file_of.messages()
     with pytest.raises(BadInputError, match="messages of /used are ros1 with ros1msg schema, expected json"):
         file_of.decoder(message.channel_id)
 
@@ -224,9 +223,9 @@ def test_no_more_is_held_than_may_be_out_of_order(tmp_path: Path, monkeypatch: p
     asked = 0
     messages = McapFile.messages
 
-    def counted(self: McapFile, *, checked: bool) -> Iterable[object]:
+    def counted(self: McapFile) -> Iterable[object]:
         nonlocal asked
-        for message in messages(self, checked=checked):
+        for message in messages(self):
             asked += 1
             yield message
 
@@ -245,6 +244,5 @@ def test_the_sum_of_the_whole_file_is_compared(tmp_path: Path) -> None:
             writer.add_message(channel, 0, b'{"turn": 0.125}', 0)
         writer.finish()  # type: ignore[no-untyped-call]
     path.write_bytes(path.read_bytes().replace(b"0.125", b"0.135", 1))
-    read = Timeline(McapFile(Source(path, None, path), ["/pose", "/command"]), GAP_S, PAUSE_S)
     with pytest.raises(ValueError, match="crc validation failed in DataEnd"):
-        list(read.messages())
+        Timeline(McapFile(Source(path, None, path), ["/pose", "/command"]), GAP_S, PAUSE_S)

@@ -144,10 +144,7 @@ def _refuse_groups(stored: dict[str, Any], mapping: ImportMapping, origin: str) 
 
 
 def _episodes(
-    h5py: Any,  # noqa: ANN401 - a module
-    file: Any,  # noqa: ANN401 - of h5py
-    pattern: str | None,
-    origin: str,
+    h5py: Any, file: Any, pattern: str | None, origin: str
 ) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
     """Yield the name of each episode's part of the file, its fields, and its attributes as "@name"."""
     if pattern != NUMBERED:
@@ -163,7 +160,7 @@ def _episodes(
         yield f"{origin}/{number}", numbered[number], {}
 
 
-def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:  # noqa: ANN401 - of h5py
+def _groups(h5py: Any, file: Any, pattern: str | None, origin: str) -> list[Any]:
     groups = [file]
     if pattern is None:
         return groups

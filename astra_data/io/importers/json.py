@@ -78,7 +78,7 @@ def _picked(row: dict[str, Any], names: Sequence[str], origin: str) -> list[Any]
     return [flat[name] for name in names]
 
 
-def _flat(value: Any) -> Any:  # noqa: ANN401 - any JSON
+def _flat(value: Any) -> Any:
     """Return an object with the values of objects in it as fields of their own: {"a": {"b": 1}} has a/b."""
     if not isinstance(value, dict):
         return value

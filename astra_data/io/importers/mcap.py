@@ -45,13 +45,13 @@ class MessageField:
         self.wanted = named[2] if named else ""
         self._names: list[str] | None = None
 
-    def names_in(self, content: Any) -> list[str]:  # noqa: ANN401 - any message
+    def names_in(self, content: Any) -> list[str]:
         """Return the names of the values in a message; empty if it has none."""
         for key in self._keys[:-1]:
             content = _part(content, key)
         return _names_in(content) or []
 
-    def value(self, content: Any) -> Array:  # noqa: ANN401 - any message
+    def value(self, content: Any) -> Array:
         """Return the numbers, or the text, in a message; a time in s and ns as whole ns."""
         before = owner = None
         part = content
@@ -72,7 +72,7 @@ class MessageField:
             return np.array(_part(part, "sec") * 10**9 + _part(part, "nanosec"))
         raise BadInputError(f"'{self.name}' is neither a number nor a list of numbers")
 
-    def _lacks(self, owner: Any, depth: int) -> str:  # noqa: ANN401 - any part of a message
+    def _lacks(self, owner: Any, depth: int) -> str:
         key, where = self._keys[depth], self._path(depth)
         if _is_list(owner):
             return f"no part '{key}' in {where}, which has {len(owner)} values, counted from 0"
@@ -83,7 +83,7 @@ class MessageField:
     def _path(self, depth: int) -> str:
         return ":".join(filter(None, (self.topic, ".".join(self._keys[:depth]))))
 
-    def _named(self, owner: Any, values: Any) -> Any:  # noqa: ANN401 - any parts of a message
+    def _named(self, owner: Any, values: Any) -> Any:
         """Return the one of `values` that the list of names beside them calls as is wanted."""
         where, names = self._path(len(self._keys)), _names_in(owner)
         if names is None or not _is_list(values):
@@ -94,7 +94,7 @@ class MessageField:
             raise BadInputError(f"{where} has {len(values)} values for {len(names)} names")
         return values[names.index(self.wanted)]
 
-    def _check_order(self, owner: Any, values: Any) -> None:  # noqa: ANN401 - any parts of a message
+    def _check_order(self, owner: Any, values: Any) -> None:
         names = _names_in(owner)
         if names is None or len(names) != len(values) or names == self._names or self._keys[-1] == _NAMES:
             return
@@ -160,7 +160,7 @@ def _by_publisher(file: McapFile, fields: dict[str, list[MessageField]]) -> dict
     """
     named = {topic for topic, each in fields.items() if any(field.wanted for field in each)}
     sent: dict[str, set[frozenset[str]]] = {topic: set() for topic in named}
-    for topic, message in file.messages(checked=False) if named else ():
+    for topic, message in file.messages() if named else ():
         if topic in named:
             sent[topic].add(_sent(file, fields[topic], message))
     split = {topic: each for topic, each in fields.items() if topic not in named}
@@ -177,13 +177,13 @@ def _by_publisher(file: McapFile, fields: dict[str, list[MessageField]]) -> dict
     return split
 
 
-def _sent(file: McapFile, fields: Sequence[MessageField], message: Any) -> frozenset[str]:  # noqa: ANN401
+def _sent(file: McapFile, fields: Sequence[MessageField], message: Any) -> frozenset[str]:
     """Return which of the names that `fields` want are in a message of theirs."""
     content = file.decoder(message.channel_id)(message.data)
     return frozenset(field.wanted for field in fields if field.wanted in field.names_in(content))
 
 
-def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str], message: Any) -> list[str]:  # noqa: ANN401
+def _streams(file: McapFile, fields: Sequence[MessageField], of: dict[str, str], message: Any) -> list[str]:
     """Return as what topics a message counts."""
     return sorted({of[name] for name in _sent(file, fields, message)})
 
@@ -231,7 +231,7 @@ def _check_mapping(mapping: ImportMapping, origin: str) -> None:
         raise BadInputError(f"{origin}: {'; '.join(faults)}")
 
 
-def _values(content: Any, fields: Sequence[MessageField], origin: str) -> Mapping[str, Array]:  # noqa: ANN401 - any message
+def _values(content: Any, fields: Sequence[MessageField], origin: str) -> Mapping[str, Array]:
     values, faults = {}, []
     for each in fields:
         try:
@@ -243,7 +243,7 @@ def _values(content: Any, fields: Sequence[MessageField], origin: str) -> Mappin
     return values
 
 
-def _part(value: Any, key: str) -> Any:  # noqa: ANN401 - any message
+def _part(value: Any, key: str) -> Any:
     """Return part `key` of a message, `_MISSING` where there is none."""
     if isinstance(value, Mapping):
         return value.get(key, _MISSING)
@@ -252,7 +252,7 @@ def _part(value: Any, key: str) -> Any:  # noqa: ANN401 - any message
     return getattr(value, key, _MISSING)
 
 
-def _parts(value: Any) -> list[str]:  # noqa: ANN401 - any part of a message
+def _parts(value: Any) -> list[str]:
     """Return the names of the parts of a message, of JSON, protobuf or ROS 2."""
     if isinstance(value, Mapping):
         return list(value)
@@ -261,11 +261,11 @@ def _parts(value: Any) -> list[str]:  # noqa: ANN401 - any part of a message
     return list(getattr(value, "__slots__", ()))
 
 
-def _is_list(value: Any) -> bool:  # noqa: ANN401 - any part of a message
+def _is_list(value: Any) -> bool:
     return hasattr(value, "__len__") and not isinstance(value, str | Mapping)
 
 
-def _names_in(owner: Any) -> list[str] | None:  # noqa: ANN401 - any part of a message
+def _names_in(owner: Any) -> list[str] | None:
     """Return the list of names in a message; None if it has none."""
     names = _part(owner, _NAMES)
     if not _is_list(names) or not all(isinstance(name, str) for name in names):

@@ -51,7 +51,7 @@ def layout(source: Source) -> dict[str, Any]:
     return {"columns": columns | ({GOAL: {"fields": [GOAL_FIELD]}} if GOAL_FIELD in fields else {})}
 
 
-def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
+def _open(source: Source) -> Any:
     """Open the dataset; Minari itself reads whole episodes, and follows links into other files."""
     minari, h5py = optional("minari"), optional("h5py")
     for path in (source.path / "data").rglob("*.hdf5"):
@@ -65,7 +65,7 @@ def _open(source: Source) -> Any:  # noqa: ANN401 - of minari
     return minari.MinariDataset(source.path / "data")
 
 
-def _fields(episode: Any) -> dict[str, Array]:  # noqa: ANN401 - of minari
+def _fields(episode: Any) -> dict[str, Array]:
     observations = dict(_parts("observations", episode.observations))
     infos = dict(_parts("infos", episode.infos or {}))  # None where none were recorded
     with_reset = {name: values for name, values in infos.items() if len(values) == len(episode.rewards) + 1}
@@ -100,7 +100,7 @@ def _after_steps(fields: dict[str, Array], mapping: ImportMapping, origin: str) 
     return (f"{', '.join(after)}: of one entry more than steps, each step has the one after it",)
 
 
-def _parts(name: str, value: Any) -> Iterator[tuple[str, Array]]:  # noqa: ANN401 - nested dicts and tuples
+def _parts(name: str, value: Any) -> Iterator[tuple[str, Array]]:
     if isinstance(value, dict | tuple):
         pairs = sorted(value.items()) if isinstance(value, dict) else enumerate(value)
         for key, part in pairs:
