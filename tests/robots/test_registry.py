@@ -9,27 +9,16 @@ import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, GOAL, STATE
-from astra_data.robots.registry import (
-    SIMULATOR_GROUP,
-    TASK_GROUP,
-    TASKS,
-    built,
-    checked_abstraction,
-    known_names,
-    known_tasks,
-    pairing_named,
-    place_of,
-    task_named,
-)
+from astra_data.robots import registry
 from astra_data.worlds import user_code
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.task import Task
 from astra_data.worlds.variation import VariedSimulator
 
 
-@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+@pytest.mark.parametrize("task", registry.TASKS.values(), ids=registry.TASKS)
 def test_worlds_and_columns_fit_together(task: Task) -> None:
-    assert TASKS[task.name] is task and task.fps * task.timestep_s == pytest.approx(1.0, abs=0.05)
+    assert registry.TASKS[task.name] is task and task.fps * task.timestep_s == pytest.approx(1.0, abs=0.05)
     sizes = {column.name: column.size for column in task.state_columns}
     env = task.target(2, seed=0, num_threads=1)
     observation = env.reset()
@@ -47,7 +36,7 @@ def test_worlds_and_columns_fit_together(task: Task) -> None:
     assert started.shape == abstract.shape
 
 
-@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+@pytest.mark.parametrize("task", registry.TASKS.values(), ids=registry.TASKS)
 def test_simulators_vary(task: Task) -> None:
     state, action = task.simulator(3).state, torch.full((3, task.objective.action_size), 0.5)
     landed = []
@@ -63,16 +52,19 @@ def test_simulators_vary(task: Task) -> None:
 
 def test_a_task_of_the_package_comes_before_an_installed_one_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("rail-cart", "antmaze-umaze")
-    points = [EntryPoint(name, "small_cart:TASK", TASK_GROUP) for name in names]
+    points = [EntryPoint(name, "small_cart:TASK", registry.TASK_GROUP) for name in names]
     monkeypatch.setattr(user_code, "entry_points", lambda group: points)
-    assert known_names() == (*TASKS, "rail-cart") and known_tasks()["antmaze-umaze"] is TASKS["antmaze-umaze"]
-    assert place_of("rail-cart") == place_of("small_cart:TASK") == "small_cart:TASK"
-    assert place_of("antmaze-umaze") == "antmaze-umaze" and place_of("unknown") == "unknown"
+    assert (
+        registry.known_names() == (*registry.TASKS, "rail-cart")
+        and registry.known_tasks()["antmaze-umaze"] is registry.TASKS["antmaze-umaze"]
+    )
+    assert registry.place_of("rail-cart") == registry.place_of("small_cart:TASK") == "small_cart:TASK"
+    assert registry.place_of("antmaze-umaze") == "antmaze-umaze" and registry.place_of("unknown") == "unknown"
 
 
 def test_an_unknown_task_answers_with_the_known_ones() -> None:
     with pytest.raises(BadInputError, match=r"unknown task 'antmaze-umase'.*antmaze-umaze"):
-        task_named("antmaze-umase")
+        registry.task_named("antmaze-umase")
 
 
 MINE = Path(my_simulator.__file__)
@@ -80,27 +72,27 @@ STATES = np.arange(87, dtype=np.float32).reshape(3, 29)
 
 
 def test_a_task_brings_its_own_simulator() -> None:
-    pairing, task = pairing_named("antmaze-umaze"), TASKS["antmaze-umaze"]
+    pairing, task = registry.pairing_named("antmaze-umaze"), registry.TASKS["antmaze-umaze"]
     assert (pairing.id, pairing.origin, pairing.maze) == ("point_mass", {"task": "antmaze-umaze"}, U_MAZE)
-    assert pairing.abstract_state == task.abstract_state and built(pairing, 5).state.shape == (5, 4)
-    np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, [0, 1, 15, 16]])
-    assert pairing_named("humanoid-kinematics").maze is None
+    assert pairing.abstract_state == task.abstract_state and registry.built(pairing, 5).state.shape == (5, 4)
+    np.testing.assert_array_equal(registry.checked_abstraction(pairing, STATES), STATES[:, [0, 1, 15, 16]])
+    assert registry.pairing_named("humanoid-kinematics").maze is None
     # Commands of ±1 need no bounds.
     assert pairing.commands is None
-    assert dict(pairing_named("small_cart:TASK").commands or {}) == {"v": (-1.0, 4.0)}
+    assert dict(registry.pairing_named("small_cart:TASK").commands or {}) == {"v": (-1.0, 4.0)}
 
 
 def test_a_class_of_a_file_is_known_by_its_name_and_the_files_digest() -> None:
-    pairing = pairing_named(f"{MINE}:Glider")
+    pairing = registry.pairing_named(f"{MINE}:Glider")
     assert (pairing.id, pairing.maze) == ("Glider", None)
     assert pairing.origin == {"file_sha256": hashlib.sha256(MINE.read_bytes()).hexdigest()}
-    batch = built(pairing, 2)
+    batch = registry.built(pairing, 2)
     batch.reset_to(torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
     batch.reset_to(torch.tensor([[5.0, 6.0]]), torch.tensor([1]))
     assert batch.step(torch.tensor([[2.0, 0.0], [0.0, -2.0]])).tolist() == pytest.approx(
         np.array([[1.1, 2.0], [5.0, 5.9]])
     )
-    np.testing.assert_array_equal(checked_abstraction(pairing, STATES), STATES[:, :2])
+    np.testing.assert_array_equal(registry.checked_abstraction(pairing, STATES), STATES[:, :2])
 
 
 @pytest.mark.parametrize(
@@ -118,15 +110,17 @@ def test_a_class_of_a_file_is_known_by_its_name_and_the_files_digest() -> None:
 def test_a_file_without_a_simulator_is_refused(tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "sim.py").write_text(text)
     with pytest.raises(BadInputError, match=told):
-        pairing_named(f"{tmp_path}/sim.py:Mine")
+        registry.pairing_named(f"{tmp_path}/sim.py:Mine")
 
 
 def test_installed_packages_offer_simulators_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    offered = [EntryPoint(name, "my_simulator:Glider", SIMULATOR_GROUP) for name in ("glider", "antmaze-umaze")]
-    monkeypatch.setattr(user_code, "entry_points", lambda group: {SIMULATOR_GROUP: offered}.get(group, []))
-    pairing = pairing_named("glider")
+    offered = [
+        EntryPoint(name, "my_simulator:Glider", registry.SIMULATOR_GROUP) for name in ("glider", "antmaze-umaze")
+    ]
+    monkeypatch.setattr(user_code, "entry_points", lambda group: {registry.SIMULATOR_GROUP: offered}.get(group, []))
+    pairing = registry.pairing_named("glider")
     assert (pairing.id, pairing.origin) == ("glider", {"package": "my_simulator:Glider"})
     assert pairing.simulator(2).step(torch.ones(2, 2)).tolist() == pytest.approx(np.full((2, 2), 0.05))
-    assert pairing_named("antmaze-umaze").id == "point_mass"
+    assert registry.pairing_named("antmaze-umaze").id == "point_mass"
     with pytest.raises(BadInputError, match=r"unknown task 'glidr': did you mean 'glider'"):
-        pairing_named("glidr")
+        registry.pairing_named("glidr")

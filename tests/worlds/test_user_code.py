@@ -10,31 +10,21 @@ import torch
 
 from astra_data.core.errors import BadInputError
 from astra_data.robots.registry import task_named
+from astra_data.worlds import user_code
 from astra_data.worlds.task import Task
-from astra_data.worlds.user_code import (
-    code_digest,
-    expect,
-    explained,
-    file_of,
-    found_near,
-    is_user_code,
-    parts_of,
-    restored,
-    user_object,
-)
 
 CART = Path(__file__).parents[1] / "small_cart.py"
 
 
 def test_code_is_named_by_its_place_and_an_object() -> None:
-    assert all(map(is_user_code, ("cart.py:TASK", "package.module:TASK")))
-    assert not any(map(is_user_code, ("antmaze-umaze", ":TASK", "cart.py:", "s3://bucket")))
+    assert all(map(user_code.is_user_code, ("cart.py:TASK", "package.module:TASK")))
+    assert not any(map(user_code.is_user_code, ("antmaze-umaze", ":TASK", "cart.py:", "s3://bucket")))
 
 
 def test_a_file_is_run_once_and_its_objects_are_found() -> None:
     task = task_named(f"{CART}:TASK")
     assert isinstance(task, Task) and task.name == "rail-cart" and task_named(f"{CART}:TASK") is task
-    assert task_named(f"{CART}:LOGS_ALONE") is user_object(f"{CART}:LOGS_ALONE")
+    assert task_named(f"{CART}:LOGS_ALONE") is user_code.user_object(f"{CART}:LOGS_ALONE")
 
 
 def test_a_file_imports_those_beside_it_but_hides_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,14 +32,14 @@ def test_a_file_imports_those_beside_it_but_hides_no_package(tmp_path: Path, mon
     (tmp_path / "wheels_of_mine.py").write_text("COUNT = 4\n")
     (tmp_path / "json.py").write_text("dumps = None\n")
     (tmp_path / "robot.py").write_text("import json\nfrom wheels_of_mine import COUNT\nDUMPS = json.dumps\n")
-    assert user_object(f"{tmp_path / 'robot.py'}:COUNT") == 4
-    assert user_object(f"{tmp_path / 'robot.py'}:DUMPS") is json.dumps
+    assert user_code.user_object(f"{tmp_path / 'robot.py'}:COUNT") == 4
+    assert user_code.user_object(f"{tmp_path / 'robot.py'}:DUMPS") is json.dumps
 
 
 def test_a_module_of_an_installed_package_is_found() -> None:
-    assert user_object("astra_data.worlds.task:Task") is Task
+    assert user_code.user_object("astra_data.worlds.task:Task") is Task
     with pytest.raises(BadInputError, match=r"importing no.such fails with ModuleNotFoundError"):
-        user_object("no.such:TASK")
+        user_code.user_object("no.such:TASK")
     with pytest.raises(BadInputError, match=r"astra_data.worlds.task:Task is a type, expected a Task"):
         task_named("astra_data.worlds.task:Task")
 
@@ -61,13 +51,13 @@ def test_each_file_imports_those_beside_it(tmp_path: Path, monkeypatch: pytest.M
         (tmp_path / folder / "mine.py").write_text("from own_dynamics import TOLD\n")
         (tmp_path / folder / "own_dynamics.py").write_text("import own_facts\nTOLD = own_facts.VALUE")
         (tmp_path / folder / "own_facts.py").write_text(f"VALUE = {value}")
-    assert [user_object(f"{tmp_path}/{folder}/mine.py:TOLD") for folder in "ab"] == [1, 2]
+    assert [user_code.user_object(f"{tmp_path}/{folder}/mine.py:TOLD") for folder in "ab"] == [1, 2]
     (tmp_path / "a" / "again.py").write_text("import own_facts\nTOLD = own_facts.VALUE")
     first = [f"{tmp_path}/b", *sys.path]  # as the folder of a script is
     monkeypatch.setattr(sys, "path", [*first])
-    assert user_object(f"{tmp_path}/a/again.py:TOLD") == 1
+    assert user_code.user_object(f"{tmp_path}/a/again.py:TOLD") == 1
     (tmp_path / "b" / "again.py").write_text("import own_facts\nTOLD = own_facts.VALUE")
-    assert user_object(f"{tmp_path}/b/again.py:TOLD") == 2 and sys.path == first
+    assert user_code.user_object(f"{tmp_path}/b/again.py:TOLD") == 2 and sys.path == first
     assert sys.modules["own_facts"].VALUE == 1  # what was imported first stays so for all else
 
 
@@ -75,11 +65,11 @@ def test_what_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text("import sys\nfrom pathlib import Path\nTASK = 3\n_HIDDEN = 4\ndef reach(): pass\n")
     with pytest.raises(BadInputError, match=r"mine.py has no 'TAKS'; it has TASK, reach$"):
-        user_object(f"{file}:TAKS")
+        user_code.user_object(f"{file}:TAKS")
     with pytest.raises(BadInputError, match=r"none.py does not exist: expected a Python file"):
-        user_object(f"{tmp_path}/none.py:TASK")
+        user_code.user_object(f"{tmp_path}/none.py:TASK")
     with pytest.raises(BadInputError, match=f"none.py does not exist in {Path.cwd()}: expected a Python file"):
-        user_object("none.py:TASK")
+        user_code.user_object("none.py:TASK")
 
 
 def test_a_file_is_looked_up_above_a_folder_and_then_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,34 +78,34 @@ def test_a_file_is_looked_up_above_a_folder_and_then_here(tmp_path: Path, monkey
     for folder in (here, run):
         folder.mkdir(parents=True)
     monkeypatch.chdir(here)
-    assert found_near("cart.py:TASK", run) == "cart.py:TASK"
+    assert user_code.found_near("cart.py:TASK", run) == "cart.py:TASK"
     (here / "cart.py").touch()
-    assert found_near("cart.py:TASK", run) == "cart.py:TASK"
+    assert user_code.found_near("cart.py:TASK", run) == "cart.py:TASK"
     (project / "cart.py").touch()
-    assert found_near("cart.py:TASK", run) == f"{project}/cart.py:TASK"
+    assert user_code.found_near("cart.py:TASK", run) == f"{project}/cart.py:TASK"
     (project / "runs/cart.py").touch()
-    assert found_near("cart.py:TASK", run) == f"{project}/runs/cart.py:TASK"
+    assert user_code.found_near("cart.py:TASK", run) == f"{project}/runs/cart.py:TASK"
     monkeypatch.chdir(project / "runs")
-    assert found_near("cart.py:TASK", Path("cart")) == "cart.py:TASK"
-    assert found_near(f"{here}/cart.py:TASK", run) == f"{here}/cart.py:TASK"
+    assert user_code.found_near("cart.py:TASK", Path("cart")) == "cart.py:TASK"
+    assert user_code.found_near(f"{here}/cart.py:TASK", run) == f"{here}/cart.py:TASK"
     (run / "cart.py").touch()
-    assert found_near("cart.py:TASK", run) == f"{run}/cart.py:TASK"
+    assert user_code.found_near("cart.py:TASK", run) == f"{run}/cart.py:TASK"
     (run / "package.module").touch()
     for no_file in ("antmaze-umaze", "package.module:TASK"):
-        assert found_near(no_file, run) == no_file
+        assert user_code.found_near(no_file, run) == no_file
 
 
 def test_a_file_is_known_by_its_digest() -> None:
-    assert file_of(f"{CART}:TASK") == {"file_sha256": hashlib.sha256(CART.read_bytes()).hexdigest()}
-    assert file_of("antmaze-umaze") == file_of("package.module:TASK") == {}
+    assert user_code.file_of(f"{CART}:TASK") == {"file_sha256": hashlib.sha256(CART.read_bytes()).hexdigest()}
+    assert user_code.file_of("antmaze-umaze") == user_code.file_of("package.module:TASK") == {}
 
 
 def test_an_error_names_the_line_of_the_file_that_it_comes_from(tmp_path: Path) -> None:
     file = tmp_path / "wheel.py"
     file.write_text("import numpy as np\n\n\ndef roll():\n    return np.zeros(3).reshape(2, 2)\n")
-    roll = user_object(f"{file}:roll")
+    roll = user_code.user_object(f"{file}:roll")
     told = r"^rolling fails with ValueError: .* \(wheel.py, line 5\)$"
-    with pytest.raises(BadInputError, match=told), explained("rolling"):
+    with pytest.raises(BadInputError, match=told), user_code.explained("rolling"):
         roll()
 
 
@@ -123,7 +113,7 @@ def test_a_file_that_exits_is_an_error_and_not_an_end(tmp_path: Path) -> None:
     file = tmp_path / "script.py"
     file.write_text("import sys\nsys.exit(0)\n")
     with pytest.raises(BadInputError, match=r"importing .*script.py ends the program \(script.py, line 2\)"):
-        user_object(f"{file}:TASK")
+        user_code.user_object(f"{file}:TASK")
 
 
 def test_code_has_one_digest_in_every_version_of_python(tmp_path: Path) -> None:
@@ -131,22 +121,22 @@ def test_code_has_one_digest_in_every_version_of_python(tmp_path: Path) -> None:
     assigned = "Assign(targets=[Name(id='TASK', ctx=Store())], value=Constant(value=1))"
     parsed = f"Module(body=[{assigned}], type_ignores=[])"
     told = hashlib.sha256(f"cart.py\n{parsed}\n".encode()).hexdigest()
-    assert code_digest(f"{tmp_path}/cart.py:TASK") == told
+    assert user_code.code_digest(f"{tmp_path}/cart.py:TASK") == told
 
 
 def test_code_is_known_by_what_it_does_and_imports_beside_it(tmp_path: Path) -> None:
     (tmp_path / "cart.py").write_text("from wheel import R\nimport json\nTASK = R\n")
     (tmp_path / "wheel.py").write_text("import cart\nR = 1\n")
     (tmp_path / "json.py").write_text("")
-    first = code_digest(f"{tmp_path}/cart.py:TASK")
+    first = user_code.code_digest(f"{tmp_path}/cart.py:TASK")
     (tmp_path / "cart.py").write_text("# A cart.\nfrom wheel import R\nimport json\n\nTASK = (R)\n")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") == first
+    assert user_code.code_digest(f"{tmp_path}/cart.py:TASK") == first
     (tmp_path / "wheel.py").write_text("import cart\nR = 2\n")
-    assert code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
-    assert code_digest("antmaze-umaze") is code_digest("some.module:TASK") is None
+    assert user_code.code_digest(f"{tmp_path}/cart.py:TASK") not in (first, None)
+    assert user_code.code_digest("antmaze-umaze") is user_code.code_digest("some.module:TASK") is None
     (tmp_path / "wheel.py").write_text("R = 1\nR = = 2\n")
     with pytest.raises(BadInputError, match=r"wheel\.py, line 2: expected Python, got invalid syntax"):
-        code_digest(f"{tmp_path}/cart.py:TASK")
+        user_code.code_digest(f"{tmp_path}/cart.py:TASK")
 
 
 def test_the_digest_covers_a_package_beside_the_file(tmp_path: Path) -> None:
@@ -156,14 +146,14 @@ def test_the_digest_covers_a_package_beside_the_file(tmp_path: Path) -> None:
     (tmp_path / "wheel.py").write_text("R = 1\n")
     (tmp_path / "other.py").write_text("R = 1\n")
     (tmp_path / "parts/joints/knee.py").write_text("LIMIT = 1\n")
-    digests = [code_digest(f"{tmp_path}/cart.py:TASK")]
+    digests = [user_code.code_digest(f"{tmp_path}/cart.py:TASK")]
     for path, text in (("other.py", "R = 2"), ("parts/joints/knee.py", "LIMIT = 2"), ("wheel.py", "R = 2")):
         (tmp_path / path).write_text(text)
-        digests.append(code_digest(f"{tmp_path}/cart.py:TASK"))
+        digests.append(user_code.code_digest(f"{tmp_path}/cart.py:TASK"))
     assert digests[0] == digests[1] and len(set(digests)) == 3
     (tmp_path / "parts/template.py").write_text("class {{ name }}:\n")
     (tmp_path / "cart.py").write_text("import numpy\nfrom parts.joints import knee\nTASK = knee.LIMIT\n")
-    assert (code_digest(f"{tmp_path}/cart.py:TASK")) not in (*digests, None)
+    assert (user_code.code_digest(f"{tmp_path}/cart.py:TASK")) not in (*digests, None)
 
 
 @pytest.mark.parametrize(
@@ -182,11 +172,11 @@ def test_data_of_any_kind_count_by_their_names_or_the_parts_of_their_paths(
     (tmp_path / "cart.py").write_text(f"{code}\n")
     (named.parent / "another.npz").write_text("1")
     named.write_text("1")
-    first = code_digest(place)
+    first = user_code.code_digest(place)
     (named.parent / "another.npz").write_text("2")
-    assert code_digest(place) == first
+    assert user_code.code_digest(place) == first
     named.write_text("2")
-    assert code_digest(place) not in (first, None)
+    assert user_code.code_digest(place) not in (first, None)
 
 
 @pytest.fixture
@@ -202,12 +192,12 @@ def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("place", ["levers_of_mine:TASK", "levers_of_mine.parts.knee:TASK"])
 def test_installed_code_is_known_by_all_of_its_package(library: Path, place: str) -> None:
-    first = code_digest(place)
+    first = user_code.code_digest(place)
     (library / "others.py").write_text("LIMIT = 2\n")
     (library / "levers_of_mine/__init__.py").write_text("import others  # Another.\nLIMIT = 1\n")
-    assert code_digest(place) == first
+    assert user_code.code_digest(place) == first
     (library / "levers_of_mine/parts/knee.py").write_text("import others\nLIMIT = 2\n")
-    assert code_digest(place) not in (first, None) and "levers_of_mine" not in sys.modules
+    assert user_code.code_digest(place) not in (first, None) and "levers_of_mine" not in sys.modules
 
 
 class Linear:
@@ -238,7 +228,7 @@ class Linear:
 )
 def test_anything_else_is_told(returned: object, told: str) -> None:
     with pytest.raises(BadInputError, match=f"^Linear.to_file: {told}$"):
-        parts_of(Linear(returned))
+        user_code.parts_of(Linear(returned))
 
 
 OWN = """
@@ -256,7 +246,7 @@ def test_what_it_asks_for_and_the_file_has_not_is_told_with_what_it_has(tmp_path
     (tmp_path / "mine.py").write_text(OWN)
     given = "^Own.from_file, given the tensors matrix, factor and the values sizes, kind, fails with KeyError: 'matrx' "
     with pytest.raises(BadInputError, match=given + r"\(mine.py, line 7\)$"):
-        restored(user_object(f"{tmp_path / 'mine.py'}:Own"), TENSORS, METADATA)
+        user_code.restored(user_code.user_object(f"{tmp_path / 'mine.py'}:Own"), TENSORS, METADATA)
 
 
 @pytest.mark.parametrize(
@@ -273,10 +263,10 @@ def test_what_it_asks_for_and_the_file_has_not_is_told_with_what_it_has(tmp_path
 def test_anything_else_is_refused_with_what_it_is(found: object, said: str) -> None:
     """One line says what was expected and what came."""
     with pytest.raises(BadInputError, match=f"^{said}"):
-        expect("step", found, (-1, 2), torch.float32)
+        user_code.expect("step", found, (-1, 2), torch.float32)
 
 
 def test_answers_come_where_the_states_are() -> None:
     """Else they meet no other tensor of a training on a GPU; "meta" stands for one."""
     with pytest.raises(BadInputError, match=r"^pay: expected a tensor on meta, where its inputs are, got cpu$"):
-        expect("pay", torch.zeros(3), (3,), device=torch.device("meta"))
+        user_code.expect("pay", torch.zeros(3), (3,), device=torch.device("meta"))

@@ -12,17 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.core.arrays import normalized
-from astra_data.robots.humanoid.target import (
-    COMMANDED,
-    CONTACT_M,
-    FEET,
-    FOOT_RADIUS_M,
-    JOINTS,
-    POSITIONS,
-    VELOCITY_M_S,
-    humanoid_model,
-    in_spreads,
-)
+from astra_data.robots.humanoid import target as humanoid
 from astra_data.worlds.geometry import rotation
 
 _TORSO = 1
@@ -52,14 +42,14 @@ class _Skeleton(NamedTuple):
 
 @cache
 def _skeleton(dtype: torch.dtype, device: torch.device) -> _Skeleton:
-    model = humanoid_model()
+    model = humanoid.humanoid_model()
     bodies = range(_TORSO, model.nbody)
 
     def tensor(values: object) -> Tensor:
         return torch.as_tensor(np.array(values), dtype=dtype, device=device)
 
     links = {}
-    moved = np.zeros((len(JOINTS), len(bodies)))
+    moved = np.zeros((len(humanoid.JOINTS), len(bodies)))
     shares = model.body_mass[bodies] / model.body_mass.sum()
     for body in bodies[1:]:
         turn = np.zeros(9)
@@ -85,7 +75,7 @@ def _skeleton(dtype: torch.dtype, device: torch.device) -> _Skeleton:
         centers={body: tensor(model.body_ipos[body]) for body in bodies},
         shares=tensor(shares),
         moved=tensor(moved),
-        feet=tuple((int(foot.bodyid[0]), tensor(foot.pos)) for foot in map(model.geom, FEET)),
+        feet=tuple((int(foot.bodyid[0]), tensor(foot.pos)) for foot in map(model.geom, humanoid.FEET)),
     )
 
 
@@ -107,7 +97,7 @@ def _place(joints: Tensor) -> _Placed:
     turns = identity + torch.sin(angle) * crosses + (1 - torch.cos(angle)) * (crosses @ crosses)
     origin = torch.zeros(*joints.shape[:-1], 3, dtype=joints.dtype, device=joints.device)
     frames = {_TORSO: (origin, identity.expand(*joints.shape[:-1], 3, 3))}
-    axes, anchors = [origin] * len(JOINTS), [origin] * len(JOINTS)
+    axes, anchors = [origin] * len(humanoid.JOINTS), [origin] * len(humanoid.JOINTS)
     for body, link in skeleton.links.items():
         origin, turn = frames[link.parent]
         origin = origin + turn @ link.offset
@@ -148,10 +138,10 @@ def mass_velocity(joints: Tensor, rates: Tensor) -> Tensor:
 
 _HEIGHT = 2
 _QUATERNION = slice(3, 7)
-_JOINTS = slice(7, POSITIONS)
-_VELOCITY = slice(POSITIONS, POSITIONS + 3)
-_SPIN = slice(POSITIONS + 3, POSITIONS + 6)
-_RATES = slice(POSITIONS + 6, None)
+_JOINTS = slice(7, humanoid.POSITIONS)
+_VELOCITY = slice(humanoid.POSITIONS, humanoid.POSITIONS + 3)
+_SPIN = slice(humanoid.POSITIONS + 3, humanoid.POSITIONS + 6)
+_RATES = slice(humanoid.POSITIONS + 6, None)
 
 
 class Phi:
@@ -189,10 +179,10 @@ def humanoid_to_walker2d(state: Tensor) -> Tensor:
     pitch_rate = (up * spin[..., 1] - left * spin[..., 2]) / level
     _, feet = mass_and_feet(joints)
     axes = torch.stack([forward, left, up], dim=-1).unsqueeze(-2)
-    clearance = height.unsqueeze(-1) + (axes * feet).sum(-1) - FOOT_RADIUS_M
-    pose = [torch.stack([height, pitch], dim=-1), joints[..., COMMANDED]]
-    rates = [velocity[..., [0, 2]], pitch_rate.unsqueeze(-1), state[..., _RATES][..., COMMANDED]]
-    return torch.cat([*pose, *rates, (clearance < CONTACT_M).to(state.dtype)], dim=-1)
+    clearance = height.unsqueeze(-1) + (axes * feet).sum(-1) - humanoid.FOOT_RADIUS_M
+    pose = [torch.stack([height, pitch], dim=-1), joints[..., humanoid.COMMANDED]]
+    rates = [velocity[..., [0, 2]], pitch_rate.unsqueeze(-1), state[..., _RATES][..., humanoid.COMMANDED]]
+    return torch.cat([*pose, *rates, (clearance < humanoid.CONTACT_M).to(state.dtype)], dim=-1)
 
 
 @Phi
@@ -225,17 +215,17 @@ def humanoid_to_extended_kinematics(state: Tensor) -> Tensor:
 
 def beyond_walker2d(state: Tensor) -> Tensor:
     """Return what `humanoid_to_walker2d` drops except x and y: (..., 47) to (..., 34), in spreads."""
-    seen = in_spreads(state)
+    seen = humanoid.in_spreads(state)
     velocity = _headed(rotation(state[..., _QUATERNION]), state[..., _VELOCITY])
-    rest = [joint for joint in range(len(JOINTS)) if joint not in COMMANDED]
+    rest = [joint for joint in range(len(humanoid.JOINTS)) if joint not in humanoid.COMMANDED]
     joints, rates = seen[..., _JOINTS][..., rest], seen[..., _RATES][..., rest]
-    left = normalized(velocity[..., 1:2], 0.0, VELOCITY_M_S)
+    left = normalized(velocity[..., 1:2], 0.0, humanoid.VELOCITY_M_S)
     return torch.cat([seen[..., _QUATERNION], joints, left, seen[..., _SPIN], rates], dim=-1)
 
 
 def beyond_kinematics(state: Tensor) -> Tensor:
     """Return what `humanoid_to_kinematics` drops except x and y: (..., 47) to (..., 11), in spreads."""
-    seen = in_spreads(state)
+    seen = humanoid.in_spreads(state)
     height, quaternion = seen[..., [_HEIGHT]], seen[..., _QUATERNION]
     return torch.cat([height, quaternion, seen[..., _VELOCITY], seen[..., _SPIN]], dim=-1)
 

@@ -11,24 +11,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from astra_data.dataset.columns import ABSTRACT_STATE
+from astra_data.robots.humanoid import target as humanoid
 from astra_data.robots.humanoid.abstraction import (
     humanoid_to_extended_kinematics,
     humanoid_to_kinematics,
     humanoid_to_walker2d,
     mass_and_feet,
-)
-from astra_data.robots.humanoid.target import (
-    COMMANDED,
-    CONTACT_M,
-    CONTROL_SUBSTEPS,
-    DAMPING,
-    FOOT_RADIUS_M,
-    JOINTS,
-    STANDING,
-    STIFFNESS,
-    TIMESTEP_S,
-    CommandRanges,
-    humanoid_model,
 )
 from astra_data.worlds.simulators import ColdSteps, FreeStates
 from astra_data.worlds.task import column, entries
@@ -52,7 +40,7 @@ def sole_clearance(pose: Tensor) -> Tensor:
     height, pitch, hip, knee = pose[..., :1], pose[..., 1:2], pose[..., [2, 4]], pose[..., [3, 5]]
     for (x, z), angle in zip(_LEG_M, (pitch, pitch + hip, pitch + hip - knee), strict=True):
         height = height - x * torch.sin(angle) + z * torch.cos(angle)
-    return height - FOOT_RADIUS_M
+    return height - humanoid.FOOT_RADIUS_M
 
 
 _POSE, _MOTION, _CONTACTS = slice(0, 6), slice(0, 13), slice(13, 15)
@@ -77,10 +65,10 @@ class HumanoidWalker2d(FreeStates):
     abstraction = humanoid_to_walker2d
 
     def __init__(self, num_envs: int, *, num_threads: int | None = None, device: str = "cpu") -> None:
-        standing = humanoid_to_walker2d(torch.tensor(STANDING))
+        standing = humanoid_to_walker2d(torch.tensor(humanoid.STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
         self.memory = self._sunk(self.state)
-        self.ranges = CommandRanges()
+        self.ranges = humanoid.CommandRanges()
         self._model = walker_model()
         self._models = [self._model]
         self._steps = ColdSteps(self._model, num_envs, num_threads)
@@ -88,7 +76,7 @@ class HumanoidWalker2d(FreeStates):
     @property
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
+        return {"timestep_s": humanoid.TIMESTEP_S, **self.ranges.parameters}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use factors (B, 1) on the joints' damping and on the control step, of as many physics steps, from now on."""
@@ -123,19 +111,19 @@ class HumanoidWalker2d(FreeStates):
         targets = self.ranges.targets(action.cpu().double()).numpy()
         # Before z comes x, which is 0 at the start of every step.
         placed = np.pad(motion.numpy(), ((0, 0), (1, 0)))
-        landed = self._steps(self._models, placed, targets, substeps=CONTROL_SUBSTEPS)
+        landed = self._steps(self._models, placed, targets, substeps=humanoid.CONTROL_SUBSTEPS)
         motion = torch.from_numpy(landed[:, 1:].copy())
-        contacts = (sole_clearance(motion[:, _POSE]) < CONTACT_M).to(motion.dtype)
+        contacts = (sole_clearance(motion[:, _POSE]) < humanoid.CONTACT_M).to(motion.dtype)
         motion[:, 0] -= sunk
         self.state = torch.cat([motion, contacts], dim=-1).float().to(self.state.device)
         return self.state
 
 
-_COUNT = len(JOINTS)
+_COUNT = len(humanoid.JOINTS)
 _CENTER, _VELOCITY, _UP, _SPIN = (slice(first, first + 3) for first in range(2 * _COUNT, 2 * _COUNT + 12, 3))
 _JOINTS = [
-    *entries(" ".join(JOINTS), "rad", *_OF_JOINTS),
-    *entries(" ".join(f"{name}_rate" for name in JOINTS), "rad/s", *_OF_JOINTS),
+    *entries(" ".join(humanoid.JOINTS), "rad", *_OF_JOINTS),
+    *entries(" ".join(f"{name}_rate" for name in humanoid.JOINTS), "rad/s", *_OF_JOINTS),
 ]
 
 
@@ -146,24 +134,24 @@ class HumanoidKinematics(FreeStates):
     abstract_state = column(ABSTRACT_STATE, _JOINTS, "angles and rates of all joints")
     abstraction = humanoid_to_kinematics
 
-    ranges = CommandRanges()  # joint angles of commands
+    ranges = humanoid.CommandRanges()  # joint angles of commands
 
     def __init__(self, num_envs: int, *, device: str = "cpu") -> None:
-        standing = type(self).abstraction(torch.tensor(STANDING))
+        standing = type(self).abstraction(torch.tensor(humanoid.STANDING))
         super().__init__(standing.repeat(num_envs, 1).to(device))
-        self._damping = torch.from_numpy(humanoid_model().dof_damping[-_COUNT:]).float().to(device)
-        self._approach = STIFFNESS / (DAMPING + self._damping)
-        self._timestep_s = torch.tensor(TIMESTEP_S, device=device)
+        self._damping = torch.from_numpy(humanoid.humanoid_model().dof_damping[-_COUNT:]).float().to(device)
+        self._approach = humanoid.STIFFNESS / (humanoid.DAMPING + self._damping)
+        self._timestep_s = torch.tensor(humanoid.TIMESTEP_S, device=device)
 
     @property
     def parameters(self) -> dict[str, float]:
         """What a dataset paired with this simulator records about it."""
-        return {"timestep_s": TIMESTEP_S, **self.ranges.parameters}
+        return {"timestep_s": humanoid.TIMESTEP_S, **self.ranges.parameters}
 
     def vary(self, parameters: Mapping[str, Tensor]) -> None:
         """Use factors (B, 1) on the joints' damping and on the control step from the next step on."""
-        self._approach = STIFFNESS / (DAMPING + parameters["friction"] * self._damping)
-        self._timestep_s = TIMESTEP_S * parameters["timestep_scale"]
+        self._approach = humanoid.STIFFNESS / (humanoid.DAMPING + parameters["friction"] * self._damping)
+        self._timestep_s = humanoid.TIMESTEP_S * parameters["timestep_scale"]
 
     def step(self, action: Tensor) -> Tensor:
         """Follow the commands `action` (B, 4) for one control step; return the new state (B, X)."""
@@ -174,7 +162,7 @@ class HumanoidKinematics(FreeStates):
         """Return angles and rates (B, 34) of all joints after the step."""
         angles = self.state[:, :_COUNT]
         target = torch.zeros_like(angles)
-        target[:, COMMANDED] = self.ranges.targets(action)
+        target[:, humanoid.COMMANDED] = self.ranges.targets(action)
         left = (target - angles) * torch.exp(-self._approach * self._timestep_s)
         return torch.cat([target - left, self._approach * left], dim=-1)
 

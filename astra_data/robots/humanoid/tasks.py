@@ -16,6 +16,7 @@ from torch import Tensor
 from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE
+from astra_data.robots.humanoid import target as humanoid
 from astra_data.robots.humanoid.abstraction import (
     Phi,
     beyond_extended_kinematics,
@@ -28,44 +29,25 @@ from astra_data.robots.humanoid.abstraction import (
     mass_velocity,
 )
 from astra_data.robots.humanoid.simulators import HumanoidExtendedKinematics, HumanoidKinematics, HumanoidWalker2d
-from astra_data.robots.humanoid.target import (
-    COMMANDED,
-    DAMPING,
-    JOINT_RATES_RAD_S,
-    JOINTS,
-    JOINTS_RAD,
-    LEAN_RAD,
-    POSITION_M,
-    POSITIONS,
-    SPIN_RAD_S,
-    STANDING,
-    STIFFNESS,
-    TIMESTEP_S,
-    VELOCITY_M_S,
-    CommandRanges,
-    HumanoidEnv,
-    Locomotion,
-    humanoid_model,
-)
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.task import Task, Varied, column, entries, free_body
 from astra_data.worlds.variation import JointVariation, VariedSimulator, noisy_command
 
-_COUNT = len(JOINTS)
-_LEGS_RAD = tuple(JOINTS_RAD[joint] for joint in COMMANDED)
-_LEG_RATES_RAD_S = tuple(JOINT_RATES_RAD_S[joint] for joint in COMMANDED)
+_COUNT = len(humanoid.JOINTS)
+_LEGS_RAD = tuple(humanoid.JOINTS_RAD[joint] for joint in humanoid.COMMANDED)
+_LEG_RATES_RAD_S = tuple(humanoid.JOINT_RATES_RAD_S[joint] for joint in humanoid.COMMANDED)
 
 
 @dataclass(frozen=True)
 class Walking(Objective):
     """Walk along x and do not fall; there is no goal."""
 
-    action_size = len(COMMANDED)
+    action_size = len(humanoid.COMMANDED)
     is_lasting = True
     spread: ClassVar[tuple[float, ...]]  # typical deviation of each entry of a state from standing, (X,)
     phi: ClassVar[Phi]  # φ of target states (count, 47), (count, X)
 
-    locomotion: Locomotion = field(default_factory=Locomotion)  # rewards and starts of the target
+    locomotion: humanoid.Locomotion = field(default_factory=humanoid.Locomotion)  # rewards and starts of the target
     failure_reward: float = field(default=-5.0, kw_only=True)
     """Minus the reward for staying up, which a step that ends in a fall does not get."""
 
@@ -75,7 +57,7 @@ class Walking(Objective):
 
     @cached_property
     def _standing(self) -> NDArray[np.float64]:
-        return self.phi(np.array(STANDING))
+        return self.phi(np.array(humanoid.STANDING))
 
     @abstractmethod
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
@@ -100,8 +82,8 @@ class PlanarWalking(Walking):
     """Walking of the planar walker, states (..., 15); outside of the healthy heights it has fallen."""
 
     spread = (
-        *(POSITION_M, LEAN_RAD, *_LEGS_RAD),
-        *(VELOCITY_M_S, VELOCITY_M_S, SPIN_RAD_S, *_LEG_RATES_RAD_S),
+        *(humanoid.POSITION_M, humanoid.LEAN_RAD, *_LEGS_RAD),
+        *(humanoid.VELOCITY_M_S, humanoid.VELOCITY_M_S, humanoid.SPIN_RAD_S, *_LEG_RATES_RAD_S),
         *(1.0, 1.0),
     )
     phi = humanoid_to_walker2d
@@ -114,7 +96,7 @@ class PlanarWalking(Walking):
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the forward velocity of the center of mass after the step, with stiff arms, (B,) in m/s."""
         joints = after.new_zeros(2, len(after), _COUNT)
-        joints[..., COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
+        joints[..., humanoid.COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
         mass, _ = mass_and_feet(joints[0])
         swept = mass_velocity(*joints)
         pitch, pitch_rate = after[:, 1], after[:, 8]
@@ -126,7 +108,7 @@ class PlanarWalking(Walking):
 class JointWalking(Walking):
     """Walking of the joints alone, states (..., 34); they show no falls, so every episode succeeds."""
 
-    spread = (*JOINTS_RAD, *JOINT_RATES_RAD_S)
+    spread = (*humanoid.JOINTS_RAD, *humanoid.JOINT_RATES_RAD_S)
     phi = humanoid_to_kinematics
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
@@ -134,14 +116,22 @@ class JointWalking(Walking):
         feet, later = (mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
         rows = torch.arange(len(feet), device=feet.device)
         lower = feet[..., 2].argmin(dim=-1)
-        return (feet[rows, lower, 0] - later[rows, lower, 0]) / TIMESTEP_S
+        return (feet[rows, lower, 0] - later[rows, lower, 0]) / humanoid.TIMESTEP_S
 
 
 @dataclass(frozen=True)
 class MassWalking(Walking):
     """Walking of joints, center of mass and the torso's lean, states (..., 46)."""
 
-    spread = (*JointWalking.spread, *([POSITION_M] * 3 + [VELOCITY_M_S] * 3 + [LEAN_RAD] * 3 + [SPIN_RAD_S] * 3))
+    spread = (
+        *JointWalking.spread,
+        *(
+            [humanoid.POSITION_M] * 3
+            + [humanoid.VELOCITY_M_S] * 3
+            + [humanoid.LEAN_RAD] * 3
+            + [humanoid.SPIN_RAD_S] * 3
+        ),
+    )
     phi = humanoid_to_extended_kinematics
 
     lowest_mass_m: float = 0.65
@@ -186,7 +176,7 @@ class VariedHumanoid(VariedSimulator):
 def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 200) -> NDArray[np.uint8]:
     """Return a picture of each of the target states (K, 47), seen from its right, (K, height, width, 3)."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    model = humanoid_model()
+    model = humanoid.humanoid_model()
     data = mujoco.MjData(model)
     try:
         from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer  # noqa: PLC0415 - slow
@@ -200,7 +190,7 @@ def photograph(states: NDArray[np.float64], *, height: int = 240, width: int = 2
     viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = 3.8, 90.0, -8.0
     pictures = []
     for state in states:
-        data.qpos[:] = state[:POSITIONS]
+        data.qpos[:] = state[: humanoid.POSITIONS]
         mujoco.mj_forward(model, data)
         viewer.cam.lookat[:] = (*state[:2], 0.95)
         pictures.append(viewer.render("rgb_array"))
@@ -220,7 +210,7 @@ WIDE_RANGES = JointVariation(
     action_scale=(-0.05, 0.05),
     action_noise=(0.05, 0.05),
     observation_scale=(0.9, 1.1),
-    timestep_scale=(1.0, 0.025 / TIMESTEP_S),
+    timestep_scale=(1.0, 0.025 / humanoid.TIMESTEP_S),
 )
 """Of COMPASS, as printed in the paper (Section V-B): "additionally" to domain randomization. A control period
 of 0.015 to 0.025 s begins at the simulator's own, so it only gets longer; in navigation, whose simulators
@@ -245,8 +235,8 @@ _WALKER_QUANTITIES: Quantities = {
 }
 
 
-def _humanoids(objective: Walking, num_envs: int, **options: Any) -> HumanoidEnv:
-    return HumanoidEnv(objective.locomotion, num_envs, **options)
+def _humanoids(objective: Walking, num_envs: int, **options: Any) -> humanoid.HumanoidEnv:
+    return humanoid.HumanoidEnv(objective.locomotion, num_envs, **options)
 
 
 def _task(
@@ -261,15 +251,15 @@ def _task(
         make_simulator=kind,
         abstraction=kind.abstraction,
         beyond=beyond,
-        state=column(STATE, free_body(JOINTS), "qpos (24) and qvel (23) of the humanoid"),
+        state=column(STATE, free_body(humanoid.JOINTS), "qpos (24) and qvel (23) of the humanoid"),
         action=column(ACTION, _COMMAND, "commanded joint angles, ±1 over their ranges"),
         commands=dict.fromkeys(_COMMANDS, (-1.0, 1.0)),
         abstract_state=kind.abstract_state,
         quantities=quantities,
-        timestep_s=TIMESTEP_S,
+        timestep_s=humanoid.TIMESTEP_S,
         simulator_id=f"humanoid_{name}",
         photograph=photograph,
-        facts={"stiffness": STIFFNESS, "damping": DAMPING, **CommandRanges().parameters},
+        facts={"stiffness": humanoid.STIFFNESS, "damping": humanoid.DAMPING, **humanoid.CommandRanges().parameters},
         varied=Varied(VariedHumanoid, RANDOMIZED_ACTIONS, WIDE_RANGES),
     )
 

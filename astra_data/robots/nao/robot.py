@@ -17,22 +17,8 @@ from numpy.typing import NDArray
 
 from astra_data.core.arrays import Bools, Floats
 from astra_data.core.provenance import cores
+from astra_data.robots.nao import walk
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
-from astra_data.robots.nao.walk import (
-    HIP_OFFSET_Z_M,
-    TICK_S,
-    TO_MOTORS,
-    Gait,
-    StepPlanner,
-    Targets,
-    Traits,
-    TraitSpread,
-    WalkEngine,
-    WalkLimits,
-    WalkStyle,
-    leg_angles,
-    put_rows,
-)
 from astra_data.worlds.geometry import rotation_matrix
 from astra_data.worlds.plane.mazes import Maze
 from astra_data.worlds.simulators import add_walls, share_out, views, wall_geoms
@@ -54,7 +40,7 @@ def nao_model(maze: Maze | None = None, *, ball: bool = False) -> mujoco.MjModel
 
 TICKS = 16  # per control step
 FALLEN_COSINE = 0.7  # a robot has fallen when the cosine between its up axis and the vertical is below this (45°)
-MOTORS = len(TO_MOTORS)
+MOTORS = len(walk.TO_MOTORS)
 
 _STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART | mujoco.mjtState.mjSTATE_CTRL)
 # Ankles among the motors: pitch, roll; left, right.
@@ -65,7 +51,13 @@ class BatchedBodies:
     """B bodies of one model; one that has fallen stays as it is until its reset."""
 
     def __init__(
-        self, model: mujoco.MjModel, traits: Traits, *, longest_delay_ticks: int, style: WalkStyle, num_threads: int
+        self,
+        model: mujoco.MjModel,
+        traits: walk.Traits,
+        *,
+        longest_delay_ticks: int,
+        style: walk.WalkStyle,
+        num_threads: int,
     ) -> None:
         self.model = model
         self.traits = traits
@@ -101,7 +93,7 @@ class BatchedBodies:
         for part in (self.waited, self.tilting, self.gyro, self.pressure, self.fallen, self.touching):
             part[rows] = 0
 
-    def step(self, rows: NDArray[np.intp], targets: Targets, noise: Floats) -> NDArray[np.intp]:
+    def step(self, rows: NDArray[np.intp], targets: walk.Targets, noise: Floats) -> NDArray[np.intp]:
         """Run `rows` (n,) through one control step; return how many ticks of the targets were followed, (B,) int."""
         self.touching[rows] = False
         rows = rows[~self.fallen[rows]]
@@ -113,7 +105,7 @@ class BatchedBodies:
         return followed
 
     def _step_rows(
-        self, targets: Targets, noise: Floats, followed: NDArray[np.intp], thread: int, rows: Iterator[int]
+        self, targets: walk.Targets, noise: Floats, followed: NDArray[np.intp], thread: int, rows: Iterator[int]
     ) -> None:
         model, data, traits = self._models[thread], self._data[thread], self.traits
         floor = model.geom("floor").id
@@ -126,9 +118,9 @@ class BatchedBodies:
             mujoco.mj_getState(model, data, self.state[row], _STATE)
             self.pressure[row] = data.sensordata
 
-    def _walk(self, model: mujoco.MjModel, data: mujoco.MjData, row: int, targets: Targets, noise: Floats) -> int:
+    def _walk(self, model: mujoco.MjModel, data: mujoco.MjData, row: int, targets: walk.Targets, noise: Floats) -> int:
         style, sent, rates, step = self.style, self.sent[row], data.qvel[3:6], mujoco.mj_step
-        planned = (targets.angles[row] + self.traits.joint_offset_rad[row])[:, TO_MOTORS]
+        planned = (targets.angles[row] + self.traits.joint_offset_rad[row])[:, walk.TO_MOTORS]
         supports, lifts_off = targets.supports[row].tolist(), targets.lifts_off[row].tolist()
         first = sent.shape[0] - TICKS
         arrived = first - int(self.traits.delay_ticks[row])
@@ -174,7 +166,7 @@ class BatchedBodies:
         return bool((walls[:, ::-1] & self._robot_geoms[geoms]).any())
 
 
-CONTROL_STEP_S = TICKS * TICK_S
+CONTROL_STEP_S = TICKS * walk.TICK_S
 _BALL = 7 + MOTORS
 _MIDDLE_M = 0.03  # either foot may kick a ball that is less far to the side: the torso sways as far from step to step
 
@@ -189,18 +181,18 @@ class BatchedNao:
         seed: int,
         maze: Maze | None = None,
         ball: bool = False,
-        spread: TraitSpread | None = None,
+        spread: walk.TraitSpread | None = None,
         num_threads: int | None = None,
     ) -> None:
         self.num_robots = num_robots
-        self.spread = spread or TraitSpread()
+        self.spread = spread or walk.TraitSpread()
         self.has_ball = ball
-        self._limits, style = WalkLimits(), WalkStyle()
+        self._limits, style = walk.WalkLimits(), walk.WalkStyle()
         self._seed, self._steps = seed, 0
         rng = np.random.default_rng(seed)
-        self.traits = Traits.draw(self.spread, num_robots, rng)
-        self.gait = Gait.standing(num_robots, self._limits)
-        self._engine = WalkEngine(StepPlanner(self.traits.quality, self._limits), style)
+        self.traits = walk.Traits.draw(self.spread, num_robots, rng)
+        self.gait = walk.Gait.standing(num_robots, self._limits)
+        self._engine = walk.WalkEngine(walk.StepPlanner(self.traits.quality, self._limits), style)
         self.bodies = BatchedBodies(
             nao_model(maze, ball=ball),
             self.traits,
@@ -214,21 +206,21 @@ class BatchedNao:
         self, rows: NDArray[np.intp], poses: Floats, rng: np.random.Generator, ball: Floats | None = None
     ) -> None:
         """Set robots upright at `poses` (n, 3), with new traits, and balls at `ball` (n, 2), by default 1 m ahead."""
-        put_rows(self.traits, rows, Traits.draw(self.spread, len(rows), rng))
-        standing = Gait.standing(len(rows), self._limits)
-        put_rows(self.gait, rows, standing)
-        angles = leg_angles(self._engine.feet(standing))
+        walk.put_rows(self.traits, rows, walk.Traits.draw(self.spread, len(rows), rng))
+        standing = walk.Gait.standing(len(rows), self._limits)
+        walk.put_rows(self.gait, rows, standing)
+        angles = walk.leg_angles(self._engine.feet(standing))
         x, y, yaw = poses.T
         qpos = np.tile(self.bodies.model.qpos0, (len(rows), 1))
         qpos[:, 0], qpos[:, 1] = x, y
-        qpos[:, 2] = self._engine.style.hip_height_m + HIP_OFFSET_Z_M
+        qpos[:, 2] = self._engine.style.hip_height_m + walk.HIP_OFFSET_Z_M
         qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
-        qpos[:, 7:_BALL] = angles[:, TO_MOTORS]
+        qpos[:, 7:_BALL] = angles[:, walk.TO_MOTORS]
         if self.has_ball:
             ahead = np.stack([x + np.cos(yaw), y + np.sin(yaw)], axis=1)
             qpos[:, _BALL : _BALL + 2] = ahead if ball is None else ball
             qpos[:, _BALL + 2] = BALL_RADIUS_M
-        self.bodies.reset(rows, qpos, (angles + self.traits.joint_offset_rad[rows])[:, TO_MOTORS])
+        self.bodies.reset(rows, qpos, (angles + self.traits.joint_offset_rad[rows])[:, walk.TO_MOTORS])
 
     def step(self, command: Floats, active: Bools | None = None, kick: Bools | None = None) -> None:
         """Walk for 0.192 s at `command` (B, 3), m/s ahead and left, rad/s; who is to `kick` does in its next swing."""

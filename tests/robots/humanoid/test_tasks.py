@@ -24,32 +24,13 @@ from astra_data.pipeline.stages.evaluate import EvaluateConfig, evaluate
 from astra_data.pipeline.stages.pair import PairConfig, pair
 from astra_data.pipeline.stages.train import train
 from astra_data.policies.train import PpoTrainConfig
+from astra_data.robots.humanoid import target as humanoid
+from astra_data.robots.humanoid import tasks
 from astra_data.robots.humanoid.simulators import (
     HumanoidExtendedKinematics,
     HumanoidKinematics,
     HumanoidWalker2d,
     walker_model,
-)
-from astra_data.robots.humanoid.target import (
-    COMMANDED,
-    FEET,
-    STANDING,
-    TIMESTEP_S,
-    CommandRanges,
-    HumanoidEnv,
-    Locomotion,
-    humanoid_model,
-)
-from astra_data.robots.humanoid.tasks import (
-    EXTENDED,
-    KINEMATICS,
-    WALKER2D,
-    JointWalking,
-    MassWalking,
-    PlanarWalking,
-    VariedHumanoid,
-    Walking,
-    photograph,
 )
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.task import Task
@@ -58,21 +39,21 @@ from astra_data.worlds.variation import JointVariation, VariedSimulator
 NOTHING = torch.zeros(3, 0)
 
 
-def made(kind: type[Walking]) -> Walking:
+def made(kind: type[tasks.Walking]) -> tasks.Walking:
     return kind(horizon=5)
 
 
 @pytest.mark.parametrize(
-    ("kind", "bias", "scatter", "early"), [(PlanarWalking, 0.1, 0.8, 0.0), (MassWalking, 0.03, 0.05, 4.0)]
+    ("kind", "bias", "scatter", "early"), [(tasks.PlanarWalking, 0.1, 0.8, 0.0), (tasks.MassWalking, 0.03, 0.05, 4.0)]
 )
 def test_pay_and_falls_are_the_targets_but_for_costs(
-    kind: type[Walking], bias: float, scatter: float, early: float
+    kind: type[tasks.Walking], bias: float, scatter: float, early: float
 ) -> None:
     """Of what the humanoid does under random commands; `early`: steps by which falls are told too early.
 
     `scatter` is of the steps after which it looks along x, as it is paid there and as simulators take it to.
     """
-    env = HumanoidEnv(Locomotion(effort_cost=0.0, contact_cost=0.0), 32, seed=0, num_threads=1)
+    env = humanoid.HumanoidEnv(humanoid.Locomotion(effort_cost=0.0, contact_cost=0.0), 32, seed=0, num_threads=1)
     env.reset()
     generator = torch.Generator().manual_seed(0)
     objective, alive = made(kind), torch.ones(32, dtype=torch.bool)
@@ -99,7 +80,7 @@ def test_pay_and_falls_are_the_targets_but_for_costs(
 
 
 def test_the_walkers_mass_moves_as_mujoco_says() -> None:
-    objective, model = PlanarWalking(horizon=5), walker_model()
+    objective, model = tasks.PlanarWalking(horizon=5), walker_model()
     data = mujoco.MjData(model)
     generator = np.random.default_rng(0)
     data.qpos[1:], data.qvel[:] = [1.4, 0.3, -0.4, -1.0, 0.2, -0.5], generator.normal(size=7)
@@ -111,21 +92,21 @@ def test_the_walkers_mass_moves_as_mujoco_says() -> None:
 
 
 def test_joints_are_paid_for_the_way_of_the_torso_over_the_lower_foot() -> None:
-    objective, model = JointWalking(horizon=5), humanoid_model()
+    objective, model = tasks.JointWalking(horizon=5), humanoid.humanoid_model()
     data = mujoco.MjData(model)
     # The left knee is drawn up, so that the right foot is the lower one; then both hips turn.
     poses = np.zeros((2, 17))
-    poses[:, COMMANDED[1]] = -1.0
-    poses[1, [COMMANDED[0], COMMANDED[2]]] = 0.02, 0.1
+    poses[:, humanoid.COMMANDED[1]] = -1.0
+    poses[1, [humanoid.COMMANDED[0], humanoid.COMMANDED[2]]] = 0.02, 0.1
     feet = []
     for pose in poses:
-        data.qpos[:] = STANDING[:24]
+        data.qpos[:] = humanoid.STANDING[:24]
         data.qpos[7:] = pose
         mujoco.mj_forward(model, data)
-        feet.append([data.geom(name).xpos.copy() for name in FEET])
+        feet.append([data.geom(name).xpos.copy() for name in humanoid.FEET])
     (left, right), (_, later) = feet
     assert right[2] < left[2]
-    velocity = (right[0] - later[0]) / TIMESTEP_S
+    velocity = (right[0] - later[0]) / humanoid.TIMESTEP_S
     before, after = torch.zeros(2, 1, 34)
     before[0, :17], after[0, :17] = torch.from_numpy(poses).float()
     reward = objective.reward(before, after, NOTHING[:1], torch.zeros(1, dtype=torch.bool))
@@ -140,7 +121,7 @@ ACTION = torch.tensor([[-0.5, -0.2, 0.4, 0.1]])
 
 def moving(kind: Kind, count: int) -> Tensor:
     """Return states (count, X) of humanoids under random commands."""
-    env = HumanoidEnv(Locomotion(), count, seed=0, num_threads=1)
+    env = humanoid.HumanoidEnv(humanoid.Locomotion(), count, seed=0, num_threads=1)
     env.reset()
     generator = torch.Generator().manual_seed(0)
     for _ in range(20):
@@ -148,8 +129,8 @@ def moving(kind: Kind, count: int) -> Tensor:
     return kind.abstraction(env.state)
 
 
-def varied(kind: Kind, state: Tensor, variation: JointVariation) -> VariedHumanoid:
-    simulator = VariedHumanoid(kind(len(state)), variation)
+def varied(kind: Kind, state: Tensor, variation: JointVariation) -> tasks.VariedHumanoid:
+    simulator = tasks.VariedHumanoid(kind(len(state)), variation)
     simulator.reset_to(state)
     return simulator
 
@@ -196,8 +177,8 @@ def test_friction_and_timestep_change_how_far_joints_get(kind: Kind) -> None:
     state = kind(1).state.repeat(2, 1)
     simulator = varied(kind, state, JointVariation(friction=(2.0, 2.0), timestep_scale=(1.5, 1.5)))
     landed = simulator.step(ACTION.expand(2, 4))[0]
-    targets = CommandRanges().targets(ACTION[0]).tolist()
-    for joint, target, damping in zip(COMMANDED, targets, [5.0, 1.0, 5.0, 1.0], strict=True):
+    targets = humanoid.CommandRanges().targets(ACTION[0]).tolist()
+    for joint, target, damping in zip(humanoid.COMMANDED, targets, [5.0, 1.0, 5.0, 1.0], strict=True):
         rate = 200 / (10 + 2 * damping)
         left = math.exp(-rate * 1.5 * 0.015)
         assert float(landed[joint]) == pytest.approx(target * (1 - left), abs=1e-5)
@@ -219,7 +200,7 @@ def test_walkers_have_the_damping_and_the_time_that_they_were_given() -> None:
         model.opt.timestep *= simulator.parameters[row, simulator.variation.names.index("timestep_scale")]
         data = mujoco.MjData(model)
         data.qpos[1:], data.qvel[:] = state[row, :6].numpy(), state[row, 6:13].numpy()
-        data.ctrl[:] = CommandRanges().targets(ACTION[0].double()).numpy()
+        data.ctrl[:] = humanoid.CommandRanges().targets(ACTION[0].double()).numpy()
         mujoco.mj_step(model, data, 5)
         assert data.time == pytest.approx(0.015 * scale[row])
         landed = torch.tensor([*data.qpos[1:], *data.qvel]).float()
@@ -233,11 +214,11 @@ def skin(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def test_the_camera_follows_who_walks_and_sees_who_lies() -> None:
-    states = np.tile(np.array(STANDING), (3, 1))
+    states = np.tile(np.array(humanoid.STANDING), (3, 1))
     states[1, 0] = 5.0
     states[2, [2, *range(3, 7)]] = 0.1, *(0.5**0.5 * np.array([1.0, 0.0, 1.0, 0.0]))
     try:
-        pictures = photograph(states, height=120, width=120)
+        pictures = tasks.photograph(states, height=120, width=120)
     except BadInputError as error:
         pytest.skip(str(error))
     assert pictures.shape == (3, 120, 120, 3)
@@ -255,10 +236,10 @@ def test_without_opengl_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr("gymnasium.envs.mujoco.mujoco_rendering.OffScreenViewer", none)
     with pytest.raises(BadInputError, match=r"OpenGL that works without a window.*no libEGL.*MUJOCO_GL"):
-        photograph(np.array([STANDING]))
+        tasks.photograph(np.array([humanoid.STANDING]))
 
 
-HUMANOID_TASKS = (WALKER2D, KINEMATICS, EXTENDED)
+HUMANOID_TASKS = (tasks.WALKER2D, tasks.KINEMATICS, tasks.EXTENDED)
 
 
 LASTING = "humanoid-short"
@@ -269,7 +250,7 @@ HORIZON = 12
 @pytest.mark.parametrize("task", HUMANOID_TASKS, ids=lambda task: task.name)
 def test_phi_and_what_is_beyond_it_lose_only_the_place(task: Task) -> None:
     generator = torch.Generator().manual_seed(0)
-    state = torch.tensor(STANDING) + 0.03 * torch.randn(47, generator=generator)
+    state = torch.tensor(humanoid.STANDING) + 0.03 * torch.randn(47, generator=generator)
     state[3:7] = functional.normalize(torch.tensor([0.9, 0.2, 0.3, 0.1]), dim=0)
     changed = state + 1e-2 * torch.eye(47)
     changed[:, 3:7] = functional.normalize(changed[:, 3:7], dim=-1)

@@ -7,21 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Floats
+from astra_data.robots.nao import walk as legs
 from astra_data.robots.nao.kicking import BALL_RADIUS_M
 from astra_data.robots.nao.robot import MOTORS, SUBSTEPS, TICKS, BatchedBodies, BatchedNao, nao_model
-from astra_data.robots.nao.walk import (
-    HIP_OFFSET_Z_M,
-    IDENTICAL,
-    TO_MOTORS,
-    Gait,
-    StepPlanner,
-    Targets,
-    Traits,
-    WalkEngine,
-    WalkLimits,
-    WalkStyle,
-    leg_angles,
-)
 from astra_data.worlds.plane.mazes import U_MAZE
 
 LEG = ("HipYawPitch", "HipRoll", "HipPitch", "KneePitch", "AnklePitch", "AnkleRoll")
@@ -74,25 +62,29 @@ def test_shanks_and_feet_touch_the_ball_and_the_chest_does_not(part: str) -> Non
     assert (part in touched) == (part != "chest")
 
 
-STYLE = WalkStyle(gyro_gain=(0.0, 0.0))
-STANDING = leg_angles(WalkEngine(StepPlanner(np.ones(1)), STYLE).feet(Gait.standing(1, WalkLimits())))[0]
+STYLE = legs.WalkStyle(gyro_gain=(0.0, 0.0))
+STANDING = legs.leg_angles(
+    legs.WalkEngine(legs.StepPlanner(np.ones(1)), STYLE).feet(legs.Gait.standing(1, legs.WalkLimits()))
+)[0]
 FIRST = 3  # the longest delay: so many angles are under way when a control step begins
 
 
-def bodies(count: int = 1, *, height_m: float = 0.0, style: WalkStyle = STYLE, **traits: NDArray[Any]) -> BatchedBodies:
-    drawn = replace(Traits.draw(IDENTICAL, count, np.random.default_rng(0)), **traits)
+def bodies(
+    count: int = 1, *, height_m: float = 0.0, style: legs.WalkStyle = STYLE, **traits: NDArray[Any]
+) -> BatchedBodies:
+    drawn = replace(legs.Traits.draw(legs.IDENTICAL, count, np.random.default_rng(0)), **traits)
     made = BatchedBodies(nao_model(), drawn, longest_delay_ticks=FIRST, style=style, num_threads=1)
     qpos = np.tile(made.model.qpos0, (count, 1))
-    qpos[:, 2] = STYLE.hip_height_m + HIP_OFFSET_Z_M + height_m
-    qpos[:, 7 : 7 + MOTORS] = STANDING[TO_MOTORS]
-    made.reset(np.arange(count), qpos, np.tile(STANDING[TO_MOTORS], (count, 1)))
+    qpos[:, 2] = STYLE.hip_height_m + legs.HIP_OFFSET_Z_M + height_m
+    qpos[:, 7 : 7 + MOTORS] = STANDING[legs.TO_MOTORS]
+    made.reset(np.arange(count), qpos, np.tile(STANDING[legs.TO_MOTORS], (count, 1)))
     return made
 
 
-def targets(count: int = 1, *, carries: tuple[bool, bool] = (False, False), lifts_off: int = 0) -> Targets:
+def targets(count: int = 1, *, carries: tuple[bool, bool] = (False, False), lifts_off: int = 0) -> legs.Targets:
     """Return the standing posture for one control step, changing by 1 mrad per tick."""
     ramp = 1e-3 * np.arange(1, TICKS + 1)[:, None]
-    return Targets(
+    return legs.Targets(
         angles=np.tile(STANDING + ramp, (count, 1, 1)),
         supports=np.tile(np.array(carries), (count, TICKS, 1)),
         lifts_off=np.full((count, TICKS), lifts_off),
@@ -108,10 +100,10 @@ def test_angles_arrive_after_their_delay() -> None:
     robots = bodies(3, delay_ticks=np.array([0, 2, 3]))
     followed = robots.step(np.arange(3), targets(3), noise(3))
     assert followed.tolist() == [TICKS] * 3
-    expected = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+    expected = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, legs.TO_MOTORS]
     for row in range(3):
         np.testing.assert_allclose(robots.sent[row, FIRST:], expected)
-        np.testing.assert_array_equal(robots.sent[row, :FIRST], np.tile(STANDING[TO_MOTORS], (FIRST, 1)))
+        np.testing.assert_array_equal(robots.sent[row, :FIRST], np.tile(STANDING[legs.TO_MOTORS], (FIRST, 1)))
     # What the servos held in the last tick is the end of a saved state.
     controls = robots.state[:, -MOTORS:]
     for row, delay in enumerate((0, 2, 3)):
@@ -133,9 +125,9 @@ def test_one_control_step_is_mujocos_own_with_each_robots_floor_and_servos() -> 
         data = mujoco.MjData(model)
         data.qpos[:] = before[row]
         mujoco.mj_forward(model, data)
-        angles = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+        angles = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, legs.TO_MOTORS]
         for tick in range(TICKS):
-            data.ctrl[:] = angles[tick - 2] if tick >= 2 else STANDING[TO_MOTORS]
+            data.ctrl[:] = angles[tick - 2] if tick >= 2 else STANDING[legs.TO_MOTORS]
             mujoco.mj_step(model, data, SUBSTEPS)
         np.testing.assert_allclose(robots.qpos[row], data.qpos, atol=1e-9)
         np.testing.assert_allclose(robots.pressure[row], data.sensordata, atol=1e-6)
@@ -148,7 +140,7 @@ def test_the_ankles_that_carry_push_against_the_measured_rates() -> None:
     measured = noise()
     measured[0, 0] = [0.4, 0.8, 0.0]  # roll and pitch rate in the first tick only
     robots.step(np.array([0]), targets(carries=(True, False)), measured)
-    planned = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, TO_MOTORS]
+    planned = (STANDING + 1e-3 * np.arange(1, TICKS + 1)[:, None])[:, legs.TO_MOTORS]
     added = robots.sent[0, FIRST:] - planned
     assert added[0, [4, 5]] == pytest.approx([0.1 * 0.4, 0.2 * 0.2], abs=2e-3)
     # Half of a filtered rate lasts to the next tick.
@@ -205,7 +197,7 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads() -> None:
     "command", [(0.2, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.15, 0.0), (0.0, 0.0, 0.8)]
 )
 def test_it_walks_as_told(command: tuple[float, float, float]) -> None:
-    nao = BatchedNao(1, seed=0, spread=IDENTICAL, num_threads=1)
+    nao = BatchedNao(1, seed=0, spread=legs.IDENTICAL, num_threads=1)
     poses = []
     for _ in range(25):
         nao.step(np.array([command]))
@@ -234,7 +226,7 @@ def test_a_lean_to_the_right_and_one_ahead_are_positive_and_tilts_see_no_heading
 
 def test_walls_are_felt_and_stop_it() -> None:
     # The wall's face is at x = -6; the robot's toes are 0.1 m ahead of it.
-    nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=IDENTICAL, num_threads=1)
+    nao = BatchedNao(2, seed=0, maze=U_MAZE, spread=legs.IDENTICAL, num_threads=1)
     nao.reset(np.arange(2), np.array([[-5.7, 4.0, np.pi], [-4.0, 4.0, np.pi]]), np.random.default_rng(0))
     felt = np.zeros(2, dtype=bool)
     for _ in range(15):
@@ -259,7 +251,7 @@ def test_a_fallen_robot_is_told_and_stays_until_its_reset() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 def test_balls_are_kicked_by_the_foot_on_their_side_wherever_the_robot_looks(side: int) -> None:
     yaw = np.array([0.0, 1.5, 3.0, -1.5])
-    nao = BatchedNao(4, seed=0, ball=True, spread=IDENTICAL, num_threads=1)
+    nao = BatchedNao(4, seed=0, ball=True, spread=legs.IDENTICAL, num_threads=1)
     ball = np.exp(1j * yaw) * (0.3 + 0.06j * side)
     nao.reset(
         np.arange(4),

@@ -4,25 +4,9 @@ import pytest
 from nao_values import foot_poses
 
 from astra_data.core.arrays import Floats
-from astra_data.robots.nao.walk import (
-    GRAVITY,
-    HIP_OFFSET_Y_M,
-    HIP_OFFSET_Z_M,
-    START,
-    STOP,
-    STRIDE,
-    TICK_S,
-    Gait,
-    StepPlanner,
-    Traits,
-    TraitSpread,
-    WalkEngine,
-    WalkLimits,
-    WalkStyle,
-    leg_angles,
-)
+from astra_data.robots.nao import walk
 
-STANDING_Z_M = -0.230 - HIP_OFFSET_Z_M
+STANDING_Z_M = -0.230 - walk.HIP_OFFSET_Z_M
 
 
 def random_poses(count: int) -> Floats:
@@ -31,7 +15,7 @@ def random_poses(count: int) -> Floats:
     middle = np.array([0.0, 0.0, STANDING_Z_M + 0.02, 0.0, 0.0, 0.0])
     reach = np.array([0.06, 0.04, 0.015, 0.15, 0.15, 0.4])
     poses = middle + reach * rng.uniform(-1, 1, (count, 2, 6))
-    poses[..., 1] += np.array([HIP_OFFSET_Y_M, -HIP_OFFSET_Y_M])
+    poses[..., 1] += np.array([walk.HIP_OFFSET_Y_M, -walk.HIP_OFFSET_Y_M])
     return np.asarray(poses)
 
 
@@ -45,7 +29,7 @@ def normal(pose: Floats) -> Floats:
 
 def test_angles_bring_the_feet_where_they_should_be() -> None:
     poses = random_poses(500)
-    reached = foot_poses(leg_angles(poses))
+    reached = foot_poses(walk.leg_angles(poses))
     np.testing.assert_allclose(reached[..., :3], poses[..., :3], atol=1e-9)
     for found, wanted in zip(reached.reshape(-1, 6), poses.reshape(-1, 6), strict=True):
         np.testing.assert_allclose(normal(found), normal(wanted), atol=1e-9)
@@ -55,14 +39,14 @@ def test_feet_turned_against_each_other_reach_their_yaw() -> None:
     # What one motor can do: mirror images.
     poses = random_poses(200)
     poses[:, 1] = poses[:, 0] * [1, -1, 1, -1, 1, -1]
-    np.testing.assert_allclose(foot_poses(leg_angles(poses)), poses, atol=1e-9)
+    np.testing.assert_allclose(foot_poses(walk.leg_angles(poses)), poses, atol=1e-9)
 
 
 def test_each_trait_has_its_own_range() -> None:
-    spread = TraitSpread(
+    spread = walk.TraitSpread(
         joint_offset_deg=2.0, stiffness_loss=0.4, delay_ticks=(1, 4), friction=(0.2, 0.3), quality=(0.5, 0.6)
     )
-    traits = Traits.draw(spread, 4000, np.random.default_rng(0))
+    traits = walk.Traits.draw(spread, 4000, np.random.default_rng(0))
     assert np.degrees(traits.joint_offset_rad).std() == pytest.approx(2.0, rel=0.02)
     assert np.degrees(traits.joint_offset_rad).mean() == pytest.approx(0.0, abs=0.05)
     for values, low, high in ((traits.stiffness, 0.6, 1.0), (traits.friction, 0.2, 0.3), (traits.quality, 0.5, 0.6)):
@@ -71,25 +55,25 @@ def test_each_trait_has_its_own_range() -> None:
     assert np.unique(traits.delay_ticks).tolist() == [1, 2, 3, 4]
 
 
-LIMITS = WalkLimits()
+LIMITS = walk.WalkLimits()
 
 
-def planner(*quality: float) -> StepPlanner:
-    return StepPlanner(np.array(quality))
+def planner(*quality: float) -> walk.StepPlanner:
+    return walk.StepPlanner(np.array(quality))
 
 
 def one(*command: float) -> Floats:
     return np.array([command])
 
 
-def strides(command: Floats, seconds: float, gait: Gait | None = None) -> list[Gait]:
+def strides(command: Floats, seconds: float, gait: walk.Gait | None = None) -> list[walk.Gait]:
     """Return the gait at the begin of each stride."""
-    gait = gait or Gait.standing(1, LIMITS)
+    gait = gait or walk.Gait.standing(1, LIMITS)
     seen = []
-    for _ in range(round(seconds / TICK_S)):
-        begins = planner(1.0).advance(gait, command, TICK_S)
-        if begins[0] and gait.kind[0] == STRIDE:
-            seen.append(Gait(**{name: value.copy() for name, value in vars(gait).items()}))
+    for _ in range(round(seconds / walk.TICK_S)):
+        begins = planner(1.0).advance(gait, command, walk.TICK_S)
+        if begins[0] and gait.kind[0] == walk.STRIDE:
+            seen.append(walk.Gait(**{name: value.copy() for name, value in vars(gait).items()}))
     return seen
 
 
@@ -141,26 +125,26 @@ def test_a_turn_is_split_between_wide_and_narrow_steps() -> None:
 
 
 def test_walking_begins_and_ends_with_a_shift_of_weight() -> None:
-    gait, kinds = Gait.standing(1, LIMITS), []
+    gait, kinds = walk.Gait.standing(1, LIMITS), []
     for tick in range(200):
         command = one(0.1, 0, 0) if tick < 100 else one(0, 0, 0)
-        if planner(1.0).advance(gait, command, TICK_S)[0]:
+        if planner(1.0).advance(gait, command, walk.TICK_S)[0]:
             kinds.append(int(gait.kind[0]))
-    assert kinds[0] == START and kinds[-1] == STOP and set(kinds[1:-1]) == {STRIDE}
+    assert kinds[0] == walk.START and kinds[-1] == walk.STOP and set(kinds[1:-1]) == {walk.STRIDE}
     assert not gait.walking[0] and (gait.after == 0).all()
 
 
-STYLE = WalkStyle(step_scale=(1.0, 1.0, 1.0))
+STYLE = walk.WalkStyle(step_scale=(1.0, 1.0, 1.0))
 
 
-def engine(count: int = 1, style: WalkStyle = STYLE) -> WalkEngine:
-    return WalkEngine(StepPlanner(np.ones(count), LIMITS), style)
+def engine(count: int = 1, style: walk.WalkStyle = STYLE) -> walk.WalkEngine:
+    return walk.WalkEngine(walk.StepPlanner(np.ones(count), LIMITS), style)
 
 
-def striding(**changes: object) -> Gait:
+def striding(**changes: object) -> walk.Gait:
     """Return a robot amid a stride of its left foot, straight on by 4 cm from step to step."""
-    gait = Gait.standing(1, LIMITS)
-    gait.walking[:], gait.kind[:], gait.left_swings[:] = True, STRIDE, True
+    gait = walk.Gait.standing(1, LIMITS)
+    gait.walking[:], gait.kind[:], gait.left_swings[:] = True, walk.STRIDE, True
     gait.before[:], gait.after[:] = [[0.04, 0.0, 0.0]], [[0.04, 0.0, 0.0]]
     for name, value in changes.items():
         getattr(gait, name)[:] = value
@@ -184,7 +168,7 @@ def test_the_supporting_foot_moves_back_evenly_and_the_swinging_one_comes_forwar
 
 
 def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
-    rate = np.sqrt(GRAVITY / STYLE.pendulum_m)
+    rate = np.sqrt(walk.GRAVITY / STYLE.pendulum_m)
     duration, dt = LIMITS.step_s, 1e-3
     phases = (np.array([-1, 0, 1])[:, None] * dt + np.linspace(0.1, 0.9, 9) * duration) / duration
 
@@ -202,11 +186,11 @@ def test_the_torso_sways_as_a_pendulum_on_the_supporting_foot() -> None:
 
 def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
     command = np.array([[0.2, 0.0, 0.0]])
-    walking, again = Gait.standing(1, LIMITS), Gait.standing(1, LIMITS)
+    walking, again = walk.Gait.standing(1, LIMITS), walk.Gait.standing(1, LIMITS)
     targets = engine().advance(walking, command, 40)
     assert targets.angles.shape == (1, 40, 11) and len(targets.gaits) == 41
     for tick in range(40):
-        engine().planner.advance(again, command, TICK_S)
+        engine().planner.advance(again, command, walk.TICK_S)
         np.testing.assert_allclose(
             foot_poses(targets.angles[0, tick])[:, :5], engine().feet(again)[0][:, :5], atol=1e-9
         )
@@ -219,9 +203,9 @@ def test_targets_are_the_angles_of_the_planned_feet_tick_by_tick() -> None:
 
 def test_a_kick_waits_for_the_foot_that_is_asked_for_and_keeps_the_robot_stepping() -> None:
     for asked, swings_left in (([True, False], True), ([False, True], False)):
-        gait = Gait.standing(1, LIMITS)
+        gait = walk.Gait.standing(1, LIMITS)
         targets = engine().advance(gait, np.zeros((1, 3)), 120, np.array([asked]))
         kicking = [bool(gait.left_swings[0]) for gait in targets.gaits if gait.kicking[0]]
         assert kicking and set(kicking) == {swings_left}
-    still = engine().advance(Gait.standing(1, LIMITS), np.zeros((1, 3)), 120, np.array([[False, False]]))
+    still = engine().advance(walk.Gait.standing(1, LIMITS), np.zeros((1, 3)), 120, np.array([[False, False]]))
     assert not any(gait.walking[0] for gait in still.gaits)
