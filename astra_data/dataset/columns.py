@@ -162,8 +162,7 @@ OUTCOME_COLUMNS = (
     Column(TRUNCATED, "bool", meaning="time ran out"),
     Column(DONE, "bool", meaning="terminated or truncated"),
     Column(SUCCESS, "bool", meaning="the goal is reached after the step"),
-)
-"""The outcome of a step, in every collected dataset."""
+)  # the outcome of a step, in every collected dataset
 
 
 @dataclass(frozen=True, repr=False, eq=False)

@@ -1,7 +1,7 @@
 """The contents of a dataset: everything but the values of its columns."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
@@ -37,26 +37,17 @@ class Contents:
     """The metadata of a dataset of E episodes."""
 
     root: Path
-    info: dict[str, Any]
-    """meta/info.json."""
-    description: dict[str, Any]
-    """meta/astra/dataset.json."""
-    metadata: dict[str, list[Scalar | None]]
-    """Key to one value per episode, None where one has none."""
-    uids: Ints
-    """(E,)."""
-    lengths: Ints
-    """Steps of each episode, (E,)."""
-    order: list[int]
-    """The permutation of episode indices whose prefixes are the nested subsets."""
+    info: dict[str, Any]  # meta/info.json
+    description: dict[str, Any]  # meta/astra/dataset.json
+    metadata: dict[str, list[Scalar | None]]  # key to one value per episode, None where one has none
+    uids: Ints  # (E,)
+    lengths: Ints  # steps of each episode, (E,)
+    order: list[int]  # the permutation of episode indices whose prefixes are the nested subsets
     subset_seed: int
     task: str
-    paths: list[Path]
-    """The data files in order."""
-    file_starts: Ints
-    """First row of each file."""
-    recorded: RecordedFiles | None = None
-    """Where LeRobot recorded it, how its rows are converted."""
+    paths: list[Path]  # the data files in order
+    file_starts: Ints  # first row of each file
+    recorded: RecordedFiles | None = None  # where LeRobot recorded it, how its rows are converted
 
     @cached_property
     def starts(self) -> Ints:
@@ -88,23 +79,32 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
     lengths, chunks, files = (to_numpy(tables.column(name), 1, "int64") for name in _LOCATION)
     metadata = pa.concat_tables(read_blocks([root / layout.METADATA_PATH])).to_pydict()
     del metadata["length"]
-    uids = np.array(metadata.pop("episode_uid"), dtype=np.int64)
+    uids = metadata.pop("episode_uid")
     rows: dict[Path, int] = {}
     for chunk, file, length in zip(chunks.tolist(), files.tolist(), lengths.tolist(), strict=True):
         path = root / info["data_path"].format(chunk_index=chunk, file_index=file)
         rows[path] = rows.get(path, 0) + length
-    if faults := list(_file_faults(root, [PlainColumn(c.name, c.dtype, c.size) for c in columns], rows)):
-        raise CorruptDatasetError("; ".join(faults))
+    faults = [f"{path.relative_to(root)} does not belong to it" for path in sorted({*data_files(root)} - {*rows})]
+    for path, expected in rows.items():
+        name, footer = path.relative_to(root), read_footer(path)
+        if isinstance(footer, str):
+            faults.append(f"{name} {footer}")
+            continue
+        faults += [f"{name} has {footer[0]} rows, expected {expected}"] if footer[0] != expected else []
+        stored = [PlainColumn(column.name, column.dtype, column.size) for column in columns]
+        faults += [f"{name} {fault}" for fault in schema_faults(footer[1], stored)]
     tasks = read_tasks(root)
     if isinstance(tasks, str) or 0 not in tasks:
-        raise CorruptDatasetError(f"{layout.TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
-    position = {uid: episode for episode, uid in enumerate(uids.tolist())}
+        faults.append(f"{layout.TASKS_PATH} {tasks if isinstance(tasks, str) else 'has no task 0'}")
+    if faults:
+        raise CorruptDatasetError("; ".join(faults))
+    position = {uid: episode for episode, uid in enumerate(uids)}
     return Contents(
         root=root,
         info=info,
         description=description,
         metadata=metadata,
-        uids=uids,
+        uids=np.array(uids, dtype=np.int64),
         lengths=lengths,
         order=[position[uid] for uid in subsets["uids"]],
         subset_seed=int(subsets["seed"]),
@@ -112,21 +112,6 @@ def _parsed(root: Path, description: dict[str, Any]) -> Contents:
         paths=list(rows),
         file_starts=np.cumsum([0, *rows.values()])[:-1],
     )
-
-
-def _file_faults(root: Path, columns: Sequence[PlainColumn], rows: Mapping[Path, int]) -> Iterator[str]:
-    """Compare the footers of the data files with the columns and with the number of rows of each."""
-    for path in sorted(set(data_files(root)) - set(rows)):
-        yield f"{path.relative_to(root)} does not belong to it"
-    for path, expected in rows.items():
-        name, footer = path.relative_to(root), read_footer(path)
-        if isinstance(footer, str):
-            yield f"{name} {footer}"
-            continue
-        found, schema = footer
-        if found != expected:
-            yield f"{name} has {found} rows, expected {expected}"
-        yield from (f"{name} {fault}" for fault in schema_faults(schema, columns))
 
 
 def read_values(

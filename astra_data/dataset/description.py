@@ -139,8 +139,7 @@ SEALED = (
     layout.METADATA_PATH,
     layout.SUBSETS_PATH,
     layout.DIGESTS_PATH,
-)
-"""The files with a sum, beside the description and those of meta/episodes."""
+)  # the files with a sum, beside the description and those of meta/episodes
 
 
 def digest_of(values: Array) -> int:

@@ -1,5 +1,6 @@
 """New versions of a dataset with other episodes: subset, delete, filter and merge; nothing is edited in place."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -65,11 +66,11 @@ def subset(
             f"to {len(source)}. Episodes are never repeated: collect or augment more, or give a smaller --of."
         )
     chosen = source.subset_seed if seed is None else seed
-    strata = _strata(source, stratify, chosen) if stratify else {}
-    order = _stratified(source, stratify, strata, chosen) if stratify else permutation(_uids(source), chosen)
-    config = {"episodes": count, "percent": percent, "of": of, "seed": chosen} | (
-        {"stratify": stratify, "strata": strata} if stratify else {}
-    )
+    config: dict[str, Any] = {"episodes": count, "percent": percent, "of": of, "seed": chosen}
+    order = permutation(_uids(source), chosen)
+    if stratify:
+        order, strata = _stratified(source, stratify, chosen)
+        config |= {"stratify": stratify, "strata": strata}
     return _write(source, set(order[:count]), stage="subset", config=config, name=name, out=out, seed=chosen)
 
 
@@ -193,19 +194,17 @@ def _write(
 
 def _tasks(source: Dataset) -> list[str]:
     """Return the tasks of its episodes, which have their own where there are several."""
-    own = [source.task if task is None else str(task) for task in source.metadata.get("task", [])]
-    return list(dict.fromkeys(own)) or [source.task]
+    tasks = [source.task if task is None else str(task) for task in source.metadata.get("task", [])]
+    return list(dict.fromkeys(tasks)) or [source.task]
 
 
 def _uids(source: Dataset) -> list[int]:
-    uids: list[int] = source.uids.tolist()
-    return uids
+    return [int(uid) for uid in source.uids]
 
 
 def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
     if key == "length":
-        lengths: list[Scalar | None] = source.lengths.tolist()
-        return lengths
+        return [int(length) for length in source.lengths]
     if key == "success" and (successes := source.successes()) is not None:
         return successes
     if key not in source.metadata:
@@ -216,30 +215,23 @@ def _facts(source: Dataset, key: str) -> Sequence[Scalar | None]:
     return source.metadata[key]
 
 
-def _strata(source: Dataset, key: str, seed: int) -> dict[str, int]:
-    """Count the episodes per value of `key`; a subset stratified likewise hands on its own counts, not its shares."""
-    config = source.description["config"]
-    if (config.get("stratify"), config.get("seed")) == (key, seed):
-        return dict(config["strata"])
-    values = [str(value) for value in _facts(source, key)]
-    return {value: values.count(value) for value in sorted(set(values))}
-
-
-def _stratified(source: Dataset, key: str, strata: Mapping[str, int], seed: int) -> list[int]:
-    """Order the uids so that every prefix has its share of each stratum; within one, by the permutation."""
+def _stratified(source: Dataset, key: str, seed: int) -> tuple[list[int], dict[str, int]]:
+    """Order the uids so that every prefix has its share of each stratum; return the episodes per stratum, too."""
+    # A subset stratified likewise hands on its own counts, not its rounded shares.
     stratum = dict(zip(_uids(source), map(str, _facts(source, key)), strict=True))
-    ranks = dict.fromkeys(strata, 0)
-    place = {}
-    for uid in permutation(_uids(source), seed):
+    strata, config = dict(sorted(Counter(stratum.values()).items())), source.description["config"]
+    if (config.get("stratify"), config.get("seed")) == (key, seed):
+        strata = dict(config["strata"])
+    place, ranks = dict[int, float](), dict.fromkeys(strata, 0)
+    for uid in permutation(stratum, seed):
         place[uid] = (ranks[stratum[uid]] + 0.5) / strata[stratum[uid]]
         ranks[stratum[uid]] += 1
-    return sorted(place, key=lambda uid: place[uid])
+    return sorted(place, key=lambda uid: place[uid]), strata
 
 
 def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, int]]:
     """Return, for each of `sources`, its episodes' new uids by their old ones."""
-    known = {uid for source in sources for uid in _uids(source)}
-    taken: set[int] = set()
+    known, taken = {uid for source in sources for uid in _uids(source)}, set[int]()
     names: list[dict[int, int]] = []
     for source in sources:
         origin, named = f"{source.content_hash} ".encode(), dict[int, int]()
@@ -248,11 +240,8 @@ def _merged_uids(sources: Sequence[Dataset], new_uids: bool) -> list[dict[int, i
             known.add(named[uid])
             taken.add(named[uid])
         names.append(named)
-    repeated = [uid for named in names for uid, name in named.items() if uid != name]
+    repeated = sorted(uid for named in names for uid, name in named.items() if uid != name)
     if repeated and not new_uids:
-        raise BadInputError(
-            f"{len(repeated)} episodes have the uid of an earlier one "
-            f"({first_few(sorted(repeated), MOST_UIDS)}): "
-            "leave them out, or give them new ones with --new-uids"
-        )
+        which = f"{len(repeated)} episodes have the uid of an earlier one ({first_few(repeated, MOST_UIDS)})"
+        raise BadInputError(f"{which}: leave them out, or give them new ones with --new-uids")
     return names

@@ -33,8 +33,7 @@ from astra_data.dataset.lerobot_rows import (
 from astra_data.dataset.parquet import read_blocks
 from astra_data.dataset.rounding import Roundings
 
-MOST_FAULTS = 8
-"""Faults that a message lists."""
+MOST_FAULTS = 8  # faults that a message lists
 _log = logging.getLogger(__name__)
 
 

@@ -16,8 +16,7 @@ from astra_data.dataset.description import Digests
 from astra_data.dataset.format import DEFAULT_COLUMNS, INFO_PATH, reserved_values
 from astra_data.dataset.plain import MOST_FPS, PlainColumn, Run, plain_columns
 
-RECORDED_TASK = "recorded.task_index"
-"""(T,) int64: LeRobot's task_index, where there are several tasks."""
+RECORDED_TASK = "recorded.task_index"  # (T,) int64: LeRobot's task_index, where there are several tasks
 ENDS = (names.TERMINATED, names.TRUNCATED)
 FLOATS = (names.STATE, names.NEXT_STATE, names.GOAL, names.ACTION, names.REWARD)
 _OUTCOME_FLAGS = (*ENDS, names.DONE, names.SUCCESS)
@@ -26,16 +25,14 @@ DERIVED_FLAGS = (
     Column(names.TRUNCATED, "bool", meaning="the recording of the episode ends"),
     Column(names.DONE, "bool", meaning="terminated or truncated"),
 )
-DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}
-"""Ours, by the kind of the stored values."""
+DTYPES = {"f": "float32", "i": "int64", "u": "int64", "b": "bool"}  # ours, by the kind of the stored values
 
 
 @dataclass(frozen=True)
 class Rows:
     """How rows of an episode in the files become rows of ours."""
 
-    stored: Mapping[str, PlainColumn]
-    """The columns of numbers in the files."""
+    stored: Mapping[str, PlainColumn]  # the columns of numbers in the files
     fps: int
 
     @property
@@ -83,11 +80,9 @@ class RecordedFiles:
     """What is known of the files of a recording, and of the E episodes in them that have steps."""
 
     rows: Rows
-    first_rows: Ints
-    """The row of the files in which each episode begins, (E,)."""
+    first_rows: Ints  # the row of the files in which each episode begins, (E,)
     total_rows: int
-    digests: Digests
-    """Those of the values when the recording was opened."""
+    digests: Digests  # those of the values when the recording was opened
 
 
 def lacking(recorded: Iterable[Column]) -> list[str]:

@@ -31,8 +31,7 @@ _FORMAT_2 = {
     "tasks": "meta/tasks.jsonl",
     "episodes": "meta/episodes.jsonl",
     "data": "data/chunk-{:03d}/episode_{:06d}.parquet",
-}
-"""Files of LeRobot's formats 2.0 and 2.1: one of the data for each episode."""
+}  # files of LeRobot's formats 2.0 and 2.1: one of the data for each episode
 PLAIN_STATISTICS = ("min", "max", "mean", "std", "count")  # those that every file of the format has of every column
 _MOST_ROWS = 10**12
 _MOST_BYTES = 2**28  # of a file of metadata in JSON

@@ -100,18 +100,15 @@ class Dataset(Contents):
         order.
 
         Raises:
-            BadInputError: a column or an episode does not exist, or an episode is listed twice.
             CorruptDatasetError: a file cannot be read, or values differ from their digests.
         """
-        chosen = self.selected(episodes)
-        rows = int(self.lengths[chosen].sum())
-        specs = self.specs(names)
-        out = {c.name: np.empty((rows, c.size) if c.size > 1 else rows, c.dtype) for c in specs}
-        row = 0
+        rows, row = int(self.lengths[self.selected(episodes)].sum()), 0
+        out = {c.name: np.empty((rows, c.size) if c.size > 1 else rows, c.dtype) for c in self.specs(names)}
         for block in self.blocks(names, episodes):
+            end = row + len(next(iter(block.values())))
             for name, values in block.items():
-                out[name][row : row + len(values)] = values
-            row += len(next(iter(block.values()), ()))
+                out[name][row:end] = values
+            row = end
         return out
 
     def blocks(self, names: Sequence[str], episodes: Collection[int] | None = None) -> Iterator[dict[str, Array]]:
@@ -124,11 +121,8 @@ class Dataset(Contents):
         if episodes is None:
             return np.arange(len(self))
         chosen, counts = np.unique(np.array(list(episodes), dtype=np.int64), return_counts=True)
-        faults = [
-            f"has no episode {episode}, expected 0 to {len(self) - 1}"
-            for episode in chosen
-            if not 0 <= episode < len(self)
-        ]
+        outside = chosen[(chosen < 0) | (chosen >= len(self))]
+        faults = [f"has no episode {episode}, expected 0 to {len(self) - 1}" for episode in outside]
         faults += [f"episode {episode} is listed twice" for episode in chosen[counts > 1]]
         faults += [] if len(chosen) else ["no episodes are listed"]
         if faults:
@@ -138,10 +132,7 @@ class Dataset(Contents):
     def episodes(
         self, names: Sequence[str] | None = None, episodes: Collection[int] | None = None
     ) -> Iterator[Episode]:
-        """Yield episodes in order with the columns `names`, by default `schema`; memory stays bounded.
-
-        `episodes` and errors are those of `columns`.
-        """
+        """Yield `episodes` in order with the columns `names`, by default `schema`; memory stays bounded."""
         specs = self.schema if names is None else self.specs(names)
         for block, indices in self._verified(specs, self.selected(episodes)):
             for episode, columns in self._split(block, indices):
@@ -150,14 +141,9 @@ class Dataset(Contents):
                 yield Episode(int(self.uids[episode]), columns, known)
 
     def successes(self) -> list[bool | None] | None:
-        """Return whether each episode succeeded, None where unknown; None if unknown of all.
-
-        Taken from the episodes' metadata or, where some episode has none, from the column next.success.
-        """
-        known = [
-            None if value is None or isinstance(value, str) else bool(value)
-            for value in self.metadata.get("success", [None])
-        ]
+        """Return whether each episode succeeded, by metadata or next.success; None where or if it is unknown."""
+        stored = self.metadata.get("success", [None])
+        known = [None if value is None or isinstance(value, str) else bool(value) for value in stored]
         if None in known and SUCCESS in self.features:
             return [bool(episode.columns[SUCCESS].any()) for episode in self.episodes([SUCCESS])]
         return None if set(known) == {None} else known
@@ -193,8 +179,8 @@ class Dataset(Contents):
     def to_huggingface(self) -> "datasets.Dataset":
         """Return the rows as a `datasets.Dataset` in memory, once all values are verified."""
         self.require_whole()
-        library = optional("datasets")
-        rows: datasets.Dataset = library.Dataset(pa.concat_tables(map(pq.read_table, data_files(self.root))))
+        table = pa.concat_tables(map(pq.read_table, data_files(self.root)))
+        rows: datasets.Dataset = optional("datasets").Dataset(table)
         return rows
 
     def to_lerobot(self, **options: Any) -> "LeRobotDataset":
@@ -241,25 +227,27 @@ class Dataset(Contents):
         """Return the columns `names`."""
         if isinstance(names, str):
             raise BadInputError(f"expected a list of columns, got the text '{names}': write ['{names}']")
-        unknown = [name for name in names if name not in self.features]
-        if unknown:
-            known = ", ".join(self.features)
-            raise BadInputError(f"{self.reference} has no column {', '.join(unknown)}; it has {known}.")
+        if unknown := ", ".join(name for name in names if name not in self.features):
+            raise BadInputError(f"{self.reference} has no column {unknown}; it has {', '.join(self.features)}.")
         return [Column.from_feature(name, self.features[name]) for name in names]
 
 
 def refuse_others(root: Path) -> None:
     """Raise BadInputError where `root` holds no dataset, versions of one, or one of another format."""
     refuse_versions(root)
-    if fault := format_fault(root):
-        raise BadInputError(fault)
-    if not (root / "meta").is_dir():
+    fault = format_fault(root)
+    if not fault and not (root / "meta").is_dir():
         refuse_run(root)
-        if logs := sorted(path.name for path in root.glob("*.[cC][sS][vV]")):
-            advice = "make them a dataset with `astra-data import` and a mapping, which `astra-data new` writes"
-            raise BadInputError(f"{root} contains logs ({logs[0]} and so on): {advice}")
-        advice = "check the path (`astra-data list` shows where names are) or run the stage that writes it."
-        raise BadInputError(f"{root}: found no dataset; {advice}")
+        logs = sorted(path.name for path in root.glob("*.[cC][sS][vV]"))
+        fault = (
+            f"{root} contains logs ({logs[0]} and so on): make them a dataset with `astra-data import` and a "
+            "mapping, which `astra-data new` writes"
+            if logs
+            else f"{root}: found no dataset; check the path (`astra-data list` shows where names are) or run the "
+            "stage that writes it."
+        )
+    if fault:
+        raise BadInputError(fault)
 
 
 def format_fault(root: Path) -> str | None:
@@ -300,22 +288,16 @@ def explained(root: Path) -> Iterator[None]:
         fault = f"{error} is missing in its metadata" if isinstance(error, KeyError) else error
         others = " or run the stage that wrote it again"
         if can_be_repaired(root):
-            others = (
-                ", run the stage that wrote it again, or recover its intact episodes: "
-                f"`astra-data repair {root} --out FOLDER`"
-            )
-        raise CorruptDatasetError(
-            f"{root} is incomplete or was altered: {fault}. Restore it from a copy{others}."
-        ) from error
+            repair = f"`astra-data repair {root} --out FOLDER`"
+            others = f", run the stage that wrote it again, or recover its intact episodes: {repair}"
+        advice = f"Restore it from a copy{others}."
+        raise CorruptDatasetError(f"{root} is incomplete or was altered: {fault}. {advice}") from error
 
 
 def can_be_repaired(root: Path) -> bool:
     """Return whether columns and rate of the dataset in `root` are known, without which no value is."""
     info = read_object(root / INFO_PATH)
-    if isinstance(info, str):
-        return False
     try:
-        declared_columns(root, info)
+        return not isinstance(info, str) and bool(declared_columns(root, info))
     except CorruptDatasetError:
         return False
-    return True

@@ -65,13 +65,13 @@ class Version:
 
     def next(self, change: Change, taken: Iterable["Version"] = ()) -> "Version":
         """Return the version after `change`, greater than all of `taken` that it could collide with."""
+        every = [self, *taken]
         if change == "columns":
-            return Version(max([self.major, *(version.major for version in taken)]) + 1, 0, 0)
-        alike = [version for version in (self, *taken) if version.major == self.major]
+            return Version(max(every).major + 1, 0, 0)
         if change == "episodes":
-            return Version(self.major, max(version.minor for version in alike) + 1, 0)
-        patches = [version.patch for version in alike if version.minor == self.minor]
-        return Version(self.major, self.minor, max(patches) + 1)
+            return Version(self.major, max(one.minor for one in every if one.major == self.major) + 1, 0)
+        alike = [one.patch for one in every if (one.major, one.minor) == (self.major, self.minor)]
+        return Version(self.major, self.minor, max(alike) + 1)
 
 
 def home() -> Path:
@@ -151,17 +151,14 @@ def successor(
         parents: the identities of further parents.
         more: keys of the description that differ from those of `source`.
     """
-    kept = {key: source[key] for key in ("name", "seeds", "environment", "simulator")}
-    taken = versions_at_home(name or source["name"]) if out is None else []
-    version = Version.parse(source["version"])
-    if name in (None, source["name"]):
-        version = version.next(change, taken)
-    else:
-        kept["name"] = name
-        version = taken[-1].next(change, taken) if taken else Version(1, 0, 0)
+    kept = {key: source[key] for key in ("seeds", "environment", "simulator")}
+    name = name or source["name"]
+    taken = versions_at_home(name) if out is None else []
+    before = Version.parse(source["version"]) if name == source["name"] else max(taken, default=None)
+    version = before.next(change, taken) if before else Version(1, 0, 0)
     identities = [identity_of(source), *parents]
-    changed = {"version": str(version), "stage": stage, "config": dict(config), "parents": identities}
-    description = {**kept, **changed, **more}
+    made = {"name": name, "version": str(version), "stage": stage, "config": dict(config), "parents": identities}
+    description = {**made, **kept, **more}
     return description, home_of(description) if out is None else out
 
 

@@ -34,16 +34,11 @@ from astra_data.dataset.reader import Dataset, format_fault, refuse_run, refuse_
 from astra_data.dataset.statistics import episode_statistics, side_by_side
 
 _META_FILES = (*SEALED, layout.DATASET_PATH, layout.POLICY_PATH)
-MOST = 5
-"""Findings of one kind that are shown; further ones are only counted."""
-ESTIMATED = 1e-3
-"""Relative tolerance of LeRobot's statistics, which are summed in float32."""
-_SUMS = 3e-5
-"""Error of its means of values and of squares, relative to the largest one; std is their difference."""
-WINDOWS = 32
-"""Number of windows compared with lerobot's, spread evenly over the dataset."""
-OFFSETS = np.array([-2, -1, 0, 1])
-"""Steps of a window, relative to its row."""
+MOST = 5  # findings of one kind that are shown; further ones are only counted
+ESTIMATED = 1e-3  # relative tolerance of LeRobot's statistics, which are summed in float32
+_SUMS = 3e-5  # error of its means of values and of squares, relative to the largest one; std is their difference
+WINDOWS = 32  # number of windows compared with lerobot's, spread evenly over the dataset
+OFFSETS = np.array([-2, -1, 0, 1])  # steps of a window, relative to its row
 
 
 @dataclass
@@ -221,8 +216,7 @@ class EpisodeChecks:
     digests: Digests
     report: Report
     tasks: Mapping[int, str] = field(default_factory=dict)
-    total: dict[str, Floats] = field(default_factory=dict)
-    """The statistics of all rows so far."""
+    total: dict[str, Floats] = field(default_factory=dict)  # the statistics of all rows so far
 
     def run(self) -> None:
         """Check every episode, and what is counted over all of them."""

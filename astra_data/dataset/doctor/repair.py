@@ -37,8 +37,7 @@ _IF_ALTERED = {
     layout.TASKS_PATH: "the task may be wrong",
     layout.METADATA_PATH: _LOST,
     layout.SUBSETS_PATH: "the order of the subsets is that of seed 0",
-}
-"""What follows for the new dataset; statistics are rebuilt, and digests have notes of their own."""
+}  # what follows for the new dataset; statistics are rebuilt, and digests have notes of their own
 
 
 @dataclass
@@ -146,22 +145,16 @@ def repair(
 class Remains:
     """What is known of a damaged dataset before its episodes are read; empty is what cannot be relied on."""
 
-    info: Mapping[str, Any]
-    """meta/info.json."""
-    columns: Sequence[PlainColumn]
-    """The columns of numbers in its files."""
-    specs: Sequence[Column]
-    """Those of the new dataset."""
+    info: Mapping[str, Any]  # meta/info.json
+    columns: Sequence[PlainColumn]  # the columns of numbers in its files
+    specs: Sequence[Column]  # those of the new dataset
     fps: int
     tasks: Mapping[int, str]
-    rows: Rows | None
-    """How its rows become ours, where LeRobot recorded it without next states; otherwise None."""
+    rows: Rows | None  # how its rows become ours, where LeRobot recorded it without next states; otherwise None
     subset_seed: int
-    old: Mapping[str, Any] = field(default_factory=dict)
-    """Its own description."""
+    old: Mapping[str, Any] = field(default_factory=dict)  # its own description
     digests: Digests = field(default_factory=dict)
-    metadata: Mapping[int, dict[str, Scalar]] = field(default_factory=dict)
-    """The episodes' metadata by uid."""
+    metadata: Mapping[int, dict[str, Scalar]] = field(default_factory=dict)  # the episodes' metadata by uid
 
     def values(self, run: Run, uid: int) -> dict[str, Array]:
         """Return the columns of an episode; the writer refuses what is too large for its type."""
@@ -185,8 +178,7 @@ class Joined(NamedTuple):
 
     uid: int
     metadata: dict[str, Scalar]
-    is_known: bool
-    """Whether one of the datasets has it."""
+    is_known: bool  # whether one of the datasets has it
 
 
 def join(

@@ -22,10 +22,8 @@ from astra_data.dataset.parquet import UNREADABLE
 _DICTIONARY, _DATA_V2 = 2, 3
 _FIELDS = {0: (5, 2), _DICTIONARY: (7, 2), _DATA_V2: (8, 4)}
 """Of each kind of page, the field of its header with the details, and the field of these with the encoding."""
-_FIXED_WIDTH = (0, 9)
-"""Encodings PLAIN and BYTE_STREAM_SPLIT."""
-_HEADER = 1000
-"""Upper bound of a page header in bytes, including the extremes of its values."""
+_FIXED_WIDTH = (0, 9)  # encodings PLAIN and BYTE_STREAM_SPLIT
+_HEADER = 1000  # upper bound of a page header in bytes, including the extremes of its values
 _SNAPPY, _ZSTD, _ZSTD_MAGIC = 1, 6, b"\x28\xb5\x2f\xfd"
 TRUE, FALSE, BYTE, I16, I32, I64 = range(1, 7)
 BINARY, LIST, STRUCT = 8, 9, 12
@@ -174,8 +172,7 @@ class _Page(NamedTuple):
     end: int
     unpacked: int
     kind: int
-    values: int
-    """0 of a dictionary."""
+    values: int  # 0 of a dictionary
     encoding: int
     is_zstd: bool
 
