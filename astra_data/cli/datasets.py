@@ -147,7 +147,7 @@ def inspect(
     from rich.console import Console
 
     from astra_data.cli.inspection_page import inspection_page
-    from astra_data.dataset.checkup.checkup import check_up
+    from astra_data.dataset.checkup import check_up
     from astra_data.dataset.inspection import inspect_dataset
     from astra_data.dataset.versions import open_dataset
 

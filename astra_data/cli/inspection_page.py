@@ -9,7 +9,7 @@ from rich.text import Text
 
 from astra_data.core.arrays import Ints
 from astra_data.core.naming import printable
-from astra_data.dataset.checkup.checkup import Checkup
+from astra_data.dataset.checkup import Checkup
 from astra_data.dataset.inspection import BINS, Inspection, Map, Spread
 
 _BARS = " ▁▂▃▄▅▆▇█"

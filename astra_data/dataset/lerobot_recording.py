@@ -31,7 +31,7 @@ from astra_data.dataset.lerobot_rows import (
     robot_of,
 )
 from astra_data.dataset.parquet import read_blocks
-from astra_data.dataset.rounding import Roundings
+from astra_data.dataset.statistics import Roundings
 
 MOST_FAULTS = 8  # faults that a message lists
 _log = logging.getLogger(__name__)

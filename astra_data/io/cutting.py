@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.errors import BadInputError
 from astra_data.core.naming import first_few
-from astra_data.dataset.checkup.findings import Clock, full_turns, shortest
+from astra_data.dataset.checkup import Clock, full_turns, shortest
 from astra_data.dataset.columns import (
     DONE,
     NEXT_STATE,
@@ -28,7 +28,7 @@ from astra_data.dataset.columns import (
 )
 from astra_data.dataset.inspection import Endings, is_terminated
 from astra_data.dataset.lerobot_rows import DERIVED_FLAGS, next_state_of
-from astra_data.dataset.rounding import Rounding
+from astra_data.dataset.statistics import Rounding
 from astra_data.io.mapping import MAPPED_FLAGS, ColumnMapping, ImportMapping
 from astra_data.io.recording import Block
 

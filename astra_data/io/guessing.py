@@ -18,7 +18,7 @@ from pyarrow import csv
 
 from astra_data.core.arrays import Floats
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.checkup.findings import ANGLE, LARGEST, is_angle
+from astra_data.dataset.checkup import ANGLE, LARGEST, is_angle
 from astra_data.dataset.columns import ACTION, GOAL, STATE, SUCCESS, TERMINATED, TIMESTAMP
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
 from astra_data.io.cutting import RATE_TOLERANCE

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from astra_data.core.errors import BadInputError
-from astra_data.dataset.checkup.findings import GAP
+from astra_data.dataset.checkup import GAP
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.io.cutting import RATE_TOLERANCE
 from astra_data.io.mapping import ImportMapping

@@ -6,8 +6,7 @@ import pytest
 from rich.console import Console
 
 from astra_data.cli.inspection_page import inspection_page
-from astra_data.dataset.checkup.checkup import Checkup
-from astra_data.dataset.checkup.findings import Finding
+from astra_data.dataset.checkup import Checkup, Finding
 from astra_data.dataset.columns import Column
 from astra_data.dataset.inspection import BINS, Endings, Inspection, Map, Spread
 

@@ -27,7 +27,7 @@ from astra_data.dataset.lerobot_rows import (
 )
 from astra_data.dataset.plain import PlainColumn, Run, is_format_2, read_object, read_small_table, read_tasks
 from astra_data.dataset.reader import Dataset, refuse_run, refuse_versions
-from astra_data.dataset.rounding import Roundings
+from astra_data.dataset.statistics import Roundings
 from astra_data.dataset.versions import successor
 from astra_data.dataset.writer import DatasetWriter
 

@@ -12,7 +12,7 @@ from astra_data.core.durable import make_folder, refuse_existing
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, silent
 from astra_data.core.seeding import generator
-from astra_data.dataset.checkup.findings import continuity
+from astra_data.dataset.checkup import continuity
 from astra_data.dataset.columns import (
     DONE,
     GOAL,

@@ -12,7 +12,7 @@ from astra_data.core.arrays import as_column, as_rows
 from astra_data.core.config import Config, NotNegative
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress, Stopwatch, silent
-from astra_data.dataset.checkup.findings import LARGEST, TURNS, is_angle
+from astra_data.dataset.checkup import LARGEST, TURNS, is_angle
 from astra_data.dataset.columns import (
     ABSTRACT_NEXT_STATE,
     ABSTRACT_SIMULATED_NEXT_STATE,
