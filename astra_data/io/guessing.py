@@ -1,14 +1,11 @@
-"""What the fields of a new robot's logs are, guessed from their names and values; a person checks it.
-
-Logs are CSV files, or the episodes of a dataset.
-"""
+"""What the fields of a new robot's logs are, guessed from their names and values; a person checks it."""
 
 import io
 import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import batched, pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -29,8 +26,8 @@ Role = Literal["time", "episode", "state", "command", "goal", "failure", "succes
 TURNED = "heading|yaw|theta|psi|compass|course|cog|azimuth|hdg"
 HEADING = re.compile(rf"(.+_)?({TURNED})")
 EPISODE = re.compile(r"(ep(isode)?|trial|drive|run|rollout|traj(ectory)?|flight|lap|session|bag)(_?(id|index|nr))?")
-CLOCK = r"time|timestamps?|stamp|clock|utc|epoch|uptime|[mun]?secs?|seconds"
-TIME, STAMP = re.compile(rf"t|(.+_)?({CLOCK})"), re.compile(rf"t|(.+_)?({CLOCK})(_.+|\d+)?")
+CLOCK = r"t|(.+_)?(time|timestamps?|stamp|clock|utc|epoch|uptime|[mun]?secs?|seconds)"
+TIME, STAMP = re.compile(CLOCK), re.compile(rf"{CLOCK}(_.+|\d+)?")
 """Names of a log's time, and of times of topics too, such as stamp_motors; they never go back."""
 COUNT = re.compile(r"(frame|row|step|seq|sample)(_?(id|index|nr))?|index|idx|id|(.+_)?n(ano)?secs?")
 FLAGS: dict[Role, str] = {
@@ -41,9 +38,11 @@ FLAGS: dict[Role, str] = {
 UNCLEAR = re.compile(r"done|ended|truncated|timeout")
 """Ends of which the name does not tell whether they are successes, failures or neither."""
 COMMANDED = "cmd|command|action|act|ctrl|control|setpoint|sp|desired|des|target|ref"
-COMMAND = re.compile(rf"(.+_)?({COMMANDED})(_.+|\d+)?|u(_.+|\d+)?")
 COMMAND_WORD = re.compile(rf"(^|_)({COMMANDED}|u)(_|(?=\d)|$)")
-TORQUE, FORCE = (re.compile(rf"(.+_)?({words})(_.+|\d+)?") for words in ("tau|torque|effort|moment", "force|thrust"))
+COMMAND, TORQUE, FORCE = (
+    re.compile(rf"{words}(_.+|\d+)?")
+    for words in (rf"((.+_)?({COMMANDED})|u)", "(.+_)?(tau|torque|effort|moment)", "(.+_)?(force|thrust)")
+)
 PEDAL = re.compile(r"throttle|brake|steer(ing)?(_angle)?")
 NO_PLACE = f"{TURNED}|quat|orient|vel|twist|linear|angular|speed|acc|rate|force|torque|moment"
 PLACE = re.compile(rf"(?!.*({NO_PLACE}))(.+_)?(p|pos)?(?P<axis>[xyz]|east(ing)?|north(ing)?|up|alt(itude)?|depth)")
@@ -58,37 +57,25 @@ METERS_PER_DEGREE = 111_195.0
 """Along a meridian of a sphere with Earth's mean radius, 6371 km."""
 _DEGREE = math.pi / 180
 _UNITS = {
-    "m/s": "mm_s 1e-3 cm_s 1e-2 m_s 1 m_per_s 1 mps 1 mph 0.44704 knots 0.514444 "
-    f"km_h {1 / 3.6} kmh {1 / 3.6} kph {1 / 3.6}",
+    "m/s": f"mm_s 1e-3 cm_s 1e-2 m_s 1 m_per_s 1 mps 1 mph 0.44704 knots 0.514444 km_h {1 / 3.6} kmh {1 / 3.6} kph {1 / 3.6}",
     "rad/s": f"deg_s {_DEGREE} deg_per_s {_DEGREE} dps {_DEGREE} rpm {math.pi / 30} rad_s 1 rad_per_s 1",
     "m/s²": "m_s2 1 mps2 1",
     "rad/s²": f"deg_s2 {_DEGREE} rad_s2 1",
     "m": "mm 1e-3 cm 1e-2 km 1e3 m 1",
     "rad": f"deg {_DEGREE} degrees {_DEGREE} rad 1",
-    "N m": "nm 1",
-    "N": "n 1",
-    "V": "v 1",
-    "A": "a 1",
-}
-UNITS = {
-    ending: (unit, float(scale))
-    for unit, endings in _UNITS.items()
-    for ending, scale in zip(*[iter(endings.split())] * 2, strict=True)
-}
+} | {"N m": "nm 1", "N": "n 1", "V": "v 1", "A": "a 1"}
+UNITS = {end: (unit, float(scale)) for unit, ends in _UNITS.items() for end, scale in batched(ends.split(), 2)}
 """Endings of names, the unit that values are stored in, and the factor to it."""
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MOST_END_ROWS = 10
 """Rows at the end of a log for which a flag that ends it may be set."""
-
-
-RATE_HZ = 10
+RATE_HZ = 10.0
 """Assumed rate of logs without a time."""
 MOSTLY = 0.9
 """Share of a field's rows with a number above which the others are faults."""
 _EVEN = 0.005
 """Relative error of a rate that counts as a whole number."""
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*|[+-]?(nan|inf)", re.IGNORECASE)
-_ROLES: dict[str, Role] = {STATE: "state", ACTION: "command", GOAL: "goal"}
 
 
 @dataclass(frozen=True)
@@ -138,10 +125,9 @@ class Logs:
     def recorded_rate(self) -> float:
         """Rows per second without gaps and repeated rows; `RATE_HZ` where the logs have no time."""
         for field in self.of("time"):
-            steps = np.concatenate([np.diff(episode[field.name]) for episode in self.episodes])
-            regular = steps[(steps > 0) & (steps <= 5 * np.median(steps))]
-            return 1 / float(regular.mean())
-        return float(RATE_HZ)
+            steps = _steps(self.episodes, field)
+            return 1 / float(steps[(steps > 0) & (steps <= 5 * np.median(steps))].mean())
+        return RATE_HZ
 
     @property
     def rate(self) -> int:
@@ -152,33 +138,33 @@ class Logs:
     def uneven(self) -> str:
         """Why the rate is no whole number, and what to do; empty where it is one within `_EVEN`."""
         error = self.recorded_rate / self.rate - 1
-        if abs(error) < _EVEN:
-            return ""
-        off = f"{abs(error):.1%} too {'long' if error > 0 else 'short'}"
         return (
-            f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is "
-            f"{off}; resample them to {self.rate} rows per second"
+            ""
+            if abs(error) < _EVEN
+            else (
+                f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is {abs(error):.1%} "
+                f"too {'long' if error > 0 else 'short'}; resample them to {self.rate} rows per second"
+            )
         )
 
     @property
     def still(self) -> str:
         """Which commands never change, and the consequence; empty where all do."""
-        fields = self.of("command")
-        given = np.concatenate(self.values(fields)).T
-        named = [f"{f.short} is {v[0]:g}" for f, v in zip(fields, given, strict=True) if not np.ptp(v)]
+        given = np.concatenate(self.values(self.of("command")))
+        named = [f"{f.short} is {v[0]:g}" for f, v in zip(self.of("command"), given.T, strict=True) if not np.ptp(v)]
         what = "it does" if len(named) == 1 else "they do"
         return f"{' and '.join(named)} in all rows: no simulator can learn what {what}" if named else ""
 
 
 def guess(paths: Sequence[Path]) -> Logs:
     """Read CSV logs, files with the same fields or folders of them, and guess what their fields are."""
-    files = [file for path in paths for file in csv_files(path)]
-    sources = [Source(file, None, file) for file in files]
+    sources = [Source(file, None, file) for path in paths for file in csv_files(path)]
     tables = [read_numbers(source) for source in sources]
     filled = [[name for name, values in table.items() if np.isfinite(values).any()] for table in tables]
-    for file, names, table in zip(files, filled, tables, strict=True):
+    first = sources[0].path
+    for source, names, table in zip(sources, filled, tables, strict=True):
         if {*names, *filled[0]} - (table.keys() & tables[0].keys()):
-            raise BadInputError(f"{file}: expected the fields of {files[0]}, {filled[0]}: got {names}")
+            raise BadInputError(f"{source.path}: expected the fields of {first}, {filled[0]}: got {names}")
     raw = [episode for table in tables for episode in _episodes(table)]
     fields: list[Field] = []
     for name in (name for name in tables[0] if all(name in table for table in tables)):
@@ -187,28 +173,26 @@ def guess(paths: Sequence[Path]) -> Logs:
         fields.append(replace(found, short=plain_name(name)) if found.taken_for in taken else found)
     fields = _places(_roles(_times(fields, raw)), raw)
     needed = [field.name for field in fields if field.role in ("time", "state", "command")]
-    gaps = {name: sum(int((~np.isfinite(episode[name])).sum()) for episode in raw) for name in needed}
-    rows = [np.all([np.isfinite(episode[name]) for name in needed], axis=0) for episode in raw]
-    episodes = tuple(
-        {one.name: (episode[one.name] * one.scale + one.offset)[kept] for one in fields}
-        for episode, kept in zip(raw, rows, strict=True)
+    gaps = {name: gap for name in needed if (gap := sum(int((~np.isfinite(one[name])).sum()) for one in raw))}
+    rows = [np.isfinite([one[name] for name in needed]).all(axis=0) for one in raw]
+    scaled = [
+        {field.name: (one[field.name] * field.scale + field.offset)[kept] for field in fields}
+        for one, kept in zip(raw, rows, strict=True)
         if kept.any()
-    )
+    ]
     cut_off = tuple(str(source.path) for source in sources if whole_lines(source, str(source.path))[1])
-    logs = Logs(tuple(fields), episodes, {name: gap for name, gap in gaps.items() if gap}, cut_off)
+    logs = Logs(tuple(fields), tuple(scaled), gaps, cut_off)
     for role, example in (("command", "cmd_v"), ("state", "x")):
         if role not in [field.role for field in fields]:
             listed = ", ".join(f"{field.name} ({field.role})" for field in fields)
-            raise BadInputError(
-                f"{files[0]}: found no {role} among {listed}: name one in the header, such as {example}"
-            )
+            raise BadInputError(f"{first}: found no {role} among {listed}: name one in the header, such as {example}")
     if all(kept.sum() < 2 for kept in rows):
-        cut = [field.name for field in fields if field.role == "episode" or gaps.get(field.name)]
+        cut = [field.name for field in fields if field.role == "episode" or field.name in gaps]
         why = f"look at {' and '.join(cut)}, which cut or lack rows" if cut else "record longer"
-        raise BadInputError(f"{files[0]}: expected episodes of two rows or more, found none: {why}")
+        raise BadInputError(f"{first}: expected episodes of two rows or more, found none: {why}")
     if abs(logs.recorded_rate / logs.rate - 1) > RATE_TOLERANCE:
         raise BadInputError(
-            f"{files[0]}: {logs.of('time')[0].name}: expected rows per second within {RATE_TOLERANCE:.0%} "
+            f"{first}: {logs.of('time')[0].name}: expected rows per second within {RATE_TOLERANCE:.0%} "
             f"of a whole number, as fps is one, got {logs.recorded_rate:.4g}: correct its unit or resample"
         )
     return logs
@@ -224,82 +208,69 @@ def _episodes(table: dict[str, Floats]) -> list[dict[str, Floats]]:
 
 
 def _field(name: str, series: Sequence[Floats]) -> Field:
-    """Return what a field is by itself, of its values (T,) in each episode."""
+    """Return what a field is by itself, of its values (T,) in each episode: the first of these that it can be."""
     plain, values = plain_name(name), np.concatenate(series)
-    finite = np.isfinite(values)
+    finite = values[np.isfinite(values)]
     steps = np.concatenate([np.diff(one[np.isfinite(one)]) for one in series])
+    step = float(np.median(steps)) if len(steps) else 0.0
     clock, time_unit = _without_unit(plain, TIMES)
     body, ending = _without_unit(plain, UNITS)
     if ending in ("n", "v", "a") and re.fullmatch(f"{COMMANDED}|u", body):
         body, ending = plain, None  # an axis, as in cmd_v
-    is_flag, is_constant = bool(np.isin(values, (0, 1)).all()), not finite.any() or not np.ptp(values[finite])
-    role: Role = "left out"
-    why = "its name"
-    if not plain:
-        why = "no letter a to z"
-    elif not finite.any():
-        why = "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"
-    elif (STAMP.fullmatch(clock) or time_unit) and (steps >= 0).all() and (steps > 0).any():
-        step = float(np.median(steps))
+    is_flag, flags = bool(np.isin(values, (0, 1)).all()), [one for one in series if one.any()]
+    ends = all(one[-1] and one[np.argmax(one > 0) :].all() and one.sum() <= MOST_END_ROWS for one in flags)
+    goal = GOAL_NAME.fullmatch(body)
+    is_goal = goal and (goal["axis"] or not is_flag) and not any(map(np.ptp, series))
+    rises = (STAMP.fullmatch(clock) or time_unit) and (steps >= 0).all() and (steps > 0).any()
+    named, lacking = "its name", len(values) - len(finite)
+    roles: list[tuple[object, Role, str]] = [
+        (not plain, "left out", "no letter a to z"),
+        (not finite.size, "left out", "texts, dates or nothing: expected numbers, of a time in s, ms, us or ns"),
+        (rises, "time", "its ending, and it never goes back" if time_unit else f"steps of {step:g}"),
+        (TIME.fullmatch(clock), "left out", "a time that does not rise"),
+        (UNCLEAR.fullmatch(plain), "left out", "an end, but which? name it success or failed"),
+        (EPISODE.fullmatch(plain) and _is_whole(values), "episode", named),
+        (COUNT.fullmatch(plain), "left out", named),
+        *((is_flag and re.fullmatch(words, plain), flag, named) for flag, words in FLAGS.items()),
+        (plain == "reward", "reward", named),
+        (is_goal, "goal", ""),
+        (not np.ptp(finite) if finite.size else True, "left out", "never changes"),
+        (COMMAND.fullmatch(body), "command", ""),
+        (
+            is_flag and ends,
+            "failure",
+            f"0 or 1, and it ends all {len(flags)} of {len(series)} episodes that have a 1 (CHECK)",
+        ),
+        (is_flag, "left out", "0 or 1: name it success or failed if it is an end"),
+        (lacking >= (1 - MOSTLY) * len(values), "left out", f"no number in {lacking} rows"),
+    ]
+    role, why = next(((role, why) for holds, role, why in roles if holds), ("state", ""))
+    if role == "time":
         unit = time_unit or ("s" if step < 1 else "ms" if step < 1e3 else "us" if step < 1e6 else "ns")
-        why = "its ending, and it never goes back" if time_unit else f"steps of {step:g}"
-        return Field(name, "time", plain, unit, TIMES[unit], why)
-    elif TIME.fullmatch(clock):
-        why = "a time that does not rise"
-    elif UNCLEAR.fullmatch(plain):
-        why = "an end, but which? name it success or failed"
-    elif EPISODE.fullmatch(plain) and _is_whole(values):
-        role = "episode"
-    elif COUNT.fullmatch(plain):
-        pass
-    elif is_flag and (flag := next((flag for flag in FLAGS if re.fullmatch(FLAGS[flag], plain)), None)):
-        role = flag
-    elif plain == "reward":
-        role = "reward"
-    elif (
-        (goal := GOAL_NAME.fullmatch(body)) and (goal["axis"] or not is_flag) and not any(np.ptp(one) for one in series)
-    ):
-        return _with_unit(name, "goal", body, ending, values)
-    elif is_constant:
-        why = "never changes"
-    elif COMMAND.fullmatch(body):
-        short = COMMAND_WORD.sub("_", body).strip("_") or "command"
-        return _with_unit(name, "command", short, ending, values)
-    elif is_flag:
-        flags = [one for one in series if one.any()]
-        why = "0 or 1: name it success or failed if it is an end"
-        if all(one[-1] and one[np.argmax(one > 0) :].all() and one.sum() <= MOST_END_ROWS for one in flags):
-            role = "failure"
-            why = f"0 or 1, and it ends all {len(flags)} of {len(series)} episodes that have a 1 (CHECK)"
-    elif finite.mean() <= MOSTLY:
-        why = f"no number in {(~finite).sum()} rows"
-    else:
-        return _with_unit(name, "state", body, ending, values)
-    return Field(name, role, plain, why=why)
-
-
-def _with_unit(name: str, role: Role, short: str, ending: str | None, values: Floats) -> Field:
-    """Return a field with its unit, by the ending of its name, or else by what it is called."""
+        return Field(name, role, plain, unit, TIMES[unit], why)
+    if why:
+        return Field(name, role, plain, why=why)
+    short = COMMAND_WORD.sub("_", body).strip("_") or "command" if role == "command" else body
     short = f"{'u' if role == 'command' else 's'}{short}" if short[0].isdigit() else short
     if ending is not None:
         return Field(name, role, short, *UNITS[ending], "its ending")
-    unit, scale, why = "1", 1.0, "its name"
+    unit, scale = "1", 1.0
     if TORQUE.fullmatch(short) or FORCE.fullmatch(short):
         unit = "N m" if TORQUE.fullmatch(short) else "N"
     elif role != "command" and (ANGLE.fullmatch(short) or HEADING.fullmatch(short)):
-        largest, unit = np.nanmax(np.abs(values)), "rad"
-        scale, why = (_DEGREE, f"an angle up to {largest:.0f}: degrees") if largest > LARGEST else (scale, why)
+        unit, largest = "rad", np.abs(finite).max()
+        scale, named = (_DEGREE, f"an angle up to {largest:.0f}: degrees") if largest > LARGEST else (scale, named)
     elif role != "command" and PLACE.fullmatch(short):
         unit = "m"
-    return Field(name, role, short, unit, scale, why if unit != "1" else "no unit in its name")
+    return Field(name, role, short, unit, scale, named if unit != "1" else "no unit in its name")
 
 
 def _times(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
     """Return the fields with one time, that of the log: the others are times of topics."""
 
     def rank(field: Field) -> tuple[bool, bool]:
-        steps = np.concatenate([np.diff(episode[field.name]) for episode in episodes])
-        return bool((steps > 0).mean() <= MOSTLY), not TIME.fullmatch(_without_unit(field.short, TIMES)[0])
+        rises = bool((_steps(episodes, field) > 0).mean() > MOSTLY)
+        return not rises, not TIME.fullmatch(_without_unit(field.short, TIMES)[0])
 
     times = sorted((field for field in fields if field.role == "time"), key=rank)
     chosen = [field for field in times[:1] if not rank(field)[0]]
@@ -312,10 +283,10 @@ def _roles(fields: Sequence[Field]) -> list[Field]:
     is_commanded = any(field.role == "command" for field in fields)
     found: dict[str, Field] = {}
     for field in sorted(fields, key=lambda field: field.why.endswith("(CHECK)")):
-        if field.role in ("failure", "success", "reward") and field.role in [f.role for f in found.values()]:
-            field = replace(field, role="left out", why=f"a second {field.role}: combine both into one field")
         acts = any(pattern.fullmatch(field.short) for pattern in (TORQUE, FORCE, PEDAL))
-        if acts and field.role == "state" and not is_commanded:
+        if field.role in ("failure", "success", "reward") and field.role in [one.role for one in found.values()]:
+            field = replace(field, role="left out", why=f"a second {field.role}: combine both into one field")
+        elif field.role == "state" and acts and not is_commanded:
             field = replace(field, role="command", why=f"{field.why}, and no other command")
         found[field.name] = field
     return [found[field.name] for field in fields]
@@ -323,27 +294,25 @@ def _roles(fields: Sequence[Field]) -> list[Field]:
 
 def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> list[Field]:
     """Return the fields, with latitude and longitude in m, and with offsets where float32 loses steps."""
-    gps = {field.short: found for field in fields if (found := GPS.fullmatch(field.short))}
-    latitudes = {found["stem"]: short for short, found in gps.items() if found["axis"] == "lat"}
+    gps = {field.name: found for field in fields if (found := GPS.fullmatch(field.short))}
+    latitudes = {found["stem"]: name for name, found in gps.items() if found["axis"] == "lat"}
     pairs = {found["stem"] for found in gps.values() if found["axis"] != "lat"} & latitudes.keys()
     offsets: dict[str, float] = {}
     placed: dict[str, Field] = {}
     for field in sorted(fields, key=lambda field: field.role == "goal"):  # goals take the offsets of states
-        values = np.concatenate([episode[field.name] for episode in episodes])
-        if field.role not in ("state", "goal") or not np.isfinite(values).any():
+        if field.role not in ("state", "goal"):
             continue
+        values = np.concatenate([episode[field.name] for episode in episodes])
         first, largest = float(values[np.isfinite(values)][0]), float(np.nanmax(np.abs(values)))
-        place, at = PLACE.fullmatch(field.short), gps.get(field.short)
+        place, at = PLACE.fullmatch(field.short), gps.get(field.name)
         if at and at["stem"] in pairs:
-            latitude = next(one.name for one in fields if one.short == latitudes[at["stem"]])
             degrees = 1e-7 if largest > 360 else 1.0
-            north = math.radians(float(np.nanmean(episodes[0][latitude])) * degrees)
+            north = math.radians(float(np.nanmean(episodes[0][latitudes[at["stem"]]])) * degrees)
             scale = degrees * METERS_PER_DEGREE * (1.0 if at["axis"] == "lat" else math.cos(north))
             why, offset = "degrees, to m from the first row", offsets.setdefault(at["axis"], -first * scale)
             placed[field.name] = replace(field, unit="m", scale=scale, offset=offset, why=why)
         elif place and field.unit == "m":
-            steps = np.concatenate([np.diff(episode[field.name]) for episode in episodes])
-            steps = np.abs(steps) * field.scale
+            steps = np.abs(_steps(episodes, field)) * field.scale
             step = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.inf
             if field.role == "state" and np.spacing(np.float32(largest * field.scale)) > step / 100:
                 offsets[place["axis"]] = -float(round(first * field.scale))
@@ -353,16 +322,19 @@ def _places(fields: Sequence[Field], episodes: Sequence[dict[str, Floats]]) -> l
     return [placed.get(field.name, field) for field in fields]
 
 
+def _steps(episodes: Sequence[dict[str, Floats]], field: Field) -> Floats:
+    return np.concatenate([np.diff(episode[field.name]) for episode in episodes])
+
+
 def _is_whole(values: Floats) -> bool:
     finite = values[np.isfinite(values)]
     return bool((finite == np.rint(finite)).all())
 
 
 def _without_unit(name: str, endings: Iterable[str]) -> tuple[str, str | None]:
-    for ending in sorted(endings, key=len, reverse=True):
-        if name.endswith(f"_{ending}") and len(name) > len(ending) + 1:
-            return name.removesuffix(f"_{ending}"), ending
-    return name, None
+    found = [ending for ending in endings if re.fullmatch(f".+_{ending}", name)]
+    ending = max(found, key=len, default=None)
+    return (name.removesuffix(f"_{ending}"), ending) if ending else (name, None)
 
 
 def csv_files(place: Path) -> list[Path]:
@@ -377,10 +349,9 @@ def csv_files(place: Path) -> list[Path]:
     refuse_run(place)
     hint = foreign([str(path) for path in inside])
     raise BadInputError(
-        f"{place}: {hint}{'; ' if hint else ''}expected files that end in {' or '.join(SUFFIXES)}, or a "
-        "dataset: make one of other "
-        "recordings with `astra-data import LOGS --mapping FILE` (`astra-data recipes list` shows mappings, "
-        "such as ros2_base), then name it: --from NAME"
+        f"{place}: {hint}{'; ' if hint else ''}expected files that end in {' or '.join(SUFFIXES)}, or a dataset: "
+        "make one of other recordings with `astra-data import LOGS --mapping FILE` (`astra-data recipes list` shows "
+        "mappings, such as ros2_base), then name it: --from NAME"
     )
 
 
@@ -393,58 +364,53 @@ def plain_name(name: str) -> str:
 def read_numbers(source: Source) -> dict[str, Floats]:
     """Return the fields (T,) of a CSV file as numbers; true and false are 1 and 0, texts and dates NaN.
 
-    Equal texts of an episode's name have the same number. A last line that is cut off is left out. Raise
-    BadInputError if it is no CSV, has too few rows, or a field of numbers has a text or is there twice.
+    Equal texts of an episode's name have the same number. A last line that is cut off is left out.
     """
-    delimiter = delimiter_of(source.path.name)
-    with explained(str(source.path), source):
-        content, _ = whole_lines(source, str(source.path))
-        table = csv.read_csv(io.BytesIO(content), parse_options=csv.ParseOptions(delimiter=delimiter))
+    file = str(source.path)
+    with explained(file, source):
+        content, _ = whole_lines(source, file)
+        options = csv.ParseOptions(delimiter=delimiter_of(file))
+        table = csv.read_csv(pa.BufferReader(content), parse_options=options)
     if len(table) < 2:
-        found = f"expected two rows or more below its header, got {len(table)}: leave it out"
-        raise BadInputError(f"{source.path}: {found}")
+        raise BadInputError(f"{file}: expected two rows or more below its header, got {len(table)}: leave it out")
     numbers: dict[str, Floats] = {}
     for name, values in zip(table.column_names, table.columns, strict=True):
         series: Floats = np.full(len(table), np.nan)
         if pa.types.is_string(values.type):
             texts = [text if text and text.strip() else "nan" for text in values.to_pylist()]
-            wrong = [row for row, text in enumerate(texts) if not _NUMBER.fullmatch(text)]
-            series = np.array([float(text) if _NUMBER.fullmatch(text) else math.nan for text in texts])
+            parsed = [float(text) if _NUMBER.fullmatch(text) else None for text in texts]
+            wrong = [row for row, number in enumerate(parsed) if number is None]
             if wrong and len(wrong) < (1 - MOSTLY) * len(texts):
-                where = f"{source.path} line {line_of(source, wrong[0])}: {name}"
+                where = f"{file} line {line_of(source, wrong[0])}: {name}"
                 raise BadInputError(f"{where}: expected a number, got {texts[wrong[0]]!r}")
-            if wrong:
-                series[:] = np.nan
-                if EPISODE.fullmatch(plain_name(name)) and not values.null_count:
-                    series = np.unique(values.to_numpy(), return_inverse=True)[1].astype(np.float64)
-        elif pa.types.is_integer(values.type) or pa.types.is_floating(values.type):
+            if not wrong:
+                series = np.array(parsed, float)
+            elif EPISODE.fullmatch(plain_name(name)) and not values.null_count:
+                series = np.unique(values.to_numpy(), return_inverse=True)[1].astype(float)
+        elif not pa.types.is_temporal(values.type):
             series = np.asarray(values.cast(pa.float64(), safe=False).to_numpy())
-        elif pa.types.is_boolean(values.type):
-            series = np.asarray(values.cast(pa.int8()).cast(pa.float64()).to_numpy())
         if np.isfinite(series).any() and np.isfinite(numbers.get(name, np.nan)).any():
-            raise BadInputError(f"{source.path}: expected a header of different names, got {name} twice")
+            raise BadInputError(f"{file}: expected a header of different names, got {name} twice")
         numbers[name] = series
     if not any(np.isfinite(values).any() for values in numbers.values()):
-        mark = "tabs" if delimiter == "\t" else "commas"
-        raise BadInputError(f"{source.path}: expected rows of numbers separated by {mark} below a header")
+        raise BadInputError(f"{file}: expected rows of numbers below a header")
     return numbers
 
 
 def logs_of(data: Dataset) -> Logs:
     """Return the episodes of `data` as logs: its states, commands and goals by their own names, and failures.
 
-    Raises:
-        BadInputError: it has no states or commands, or a heading that is not in rad, or commands in degrees
-            beside one.
-        CorruptDatasetError: a file cannot be read, or values differ from their digests.
+    Raise BadInputError if a heading is not in rad, or commands beside one are in degrees.
     """
     columns = data.specs([STATE, ACTION, *([GOAL] if GOAL in data.features else [])])
-    fields = []
-    for column in columns:
-        role = _ROLES[column.name]
-        names = column.names or tuple(f"{role[0]}{number}" for number in range(column.size))
-        for name, unit in zip(names, column.units, strict=True):
-            fields.append(Field(f"{column.name} {name}", role, name, unit or "1", why="its column"))
+    roles: tuple[Role, ...] = ("state", "command", "goal")
+    fields = [
+        Field(f"{column.name} {name}", role, name, unit or "1", why="its column")
+        for column, role in zip(columns, roles, strict=False)
+        for name, unit in zip(
+            column.names or [f"{role[0]}{at}" for at in range(column.size)], column.units, strict=True
+        )
+    ]
     ends = [name for name in (TERMINATED, SUCCESS) if name in data.features]
     episodes = []
     for episode in data.episodes([*(column.name for column in columns), *ends]):
@@ -455,8 +421,7 @@ def logs_of(data: Dataset) -> Logs:
         found["failed"] = (episode.columns.get(TERMINATED, success) & ~success).astype(float)
         episodes.append(found)
     headings = [field for field in fields if field.role != "command" and HEADING.fullmatch(field.plain)]
-    turning = [*headings, *(field for field in fields if field.role == "command" and headings)]
-    wrong = [field for field in turning if field.unit in ("deg", "deg/s")]
+    wrong = [one for one in fields if headings and (one in headings or one.role == "command") and "deg" in one.unit]
     for number, field in enumerate(fields):
         largest = max(float(np.abs(values[field.name]).max()) for values in episodes)
         if field.role == "state" and field.unit == "1" and is_angle(field.short):
@@ -465,8 +430,8 @@ def logs_of(data: Dataset) -> Logs:
     if wrong:
         named = ", ".join(f"{field.name} in {field.unit}" for field in wrong)
         raise BadInputError(
-            f"{data.reference} has {named}: expected rad and rad/s, as a dataset's values are taken as they "
-            "are: import the logs again with a `scale` of 0.0174533 there (or with the `unit` rad if so)"
+            f"{data.reference} has {named}: expected rad and rad/s, as a dataset's values are taken as they are: "
+            "import the logs again with a `scale` of 0.0174533 there (or with the `unit` rad if so)"
         )
     failures = sum(bool(one["failed"].any()) for one in episodes)
     why = f"terminated, and no success: {failures} of {len(episodes)} episodes"

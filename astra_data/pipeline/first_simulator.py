@@ -4,7 +4,7 @@ import json
 import keyword
 import os.path
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from string import Template
@@ -47,9 +47,6 @@ GENERIC = re.compile(
 """Words that do not tell one moving part of a robot from another."""
 FORCES = ("N", "N m")
 DIRECT = "values that commands move"
-Fit = Callable[[float, float], dict[str, float]]
-Drive = tuple[str, dict[str, str], tuple[str, ...], Fit]
-"""What it is called, variables of commands, lines of a step, and constants by slopes of speed and turning."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +73,9 @@ class StateEntry:
 
 @dataclass(frozen=True)
 class SimulatorKind:
-    """An abstract simulator of X values and A commands, as code.
+    """An abstract simulator of X values and A commands, as code: what was fitted, and what to check.
 
-    Attributes:
-        driven: variables of the commands that it uses, by a command's name.
-        lines: of a step.
-        constants: what was fitted to the logs.
-        remarks: what to check.
+    `driven` are the variables of the commands that it uses, by a command's name.
     """
 
     logs: Logs
@@ -108,37 +101,29 @@ class SimulatorKind:
 
     def code(self) -> str:
         """Return its class."""
+        states, commands = self.logs.of("state"), self.logs.of("command")
         fields = list(dict.fromkeys(field for entry in self.entries for field in entry.fields))
-        order = [field.name for field in self.logs.of("state")]
-        names, spare = identifiers(self.logs.of("state")), identifiers(self.logs.of("command"), "cmd_")
-        used = [self.driven.get(command.name, spare[command.name]) for command in self.logs.of("command")]
-        text = (files("astra_data.pipeline") / "robot_files/simulator.py.template").read_text()
+        names, spare = identifiers(states), identifiers(commands, "cmd_")
         values = {
             "sentence": f"{self.called[0].upper()}{self.called[1:]}, without lag and slip.",
             "units": json.dumps(["1" if len(e.code) > 1 else e.unit for e in self.entries for _ in e.code]),
             "parameters": "".join(f', "{name.lower()}": {name}' for name in self.constants),
             "inputs": unpacked([names[field.name] for field in fields]),
-            "indices": repr(tuple(order.index(field.name) for field in fields)),
+            "indices": repr(tuple(map(states.index, fields))),
             "abstract": ", ".join(code for entry in self.entries for code in entry.code),
             "remarks": "".join(f"; {remark}" for remark in self.remarks),
             "variables": unpacked(self.names),
-            "commands": unpacked(used),
+            "commands": unpacked([self.driven.get(command.name, spare[command.name]) for command in commands]),
             "lines": "\n        ".join(self.lines),
             "shown": ", ".join(code for entry in self.entries for code in entry.shown("{}.cos()", "{}.sin()")),
         }
-        return Template(text).substitute(values)
+        return filled("simulator.py", values)
 
     def built(self, count: int) -> Any:  # noqa: ANN401 - an instance of the code
         """Return `count` simulators."""
-        space: dict[str, Any] = {
-            "np": np,
-            "torch": torch,
-            "Column": Column,
-            "NAMES": tuple(self.names),
-            **self.constants,
-        }
+        space = {"np": np, "torch": torch, "Column": Column, "NAMES": tuple(self.names), **self.constants}
         exec(self.code(), space | {"TIMESTEP_S": 1 / self.logs.rate}, space)
-        return space["Simulator"](count)
+        return space["Simulator"](count)  # type: ignore[operator]
 
     def episodes(self) -> list[tuple[Floats, Floats]]:
         """Return the abstract states (T, X) and commands (T, A) of each episode."""
@@ -155,10 +140,7 @@ class SimulatorKind:
         return np.asarray(simulator.state)
 
     def errors(self) -> tuple[Floats, Floats]:
-        """Return the mean errors (X,) after `JUDGED_STEPS` from each row, and those of standing still.
-
-        It is one step where no episode is as long.
-        """
+        """Return the mean errors (X,) after `JUDGED_STEPS` from each row, or one, and those of standing still."""
         episodes = self.episodes()
         steps = JUDGED_STEPS if any(len(states) > JUDGED_STEPS for states, _ in episodes) else 1
         long = [(states, commands) for states, commands in episodes if len(states) > steps]
@@ -171,16 +153,12 @@ class SimulatorKind:
 
         Sums of `steps` are compared: over one step, what lags behind looks slow. It is 0 where it stands.
         """
-        episodes = self.episodes()
-        rows = ((states[:-1], states[1:], commands[:-1]) for states, commands in episodes)
-        before, after, given = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-        ends = np.cumsum([len(states) - 1 for states, _ in episodes])[:-1]
-        sums = []
-        for landed in (self.after(before, [given]), after):
-            parts = np.split(moves(before, landed), ends)
-            totals = [np.cumsum(np.insert(part, 0, 0, axis=0), axis=0) for part in parts]
-            sums += [[t[min(steps, len(t) - 1) :] - t[: max(1, len(t) - steps)] for t in totals]]
-        simulated, recorded = map(np.concatenate, sums)
+        sums: list[list[Floats]] = []
+        for states, commands in self.episodes():
+            landed = self.after(states[:-1], [commands[:-1]])
+            totals = [np.cumsum(np.insert(moves(states[:-1], to), 0, 0, axis=0), axis=0) for to in (landed, states[1:])]
+            sums.append([t[min(steps, len(t) - 1) :] - t[: max(1, len(t) - steps)] for t in totals])
+        simulated, recorded = map(np.concatenate, zip(*sums, strict=True))
         power = (simulated**2).sum(axis=0)
         slopes = np.divide((simulated * recorded).sum(axis=0), power, np.zeros(len(power)), where=power > 0)
         return [float(f"{slope:.3g}") for slope in slopes]
@@ -192,18 +170,28 @@ def first_simulator(logs: Logs) -> SimulatorKind:
     for kind in (kinds := _planar(logs)):
         simulated, still = (errors[:4].reshape(2, 2).sum(axis=1) for errors in kind.errors())
         shares.append(float(np.divide(simulated, still, np.ones(2), where=still > 0).mean()))
-    good = [kind for kind, share in zip(kinds, shares, strict=True) if share <= CLEARLY * min(shares)]
-    if good and "TRACK_M" in good[0].constants and min(shares) >= 1:
-        good = []  # two arms rather than two wheels
-    rest = _direct(logs, good[0] if good else None)
-    if not good and not rest.entries:
-        raise BadInputError("found no state that a command could move: name it as its command, cmd_q1 and q1")
+    good = next((kind for kind, share in zip(kinds, shares, strict=True) if share <= CLEARLY * min(shares)), None)
+    if good and "TRACK_M" in good.constants and min(shares) >= 1:
+        good = None  # two arms rather than two wheels
+    rest = _direct(logs, good)
     if not good:
+        if not rest.entries:
+            raise BadInputError("found no state that a command could move: name it as its command, cmd_q1 and q1")
         return rest
-    merged = {name: getattr(good[0], name) + getattr(rest, name) for name in ("entries", "lines", "remarks")} | {
-        name: getattr(good[0], name) | getattr(rest, name) for name in ("driven", "constants")
-    }
-    return replace(good[0], **merged)
+    return replace(
+        good,
+        entries=good.entries + rest.entries,
+        driven=good.driven | rest.driven,
+        lines=good.lines + rest.lines,
+        constants=good.constants | rest.constants,
+        remarks=good.remarks + rest.remarks,
+    )
+
+
+def filled(name: str, values: Mapping[str, str]) -> str:
+    """Return a file of a new robot, by the name of its template."""
+    text = (files("astra_data.pipeline") / f"robot_files/{name}.template").read_text(encoding="utf-8")
+    return Template(text).substitute(values)
 
 
 def identifiers(fields: Sequence[Field], prefix: str = "") -> dict[str, str]:
@@ -233,88 +221,91 @@ def _planar(logs: Logs) -> list[SimulatorKind]:
     place = [StateEntry(axis, "m", (one,), (names[one.name],)) for axis, one in zip("xy", position, strict=True)]
     found = []
     for heading, remarks in _headings(states, names, position[0].plain):
-        for called, driven, lines, fit in _drives(logs.of("command")):
+        for called, driven, lines in _drives(logs.of("command")):
             step = ("heading = torch.atan2(heading_y, heading_x)", *lines)
-            kind = SimulatorKind(logs, called, (*place, heading), driven, step, fit(1.0, 1.0), remarks)
+            kind = SimulatorKind(logs, called, (*place, heading), driven, step, _sizes(lines, 1.0, 1.0), remarks)
             speed, turn = kind.slopes(_forward_and_turn, JUDGED_STEPS)
             is_off = any(not 0.5 < slope < 2 for slope in (speed, turn))
-            if kind.constants and speed and turn and (is_off or "TURN_PER_COMMAND" not in kind.constants):
-                sizes = {name: float(f"{value:.3g}") for name, value in fit(speed, turn).items()}
-                found.append(replace(kind, constants=sizes))
-            elif not kind.constants:
+            if not kind.constants:
                 found.append(kind)
+            elif speed and turn and (is_off or "TURN_PER_COMMAND" not in kind.constants):
+                found.append(replace(kind, constants=_sizes(lines, speed, turn)))
     return found
+
+
+def _sizes(lines: Sequence[str], speed: float, turn: float) -> dict[str, float]:
+    """Return the constants of a drive's lines, by the slopes of its speed and turning where all are 1."""
+    sizes = {"SPEED_PER_COMMAND": speed, "TURN_PER_COMMAND": turn, "TRACK_M": speed / turn, "WHEELBASE_M": 1 / turn}
+    return {name: float(f"{size:.3g}") for name, size in sizes.items() if any(name in line for line in lines)}
 
 
 def _position(logs: Logs, states: dict[str, Field]) -> tuple[Field, Field] | None:
     """Return the fields of a position that moves, that of the shortest name."""
     for one, other in AXES:
-        for name in sorted(states, key=len):
+        for name in (name for name in sorted(states, key=len) if name.endswith(one)):
             partner = states.get(name.removesuffix(one) + other)
-            if not name.endswith(one) or partner is None or not (PLACE.fullmatch(name) or len(one) > 2):
-                continue
-            if any(np.ptp(values, axis=0).any() for values in logs.values((states[name], partner))):
+            is_place = partner and (PLACE.fullmatch(name) or len(one) > 2)
+            if partner and is_place and any(np.ptp(v, axis=0).any() for v in logs.values((states[name], partner))):
                 return states[name], partner
     return None
 
 
 def _headings(states: dict[str, Field], names: dict[str, str], beside: str) -> list[tuple[StateEntry, tuple[str, ...]]]:
     """Return what the heading may be, of cosine and sine, an angle or a quaternion, and remarks of it."""
+
+    def heading(parts: Sequence[str], cosine: str, sine: str) -> StateEntry:
+        code = [
+            text.format(**{name: names[states[part].name] for name, part in zip("xyzw", parts, strict=False)})
+            for text in (cosine, sine)
+        ]
+        return StateEntry("heading", "1", tuple(states[part] for part in parts), tuple(code))
+
     near = sorted(states, key=lambda name: (-len(os.path.commonprefix([name, beside])), len(name)))  # noqa: RUF071
     for stem in (name[:-2] for name in near if HEADING.fullmatch(name[:-2])):
         if {f"{stem}_x", f"{stem}_y"} <= states.keys():
-            pair = states[f"{stem}_x"], states[f"{stem}_y"]
-            return [(StateEntry("heading", "1", pair, (names[pair[0].name], names[pair[1].name])), ())]
+            return [(heading((f"{stem}_x", f"{stem}_y"), "{x}", "{y}"), ())]
     for name in filter(HEADING.fullmatch, near):
-        angle, one = names[states[name].name], (states[name],)
         remarks = (f"{states[name].short} is clockwise from the axis of y, as of a compass",)
-        ways = [
-            (StateEntry("heading", "1", one, (f"of.cos({angle})", f"of.sin({angle})")), ()),
-            (StateEntry("heading", "1", one, (f"of.sin({angle})", f"of.cos({angle})")), remarks),
-        ]
+        angle, compass = heading([name], "of.cos({x})", "of.sin({x})"), heading([name], "of.sin({x})", "of.cos({x})")
+        ways = [(angle, ()), (compass, remarks)]
         return ways[::-1] if re.search("compass|course|cog|azimuth|hdg", name) else ways
     for stem in (name[:-1] for name in near if QUATERNION.fullmatch(name)):
-        for axes in ("xyzw", "zw"):
-            if {f"{stem}{axis}" for axis in axes} <= states.keys():
-                q = {axis: names[states[f"{stem}{axis}"].name] for axis in axes}
-                cosine, sine = f"{q['w']} ** 2 - {q['z']} ** 2", f"2 * {q['w']} * {q['z']}"
-                if axes == "xyzw":
-                    cosine += f" + {q['x']} ** 2 - {q['y']} ** 2"
-                    sine += f" + 2 * {q['x']} * {q['y']}"
-                parts = tuple(states[f"{stem}{axis}"] for axis in axes)
-                return [(StateEntry("heading", "1", parts, (cosine, sine)), ())]
+        if {f"{stem}{axis}" for axis in "xyzw"} <= states.keys():
+            cosine, sine = "{w} ** 2 - {z} ** 2 + {x} ** 2 - {y} ** 2", "2 * {w} * {z} + 2 * {x} * {y}"
+            return [(heading([f"{stem}{axis}" for axis in "xyzw"], cosine, sine), ())]
+        if {f"{stem}{axis}" for axis in "zw"} <= states.keys():
+            return [(heading([f"{stem}{axis}" for axis in "zw"], "{y} ** 2 - {x} ** 2", "2 * {y} * {x}"), ())]
     return []
 
 
-def _drives(commands: Sequence[Field]) -> list[Drive]:
-    """Return the kinds of drives that have such commands, and then those with commands of other units."""
+def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[str, ...]]]:
+    """Return kinds of drives that have such commands, variables of these and lines of a step; then other units."""
     along = ("x = x + speed * heading.cos() * TIMESTEP_S", "y = y + speed * heading.sin() * TIMESTEP_S")
     turning = "heading = heading + turn * TIMESTEP_S"
     sides = [side for command in commands if (side := SIDE.search(command.plain))]
     if len(commands) == 2 == len(sides) and len({SIDE.sub("", command.plain) for command in commands}) == 1:
         driven = {c.name: "left" if side[1] else "right" for c, side in zip(commands, sides, strict=True)}
-        speed = "speed = SPEED_PER_COMMAND * (left + right) / 2"
-        turn = "turn = SPEED_PER_COMMAND * (right - left) / TRACK_M"
-        step = (speed, turn, *along, turning)
-        sizes: Fit = lambda v, w: {"SPEED_PER_COMMAND": v, "TRACK_M": v / w}  # noqa: E731
-        return [("a differential drive", driven, step, sizes)]
+        speed, turn = (
+            "speed = SPEED_PER_COMMAND * (left + right) / 2",
+            "turn = SPEED_PER_COMMAND * (right - left) / TRACK_M",
+        )
+        return [("a differential drive", driven, (speed, turn, *along, turning))]
     turns = [c for c in commands if _is_turn_rate(c) or (TURN.fullmatch(c.plain) and c.unit != "m/s")]
     turns = turns or [command for command in commands if command.unit == "rad/s"]
     straight = [command for command in commands if command not in turns]
     axes = {"x": "forward", "surge": "forward", "y": "left", "sway": "left"}
     ways = {axes.get(m["axis"]): c for c in straight if (m := _along(c)) and c.unit in ("1", "m/s")}
-    found: list[Drive] = []
+    found = []
     if {"forward", "left"} <= ways.keys():
         turned, end = {turn.name: "turn" for turn in turns[:1]}, (turning,) * bool(turns)
-        x = "forward * heading.cos() - left * heading.sin()"
-        y = "forward * heading.sin() + left * heading.cos()"
+        x, y = "forward * heading.cos() - left * heading.sin()", "forward * heading.sin() + left * heading.cos()"
         frames = [("a holonomic base", ("forward", "left"), (x, y))]
         if not any(BODY.fullmatch(way.plain) for way in ways.values()):
             frames.append(("a holonomic base, driven along x and y", ("east", "north"), ("east", "north")))
         for called, names, speeds in frames:
             driven = dict(zip((ways["forward"].name, ways["left"].name), names, strict=True)) | turned
             moves = [f"{at} = {at} + ({by}) * TIMESTEP_S" for at, by in zip("xy", speeds, strict=True)]
-            found.append((called, driven, (*moves, *end), lambda v, w: {}))
+            found.append((called, driven, (*moves, *end)))
     else:
         called = "a unicycle"
         if len(commands) == 2 and not turns:
@@ -325,19 +316,12 @@ def _drives(commands: Sequence[Field]) -> list[Drive]:
             return []
         if turns[0].unit in ("1", "rad") and STEERING.fullmatch(turns[0].plain):
             driven = {ahead[0].name: "speed", turns[0].name: "angle"}
-            turn = "turn = speed * angle.tan() / WHEELBASE_M"
-            found.append(("a bicycle", driven, (turn, *along, turning), lambda v, w: {"WHEELBASE_M": 1 / w}))
-        driven = {ahead[0].name: "speed", turns[0].name: "turn"}
-        found.append((called, driven, (*along, turning), lambda v, w: {}))
-    scaled = [name for name in ("speed", "turn") if name in found[-1][1].values()]
-    factors = tuple(f"{name} = {name.upper()}_PER_COMMAND * {name}" for name in scaled)
-
-    def fit(speed: float, turn: float) -> dict[str, float]:
-        return {f"{name.upper()}_PER_COMMAND": {"speed": speed, "turn": turn}[name] for name in scaled}
-
-    for called, driven, lines, _ in [drive for drive in found if scaled and "angle" not in drive[1].values()]:
-        found.append((called, driven, (*factors, *lines), fit))
-    return found
+            found.append(("a bicycle", driven, ("turn = speed * angle.tan() / WHEELBASE_M", *along, turning)))
+        found.append((called, {ahead[0].name: "speed", turns[0].name: "turn"}, (*along, turning)))
+    names = [name for name in ("speed", "turn") if name in found[-1][1].values()]
+    factors = [f"{name} = {name.upper()}_PER_COMMAND * {name}" for name in names]
+    scaled = [(called, driven, (*factors, *lines)) for called, driven, lines in found if called != "a bicycle"]
+    return found + scaled if factors else found
 
 
 def _along(command: Field) -> re.Match[str] | None:
