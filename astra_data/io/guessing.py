@@ -57,7 +57,8 @@ METERS_PER_DEGREE = 111_195.0
 """Along a meridian of a sphere with Earth's mean radius, 6371 km."""
 _DEGREE = math.pi / 180
 _UNITS = {
-    "m/s": f"mm_s 1e-3 cm_s 1e-2 m_s 1 m_per_s 1 mps 1 mph 0.44704 knots 0.514444 km_h {1 / 3.6} kmh {1 / 3.6} kph {1 / 3.6}",
+    "m/s": "mm_s 1e-3 cm_s 1e-2 m_s 1 m_per_s 1 mps 1 mph 0.44704 knots 0.514444 "
+    f"km_h {1 / 3.6} kmh {1 / 3.6} kph {1 / 3.6}",
     "rad/s": f"deg_s {_DEGREE} deg_per_s {_DEGREE} dps {_DEGREE} rpm {math.pi / 30} rad_s 1 rad_per_s 1",
     "m/s²": "m_s2 1 mps2 1",
     "rad/s²": f"deg_s2 {_DEGREE} rad_s2 1",
@@ -137,14 +138,11 @@ class Logs:
     @property
     def uneven(self) -> str:
         """Why the rate is no whole number, and what to do; empty where it is one within `_EVEN`."""
-        error = self.recorded_rate / self.rate - 1
+        if abs(error := self.recorded_rate / self.rate - 1) < _EVEN:
+            return ""
         return (
-            ""
-            if abs(error) < _EVEN
-            else (
-                f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is {abs(error):.1%} "
-                f"too {'long' if error > 0 else 'short'}; resample them to {self.rate} rows per second"
-            )
+            f"the logs have {self.recorded_rate:.4g} rows per second, not a whole number: TIMESTEP_S is "
+            f"{abs(error):.1%} too {'long' if error > 0 else 'short'}; resample them to {self.rate} rows per second"
         )
 
     @property

@@ -56,10 +56,7 @@ def write_robot(name: str, out: Path, logs: Sequence[Path]) -> SimulatorKind:
         values = _values(name, simulator)
         if data:
             values |= dict.fromkeys(("and_mapping", "versions", "import_line", "mapping_row"), "")
-            values |= {
-                "data": _code(str(data.root.resolve())),
-                "dataset": shlex.quote(str(data.root.resolve())),
-            }
+            values |= {"data": _code(str(data.root.resolve())), "dataset": shlex.quote(str(data.root.resolve()))}
         else:
             values |= _of_mapping(name, [path.resolve() for path in logs])
         for template, written in (_FILES if data else _FILES | {"logs.toml": "logs.toml"}).items():
@@ -184,9 +181,8 @@ def _objective(simulator: SimulatorKind) -> dict[str, str]:
         use = "" if taken else "; nothing below uses them"
         bounds = f"{_code(every.min(axis=0))}, {_code(every.max(axis=0))}, (count, {len(goals)})"
         text = (
-            f"\n    goal_size = {len(goals)}\n\n"
-            f"    def draw_goals(self, rng, count):  # CHECK: where goals are{use}\n"
-            f"        return rng.uniform({bounds})"
+            f"\n    goal_size = {len(goals)}\n\n    def draw_goals(self, rng, count):  # CHECK: where goals are{use}\n "
+            f"       return rng.uniform({bounds})"
         )
     values = {
         "command_size": str(len(logs.of("command"))),

@@ -37,8 +37,8 @@ class Machine(WrittenPart):
 class Artifact(WrittenPart):
     """A file that a stage wrote, with its times and origin if recorded.
 
-    The times are its run time and the CPU time of all threads, in s, and its end, in s since 1970. The commit
-    ends in "-dirty" if there were uncommitted changes.
+    The times are its run time and the CPU time of all threads, in s, and its end, in s since 1970. The commit ends in
+    "-dirty" if there were uncommitted changes.
     """
 
     wall_seconds: float | None = None
@@ -58,8 +58,8 @@ class Artifact(WrittenPart):
 class Outcomes(WrittenPart):
     """Outcomes of a policy's episodes, one number per episode; further measures are kept as they are.
 
-    Whether it succeeded and failed (1 or 0), its share of steps in contact with a wall, its length in control
-    steps, and its undiscounted sum of rewards.
+    Whether it succeeded and failed (1 or 0), its share of steps in contact with a wall, its length in control steps,
+    and its undiscounted sum of rewards.
     """
 
     model_config = ConfigDict(extra="allow")

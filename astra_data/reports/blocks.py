@@ -204,8 +204,7 @@ def _html_picture(block: Picture, image: bytes) -> str:
     return (
         f'<figure>\n<div class="plate" role="region" tabindex="0" aria-label="{title}">'
         f'<img{mark} src="{source}" width="{width}" height="{height}" alt="{title}">'
-        f"</div>\n<figcaption><strong>{inline(block.title)}.</strong> "
-        f"{inline(block.caption)}</figcaption>\n</figure>"
+        f"</div>\n<figcaption><strong>{inline(block.title)}.</strong> {inline(block.caption)}</figcaption>\n</figure>"
     )
 
 

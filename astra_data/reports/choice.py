@@ -101,9 +101,9 @@ class TrialRound(WrittenPart):
 class TrialsFile(Artifact):
     """trials.json: trials of candidates in the target.
 
-    The trials that may be spent, the candidates of the first round, their size of the dataset if there are
-    several, and the trials that the prediction counts as; after all rounds row and seed of the chosen one,
-    and its mean success, given the prediction and its trials.
+    The trials that may be spent, the candidates of the first round, their size of the dataset if there are several, and
+    the trials that the prediction counts as; after all rounds row and seed of the chosen one, and its mean success,
+    given the prediction and its trials.
     """
 
     trials: int
@@ -326,10 +326,9 @@ def _trial_blocks(judged: Judgment, trials: TrialsFile) -> list[Text | TableBloc
         ),
         TableBlock("", ["round", "method", "seed", "succeeded", "of", "mean"], trial_lines(judged, trials), words=2),
         Text(
-            "Trials are split equally over rounds, and within a round over its candidates, which get the "
-            "same starts and goals. After each round, the better half goes on. Mean: mean success over all "
-            "trials of a candidate so far, with the judges' lower quartile as a prior worth "
-            f"{trials.pseudo_trials} trials."
+            "Trials are split equally over rounds, and within a round over its candidates, which get the same starts "
+            "and goals. After each round, the better half goes on. Mean: mean success over all trials of a candidate "
+            f"so far, with the judges' lower quartile as a prior worth {trials.pseudo_trials} trials."
         ),
     ]
 

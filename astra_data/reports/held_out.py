@@ -19,11 +19,7 @@ PAGE = "gap.md"
 RELIABILITY = "gap_reliability.png"
 _SURE = 0.1  # probability of a failure soon above which predictions are compared with what happened
 _EXACT = 1e-3  # share of the persistence baseline's error below which a prediction is exact
-_FITS = {
-    "r2_state": "state",
-    "r2_reward": "reward of steps that go on",
-    "r2_latent": "latent",
-}
+_FITS = {"r2_state": "state", "r2_reward": "reward of steps that go on", "r2_latent": "latent"}
 """R² of a grounding's heads, and their titles."""
 
 
@@ -110,10 +106,9 @@ def gap_blocks(results: Results) -> Iterator[Block]:
     if still := _no_better_than_still(last):
         names = ", ".join(f"`{name}`" for name in still)
         yield Text(
-            f"**In {names}, the simulator without grounding is no better than predicting that the state "
-            "does not change.** If it should be better, check the units and the order of states and "
-            "commands, the rate, and the abstraction φ (phi), which maps the robot's states to the "
-            "simulator's.",
+            f"**In {names}, the simulator without grounding is no better than predicting that the state does not "
+            "change.** If it should be better, check the units and the order of states and commands, the rate, and the "
+            "abstraction φ (phi), which maps the robot's states to the simulator's.",
             warns=True,
         )
     if worse := [*_regressions(results, last)]:
@@ -208,8 +203,8 @@ def _sufficient_sizes(
 ) -> Iterator[str]:
     """Yield from which size on more data makes no difference that the intervals show.
 
-    That is the smallest one whose error, and those of all larger ones, are at most the upper end of the
-    interval of the largest.
+    That is the smallest one whose error, and those of all larger ones, are at most the upper end of the interval of the
+    largest.
     """
     horizon = judged_horizon(horizons)
     for row in results.groundings():
@@ -249,9 +244,8 @@ def _failure_blocks(results: Results) -> Iterator[Block]:
     title = "Failures, predicted on held-out episodes; means over seeds"
     yield TableBlock(title, head, lines, words=1 + results.is_swept)
     yield Text(
-        "AUC: the probability that a step this many steps before a failure ranks above a step with no "
-        "failure in the next 40. Brier skill: the share of squared error removed, compared with always "
-        "predicting the mean rate. Observed of predicted: over the steps with a predicted probability above "
-        "0.1, the share before a failure, and the mean predicted probability. With few failures, these "
-        "numbers mean little."
+        "AUC: the probability that a step this many steps before a failure ranks above a step with no failure in the "
+        "next 40. Brier skill: the share of squared error removed, compared with always predicting the mean rate. "
+        "Observed of predicted: over the steps with a predicted probability above 0.1, the share before a failure, and "
+        "the mean predicted probability. With few failures, these numbers mean little."
     )

@@ -1,7 +1,7 @@
 """Results → sections of a page, which `blocks` writes as Markdown and as HTML.
 
-A column of the table of methods is a line of `COLUMNS`; its measure is what a stage writes. A figure is a
-line of `figures.FIGURES`.
+A column of the table of methods is a line of `COLUMNS`; its measure is what a stage writes. A figure is a line of
+`figures.FIGURES`.
 """
 
 from collections.abc import Iterator
@@ -15,25 +15,9 @@ from astra_data.reports.blocks import Block, Code, Section, TableBlock, Text, co
 from astra_data.reports.choice import choice_blocks
 from astra_data.reports.figures.catalog import pictures
 from astra_data.reports.held_out import gap_blocks
-from astra_data.reports.results import (
-    SIMULATED,
-    TESTED,
-    WHOLE,
-    Origin,
-    Results,
-    elapsed_seconds,
-    stage_seconds,
-    titled,
-)
+from astra_data.reports.results import SIMULATED, TESTED, WHOLE, Origin, Results, elapsed_seconds, stage_seconds, titled
 from astra_data.reports.runs import DATASET_STAGES, SHARED_WORLDS
-from astra_data.reports.statistics import (
-    LEAST_SEEDS,
-    correlation,
-    ends,
-    interval,
-    probability_of_improvement,
-    spread,
-)
+from astra_data.reports.statistics import LEAST_SEEDS, correlation, ends, interval, probability_of_improvement, spread
 from astra_data.reports.verdict import verdict_of
 
 COSTED = ("ground", "train", "align", "evaluate")  # stages that run once for each method and seed
@@ -53,8 +37,8 @@ WORDS = {
 class PageColumn:
     """A column of the table of methods: a `measure` of `Results.lines` in a place, its title and digits.
 
-    `note` says what it means where its title does not; without a method that has more than `negligible`, it
-    is left out.
+    `note` says what it means where its title does not; without a method that has more than `negligible`, it is left
+    out.
     """
 
     measure: str
@@ -206,8 +190,7 @@ def _mean(results: Results, row: str) -> float:
 def _comparisons(results: Results) -> Iterator[Block]:
     """Yield how methods of `compare` do against all others that are trained alike.
 
-    That is with the plus settings, or without; those that are trained in no simulator are compared with
-    both.
+    That is with the plus settings, or without; those that are trained in no simulator are compared with both.
     """
     headline, lines = results.headline, []
     rows = [row for row in results.tested() if method_role(row) in (None, "floor")]

@@ -1,8 +1,8 @@
 """Results of a recipe: what results.json holds, as tidy tables.
 
-`lines` holds every number that is measured once per method, seed, size of the dataset and place, `errors`
-those that have a horizon, too. Both are one `pandas` table each (`table`, `error_table`); all pages and
-figures are made of these. Results of several places are merged line by line.
+`lines` holds every number that is measured once per method, seed, size of the dataset and place, `errors` those that
+have a horizon, too. Both are one `pandas` table each (`table`, `error_table`); all pages and figures are made of these.
+Results of several places are merged line by line.
 """
 
 import json
@@ -225,8 +225,7 @@ class Results(Facts):
     def mean_errors(self, percent: int | None = None) -> "pd.DataFrame":
         """Return errors averaged over seeds, of the horizons that all seeds and groundings share.
 
-        The index is row, simulator, quantity, horizon; the columns are mean, low, high; NaN where a seed has
-        none.
+        The index is row, simulator, quantity, horizon; the columns are mean, low, high; NaN where a seed has none.
         """
         index, values = ["row", "simulator", "quantity", "horizon"], ["mean", "low", "high"]
         found = self.error_table
@@ -301,9 +300,8 @@ class Results(Facts):
         else:
             there = [method_title(row) for row in self.rows if grounded_as(row) == reference]
             place = (
-                f"All methods were tested in the abstract simulator grounded by {method_title(reference)}, "
-                f"in which only {' and '.join(there)} trained. It cannot show what is not in the abstract "
-                "state."
+                f"All methods were tested in the abstract simulator grounded by {method_title(reference)}, in which "
+                f"only {' and '.join(there)} trained. It cannot show what is not in the abstract state."
             )
         return f"**Nothing was tested on a robot: the task has no target.** {place}"
 

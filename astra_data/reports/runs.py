@@ -156,11 +156,7 @@ class RunReader:
         gap = read_json(Gap, self.path("ground", owner, GAP))
         for simulator, of in {"still": gap.still or {}, "raw": gap.raw, "grounded": gap.grounded}.items():
             for quantity, band in of.items():
-                given: dict[str, Any] = {
-                    "simulator": simulator,
-                    "quantity": quantity,
-                    "horizons": gap.horizons,
-                }
+                given: dict[str, Any] = {"simulator": simulator, "quantity": quantity, "horizons": gap.horizons}
                 self.errors.append(Errors(**owner.facts(), **given, **band.model_dump()))
 
     def dataset(self, stage: str, owner: Owner) -> None:
@@ -180,12 +176,7 @@ class RunReader:
 
 
 def read_run(
-    reported: Reported,
-    *,
-    root: Path,
-    command: str,
-    scores: tuple[Score, ...] = (SUCCESS,),
-    **facts: object,
+    reported: Reported, *, root: Path, command: str, scores: tuple[Score, ...] = (SUCCESS,), **facts: object
 ) -> Results:
     """Return the results under `root` of every method, for the seeds that it has finished.
 
@@ -228,12 +219,7 @@ def read_run(
         )
     _check_alike(files, reported.task)
     uses = [
-        DatasetUse(
-            stage="evaluate",
-            seed=file.seed,
-            version=file.dataset_version or "",
-            content_hash=file.dataset_hash,
-        )
+        DatasetUse(stage="evaluate", seed=file.seed, version=file.dataset_version or "", content_hash=file.dataset_hash)
         for file in files
         if file.dataset_hash
     ]

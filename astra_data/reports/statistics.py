@@ -1,10 +1,10 @@
 """Means, differences and correlations over a few seeds, with intervals.
 
-Seeds are the unit of repetition. The interval of a mean of shares of episodes is the wider of two at each
-end: Student's t, and Wilson's score interval with Student's quantile, in which the spread between seeds
-counts as if so many episodes had been drawn at once. Student's t alone is too narrow near 0 and 1, where
-seeds are often equal by chance. With 3 to 10 seeds of 120 episodes, it covers the mean of Beta-distributed
-seeds in 93 % of the cases or more. Below three seeds there is no interval.
+Seeds are the unit of repetition. The interval of a mean of shares of episodes is the wider of two at each end:
+Student's t, and Wilson's score interval with Student's quantile, in which the spread between seeds counts as if so many
+episodes had been drawn at once. Student's t alone is too narrow near 0 and 1, where seeds are often equal by chance.
+With 3 to 10 seeds of 120 episodes, it covers the mean of Beta-distributed seeds in 93 % of the cases or more. Below
+three seeds there is no interval.
 """
 
 import math
@@ -90,8 +90,8 @@ def paired_difference(
 ) -> Estimate | None:
     """Return the mean difference on the seeds that both have, with its 95 % interval (Student's t).
 
-    What a seed does to both cancels. The variance is at least that of drawing the episodes of shares. None
-    where no seed is shared. `limit` and `trials` are as for `summarize`.
+    What a seed does to both cancels. The variance is at least that of drawing the episodes of shares. None where no
+    seed is shared. `limit` and `trials` are as for `summarize`.
     """
     shared = [seed for seed in scores if seed in others]
     if not shared:
@@ -140,9 +140,8 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Estimate | Non
 def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False) -> Estimate | None:
     """Correlate two scores over all seeds of some rows: Pearson's coefficient, or with `ranks` Spearman's.
 
-    The seeds of a row are not independent, so the interval resamples rows, and seeds within each row. None
-    where there are fewer than three seeds in all, or one side does not vary. Each score is an array (seeds,)
-    for each row.
+    The seeds of a row are not independent, so the interval resamples rows, and seeds within each row. None where there
+    are fewer than three seeds in all, or one side does not vary. Each score is an array (seeds,) for each row.
     """
     from scipy.stats import rankdata
 

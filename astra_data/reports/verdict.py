@@ -1,9 +1,9 @@
 """Which method to deploy, by a short rule, and the lines that the page and the terminal show of it.
 
-The best method is the one with the highest mean score over seeds, references apart. It is deployed if it
-succeeds in half of the episodes or more (for scores without a limit: always), fails in less than a third of
-them, and no floor does as well. Otherwise none is, for these reasons: a method did not learn to do the task
-in the simulator of its training; what was learned there is lost in the target; the best fails too often.
+The best method is the one with the highest mean score over seeds, references apart. It is deployed if it succeeds in
+half of the episodes or more (for scores without a limit: always), fails in less than a third of them, and no floor does
+as well. Otherwise none is, for these reasons: a method did not learn to do the task in the simulator of its training;
+what was learned there is lost in the target; the best fails too often.
 """
 
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ from astra_data.reports.results import SIMULATED, WHOLE, Results, judged_horizon
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summarize
 
 ENOUGH = 0.5
-"""Share of the largest possible score from which a method can be deployed, and has learned its own
-simulator; also the R² of rewards on held-out episodes from which a grounding predicts them well."""
+"""Share of the largest possible score from which a method can be deployed, and has learned its own simulator; also the
+R² of rewards on held-out episodes from which a grounding predicts them well."""
 _TOO_MANY_FAILURES = 1 / 3
 """Share of the episodes that end in a failure, such as a fall, from which nothing is deployed."""
 
@@ -138,9 +138,8 @@ def _cause(results: Results, row: str) -> str:
     explained = results.summary(grounded_as(row), "r2_reward", "ground")
     if explained and explained.value < ENOUGH:
         return (
-            f"{method_title(row)}: its rewards are predicted poorly on held-out episodes (R² "
-            f"{explained.value:.2f}; 1 is perfect, 0 is no better than the mean). Record more episodes "
-            "(`episodes` of `[collect]`, or more logs)."
+            f"{method_title(row)}: its rewards are predicted poorly on held-out episodes (R² {explained.value:.2f}; 1 "
+            "is perfect, 0 is no better than the mean). Record more episodes (`episodes` of `[collect]`, or more logs)."
         )
     return (
         f"{method_title(row)}: train it longer (`total_steps` of `[train]`), or look at its learning curve "

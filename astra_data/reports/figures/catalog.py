@@ -1,7 +1,7 @@
 """Figures: what they show, and how they are drawn, in one style.
 
-A figure of the report is a line of `FIGURES` and a function from the results and their scene to a matplotlib
-Figure, or to None where there is nothing to draw.
+A figure of the report is a line of `FIGURES` and a function from the results and their scene to a matplotlib Figure, or
+to None where there is nothing to draw.
 """
 
 from collections.abc import Callable

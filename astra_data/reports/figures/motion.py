@@ -38,8 +38,8 @@ _COMMANDS = (((0.8, 0.0), 2.0), ((0.0, 0.8), 1.0), ((-0.8, 0.0), 2.0), ((0.0, -0
 class CommandReplay:
     """The same commands (T, 2), ±1 per axis, in the abstract simulator and in the target, at times (T,).
 
-    `simulated` is [x, y, vx, vy] after each step, (T, 4); `target` that of N robots, which start with random
-    headings, (N, T, 4).
+    `simulated` is [x, y, vx, vy] after each step, (T, 4); `target` that of N robots, which start with random headings,
+    (N, T, 4).
     """
 
     time_s: Floats

@@ -83,8 +83,8 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
 def learning_curves(results: Results, _: Scene) -> Figure | None:
     """Draw the headline score of training episodes over steps: mean over seeds, band from worst to best.
 
-    Each method has a panel; its variant with the plus settings is dashed. Methods with a seed without
-    scores are left out.
+    Each method has a panel; its variant with the plus settings is dashed. Methods with a seed without scores are left
+    out.
     """
     curves = {}
     for row in results.rows:

@@ -26,8 +26,8 @@ if TYPE_CHECKING:  # these load torch, which a dataset's figures can do without
     from astra_data.worlds.task import Task
 
 SPARE_COLORS = ("#882255", "#332288", "#661100", "#6699CC", "#88CCEE")
-"""For methods without a color of their own. The others are Okabe and Ito's palette and shades that
-color-blind readers can tell from it."""
+"""For methods without a color of their own. The others are Okabe and Ito's palette and shades that color-blind readers
+can tell from it."""
 SIMULATED, DEPLOYED = "#E07B00", "#0060A8"
 """A simulator and the target environment, in every figure (as in the paper's Fig. 3)."""
 INK, FAINT, WALL = "#2B2B2B", "#8A8A8A", "#D9D9D6"
