@@ -295,7 +295,7 @@ def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[
     straight = [command for command in commands if command not in turns]
     axes = {"x": "forward", "surge": "forward", "y": "left", "sway": "left"}
     ways = {axes.get(m["axis"]): c for c in straight if (m := _along(c)) and c.unit in ("1", "m/s")}
-    found = []
+    found: list[tuple[str, dict[str, str], tuple[str, ...]]] = []
     if {"forward", "left"} <= ways.keys():
         turned, end = {turn.name: "turn" for turn in turns[:1]}, (turning,) * bool(turns)
         x, y = "forward * heading.cos() - left * heading.sin()", "forward * heading.sin() + left * heading.cos()"
@@ -318,8 +318,8 @@ def _drives(commands: Sequence[Field]) -> list[tuple[str, dict[str, str], tuple[
             driven = {ahead[0].name: "speed", turns[0].name: "angle"}
             found.append(("a bicycle", driven, ("turn = speed * angle.tan() / WHEELBASE_M", *along, turning)))
         found.append((called, {ahead[0].name: "speed", turns[0].name: "turn"}, (*along, turning)))
-    names = [name for name in ("speed", "turn") if name in found[-1][1].values()]
-    factors = [f"{name} = {name.upper()}_PER_COMMAND * {name}" for name in names]
+    used = [name for name in ("speed", "turn") if name in found[-1][1].values()]
+    factors = [f"{name} = {name.upper()}_PER_COMMAND * {name}" for name in used]
     scaled = [(called, driven, (*factors, *lines)) for called, driven, lines in found if called != "a bicycle"]
     return found + scaled if factors else found
 

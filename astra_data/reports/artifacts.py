@@ -35,11 +35,7 @@ class Machine(WrittenPart):
 
 
 class Artifact(WrittenPart):
-    """A file that a stage wrote, with its times and origin if recorded.
-
-    The times are its run time and the CPU time of all threads, in s, and its end, in s since 1970. The commit ends in
-    "-dirty" if there were uncommitted changes.
-    """
+    """A file that a stage wrote, with its times (in s; its end since 1970) and, if recorded, its origin."""
 
     wall_seconds: float | None = None
     cpu_seconds: float | None = None
@@ -56,11 +52,7 @@ class Artifact(WrittenPart):
 
 
 class Outcomes(WrittenPart):
-    """Outcomes of a policy's episodes, one number per episode; further measures are kept as they are.
-
-    Whether it succeeded and failed (1 or 0), its share of steps in contact with a wall, its length in control steps,
-    and its undiscounted sum of rewards.
-    """
+    """Outcomes of a policy's episodes, one number per episode; further measures are kept as they are."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, list[float]]
@@ -146,10 +138,7 @@ class CurveFile(Artifact):
 
 
 class Foresight(WrittenPart):
-    """How well failures are predicted on held-out episodes.
-
-    `reliability` is predicted and observed rate, and number of steps, by predicted probability.
-    """
+    """How well failures are predicted on held-out episodes; `reliability` is predicted and observed rate, and steps."""
 
     failures: int
     auc: dict[str, float | None] | None = None
@@ -194,10 +183,7 @@ class Band(WrittenPart):
 
 
 class Gap(Artifact):
-    """gap.json: open-loop error by horizon in steps, for each quantity.
-
-    `still` is that of the persistence baseline, which predicts no motion; None where it was not measured.
-    """
+    """gap.json: open-loop error by horizon in steps, for each quantity; `still` is that of the persistence baseline."""
 
     horizons: list[int]
     grounded: dict[str, Band]

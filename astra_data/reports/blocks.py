@@ -1,7 +1,4 @@
-"""Pages as blocks, and the two ways to write them: Markdown, and one HTML page that loads nothing.
-
-Texts and cells may hold `code` and **strong** marks; all else is escaped in HTML.
-"""
+"""Pages as blocks, with `code` and **strong** marks in texts, as Markdown or as one HTML page that loads nothing."""
 
 import re
 from base64 import b64encode

@@ -14,20 +14,17 @@ from astra_data.reports.artifacts import Artifact, WrittenPart, read_json
 from astra_data.reports.blocks import Section, TableBlock, Text, markdown
 from astra_data.reports.statistics import LEAST_SEEDS, Estimate, interval, summarize
 
-TRIALS = "trials.json"
+FOLDER, SELECTED, TRIALS = "select", "select.json", "trials.json"
 PSEUDO_TRIALS = 4  # trials that a prediction counts as: as a Beta prior it is then off by 0.2 or so, as predictions are
 LEAST_TRIALS = 2  # of a candidate in a round: with one, chance decides; with more, fewer candidates are tried at all
-
+_QUANTILE = 0.25  # of the success over judges, for ranking policies: one that a single judge likes is a risk
 Attempt = Callable[[int, tuple[int, ...], int], Sequence[int]]
 """Given a round's number, its candidates and the trials of each, returns how many of these succeeded."""
 
 
 @dataclass(frozen=True)
 class Halving:
-    """The candidates of each round with the trials of each of them, the one that is left, and its mean.
-
-    The mean is that of its success, given the prediction and all of its trials.
-    """
+    """The candidates of each round with the trials of each, the one that is left, and its posterior mean success."""
 
     rounds: tuple[tuple[tuple[int, ...], int], ...]
     chosen: int
@@ -50,15 +47,9 @@ def posterior(prior: float, successes: int, trials: int) -> float:
 
 
 def halve(priors: Sequence[float], trials: int, attempt: Attempt, *, field: int | None = None) -> Halving:
-    """Halve the candidates, by the posterior mean of their success, until one is left.
+    """Halve the first `field` candidates, by the posterior mean of their success, until one is left.
 
-    Rounds share the trials equally, as do the candidates of a round. Ties go to what the prediction prefers.
-
-    Args:
-        priors: the predicted success of each candidate, the preferred first; not necessarily descending.
-        trials: to spend at most; without any, the first is chosen.
-        attempt: tries candidates.
-        field: how many of the first are tried at all; by default as many as the trials are enough for.
+    Rounds share the trials equally, as do the candidates of a round. Ties go to the first of `priors`.
     """
     left = tuple(range(widest_field(len(priors), trials) if field is None else field))
     spent, successes = [0] * len(priors), [0] * len(priors)
@@ -88,10 +79,7 @@ class Tried(WrittenPart):
 
 
 class TrialRound(WrittenPart):
-    """A round of so many trials of each candidate (row and seed, the preferred first), and those finished.
-
-    All candidates meet the same starts and goals.
-    """
+    """A round of so many trials of each candidate (row and seed, best first), with the same starts and goals."""
 
     trials: int
     candidates: list[tuple[str, int]]
@@ -99,12 +87,7 @@ class TrialRound(WrittenPart):
 
 
 class TrialsFile(Artifact):
-    """trials.json: trials of candidates in the target.
-
-    The trials that may be spent, the candidates of the first round, their size of the dataset if there are several, and
-    the trials that the prediction counts as; after all rounds row and seed of the chosen one, and its mean success,
-    given the prediction and its trials.
-    """
+    """trials.json: `trials` that may be spent on `field` candidates in the target, their rounds, and the one chosen."""
 
     trials: int
     field: int
@@ -125,10 +108,10 @@ def read_trials(path: Path) -> TrialsFile | None:
     return read_json(TrialsFile, path) if path.is_file() else None
 
 
-FOLDER = "select"
-SELECTED = "select.json"
-_QUANTILE = 0.25
-"""Of the success over the judges, by which policies are ranked: one that a single judge likes is a risk."""
+def read_judged(root: Path) -> "Judged | None":
+    """Read what the stage `select` left in a run's folder; None if it was not run."""
+    path = root / FOLDER / SELECTED
+    return read_json(Judged, path) if path.is_file() else None
 
 
 class Candidate(WrittenPart):
@@ -190,13 +173,7 @@ class Judged(Judgment, Artifact):
 
 @dataclass(frozen=True)
 class Choice:
-    """A choice without the target, and what it is worth there, as far as that is tested.
-
-    Attributes:
-        judged: what the judges found.
-        candidates: of one size, best first; the first is chosen.
-        measured: row and seed → success in the target; it has no say in the ranking.
-    """
+    """The choice among `candidates` (best first) without the target, and what it is worth there, as far as tested."""
 
     judged: Judgment
     candidates: Sequence[Candidate]
@@ -237,12 +214,6 @@ class Choice:
         return {row: (len(of), fmean(of), fmean(map(abs, of))) for row, of in errors.items()}
 
 
-def read_judged(root: Path) -> Judged | None:
-    """Read what the stage `select` left in a run's folder; None if it was not run."""
-    path = root / FOLDER / SELECTED
-    return read_json(Judged, path) if path.is_file() else None
-
-
 def choice_of(judged: Judgment, percent: int | None, *, measured: Mapping[tuple[str, int], float]) -> Choice | None:
     """Return the choice among the policies of a size, None for the whole; None without a candidate."""
     ranked = judged.ranked(percent)
@@ -253,14 +224,11 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
     """Return what a page says of a choice, with the first `shown` of its candidates, by default all."""
     judged = choice.judged
     episodes = "the same episodes, from other seeds" if judged.shares_episodes else "the episodes of other seeds"
-    lines = [
-        [
-            *(method_title(one.row), f"{one.seed}", f"{one.lower:.2f}"),
-            *(interval(judged.estimate(one)), f"{len(one.success)}"),
-            "-" if (found := choice.target(one)) is None else f"{found:.2f}",
-        ]
-        for one in choice.candidates[:shown]
-    ]
+    lines = []
+    for one in choice.candidates[:shown]:
+        found = choice.target(one)
+        cells = (method_title(one.row), f"{one.seed}", f"{one.lower:.2f}", interval(judged.estimate(one)))
+        lines.append([*cells, f"{len(one.success)}", "-" if found is None else f"{found:.2f}"])
     head = ["method", "seed", "lower quartile", "predicted [95 %]", "judges", "in the target"]
     blocks: list[Text | TableBlock] = [
         Text(
@@ -270,33 +238,25 @@ def choice_blocks(choice: Choice, shown: int | None = None) -> list[Text | Table
         TableBlock("Best first, ranked by the lower quartile of success over judges", head, lines),
         Text(
             "A judge is a simulator that did not train the policy: a policy's judges are the groundings of "
-            f"{method_title(judged.judge)} that were fitted to {episodes}, with {judged.episodes} episodes "
-            "each. The judge's failure model ends episodes; if it has none, states are scattered as much as "
-            f"the target's. Intervals need {LEAST_SEEDS} judges. The target is not used."
+            f"{method_title(judged.judge)} that were fitted to {episodes}, with {judged.episodes} episodes each. The "
+            "judge's failure model ends episodes; if it has none, states are scattered as much as the target's. "
+            f"Intervals need {LEAST_SEEDS} judges. The target is not used."
         ),
     ]
     if judged.shares_episodes:
-        blocks.append(
-            Text(
-                "All seeds of this run have the same episodes, so no judge is independent of the policies it "
-                "judges: an error that all groundings share goes unnoticed."
-            )
-        )
+        text = "All seeds of this run have the same episodes, so no judge is independent of the policies it judges: "
+        blocks.append(Text(f"{text}an error that all groundings share goes unnoticed."))
     if choice.random_regret is not None:
         regret = "unknown (the chosen policy was not tested there)"
         regret = regret if choice.regret is None else f"{choice.regret:.2f}"
+        of_random = f"of a random policy: {choice.random_regret:.2f}."
         errors = [
             [method_title(row), f"{seeds}", f"{signed:+.2f}", f"{absolute:.2f}"]
             for row, (seeds, signed, absolute) in choice.calibration.items()
         ]
         head = ["method", "seeds", "predicted \N{MINUS SIGN} measured", "absolute error"]
-        blocks += [
-            Text(
-                f"Regret of the chosen policy, in success in the target: {regret}; of a random policy: "
-                f"{choice.random_regret:.2f}."
-            ),
-            TableBlock("Error of the predicted success, means over seeds", head, errors),
-        ]
+        blocks.append(Text(f"Regret of the chosen policy, in success in the target: {regret}; {of_random}"))
+        blocks.append(TableBlock("Error of the predicted success, means over seeds", head, errors))
     return blocks
 
 

@@ -32,18 +32,7 @@ def write_held_out(
     *,
     timestep_s: float,
 ) -> Path | None:
-    """Write the page of all finished groundings to `root`; return it, None where there is no grounding.
-
-    Beside it is a figure where groundings predict failures.
-
-    Args:
-        recipe: its name.
-        root: its folder of runs.
-        groundings: the methods that ground.
-        seeds: of the recipe.
-        percents: sizes of the dataset; empty for the whole alone.
-        timestep_s: of the task.
-    """
+    """Write the page of all finished groundings to `root`, and a figure if they predict failures; None without one."""
     run = RunReader(root)
     for row in groundings:
         for percent in sorted(percents) or (None,):
@@ -167,10 +156,7 @@ def _error_lines(
 
 
 def _no_better_than_still(means: "pd.DataFrame") -> list[str]:
-    """Return the quantities in which the raw simulator is no better than the persistence baseline.
-
-    Not after the first step: a robot that lags behind its commands hardly leaves its state in one.
-    """
+    """Return the quantities in which the raw simulator is no better than persistence at the judged horizon."""
     of = means["mean"].groupby(["simulator", "quantity", "horizon"], sort=False).first()
     if "still" not in of.index:
         return []
@@ -180,10 +166,7 @@ def _no_better_than_still(means: "pd.DataFrame") -> list[str]:
 
 
 def _regressions(results: Results, means: "pd.DataFrame") -> Iterator[str]:
-    """Yield where a grounding, fitted to the most data, has larger errors than the simulator without one.
-
-    Only where their intervals over episodes do not overlap.
-    """
+    """Yield where a grounding has larger errors than the simulator without one, beyond the intervals over episodes."""
     for row in (row for row in results.groundings() if row in means.index):
         of = means.loc[row, "mean"].unstack("simulator")
         low, high = (means.loc[row, end].unstack("simulator") for end in ("low", "high"))
@@ -201,11 +184,7 @@ def _regressions(results: Results, means: "pd.DataFrame") -> Iterator[str]:
 def _sufficient_sizes(
     results: Results, means: "dict[int, pd.DataFrame]", quantities: Sequence[str], horizons: Sequence[int]
 ) -> Iterator[str]:
-    """Yield from which size on more data makes no difference that the intervals show.
-
-    That is the smallest one whose error, and those of all larger ones, are at most the upper end of the interval of the
-    largest.
-    """
+    """Yield from which size on all errors are at most the upper end of the interval of the largest."""
     horizon = judged_horizon(horizons)
     for row in results.groundings():
         of = {percent: found.loc[row] for percent, found in means.items() if row in found.index}

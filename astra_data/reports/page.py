@@ -1,8 +1,4 @@
-"""Results → sections of a page, which `blocks` writes as Markdown and as HTML.
-
-A column of the table of methods is a line of `COLUMNS`; its measure is what a stage writes. A figure is a line of
-`figures.FIGURES`.
-"""
+"""Results → sections of a page: a column of the table of methods is a line of `COLUMNS`, by a stage's measure."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,11 +31,7 @@ WORDS = {
 
 @dataclass(frozen=True)
 class PageColumn:
-    """A column of the table of methods: a `measure` of `Results.lines` in a place, its title and digits.
-
-    `note` says what it means where its title does not; without a method that has more than `negligible`, it is left
-    out.
-    """
+    """A column of the table of methods, left out where none has more than `negligible`; `note` explains its title."""
 
     measure: str
     title: str
@@ -107,12 +99,8 @@ def _facts(results: Results) -> Iterator[Block]:
         percent: [method_title(row) for row in results.rows if row not in results.tested(percent)]
         for percent in results.percents
     }
-    unfinished = [
-        f"{', '.join(titles)}{f' at {percent} %' if results.is_swept else ''}"
-        for percent, titles in lacking.items()
-        if titles
-    ]
-    if unfinished:
+    size = " at {} %" if results.is_swept else ""
+    if unfinished := [f"{', '.join(of)}{size.format(percent)}" for percent, of in lacking.items() if of]:
         text += f" Not finished yet: {'; '.join(unfinished)}."
     yield Text(text)
 
@@ -138,10 +126,10 @@ def _methods(results: Results) -> Iterator[Block]:
     learned = [results.score_of(row, SIMULATED) for row in rows]
     columns.append(("in its simulator", [spread(one, headline.digits) for one in learned]))
     lost = []
-    for one, found_there in zip(learned, map(results.score_of, rows), strict=True):
+    for one, there in zip(learned, map(results.score_of, rows), strict=True):
         # A minus sign of a rounded zero says nothing.
-        less = round(one.value - found_there.value, headline.digits) + 0.0 if one and found_there else None
-        lost.append("-" if less is None else f"{less:.{headline.digits}f}")
+        less = round(one.value - there.value, headline.digits) + 0.0 if one and there else 0.0
+        lost.append(f"{less:.{headline.digits}f}" if one and there else "-")
     columns.append(("lost", lost))
     shown = [column for column in COLUMNS if _is_shown(results, column)]
     for column in shown:
@@ -149,7 +137,8 @@ def _methods(results: Results) -> Iterator[Block]:
             found = [results.summary(row, column.measure, column.where) for row in rows]
             columns.append((column.title, [spread(one, column.digits) for one in found]))
     columns.append(("seeds", [f"{len(results.values(row, headline.measure))}" for row in rows]))
-    best = max(results.contenders(), key=lambda row: _mean(results, row), default=None)
+    scores = {row: one.value for row in results.contenders() if (one := results.score_of(row))}
+    best = max(scores, key=lambda row: scores[row], default=None)
     names = [f"**{titled(row)}**" if row == best else titled(row) for row in rows]
     lines = [*zip(names, *(cells for _, cells in columns), strict=True)]
     yield TableBlock("", ["method", *(title for title, _ in columns)], lines)
@@ -182,16 +171,8 @@ def _is_shown(results: Results, column: PageColumn) -> bool:
     return any(one is not None and one.value > column.negligible for one in found)
 
 
-def _mean(results: Results, row: str) -> float:
-    found = results.score_of(row)
-    return found.value if found else -np.inf
-
-
 def _comparisons(results: Results) -> Iterator[Block]:
-    """Yield how methods of `compare` do against all others that are trained alike.
-
-    That is with the plus settings, or without; those that are trained in no simulator are compared with both.
-    """
+    """Yield how methods of `compare` do against all others trained alike (with the plus settings or without)."""
     headline, lines = results.headline, []
     rows = [row for row in results.tested() if method_role(row) in (None, "floor")]
     scores = {row: np.array([*results.values(row, headline.measure).values()]) for row in rows}

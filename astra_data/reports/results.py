@@ -1,9 +1,4 @@
-"""Results of a recipe: what results.json holds, as tidy tables.
-
-`lines` holds every number that is measured once per method, seed, size of the dataset and place, `errors` those that
-have a horizon, too. Both are one `pandas` table each (`table`, `error_table`); all pages and figures are made of these.
-Results of several places are merged line by line.
-"""
+"""Results of a recipe: what results.json holds, as tidy tables of which all pages and figures are made."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,7 +27,6 @@ WHOLE = 100  # the size of the dataset, in percent, of a recipe that does not sw
 TESTED, SIMULATED = "tested", "simulated"
 """Places: where a method was tested (the target, if there is one), and the simulator of its training."""
 SHARES = ("success", "failed")  # measures that are shares of episodes
-
 NullableFloat = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
 """A float whose NaN is null in JSON."""
 
@@ -147,11 +141,7 @@ class Results(Facts):
         import pandas as pd
 
         columns = ["row", "seed", "percent", "simulator", "quantity", "horizon", "mean", "low", "high"]
-        lines = [
-            (*one.key, *values)
-            for one in self.errors
-            for values in zip(one.horizons, one.mean, one.low, one.high, strict=True)
-        ]
+        lines = [(*e.key, *v) for e in self.errors for v in zip(e.horizons, e.mean, e.low, e.high, strict=True)]
         return pd.DataFrame(lines, columns=columns)
 
     @cached_property
@@ -187,15 +177,9 @@ class Results(Facts):
 
     def values(self, row: str, measure: str, where: str = TESTED, percent: int | None = None) -> dict[int, float]:
         """Return the value of a measure by seed, at a size, by default the largest."""
-        return self._values.get((row, percent or self.largest, where, measure), {})
-
-    @cached_property
-    def _values(self) -> dict[tuple[str, int, str, str], dict[int, float]]:
-        found: dict[tuple[str, int, str, str], dict[int, float]] = {}
-        for line in sorted(self.lines, key=lambda line: line.seed):
-            for measure, value in line.values.items():
-                found.setdefault((line.row, line.percent, line.where, measure), {})[line.seed] = value
-        return found
+        of = (row, percent or self.largest, where)
+        lines = [line for line in self.lines if (line.row, line.percent, line.where) == of and measure in line.values]
+        return {line.seed: line.values[measure] for line in sorted(lines, key=lambda line: line.seed)}
 
     def summary(self, row: str, measure: str, where: str = TESTED, percent: int | None = None) -> Estimate | None:
         """Return a measure over the seeds that have it; None where there are none."""
@@ -223,10 +207,7 @@ class Results(Facts):
         return [*dict.fromkeys(named + sorted(known))]
 
     def mean_errors(self, percent: int | None = None) -> "pd.DataFrame":
-        """Return errors averaged over seeds, of the horizons that all seeds and groundings share.
-
-        The index is row, simulator, quantity, horizon; the columns are mean, low, high; NaN where a seed has none.
-        """
+        """Return mean, low, high by row, simulator, quantity, horizon, averaged over seeds, of shared horizons."""
         index, values = ["row", "simulator", "quantity", "horizon"], ["mean", "low", "high"]
         found = self.error_table
         found = found[found["percent"] == (percent or self.largest)]
@@ -250,10 +231,7 @@ class Results(Facts):
         }
 
     def failure_rates(self) -> dict[str, dict[str, Floats]]:
-        """Return rates over all seeds at the largest size: what predicts failures → grounding → (3, bins).
-
-        The three are predicted rate, observed rate and number of steps.
-        """
+        """Return what predicts failures → grounding → predicted and observed rate and number of steps, (3, bins)."""
         parts: dict[str, dict[str, Floats]] = {}
         for (percent, row, part), of in self.predicted_failures().items():
             rows = all_bins(of)
@@ -270,10 +248,9 @@ class Results(Facts):
         size = percent or self.largest
         if self.judged is None or size not in self.percents:
             return None
+        rows = self.tested(size) if self.tested_in == "target" else []
         target = {
-            (line.row, line.seed): line.values["success"]
-            for line in self.lines
-            if line.where == TESTED and line.percent == size and self.tested_in == "target"
+            (row, seed): found for row in rows for seed, found in self.values(row, "success", percent=size).items()
         }
         return choice_of(self.judged, None if self.judged.percents == [None] else size, measured=target)
 
@@ -291,27 +268,25 @@ class Results(Facts):
         if self.tested_in == "target":
             return ""
         reference = reference_of(self.rows)
-        if reference is None:
-            place = (
-                "Each method was tested in the simulator of its training: its own grounded one, or the raw "
-                "one. So the numbers show what it learned, not whether it transfers. Add NAS to `methods` "
-                "to test all of them in one simulator."
-            )
-        else:
-            there = [method_title(row) for row in self.rows if grounded_as(row) == reference]
+        place = (
+            "Each method was tested in the simulator of its training: its own grounded one, or the raw one. So the "
+            "numbers show what it learned, not whether it transfers. Add NAS to `methods` to test all of them in one "
+            "simulator."
+        )
+        if reference:
+            there = " and ".join(method_title(row) for row in self.rows if grounded_as(row) == reference)
             place = (
                 f"All methods were tested in the abstract simulator grounded by {method_title(reference)}, in which "
-                f"only {' and '.join(there)} trained. It cannot show what is not in the abstract state."
+                f"only {there} trained. It cannot show what is not in the abstract state."
             )
         return f"**Nothing was tested on a robot: the task has no target.** {place}"
 
 
 def all_bins(of: "pd.DataFrame") -> Floats:
     """Return predicted and observed rates and number of steps of all bins and seeds, (N, 3)."""
-    rows = of[of.index.str.startswith("reliability.")]
-    bins = rows.groupby([name.split(".")[1] for name in rows.index], sort=False)
-    stacked = np.concatenate([np.empty((0, 3)), *(values.to_numpy().T for _, values in bins)])
-    return np.asarray(stacked[~np.isnan(stacked).any(axis=1)], dtype=np.float64)
+    rows = of[of.index.str.startswith("reliability.")].to_numpy(dtype=float)
+    stacked: Floats = rows.reshape(-1, 3, of.shape[1]).transpose(0, 2, 1).reshape(-1, 3)
+    return stacked[~np.isnan(stacked).any(axis=1)]
 
 
 def titled(row: str) -> str:
@@ -321,13 +296,7 @@ def titled(row: str) -> str:
 
 
 def merge(sources: Sequence[Results]) -> Results:
-    """Return the results of several places as one, without losing any; facts are those of the last.
-
-    A later line replaces an earlier one of the same method, seed and place.
-
-    Raises:
-        BadInputError: the sources differ in task, episodes, robot, judges or data.
-    """
+    """Return the results of several places as one; a later line replaces one of the same method, seed and place."""
     last, judged = sources[-1], [one.judged for one in sources if one.judged]
     facts = {what: [getattr(one, what) for one in sources] for what in ("task", "episodes", "tested_in", "leg_scale")}
     facts["judges"] = [one.model_dump(exclude={"candidates"}) for one in judged]
@@ -398,10 +367,7 @@ def judged_horizon(horizons: Iterable[int]) -> int:
 
 
 def elapsed_seconds(results: Results) -> float:
-    """Return for how long anything ran, in s: the union of the times of all artifacts.
-
-    What ran at the same time counts once; an artifact without a time of its end counts by itself.
-    """
+    """Return for how long anything ran, in s: the union of the times of all artifacts."""
     spans, total, last = [], 0.0, -np.inf
     for line in results.lines:
         seconds, end = line.values.get("wall_seconds", 0.0), line.values.get("finished_at")

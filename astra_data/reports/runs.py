@@ -1,6 +1,6 @@
 """Artifacts of all methods, seeds and sizes of a recipe → Results."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,14 +51,7 @@ SHARED_WORLDS = ("raw", "grounded")  # simulators in which all methods are teste
 
 @dataclass(frozen=True, kw_only=True)
 class Reported:
-    """What stages of a whole recipe need of it, small enough to be sent to another process.
-
-    Attributes:
-        name: of the recipe's file, without its ending. task: as `task_named` takes it.
-        methods: rows, in the order of the table. seeds: those to report, as far as they are finished.
-        settings: all settings of the recipe.
-        percents: dataset sizes in percent that every row is repeated on; empty if only on the whole.
-    """
+    """What stages of a whole recipe need of it, small enough to be sent to another process."""
 
     name: str
     task: str
@@ -93,13 +86,9 @@ class RunReader:
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self.evaluations: list[Evaluation] = []
-        self.judged: Judgment | None = None
         self.origins: list[Origin] = []
-        self.datasets: list[DatasetUse] = []
         self.lines: list[Line] = []
         self.errors: list[Errors] = []
-        self.trainings: list[TrainingFacts] = []
 
     def path(self, stage: str, owner: Owner, name: str) -> Path:
         """Return the place of an artifact's file."""
@@ -108,25 +97,23 @@ class RunReader:
     def read[A: Artifact](self, stage: str, owner: Owner, name: str, model: type[A]) -> A | None:
         """Read an artifact's file, and write down its origin and numbers; None where there is none."""
         path = self.path(stage, owner, name)
-        if not path.is_file():
-            return None
-        file = read_json(model, path)
-        self._add(stage, owner, file)
-        return file
+        return self.add(stage, owner, read_json(model, path)) if path.is_file() else None
 
-    def _add(self, stage: str, owner: Owner, file: Artifact) -> None:
-        self.origins.append(_origin_of(stage, file))
+    def add[A: Artifact](self, stage: str, owner: Owner, file: A) -> A:
+        """Write down the origin and the numbers of a file."""
+        self.origins.append(
+            Origin(commit=file.git_commit, machine=file.machine, packages=file.packages, stages=[stage])
+        )
         self._line(owner, stage, file.numbers())
+        return file
 
     def _line(self, owner: Owner, where: str, values: Mapping[str, float | None]) -> None:
         if known := without_nan(values):
             self.lines.append(Line(**owner.facts(), where=where, values=known))
 
-    def evaluation(self, owner: Owner) -> None:
+    def evaluation(self, owner: Owner) -> Evaluation:
         """Read how a method was tested."""
-        file = self.read("evaluate", owner, EVALUATION, Evaluation)
-        assert file is not None
-        self.evaluations.append(file)
+        file = self.add("evaluate", owner, read_json(Evaluation, self.path("evaluate", owner, EVALUATION)))
         values: dict[str, float | None] = {**file.outcomes.means(), "beyond_recorded": file.beyond_recorded}
         trajectories = self.path("evaluate", owner, TRAJECTORIES)
         if trajectories.is_file():
@@ -139,14 +126,7 @@ class RunReader:
                 self._line(owner, where, outcomes.means())
         for encoder, means in file.encoders.items():
             self._line(owner, f"encoder {encoder}", means)
-
-    def training(self, owner: Owner, score: Score, *, is_shown: bool) -> None:
-        """Read how a method was trained."""
-        file = self.read("train", owner, CURVE, CurveFile)
-        if file and is_shown:
-            steps = [point.steps for point in file.points]
-            scores = [point.success if score == SUCCESS else point.episode_steps for point in file.points]
-            self.trainings.append(TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": scores}))
+        return file
 
     def grounding(self, owner: Owner) -> None:
         """Read times, R², predicted failures and open-loop errors on held-out episodes of a grounding."""
@@ -159,113 +139,84 @@ class RunReader:
                 given: dict[str, Any] = {"simulator": simulator, "quantity": quantity, "horizons": gap.horizons}
                 self.errors.append(Errors(**owner.facts(), **given, **band.model_dump()))
 
-    def dataset(self, stage: str, owner: Owner) -> None:
-        """Read which dataset a stage made."""
-        file = self.read(stage, owner, str(DATASET_PATH), DatasetFile)
-        if file and owner.percent is None:
-            facts = file.model_dump(include={"name", "version", "content_hash"})
-            self.datasets.append(DatasetUse(stage=stage, seed=owner.seed, **facts))
-
-    def choice(self, rows: Sequence[str], seeds: Sequence[int]) -> None:
-        """Read the choice without the target among the policies of rows and seeds."""
-        if judged := read_judged(self._root):
-            self._add("select", Owner("", seeds[0], None), judged)
-            known = [one for one in judged.candidates if one.row in rows and one.seed in seeds]
-            facts = judged.model_dump(include={"judge", "episodes", "shares_episodes"})
-            self.judged = Judgment(**facts, candidates=known) if known else None
-
 
 def read_run(
     reported: Reported, *, root: Path, command: str, scores: tuple[Score, ...] = (SUCCESS,), **facts: object
 ) -> Results:
-    """Return the results under `root` of every method, for the seeds that it has finished.
-
-    Args:
-        reported: whose they are; its task by its name, as in its evaluations.
-        root: its folder of runs: `root`/<stage>/<method>/seed_<seed>/.
-        command: that made them.
-        scores: that methods are compared by.
-        facts: further fields of `Results`.
-
-    Raises:
-        MissingStageError: no method has an evaluation.
-        BadInputError: an artifact is malformed, or methods differ in task, episodes, robot or quantities.
-    """
+    """Return the results under `root` of every method, for the seeds that it has finished; `facts` are of `Results`."""
     rows, seeds, run = reported.methods, reported.seeds, RunReader(root)
+    files: list[Evaluation] = []
+    trainings: list[TrainingFacts] = []
     if not rows or not seeds:
         raise BadInputError(f"{reported.name}: expected methods and seeds, got none; name some in the recipe")
     for percent in reported.percents or (None,):
         owners = [Owner(row, seed, percent) for row in rows for seed in seeds]
         finished = [owner for owner in owners if run.path("evaluate", owner, EVALUATION).is_file()]
-        for owner in finished:
-            run.evaluation(owner)
+        files += map(run.evaluation, finished)
         # Fine-tuned policies start from those of a method that need not be reported.
         initial = [(method_named(owner.row).initial, owner) for owner in finished]
         for owner in dict.fromkeys([*finished, *(owner._replace(row=row) for row, owner in initial if row)]):
-            run.training(owner, scores[0], is_shown=owner in finished)
+            curve = run.read("train", owner, CURVE, CurveFile)
+            if curve and owner in finished:
+                steps = [point.steps for point in curve.points]
+                found = [point.success if scores[0] == SUCCESS else point.episode_steps for point in curve.points]
+                trainings.append(TrainingFacts.model_validate(owner.facts() | {"steps": steps, "score": found}))
         for owner in dict.fromkeys(owner._replace(row=grounded_as(owner.row)) for owner in finished):
             run.grounding(owner)
             run.read("align", owner, METRICS, Metrics)
+    uses = []
     for stage in DATASET_STAGES:
         percents = reported.percents if stage == "subset" else (None,)
         for owner in (Owner("", seed, percent) for seed in seeds for percent in percents):
-            run.dataset(stage, owner)
-    run.choice(rows, seeds)
-    files = run.evaluations
+            data = run.read(stage, owner, str(DATASET_PATH), DatasetFile)
+            if data and owner.percent is None:
+                identity = data.model_dump(include={"name", "version", "content_hash"})
+                uses.append(DatasetUse(stage=stage, seed=owner.seed, **identity))
+    for file in files:
+        if file.dataset_hash:
+            version, content = file.dataset_version or "", file.dataset_hash
+            uses.append(DatasetUse(stage="evaluate", seed=file.seed, version=version, content_hash=content))
+    judgment = None
+    if judged := read_judged(root):
+        run.add("select", Owner("", seeds[0], None), judged)
+        if known := [one for one in judged.candidates if one.row in rows and one.seed in seeds]:
+            facts_of = judged.model_dump(include={"judge", "episodes", "shares_episodes"})
+            judgment = Judgment(**facts_of, candidates=known)
+    run.add("report", Owner("", 0, None), Artifact.model_validate(origin()))
     if not files:
         raise MissingStageError(
             f"expected {EVALUATION} in {root / 'evaluate'}/<method>/seed_<seed>/, found none for "
             f"{', '.join(rows)}; run the recipe {reported.name} again: it continues with what is missing"
         )
-    _check_alike(files, reported.task)
-    uses = [
-        DatasetUse(stage="evaluate", seed=file.seed, version=file.dataset_version or "", content_hash=file.dataset_hash)
+    first = files[0]
+    if wrong := [
+        f"{file.method} seed {file.seed} on {file.task} with {file.episodes} episodes and legs {file.leg_scale:g} "
+        "times as long"
         for file in files
-        if file.dataset_hash
-    ]
+        if (file.task, file.episodes, file.leg_scale) != (reported.task, first.episodes, first.leg_scale)
+    ]:
+        raise BadInputError(
+            f"expected every method evaluated on {reported.task} with {first.episodes} episodes and legs "
+            f"{first.leg_scale:g} times as long, got {', '.join(wrong)}; evaluate those again"
+        )
+    code = ["task", *(name for row in rows for name in (base_method(row), grounded_as(row)))]
+    recorded = recorded_code(root)
     made = {
         "recipe": reported.name,
         "task": reported.task,
         "command": command,
         "rows": rows,
         "scores": scores,
-        "episodes": files[0].episodes,
+        "episodes": first.episodes,
         "tested_in": "target" if all(file.target for file in files) else "simulators",
-        "leg_scale": files[0].leg_scale,
+        "leg_scale": first.leg_scale,
         "settings": dict(reported.settings),
-        "origins": merged_origins([*run.origins, _origin_of("report", Artifact.model_validate(origin()))]),
-        "user_code": _code_of(root, rows),
-        "judged": run.judged,
-        "datasets": [*run.datasets, *dict.fromkeys(uses)],
+        "origins": merged_origins(run.origins),
+        "user_code": {name: recorded[name] for name in dict.fromkeys(code) if name in recorded},
+        "judged": judgment,
+        "datasets": [*dict.fromkeys(uses)],
         "lines": run.lines,
         "errors": run.errors,
-        "trainings": run.trainings,
+        "trainings": trainings,
     }
     return Results.model_validate(made | facts)
-
-
-def _origin_of(stage: str, file: Artifact) -> Origin:
-    return Origin(commit=file.git_commit, machine=file.machine, packages=file.packages, stages=[stage])
-
-
-def _code_of(root: Path, rows: Iterable[str]) -> dict[str, str]:
-    """Return the digests that the run recorded of the code of its task and of methods of `rows`."""
-    recorded = recorded_code(root)
-    named = ["task", *(name for row in rows for name in (base_method(row), grounded_as(row)))]
-    return {name: recorded[name] for name in dict.fromkeys(named) if name in recorded}
-
-
-def _check_alike(files: Sequence[Evaluation], task: str) -> None:
-    """Refuse evaluations that cannot stand in one table."""
-    first = files[0]
-    wrong = [
-        f"{file.method} seed {file.seed} on {file.task} with {file.episodes} episodes and legs "
-        f"{file.leg_scale:g} times as long"
-        for file in files
-        if (file.task, file.episodes, file.leg_scale) != (task, first.episodes, first.leg_scale)
-    ]
-    if wrong:
-        raise BadInputError(
-            f"expected every method evaluated on {task} with {first.episodes} episodes and legs "
-            f"{first.leg_scale:g} times as long, got {', '.join(wrong)}; evaluate those again"
-        )

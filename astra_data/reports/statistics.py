@@ -24,10 +24,7 @@ LEAST_SEEDS = 3  # seeds below which no interval is given
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure over `seeds` with the ends of its 95 % interval, None where there are too few of them.
-
-    `std` is the sample standard deviation of a mean; None for a single seed, or where it is not of use.
-    """
+    """A figure over `seeds` with the ends of its 95 % interval, None where there are too few; `std` is the sample's."""
 
     value: float
     low: float | None = None
@@ -56,13 +53,7 @@ def interval(found: Estimate | None, digits: int = 2) -> str:
 
 
 def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, trials: int = 0) -> Estimate:
-    """Return the mean of values (N,), one per seed or judge.
-
-    Args:
-        scores: finite.
-        limit: values lie between 0 and this; None where they have no bounds.
-        trials: each value is a share of so many episodes; 0 where it is none.
-    """
+    """Return the mean of values (N,), one per seed or judge, from 0 to `limit`; each a share of `trials` episodes."""
     values = np.asarray(scores, dtype=np.float64)
     if values.size == 0 or not np.isfinite(values).all():
         raise BadInputError(f"expected one finite score per seed, got {values.tolist()}")
@@ -88,10 +79,9 @@ def summarize(scores: Sequence[float] | Floats, *, limit: float | None = None, t
 def paired_difference(
     scores: Mapping[int, float], others: Mapping[int, float], *, limit: float | None = None, trials: int = 0
 ) -> Estimate | None:
-    """Return the mean difference on the seeds that both have, with its 95 % interval (Student's t).
+    """Return the mean difference on the seeds that both have, with Student's t interval; None where there are none.
 
-    What a seed does to both cancels. The variance is at least that of drawing the episodes of shares. None where no
-    seed is shared. `limit` and `trials` are as for `summarize`.
+    The variance is at least that of drawing the episodes of shares. `limit` and `trials` are as for `summarize`.
     """
     shared = [seed for seed in scores if seed in others]
     if not shared:
@@ -112,11 +102,7 @@ def paired_difference(
 
 
 def probability_of_improvement(scores: Floats, others: Floats) -> Estimate | None:
-    """Estimate how likely a seed of `scores` (N,) beats one of `others` (M,); ties count half.
-
-    Its interval is a percentile bootstrap over seeds (Agarwal et al., 2021). None where a side has fewer than
-    `LEAST_SEEDS` seeds.
-    """
+    """Estimate how likely a seed of `scores` beats one of `others`, with a bootstrap over seeds; ties count half."""
     if min(len(scores), len(others)) < LEAST_SEEDS:
         return None
     from scipy.stats import bootstrap
@@ -138,11 +124,7 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Estimate | Non
 
 
 def correlation(first: Sequence[Floats], second: Sequence[Floats], *, ranks: bool = False) -> Estimate | None:
-    """Correlate two scores over all seeds of some rows: Pearson's coefficient, or with `ranks` Spearman's.
-
-    The seeds of a row are not independent, so the interval resamples rows, and seeds within each row. None where there
-    are fewer than three seeds in all, or one side does not vary. Each score is an array (seeds,) for each row.
-    """
+    """Correlate two scores, (seeds,) for each row, by Pearson's or Spearman's coefficient, resampling both."""
     from scipy.stats import rankdata
 
     def coefficient(pair: Floats) -> float:

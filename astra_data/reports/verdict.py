@@ -26,15 +26,7 @@ _TOO_MANY_FAILURES = 1 / 3
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to deploy.
-
-    Attributes:
-        row: the method; None where none is to be deployed.
-        seed: of its policy. percent: size of its dataset.
-        text: the verdict, in a sentence.
-        lines: best method, floor, and the difference between them, each with its label.
-        remarks: causes, what helps, and what limits the verdict.
-    """
+    """What to deploy (`row` is None for none), with best method, floor and difference, and what limits the verdict."""
 
     row: str | None
     seed: int

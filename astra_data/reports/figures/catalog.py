@@ -1,8 +1,4 @@
-"""Figures: what they show, and how they are drawn, in one style.
-
-A figure of the report is a line of `FIGURES` and a function from the results and their scene to a matplotlib Figure, or
-to None where there is nothing to draw.
-"""
+"""Figures: a line of `FIGURES`, and a function from results and scene to a Figure, or to None with nothing to draw."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

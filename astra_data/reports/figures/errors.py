@@ -69,12 +69,9 @@ def reliability_of(results: Results, _: Scene) -> Figure | None:
 
 
 def reliability(parts: Mapping[str, Mapping[str, Floats]]) -> Figure:
-    """Draw observed against predicted rates, equal on the dashed line, above the number of steps at each.
+    """Draw observed against predicted rates, by their square roots, above the number of steps at each.
 
-    Both rates are drawn by their square roots, as most are small.
-
-    Args:
-        parts: what predicts failures → row → predicted rates, observed rates and numbers of steps, (3, bins).
+    `parts` is what predicts failures → row → predicted rates, observed rates and numbers of steps, (3, bins).
     """
     with style():
         figure = Figure(figsize=(1.9 + 2.7 * len(parts), 4.2), layout="constrained")

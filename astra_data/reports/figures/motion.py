@@ -36,11 +36,7 @@ _COMMANDS = (((0.8, 0.0), 2.0), ((0.0, 0.8), 1.0), ((-0.8, 0.0), 2.0), ((0.0, -0
 
 @dataclass(frozen=True)
 class CommandReplay:
-    """The same commands (T, 2), ±1 per axis, in the abstract simulator and in the target, at times (T,).
-
-    `simulated` is [x, y, vx, vy] after each step, (T, 4); `target` that of N robots, which start with random headings,
-    (N, T, 4).
-    """
+    """Commands (T, 2), ±1 per axis, and [x, y, vx, vy] after each: simulated (T, 4), of N target robots (N, T, 4)."""
 
     time_s: Floats
     command: Floats
@@ -49,10 +45,7 @@ class CommandReplay:
 
 
 def can_replay(task: Task) -> bool:
-    """Return whether a task's target can be driven from the start cell by velocities in its plane.
-
-    A robot with a ball turns to it, so its commands are not comparable; a user's robots start where they do.
-    """
+    """Return whether a task's target can be driven from the start cell by velocities in its plane; not to a ball."""
     planar = task.plane is not None and task.objective.action_size == 2
     return planar and task.ball_index is None and task.make_target is not None
 
@@ -90,10 +83,7 @@ RIM = 0.35  # visible width of the outer walls, in cells
 
 
 def trajectories(results: Results, scene: Scene) -> Figure | None:
-    """Draw the plane once per method: dashed in the simulator, solid where tested; failures end with a cross.
-
-    Return None where no method has positions in a plane (`Objective.places`).
-    """
+    """Draw the plane once per method: dashed in the simulator, solid where tested; failures end with a cross."""
     maze = scene.task.maze if scene.task.plane else None
     panels = {row: _walked(folder, scene.episodes) for row, folder in scene.folders(results).items()}
     shown = np.concatenate([path.reshape(-1, 2) for one in panels.values() for path in one.paths] or [np.empty((0, 2))])

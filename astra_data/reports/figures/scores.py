@@ -81,11 +81,7 @@ def score_bars(measure: str) -> Callable[[Results, Scene], Figure | None]:
 
 
 def learning_curves(results: Results, _: Scene) -> Figure | None:
-    """Draw the headline score of training episodes over steps: mean over seeds, band from worst to best.
-
-    Each method has a panel; its variant with the plus settings is dashed. Methods with a seed without scores are left
-    out.
-    """
+    """Draw the headline score of training episodes over steps, by method: mean over seeds, band from worst to best."""
     curves = {}
     for row in results.rows:
         of = [one for one in results.trainings if (one.row, one.percent) == (row, results.largest)]
@@ -140,10 +136,7 @@ def _steps_label(steps: float, _: float) -> str:
 
 
 def data_efficiency(results: Results, scene: Scene) -> Figure | None:
-    """Draw the headline score over the size of the dataset, under what each size covers (the paper's figure).
-
-    Coverage is drawn if a seed has the datasets of all sizes in the folder of runs.
-    """
+    """Draw the headline score over the size of the dataset, under what each size covers (the paper's figure)."""
     percents, score = results.percents, results.headline
     if len(percents) < 2:
         return None

@@ -66,13 +66,7 @@ _RC = {
 
 @dataclass(frozen=True)
 class Scene:
-    """What figures are drawn from besides the results.
-
-    Attributes:
-        root: the recipe's folder of runs. task: the recipe's.
-        methods: whose trajectories are drawn; all methods if none of these is in the results.
-        episodes: how many of each.
-    """
+    """What figures are drawn from besides the results: `episodes` of each of `methods`, by default of all."""
 
     root: Path
     task: "Task"
@@ -147,14 +141,7 @@ def png(figure: Figure) -> bytes:
 
 
 def coverage(counts: Ints, extent: tuple[float, float, float, float], label: str, unit: str) -> Figure:
-    """Draw how often the cells of a plane were visited; those never visited stay white.
-
-    Args:
-        counts: indexed [y, x] from the lower left, (height, width).
-        extent: left, right, bottom and top edge.
-        label: what the plane is: "position" or "velocity".
-        unit: of both axes.
-    """
+    """Draw how often the cells [y, x] of a plane, from the lower left, were visited; those never visited stay white."""
     with style():
         figure = Figure(figsize=(4.2, 3.6), layout="constrained")
         axes = figure.subplots()
