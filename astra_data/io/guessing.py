@@ -1,6 +1,5 @@
 """What the fields of a new robot's logs are, guessed from their names and values; a person checks it."""
 
-import io
 import math
 import re
 from collections.abc import Iterable, Sequence
