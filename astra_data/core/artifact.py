@@ -9,19 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from astra_data.core.durable import (
-    clean,
-    discard,
-    file_digest,
-    held,
-    make_folder,
-    move,
-    remove_empty,
-    sweep,
-    sync_tree,
-    write_file,
-    writing,
-)
+from astra_data.core import durable
 from astra_data.core.errors import BadInputError
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -54,24 +42,24 @@ def finished_folder(
     def is_begun() -> bool:
         return any(path != settings for path in partial.iterdir())
 
-    with writing(out), ExitStack() as stack:
-        made = make_folder(partial)
-        if not stack.enter_context(held(partial)):
+    with durable.writing(out), ExitStack() as stack:
+        made = durable.make_folder(partial)
+        if not stack.enter_context(durable.held(partial)):
             raise BadInputError(f"{out} is being written right now: wait, or choose another folder")
         try:
-            sweep(out)
+            durable.sweep(out)
             if old.exists() and not out.exists():  # a kill came between the two renames below
-                move(old, out)
+                durable.move(old, out)
             if replace:
                 for path in partial.iterdir():
                     shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
                 if old.exists():
-                    discard(old, out)
+                    durable.discard(old, out)
             else:
                 refuse_finished(out)
-            clean(partial)
+            durable.clean(partial)
             if config is not None and not is_begun():
-                write_file(settings, config)
+                durable.write_file(settings, config)
             elif config is not None and not (settings.is_file() and settings.read_text() == config):
                 fault = "was started with other settings (see its config.json if it has one)"
                 raise BadInputError(f"{partial} {fault}: remove it")
@@ -79,23 +67,23 @@ def finished_folder(
         except BaseException:
             with suppress(OSError):
                 if not is_begun():
-                    discard(partial, out)
-                    remove_empty(made)
+                    durable.discard(partial, out)
+                    durable.remove_empty(made)
             raise
         for checkpoint in partial.glob(f"*{CHECKPOINT}"):
             checkpoint.unlink()
         if made_from is not None:
             write_manifest(partial, made_from)
-        clean(partial)
-        sync_tree(partial)
+        durable.clean(partial)
+        durable.sync_tree(partial)
         if out.exists():
-            move(out, old)
+            durable.move(out, old)
         try:
-            move(partial, out)
+            durable.move(partial, out)
         finally:
             with suppress(OSError):
                 if out.exists():
-                    discard(old, out)
+                    durable.discard(old, out)
                 else:
                     os.replace(old, out)
 
@@ -115,7 +103,7 @@ class Manifest:
                 faults.append(f"{name} is missing")
             elif (now := found[name].stat().st_size) != size:
                 faults.append(f"{name} has {now:,} bytes, expected {size:,}")
-            elif verify and file_digest(found[name]) != digest:
+            elif verify and durable.file_digest(found[name]) != digest:
                 faults.append(f"{name} was altered")
         return faults
 
@@ -123,7 +111,7 @@ class Manifest:
 def check_intact(path: Path) -> None:
     """Refuse a file whose bytes are not those in the manifest beside it, if there is one."""
     manifest = _manifest_beside(path)
-    if manifest and path.name in manifest.files and manifest.files[path.name][1] != file_digest(path):
+    if manifest and path.name in manifest.files and manifest.files[path.name][1] != durable.file_digest(path):
         raise BadInputError(
             f"{path} was altered since it was made: restore it from a copy, or remove {path.parent} and run "
             "the recipe again"
@@ -143,7 +131,10 @@ def check_made_from(made: Path, read: Mapping[str, str | None]) -> None:
 
 def write_manifest(folder: Path, made_from: Mapping[str, str | None]) -> None:
     """Write the manifest of all that is in `folder` now, leaving out of `made_from` what is None."""
-    files = {name: {"bytes": path.stat().st_size, "sha256": file_digest(path)} for name, path in _files(folder).items()}
+    files = {
+        name: {"bytes": path.stat().st_size, "sha256": durable.file_digest(path)}
+        for name, path in _files(folder).items()
+    }
     digests = {name: digest for name, digest in made_from.items() if digest}
     (folder / MANIFEST).write_text(json.dumps({"files": files, "made_from": digests}, indent=1))
 

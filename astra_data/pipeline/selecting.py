@@ -19,22 +19,7 @@ from astra_data.pipeline.stages.select import select as judge_all
 from astra_data.pipeline.trained_policy import settings_of, trained_policy
 from astra_data.pipeline.user_code import add_all
 from astra_data.policies.episodes import in_target, started
-from astra_data.reports.choice import (
-    FOLDER,
-    PSEUDO_TRIALS,
-    SELECTED,
-    TRIALS,
-    Judged,
-    TrialRound,
-    TrialsFile,
-    Tried,
-    halve,
-    least_trials,
-    read_judged,
-    read_trials,
-    select_page,
-    widest_field,
-)
+from astra_data.reports import choice
 from astra_data.reports.runs import Reported
 from astra_data.robots.registry import task_named
 
@@ -48,7 +33,7 @@ def select(
     judge: str | None = None,
     episodes: int | None = None,
     progress: Progress = silent,
-) -> Judged:
+) -> choice.Judged:
     """Judge every trained policy of a run, as the stage `select` does; write `select` in the run's folder.
 
     A choice that is there is kept if it was made of the same with the same settings, and otherwise set aside.
@@ -66,16 +51,16 @@ def select(
         percents=tuple(settings.get("sweep", {}).get("percent", ())),
     )
     with alone_in(folder):
-        if not _is_current(folder, recipe, config) or read_judged(folder) is None:
+        if not _is_current(folder, recipe, config) or choice.read_judged(folder) is None:
             judge_all(recipe, config, root=folder, progress=progress)
-        judged = read_judged(folder)
+        judged = choice.read_judged(folder)
     assert judged is not None
     return judged
 
 
 def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
     """Return whether the choice in `folder` is this one; set aside another one."""
-    out = folder / FOLDER
+    out = folder / choice.FOLDER
     if out.is_symlink():
         raise BadInputError(f"{out} belongs to {out.resolve().parent}, which this run is based on: run select there")
     if not out.is_dir():
@@ -85,8 +70,8 @@ def _is_current(folder: Path, recipe: Reported, config: SelectConfig) -> bool:
     same = manifest is not None and manifest.made_from == read and not manifest.faults(out, verify=False)
     if same and (out / "config.json").read_text() == config.model_dump_json(indent=1):
         return True
-    aside = set_aside(folder, FOLDER)
-    if (aside / TRIALS).is_file():
+    aside = set_aside(folder, choice.FOLDER)
+    if (aside / choice.TRIALS).is_file():
         _log.warning("choosing again; the old choice, with its trials in the target, is in %s", aside)
     return False
 
@@ -101,7 +86,7 @@ def choose_by_trials(
     judge: str | None = None,
     episodes: int | None = None,
     progress: Progress = silent,
-) -> TrialsFile:
+) -> choice.TrialsFile:
     """Spend so many episodes in the target on the candidates of a run; write `select/trials.json`.
 
     Candidates of a round meet the same starts and goals, others than those of `evaluate`. An interrupted call
@@ -110,7 +95,7 @@ def choose_by_trials(
     folder, task = Path(run), str(settings_of(run)["task"])
     if not task_named(task).has_target:
         raise BadInputError(f"{folder}: expected a task with a target, got {task}: leave out --trials")
-    least = least_trials(max(2, field or 2))
+    least = choice.least_trials(max(2, field or 2))
     if (field is not None and field < 2) or trials < least:
         raise BadInputError(
             f"expected --trials of {least} or more, for a first round of {field or 2} candidates and those "
@@ -124,10 +109,10 @@ def choose_by_trials(
     if not 2 <= (asked := field or len(candidates)) <= len(candidates):
         of = f"of the {len(candidates)} that were judged, got {asked}"
         raise BadInputError(f"expected two candidates or more to try, {of}: give another --field, or more rows")
-    field = field or widest_field(len(candidates), trials)
-    begun = TrialsFile(trials=trials, field=field, percent=percent, pseudo_trials=PSEUDO_TRIALS)
-    path = folder / FOLDER / TRIALS
-    if there := read_trials(path):
+    field = field or choice.widest_field(len(candidates), trials)
+    begun = choice.TrialsFile(trials=trials, field=field, percent=percent, pseudo_trials=choice.PSEUDO_TRIALS)
+    path = folder / choice.FOLDER / choice.TRIALS
+    if there := choice.read_trials(path):
         for name, now in begun.model_dump(include={"trials", "field", "percent", "pseudo_trials"}).items():
             if (was := getattr(there, name)) != now:
                 raise BadInputError(
@@ -140,7 +125,7 @@ def choose_by_trials(
     def attempt(number: int, those: tuple[int, ...], each: int) -> list[int]:
         named = [(candidates[one].row, candidates[one].seed) for one in those]
         if number == len(rounds):
-            rounds.append(TrialRound(trials=each, candidates=named))
+            rounds.append(choice.TrialRound(trials=each, candidates=named))
         for row, seed in named[len(rounds[number].tried) :]:
             trained = trained_policy(folder, row, seed=seed, percent=begun.percent)
             scale = EvaluateConfig.model_validate(trained.settings.get("evaluate") or {}).leg_scale
@@ -148,7 +133,7 @@ def choose_by_trials(
             begin, drawn = partial(started, policy, policy.act), derive(number, "trials of a choice")
             outcome = in_target(policy.task, begin, each, drawn, leg_scale=scale).outcome
             success = [int(one) for one in outcome.success]
-            tried = [*rounds[number].tried, Tried(row=row, seed=seed, success=success)]
+            tried = [*rounds[number].tried, choice.Tried(row=row, seed=seed, success=success)]
             rounds[number] = rounds[number].model_copy(update={"tried": tried})
             now = begun.model_copy(update={"rounds": rounds})
             _write(folder, judged, now)
@@ -156,20 +141,20 @@ def choose_by_trials(
         return [sum(one.success) for one in rounds[number].tried]
 
     with alone_in(folder):
-        found = halve([one.lower for one in candidates], begun.trials, attempt, field=begun.field)
+        found = choice.halve([one.lower for one in candidates], begun.trials, attempt, field=begun.field)
         first = candidates[found.chosen]
         done = begun.model_copy(update={"rounds": rounds, "chosen": (first.row, first.seed), "mean": found.mean})
         _write(folder, judged, done)
     return done
 
 
-def _write(folder: Path, judged: Judged, trials: TrialsFile) -> None:
+def _write(folder: Path, judged: choice.Judged, trials: choice.TrialsFile) -> None:
     """Write the choice again, with its trials."""
-    out = folder / FOLDER
+    out = folder / choice.FOLDER
     manifest = read_manifest(out)
     assert manifest is not None
     with finished_folder(out, replace=True, made_from=manifest.made_from) as partly:
-        for name in ("config.json", SELECTED):
+        for name in ("config.json", choice.SELECTED):
             copy2(out / name, partly / name)
-        (partly / TRIALS).write_text(trials.model_dump_json(indent=1))
-        (partly / "select.md").write_text(select_page(folder.name, judged, trials))
+        (partly / choice.TRIALS).write_text(trials.model_dump_json(indent=1))
+        (partly / "select.md").write_text(choice.select_page(folder.name, judged, trials))

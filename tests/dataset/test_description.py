@@ -11,18 +11,8 @@ from damaged import DATA, EPISODES, alter, edit, reseal
 from fake_dataset import concatenated, fake_episodes, write_fake
 
 from astra_data.core.errors import BadInputError, CorruptDatasetError
-from astra_data.dataset import Dataset, parquet
+from astra_data.dataset import Dataset, description, parquet
 from astra_data.dataset.columns import ACTION, REWARD, STATE
-from astra_data.dataset.description import (
-    SEALED,
-    ContentHash,
-    altered_files,
-    changed_values,
-    complete_description,
-    permutation,
-    read_description,
-    read_digests,
-)
 from astra_data.dataset.format import DATA_PATH, DATASET_PATH, DIGESTS_PATH
 from astra_data.dataset.plain import is_data_path
 
@@ -30,7 +20,9 @@ PARENT = {"name": "raw", "version": "1.0.0", "hash": "0"}
 
 
 def test_a_description_is_completed_with_defaults_packages_and_the_machine() -> None:
-    full = complete_description({"name": "walks", "stage": "pair", "parents": [PARENT], "config": {"a": (1, 2)}})
+    full = description.complete_description(
+        {"name": "walks", "stage": "pair", "parents": [PARENT], "config": {"a": (1, 2)}}
+    )
     assert full["version"] == "1.0.0" and full["parents"] == [PARENT] and full["config"] == {"a": [1, 2]}
     assert full["packages"]["numpy"] == np.__version__
     assert full["machine"]["cores"] == len(os.sched_getaffinity(0))
@@ -51,7 +43,7 @@ def test_a_description_is_completed_with_defaults_packages_and_the_machine() -> 
 )
 def test_a_malformed_description_is_refused(change: dict[str, object], fault: str) -> None:
     with pytest.raises(BadInputError) as caught:
-        complete_description({"name": "walks", "stage": "pair"} | change)
+        description.complete_description({"name": "walks", "stage": "pair"} | change)
     assert fault in str(caught.value)
 
 
@@ -60,12 +52,12 @@ def test_the_content_hash_is_sha256_of_the_columns_hashes() -> None:
     expected = hashlib.sha256()
     for name, kind, values in (("reward", "float32()", reward), ("state", "float32(3,)", state)):
         expected.update(f"{name}\0{kind}\0".encode() + hashlib.sha256(values.tobytes()).digest())
-    running = ContentHash()
+    running = description.ContentHash()
     for rows in (slice(0, 1), slice(1, 4)):  # block by block, and in another order
         running.update("state", state[rows])
         running.update("reward", reward[rows])
     assert running.hexdigest() == expected.hexdigest()
-    turned = ContentHash()
+    turned = description.ContentHash()
     turned.update("reward", reward)
     turned.update("state", np.ascontiguousarray(state.reshape(3, 4)))
     assert turned.hexdigest() != expected.hexdigest()
@@ -74,15 +66,15 @@ def test_the_content_hash_is_sha256_of_the_columns_hashes() -> None:
 def test_changed_values_are_found_at_any_depth() -> None:
     before = {"a": 1, "b": {"c": 2, "d": {"e": 3}}, "f": {"g": 1}}
     after = {"a": 1, "b": {"c": 2, "d": {"e": 4}}, "f": 5, "h": 6}
-    assert list(changed_values(before, after)) == [("b.d.e", 3, 4), ("f", {"g": 1}, 5), ("h", None, 6)]
+    assert list(description.changed_values(before, after)) == [("b.d.e", 3, 4), ("f", {"g": 1}, 5), ("h", None, 6)]
 
 
 def test_a_permutation_does_not_depend_on_the_other_uids() -> None:
-    order = permutation(range(100), seed=3)
-    assert sorted(order) == list(range(100)) and order != permutation(range(100), seed=4)
-    assert permutation(range(0, 100, 3), seed=3) == [uid for uid in order if uid % 3 == 0]
+    order = description.permutation(range(100), seed=3)
+    assert sorted(order) == list(range(100)) and order != description.permutation(range(100), seed=4)
+    assert description.permutation(range(0, 100, 3), seed=3) == [uid for uid in order if uid % 3 == 0]
     # Uniform: over many seeds each uid comes first about equally often.
-    first = [permutation(range(4), seed)[0] for seed in range(1000)]
+    first = [description.permutation(range(4), seed)[0] for seed in range(1000)]
     assert all(200 < first.count(uid) < 300 for uid in range(4))
 
 
@@ -110,7 +102,7 @@ def test_every_fault_of_a_forged_description_is_told_at_once(tmp_path: Path) -> 
     edit(DATASET_PATH, name="a/b", parents=[{"name": "x"}], config=3)(root)
     reseal(root)
     with pytest.raises(CorruptDatasetError) as caught:
-        read_description(root)
+        description.read_description(root)
     for fault in ("name 'a/b', expected", "parent {'name': 'x'}, expected", "config 3, expected an object"):
         assert fault in str(caught.value)
 
@@ -172,7 +164,7 @@ def test_digests_that_do_not_fit_are_refused(tmp_path: Path, table: pa.Table) ->
     (tmp_path / DIGESTS_PATH).parent.mkdir(parents=True)
     pq.write_table(table, tmp_path / DIGESTS_PATH)
     with pytest.raises(CorruptDatasetError, match="has other columns than the data"):
-        read_digests(tmp_path, [REWARD, ACTION])
+        description.read_digests(tmp_path, [REWARD, ACTION])
 
 
 def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:
@@ -180,19 +172,19 @@ def test_the_sums_are_those_of_the_files(tmp_path: Path) -> None:
     sums = dict(dataset.description["sums"])
     sums.pop(DATASET_PATH)
     assert sums == {
-        path: hashlib.sha256((dataset.root / path).read_bytes()).hexdigest() for path in (*SEALED, EPISODES)
+        path: hashlib.sha256((dataset.root / path).read_bytes()).hexdigest() for path in (*description.SEALED, EPISODES)
     }
-    assert altered_files(dataset.root, dataset.description) == []
+    assert description.altered_files(dataset.root, dataset.description) == []
 
 
-@pytest.mark.parametrize("path", [*SEALED, EPISODES])
+@pytest.mark.parametrize("path", [*description.SEALED, EPISODES])
 def test_every_sealed_file_is_known_when_altered_or_missing(path: str, tmp_path: Path) -> None:
     dataset = write_fake(tmp_path / "set")
     with (dataset.root / path).open("ab") as file:
         file.write(b" ")
-    assert altered_files(dataset.root, dataset.description) == [path]
+    assert description.altered_files(dataset.root, dataset.description) == [path]
     (dataset.root / path).unlink()
-    assert altered_files(dataset.root, dataset.description) == [path]
+    assert description.altered_files(dataset.root, dataset.description) == [path]
 
 
 @pytest.mark.parametrize("change", [{"seeds": {}}, {"content_hash": "0" * 64}, {"more": 1}])
@@ -200,6 +192,6 @@ def test_the_description_seals_itself(change: dict[str, object], tmp_path: Path)
     root = write_fake(tmp_path / "set").root
     edit(DATASET_PATH, **change)(root)
     with pytest.raises(CorruptDatasetError, match=r"^meta/astra/dataset\.json was altered$"):
-        read_description(root)
+        description.read_description(root)
     with pytest.raises(CorruptDatasetError, match=r"dataset\.json was altered.*Restore it from a copy"):
         Dataset.open(root)

@@ -6,16 +6,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from astra_data.dataset import plain
 from astra_data.dataset.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, TIMESTAMP, Array
-from astra_data.dataset.plain import (
-    PlainColumn,
-    Run,
-    flag_faults,
-    plain_columns,
-    read_tasks,
-    run_faults,
-    runs,
-)
 
 
 def test_only_rows_of_numbers_are_plain_columns() -> None:
@@ -30,16 +22,16 @@ def test_only_rows_of_numbers_are_plain_columns() -> None:
         "none": None,
         "shapeless": {"dtype": "float32"},
     }
-    columns, others = plain_columns(features)
-    assert columns == [PlainColumn("state", "float64", 3), PlainColumn("count", "uint8", 1)]
+    columns, others = plain.plain_columns(features)
+    assert columns == [plain.PlainColumn("state", "float64", 3), plain.PlainColumn("count", "uint8", 1)]
     assert others == list(features)[2:]
 
 
 def test_a_column_fits_lists_with_and_without_their_size() -> None:
-    column = PlainColumn("state", "float32", 3)
+    column = plain.PlainColumn("state", "float32", 3)
     assert column.fits(pa.list_(pa.float32(), 3)) and column.fits(pa.list_(pa.float32()))
     assert not column.fits(pa.list_(pa.float32(), 2)) and not column.fits(pa.list_(pa.float64()))
-    single = PlainColumn("reward", "float32", 1)
+    single = plain.PlainColumn("reward", "float32", 1)
     assert single.fits(pa.float32()) and not single.fits(pa.list_(pa.float32()))
 
 
@@ -57,13 +49,13 @@ def test_a_column_fits_lists_with_and_without_their_size() -> None:
 )
 def test_tasks_are_texts_by_their_index(tmp_path: Path, table: dict[str, list[object]], found: object) -> None:
     (tmp_path / "meta").mkdir()
-    assert read_tasks(tmp_path) == "is missing"
+    assert plain.read_tasks(tmp_path) == "is missing"
     pq.write_table(pa.table(table), tmp_path / "meta/tasks.parquet")
-    read = read_tasks(tmp_path)
+    read = plain.read_tasks(tmp_path)
     assert found in read if isinstance(found, str) and isinstance(read, str) else read == found
 
 
-COLUMNS = [PlainColumn(EPISODE_INDEX, "int64", 1), PlainColumn(FRAME_INDEX, "int64", 1)]
+COLUMNS = [plain.PlainColumn(EPISODE_INDEX, "int64", 1), plain.PlainColumn(FRAME_INDEX, "int64", 1)]
 
 
 def split(episodes: list[int], frames: list[int], block: int) -> list[tuple[list[int], list[int]]]:
@@ -73,7 +65,7 @@ def split(episodes: list[int], frames: list[int], block: int) -> list[tuple[list
         for first in range(0, len(table), block):
             yield table.slice(first, block)
 
-    found = list(runs(Path("data/file.parquet"), blocks(), COLUMNS))
+    found = list(plain.runs(Path("data/file.parquet"), blocks(), COLUMNS))
     assert [run.row + len(run) for run in found] == np.cumsum([len(run) for run in found]).tolist()
     return [(run.columns[EPISODE_INDEX].tolist(), run.columns[FRAME_INDEX].tolist()) for run in found]
 
@@ -93,7 +85,7 @@ def test_rows_are_split_where_episodes_begin(block: int) -> None:
     assert split([], [], block) == []
 
 
-def a_run(**changes: Array) -> Run:
+def a_run(**changes: Array) -> plain.Run:
     """Return episode 3 of 4 steps at 10 steps per second, whose first row is 20."""
     frame = np.arange(4)
     columns: dict[str, Array] = {
@@ -103,7 +95,7 @@ def a_run(**changes: Array) -> Run:
         TIMESTAMP: (frame / 10).astype(np.float32),
         "state": np.zeros((4, 2), np.float32),
     }
-    return Run(Path("file.parquet"), 0, columns | changes)
+    return plain.Run(Path("file.parquet"), 0, columns | changes)
 
 
 @pytest.mark.parametrize(
@@ -118,10 +110,10 @@ def a_run(**changes: Array) -> Run:
     ],
 )
 def test_wrong_values_of_a_run_are_found(name: str, at: int | tuple[int, int], value: float, sentence: str) -> None:
-    assert list(run_faults(a_run(), number=3, row=20, fps=10)) == []
+    assert list(plain.run_faults(a_run(), number=3, row=20, fps=10)) == []
     values = a_run().columns[name].copy()
     values[at] = value
-    [(column, fault)] = run_faults(a_run(**{name: values}), number=3, row=20, fps=10)
+    [(column, fault)] = plain.run_faults(a_run(**{name: values}), number=3, row=20, fps=10)
     assert column == name and sentence in fault
 
 
@@ -141,7 +133,7 @@ def test_flags_end_the_last_step_only_and_agree(
 ) -> None:
     flags = {"next.terminated": terminated, "next.truncated": truncated, "next.done": done}
     run = a_run(**{name: np.array([bit == "1" for bit in bits]) for name, bits in flags.items()})
-    found = list(flag_faults(run.columns, "episode 3 "))
+    found = list(plain.flag_faults(run.columns, "episode 3 "))
     assert len(found) == len(faults)
     for sentence, (name, part) in zip(found, faults, strict=True):
         assert sentence.startswith(f"next.{name} is ") and part in sentence

@@ -4,45 +4,33 @@ from pathlib import Path
 import pytest
 from html_pages import read_page
 
-from astra_data.reports.blocks import (
-    Code,
-    Picture,
-    Section,
-    TableBlock,
-    Text,
-    code,
-    duration,
-    html,
-    inline,
-    listed,
-    markdown,
-    short,
-    table,
-)
+from astra_data.reports import blocks
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (400).to_bytes(4) + (200).to_bytes(4)
 
 SECTIONS = [
-    Section("", [Text("Before `a < b` & **all**", warns=True)]),
-    Section(
+    blocks.Section("", [blocks.Text("Before `a < b` & **all**", warns=True)]),
+    blocks.Section(
         "The table",
         [
-            Text("", ["one", "two"]),
-            TableBlock("Numbers", ["method", "kind", "success"], [["A|B", "x", "0.5"]], words=2),
-            TableBlock("Nothing", ["method"], []),
-            Code("astra-data run <recipe>"),
-            Picture("drawn", "A figure", "It shows."),
-            Picture("missing", "Not drawn", "It is left out."),
+            blocks.Text("", ["one", "two"]),
+            blocks.TableBlock("Numbers", ["method", "kind", "success"], [["A|B", "x", "0.5"]], words=2),
+            blocks.TableBlock("Nothing", ["method"], []),
+            blocks.Code("astra-data run <recipe>"),
+            blocks.Picture("drawn", "A figure", "It shows."),
+            blocks.Picture("missing", "Not drawn", "It is left out."),
         ],
     ),
-    Section("Nothing at all", [TableBlock("", ["method"], []), Picture("missing", "Not drawn", "")]),
-    Section("Folded", [Text("Details")], folded=True),
+    blocks.Section(
+        "Nothing at all", [blocks.TableBlock("", ["method"], []), blocks.Picture("missing", "Not drawn", "")]
+    ),
+    blocks.Section("Folded", [blocks.Text("Details")], folded=True),
 ]
 
 
 def test_both_pages_have_the_same_content() -> None:
-    text = markdown("r", SECTIONS, {"drawn": "r_drawn.png"})
-    page = read_page(html("r", SECTIONS, {"drawn": PNG}))
+    text = blocks.markdown("r", SECTIONS, {"drawn": "r_drawn.png"})
+    page = read_page(blocks.html("r", SECTIONS, {"drawn": PNG}))
     for shown in (text, page.text):
         for words in ("Before", "The table", "Numbers", "A figure", "It shows.", "Folded", "Details", "one"):
             assert words in shown
@@ -51,7 +39,7 @@ def test_both_pages_have_the_same_content() -> None:
 
 
 def test_markdown_is_what_github_shows() -> None:
-    text = markdown("r", SECTIONS, {"drawn": "r_drawn.png"})
+    text = blocks.markdown("r", SECTIONS, {"drawn": "r_drawn.png"})
     assert text.startswith("# r\n\nBefore `a < b` & **all**\n\n## The table\n\n- one\n- two\n\nNumbers:\n\n")
     assert "| method | kind | success |\n| --- | --- | ---: |\n| A\\|B | x | 0.5 |" in text
     assert "```\nastra-data run <recipe>\n```" in text
@@ -60,26 +48,29 @@ def test_markdown_is_what_github_shows() -> None:
 
 def test_html_escapes_what_anybody_wrote_and_loads_nothing() -> None:
     hostile = "<script>alert(1)</script>"
-    text = Text(f"Task {code(hostile)} {hostile}")
-    page = html(hostile, [Section(hostile, [text, TableBlock(hostile, [hostile], [[hostile]]), Code(hostile)])])
+    text = blocks.Text(f"Task {blocks.code(hostile)} {hostile}")
+    page = blocks.html(
+        hostile,
+        [blocks.Section(hostile, [text, blocks.TableBlock(hostile, [hostile], [[hostile]]), blocks.Code(hostile)])],
+    )
     assert "<script>" not in page and "default-src 'none'" in page
-    assert code("a`b\n# c") == "`ab # c`"
-    assert inline("**Of** `a<b` & *c*") == "<strong>Of</strong> <code>a&lt;b</code> &amp; *c*"
+    assert blocks.code("a`b\n# c") == "`ab # c`"
+    assert blocks.inline("**Of** `a<b` & *c*") == "<strong>Of</strong> <code>a&lt;b</code> &amp; *c*"
 
 
 def test_each_value_carries_the_title_of_its_column_which_phones_show_beside_it() -> None:
-    page = read_page(html("r", SECTIONS, {"drawn": PNG}))
+    page = read_page(blocks.html("r", SECTIONS, {"drawn": PNG}))
     cells = [attributes.get("data-label") for attributes in page.attributes("td")]
     assert cells == ["kind", "success"]
     (image,) = page.attributes("img")
     assert (image["width"], image["height"]) == ("200", "100")
-    css = html("r", [])
+    css = blocks.html("r", [])
     assert "attr(data-label)" in css and "filter: invert" in css
 
 
 def test_figures_drawn_on_white_are_dark_where_the_page_is() -> None:
-    pictures = [Picture("drawn", "A figure", ""), Picture("seen", "A photograph", "", photo=True)]
-    text = html("r", [Section("", pictures)], {"drawn": PNG, "seen": PNG})
+    pictures = [blocks.Picture("drawn", "A figure", ""), blocks.Picture("seen", "A photograph", "", photo=True)]
+    text = blocks.html("r", [blocks.Section("", pictures)], {"drawn": PNG, "seen": PNG})
     drawn, seen = read_page(text).attributes("img")
     assert (drawn.get("class"), seen.get("class")) == (None, "photo")
     dark = re.findall(r"prefers-color-scheme: dark\) \{(.*?)\n\}", text, flags=re.DOTALL)
@@ -90,14 +81,14 @@ def test_figures_drawn_on_white_are_dark_where_the_page_is() -> None:
 
 
 def test_columns_of_words_are_aligned_left_and_of_numbers_right() -> None:
-    assert table(["a", "b", "c"], [["x", "1", "2"], ["y", "3", "4"]]) == (
+    assert blocks.table(["a", "b", "c"], [["x", "1", "2"], ["y", "3", "4"]]) == (
         "| a | b | c |\n| --- | ---: | ---: |\n| x | 1 | 2 |\n| y | 3 | 4 |"
     )
-    assert table(["a", "b", "c"], [], words=2).endswith("| --- | --- | ---: |")
+    assert blocks.table(["a", "b", "c"], [], words=2).endswith("| --- | --- | ---: |")
 
 
 def test_words_are_listed_as_in_a_sentence() -> None:
-    assert [listed(list("abc")[:count]) for count in (0, 1, 2, 3)] == ["", "a", "a and b", "a, b and c"]
+    assert [blocks.listed(list("abc")[:count]) for count in (0, 1, 2, 3)] == ["", "a", "a and b", "a, b and c"]
 
 
 @pytest.mark.parametrize(
@@ -108,7 +99,7 @@ def test_words_are_listed_as_in_a_sentence() -> None:
     ],
 )
 def test_rates_have_three_digits(rate: float, text: str) -> None:
-    assert short(rate) == text
+    assert blocks.short(rate) == text
 
 
 @pytest.mark.parametrize(
@@ -124,4 +115,4 @@ def test_rates_have_three_digits(rate: float, text: str) -> None:
     ],
 )
 def test_times_are_in_a_unit_that_suits_them(seconds: float | None, text: str) -> None:
-    assert duration(seconds) == text
+    assert blocks.duration(seconds) == text

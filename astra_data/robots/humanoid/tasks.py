@@ -16,18 +16,8 @@ from torch import Tensor
 from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
 from astra_data.dataset.columns import ACTION, STATE
+from astra_data.robots.humanoid import abstraction
 from astra_data.robots.humanoid import target as humanoid
-from astra_data.robots.humanoid.abstraction import (
-    Phi,
-    beyond_extended_kinematics,
-    beyond_kinematics,
-    beyond_walker2d,
-    humanoid_to_extended_kinematics,
-    humanoid_to_kinematics,
-    humanoid_to_walker2d,
-    mass_and_feet,
-    mass_velocity,
-)
 from astra_data.robots.humanoid.simulators import HumanoidExtendedKinematics, HumanoidKinematics, HumanoidWalker2d
 from astra_data.worlds.objective import Objective
 from astra_data.worlds.task import Task, Varied, column, entries, free_body
@@ -45,7 +35,7 @@ class Walking(Objective):
     action_size = len(humanoid.COMMANDED)
     is_lasting = True
     spread: ClassVar[tuple[float, ...]]  # typical deviation of each entry of a state from standing, (X,)
-    phi: ClassVar[Phi]  # φ of target states (count, 47), (count, X)
+    phi: ClassVar[abstraction.Phi]  # φ of target states (count, 47), (count, X)
 
     locomotion: humanoid.Locomotion = field(default_factory=humanoid.Locomotion)  # rewards and starts of the target
     failure_reward: float = field(default=-5.0, kw_only=True)
@@ -86,7 +76,7 @@ class PlanarWalking(Walking):
         *(humanoid.VELOCITY_M_S, humanoid.VELOCITY_M_S, humanoid.SPIN_RAD_S, *_LEG_RATES_RAD_S),
         *(1.0, 1.0),
     )
-    phi = humanoid_to_walker2d
+    phi = abstraction.humanoid_to_walker2d
 
     def missed(self, state: Tensor, goal: Tensor) -> Tensor:
         """Return which torsos of states (B, 15) are outside of the healthy heights, (B,) bool."""
@@ -97,8 +87,8 @@ class PlanarWalking(Walking):
         """Return the forward velocity of the center of mass after the step, with stiff arms, (B,) in m/s."""
         joints = after.new_zeros(2, len(after), _COUNT)
         joints[..., humanoid.COMMANDED] = torch.stack([after[:, 2:6], after[:, 9:13]])
-        mass, _ = mass_and_feet(joints[0])
-        swept = mass_velocity(*joints)
+        mass, _ = abstraction.mass_and_feet(joints[0])
+        swept = abstraction.mass_velocity(*joints)
         pitch, pitch_rate = after[:, 1], after[:, 8]
         forward, up = swept[:, 0] + pitch_rate * mass[:, 2], swept[:, 2] - pitch_rate * mass[:, 0]
         return after[:, 6] + torch.cos(pitch) * forward + torch.sin(pitch) * up
@@ -109,11 +99,11 @@ class JointWalking(Walking):
     """Walking of the joints alone, states (..., 34); they show no falls, so every episode succeeds."""
 
     spread = (*humanoid.JOINTS_RAD, *humanoid.JOINT_RATES_RAD_S)
-    phi = humanoid_to_kinematics
+    phi = abstraction.humanoid_to_kinematics
 
     def velocity(self, before: Tensor, after: Tensor) -> Tensor:
         """Return the velocity of a level torso over its lower foot, which does not slip, (B,) in m/s."""
-        feet, later = (mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
+        feet, later = (abstraction.mass_and_feet(state[:, :_COUNT])[1] for state in (before, after))
         rows = torch.arange(len(feet), device=feet.device)
         lower = feet[..., 2].argmin(dim=-1)
         return (feet[rows, lower, 0] - later[rows, lower, 0]) / humanoid.TIMESTEP_S
@@ -132,7 +122,7 @@ class MassWalking(Walking):
             + [humanoid.SPIN_RAD_S] * 3
         ),
     )
-    phi = humanoid_to_extended_kinematics
+    phi = abstraction.humanoid_to_extended_kinematics
 
     lowest_mass_m: float = 0.65
     """A humanoid whose center of mass is lower has fallen, on average two steps before the target's episode
@@ -264,14 +254,16 @@ def _task(
     )
 
 
-WALKER2D = _task("walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, beyond_walker2d, _WALKER_QUANTITIES)
+WALKER2D = _task(
+    "walker2d", PlanarWalking(horizon=_HORIZON), HumanoidWalker2d, abstraction.beyond_walker2d, _WALKER_QUANTITIES
+)
 KINEMATICS = _task(
-    "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, beyond_kinematics, _JOINT_QUANTITIES
+    "kinematics", JointWalking(horizon=_HORIZON), HumanoidKinematics, abstraction.beyond_kinematics, _JOINT_QUANTITIES
 )
 EXTENDED = _task(
     "extended",
     MassWalking(horizon=_HORIZON),
     HumanoidExtendedKinematics,
-    beyond_extended_kinematics,
+    abstraction.beyond_extended_kinematics,
     _JOINT_QUANTITIES | _BODY_QUANTITIES,
 )

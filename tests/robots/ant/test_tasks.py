@@ -7,15 +7,7 @@ import torch
 
 from astra_data.core.arrays import Floats
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, STATE
-from astra_data.robots.ant.tasks import (
-    AntMazeEnv,
-    VelocityController,
-    ant_beyond_point_mass,
-    ant_model,
-    canonical_view,
-    standing_pose,
-    torques_to_body,
-)
+from astra_data.robots.ant import tasks
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
@@ -28,7 +20,7 @@ SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 
 def random_state(rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Return a level, moving ant of any heading above the ground, its joints inside their limits."""
-    qpos, qvel = ant_model().qpos0.copy(), rng.normal(size=14)
+    qpos, qvel = tasks.ant_model().qpos0.copy(), rng.normal(size=14)
     qpos[2] = 0.8
     half_yaw = rng.uniform(-np.pi, np.pi) / 2
     qpos[3], qpos[6] = np.cos(half_yaw), np.sin(half_yaw)
@@ -51,7 +43,7 @@ def quarter_turned(qpos: Floats, qvel: Floats) -> tuple[Floats, Floats]:
 
 
 def feet(qpos: Floats) -> Floats:
-    model = ant_model()
+    model = tasks.ant_model()
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -61,7 +53,7 @@ def feet(qpos: Floats) -> Floats:
 
 def test_walls_are_gymnasium_robotics_own() -> None:
     theirs = gymnasium.make("AntMaze_UMaze-v5").unwrapped.ant_env.model  # type: ignore[attr-defined]
-    ours = ant_model(U_MAZE)
+    ours = tasks.ant_model(U_MAZE)
     walls = wall_geoms(ours)
     assert walls is not None
     names = {ours.geom(geom).name for geom in range(walls[0], walls[1] + 1)}
@@ -75,7 +67,7 @@ def test_walls_are_gymnasium_robotics_own() -> None:
 
 
 def test_longer_legs_are_longer_and_nothing_else() -> None:
-    plain, longer = ant_model(U_MAZE), ant_model(U_MAZE, leg_scale=1.25)
+    plain, longer = tasks.ant_model(U_MAZE), tasks.ant_model(U_MAZE, leg_scale=1.25)
     # Legs are the capsules; a capsule's size is its radius, then half of its length.
     legs = plain.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
     assert legs.sum() == 12
@@ -97,7 +89,7 @@ def test_canonical_view_does_not_see_a_quarter_turn() -> None:
         # The turned body is the same in space: each foot where the next one was.
         np.testing.assert_allclose(feet(turned_pos), np.roll(feet(qpos), -1, axis=0), atol=1e-12)
         both = np.stack([qpos, turned_pos]), np.stack([qvel, turned_vel])
-        observation, quarters = canonical_view(*both, np.stack([command, command]))
+        observation, quarters = tasks.canonical_view(*both, np.stack([command, command]))
         assert observation.shape == (2, 28)
         np.testing.assert_allclose(observation[0], observation[1], atol=1e-12)
         assert (quarters[0] - quarters[1]) % 4 == 1
@@ -108,7 +100,7 @@ def test_the_view_of_an_ant_that_looks_along_its_command_is_read_off() -> None:
     qpos, qvel = np.zeros((1, 15)), np.arange(1, 15, dtype=np.float64)[None]
     qpos[0, :3], qpos[0, 3:5] = [5.0, -3.0, 0.75], [np.cos(-0.25), np.sin(-0.25)]
     qpos[0, 7:] = [0.1, 1.0, 0.2, -0.9, 0.3, -0.8, 0.4, 0.7]
-    observation, quarters = canonical_view(qpos, qvel, np.array([[0.8, 0.3]]))
+    observation, quarters = tasks.canonical_view(qpos, qvel, np.array([[0.8, 0.3]]))
     spin = np.zeros(3)
     mujoco.mju_rotVecQuat(spin, qvel[0, 3:6].copy(), qpos[0, 3:7].copy())
     expected = [
@@ -126,7 +118,7 @@ def test_the_view_of_an_ant_that_looks_along_its_command_is_read_off() -> None:
 def test_torques_to_body_undoes_the_view() -> None:
     # The same canonical torques move the turned body exactly as the unturned one.
     rng = np.random.default_rng(4)
-    model = ant_model()
+    model = tasks.ant_model()
     command = np.array([[1.0, 0.2], [1.0, 0.2]])
     qpos, qvel = model.qpos0.copy(), np.zeros(14)
     qpos[8::2] = SIGNS
@@ -137,9 +129,9 @@ def test_torques_to_body_undoes_the_view() -> None:
         one.qpos[:], one.qvel[:] = position, velocity
     for _ in range(10):
         state = np.stack([one.qpos for one in data]), np.stack([one.qvel for one in data])
-        _, quarters = canonical_view(*state, command)
+        _, quarters = tasks.canonical_view(*state, command)
         torques = np.tile(rng.uniform(-1, 1, 8), (2, 1))
-        for one, control in zip(data, torques_to_body(torques, quarters), strict=True):
+        for one, control in zip(data, tasks.torques_to_body(torques, quarters), strict=True):
             one.ctrl[:] = control
             mujoco.mj_step(model, one, 5)
     np.testing.assert_allclose(data[0].qpos[:3], data[1].qpos[:3], atol=1e-9)
@@ -149,7 +141,7 @@ def test_torques_to_body_undoes_the_view() -> None:
 
 @pytest.mark.parametrize("command", [[0.8, 0.0], [0.0, -0.8], [-0.5, 0.5]])
 def test_the_shipped_controller_walks_as_told(command: list[float]) -> None:
-    controller, model = VelocityController.load(), ant_model()
+    controller, model = tasks.VelocityController.load(), tasks.ant_model()
     data = mujoco.MjData(model)
     data.qpos[8::2] = SIGNS
     mean = np.zeros(2)
@@ -162,7 +154,7 @@ def test_the_shipped_controller_walks_as_told(command: list[float]) -> None:
 
 def test_what_is_dropped_is_the_rest_with_slower_joint_rates() -> None:
     state = torch.arange(29.0).repeat(2, 1)
-    rest = ant_beyond_point_mass(state)
+    rest = tasks.ant_beyond_point_mass(state)
     slowed = [0.2 * entry for entry in range(21, 29)]
     expected = [*range(2, 15), *range(17, 21), *slowed]
     torch.testing.assert_close(rest, torch.tensor([expected, expected]))
@@ -172,17 +164,17 @@ def test_what_is_dropped_is_the_rest_with_slower_joint_rates() -> None:
 TASK = Navigation(U_MAZE, horizon=700)
 
 
-def placed(positions: list[list[float]], **options: float) -> AntMazeEnv:
+def placed(positions: list[list[float]], **options: float) -> tasks.AntMazeEnv:
     """Stand ants at `positions`, with the goal far away."""
-    env = AntMazeEnv(TASK, len(positions), seed=0, num_threads=1, **options)  # type: ignore[arg-type]
+    env = tasks.AntMazeEnv(TASK, len(positions), seed=0, num_threads=1, **options)  # type: ignore[arg-type]
     env.reset()
-    state = np.concatenate([standing_pose(len(positions)), np.zeros((len(positions), 14))], axis=1)
+    state = np.concatenate([tasks.standing_pose(len(positions)), np.zeros((len(positions), 14))], axis=1)
     state[:, :2] = positions
     env.reset_to(np.arange(len(positions)), state)
     return env
 
 
-def rolled(env: AntMazeEnv, rows: list[int], angle: float) -> None:
+def rolled(env: tasks.AntMazeEnv, rows: list[int], angle: float) -> None:
     """Turn `rows` by `angle` about x, well above the ground."""
     state = env.state.numpy().astype(np.float64)[rows]
     state[:, 2], state[:, 3:7] = 2.0, [np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]
@@ -206,7 +198,7 @@ def test_toppling_is_a_matter_of_the_up_axis(degrees: float, toppled: bool) -> N
 
 def test_wall_contact_equals_a_search_through_all_contacts() -> None:
     env = placed([[x, 4.0] for x in (-5.5, -5.0, -4.5, -4.0)], leg_scale=1.25)
-    model = ant_model(U_MAZE, leg_scale=1.25)
+    model = tasks.ant_model(U_MAZE, leg_scale=1.25)
     first, last = wall_geoms(model) or (0, 0)
     copies = [mujoco.MjData(model) for _ in range(4)]
     for data, qpos in zip(copies, env.physics.qpos, strict=True):
@@ -238,7 +230,7 @@ UMAZE = TASKS["antmaze-umaze"]
 
 
 def test_states_are_named_as_mujoco_orders_them() -> None:
-    model = ant_model()
+    model = tasks.ant_model()
     columns = {column.name: column for column in UMAZE.state_columns}
     joints = [model.joint(joint).name for joint in range(1, model.njnt)]
     expected = ("x", "y", "z", "qw", "qx", "qy", "qz", *joints)

@@ -5,16 +5,7 @@ import pytest
 import torch
 
 from astra_data.core.errors import BadInputError
-from astra_data.robots.nao.kicking import (
-    ROLLING_M_S2,
-    BallAgent,
-    Contact,
-    Kicking,
-    asks_to_kick,
-    kick_away,
-    knock,
-    roll,
-)
+from astra_data.robots.nao import kicking
 from astra_data.worlds.plane.mazes import FIELD
 from astra_data.worlds.plane.point_mass import VariedPlanar
 from astra_data.worlds.variation import BallVariation
@@ -23,7 +14,7 @@ from astra_data.worlds.variation import BallVariation
 def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
     position, velocity = torch.zeros(1, 2), torch.tensor([[0.6, 0.8]])
     for _ in range(10):
-        position, velocity = roll(position, velocity, 0.1, ROLLING_M_S2)
+        position, velocity = kicking.roll(position, velocity, 0.1, kicking.ROLLING_M_S2)
     # v0 t - a t² / 2 after 1 s, along (0.6, 0.8).
     assert position[0].tolist() == pytest.approx([0.6 * 0.85, 0.8 * 0.85], abs=1e-5)
     assert velocity[0].tolist() == pytest.approx([0.6 * 0.7, 0.8 * 0.7], abs=1e-5)
@@ -32,11 +23,11 @@ def test_a_ball_rolls_as_even_friction_has_it_whatever_the_steps() -> None:
 def test_a_body_knocks_its_ball_away_along_the_line_between_them() -> None:
     before, after = torch.tensor([[0.0, 0.0]]), torch.tensor([[0.1, 0.0]])
     ball = torch.tensor([[0.2, 0.1]])
-    place, velocity = knock(before, after, ball, torch.zeros(1, 2), Contact(0.19, 0.7))
+    place, velocity = kicking.knock(before, after, ball, torch.zeros(1, 2), kicking.Contact(0.19, 0.7))
     diagonal = 0.5**0.5
     assert velocity[0].tolist() == pytest.approx([0.7 * diagonal, 0.7 * diagonal], abs=1e-6)
     assert place[0].tolist() == pytest.approx([0.1 + 0.19 * diagonal, 0.19 * diagonal], abs=1e-6)
-    beside, turned = knock(before, after, ball, torch.zeros(1, 2), Contact(0.19, 0.7, torch.pi / 4))
+    beside, turned = kicking.knock(before, after, ball, torch.zeros(1, 2), kicking.Contact(0.19, 0.7, torch.pi / 4))
     # It begins where the body touches it, whichever way it leaves.
     assert torch.equal(beside, place) and turned[0].tolist() == pytest.approx([0.0, 0.7], abs=1e-6)
 
@@ -45,18 +36,18 @@ def test_a_kick_sends_balls_within_reach_straight_away() -> None:
     bodies = torch.zeros(4, 2)
     ball = torch.tensor([[0.18, 0.24], [0.18, 0.24], [0.3, 0.4], [-0.3, 0.0]])
     rolling = torch.tensor([[0.1, 0.2]]).expand(4, 2)
-    asked = asks_to_kick(torch.tensor([[0.9, 0.9, 0.6], [0.9, 0.9, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
-    velocity = kick_away(bodies, ball, rolling, asked, Contact(0.35, 2.0))
+    asked = kicking.asks_to_kick(torch.tensor([[0.9, 0.9, 0.6], [0.9, 0.9, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
+    velocity = kicking.kick_away(bodies, ball, rolling, asked, kicking.Contact(0.35, 2.0))
     # Kicked; not asked to; out of reach; behind, which a body without a heading kicks as well.
     torch.testing.assert_close(velocity, torch.tensor([[1.2, 1.6], [0.1, 0.2], [0.1, 0.2], [-2.0, 0.0]]))
     quarter = torch.full((4,), torch.pi / 2)
-    turned = kick_away(bodies, ball, rolling, asked, Contact(0.35, 2.0, quarter))
+    turned = kicking.kick_away(bodies, ball, rolling, asked, kicking.Contact(0.35, 2.0, quarter))
     torch.testing.assert_close(turned[[0, 3]], torch.tensor([[-1.6, 1.2], [0.0, -2.0]]))
 
 
 def test_commands_without_a_wish_to_kick_are_refused() -> None:
     with pytest.raises(BadInputError, match=r"expected commands of 3 values, .*, got 2: collect"):
-        asks_to_kick(torch.zeros(4, 2))
+        kicking.asks_to_kick(torch.zeros(4, 2))
 
 
 BODY: dict[str, Any] = {"timestep_s": 0.2, "radius_m": 0.2, "speed_m_s": 0.25}
@@ -66,8 +57,8 @@ STAY = torch.zeros(1, 3)
 START = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.22, 0.0, 0.0, 0.0]])
 
 
-def one(count: int = 1) -> BallAgent:
-    simulator = BallAgent(FIELD, count, **BODY, **CONTACT)
+def one(count: int = 1) -> kicking.BallAgent:
+    simulator = kicking.BallAgent(FIELD, count, **BODY, **CONTACT)
     simulator.reset_to(START.expand(count, 8))
     return simulator
 
@@ -162,7 +153,7 @@ def test_whether_a_correction_sets_a_ball_rolling_is_drawn_with_the_expected_spe
     assert not way[~hit].any()
 
 
-def kicked(simulator: BallAgent, speed_m_s: float) -> torch.Tensor:
+def kicked(simulator: kicking.BallAgent, speed_m_s: float) -> torch.Tensor:
     """Kick balls that lie, and correct them to `speed_m_s`; return which roll (B,)."""
     start = START.expand(simulator.num_envs, 8)
     simulator.reset_to(start)
@@ -197,7 +188,7 @@ def test_a_new_lie_and_a_new_episode_are_drawn_for_anew() -> None:
     assert (simulator.memory[[3, 5], 0] != after[[3, 5], 0]).all() and not simulator.memory[[3, 5], 1].any()
 
 
-TASK = Kicking(FIELD, horizon=156)
+TASK = kicking.Kicking(FIELD, horizon=156)
 GOAL = torch.tensor([[1.5, 0.0]])
 
 
