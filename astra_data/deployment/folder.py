@@ -76,22 +76,14 @@ def page(about: Mapping[str, Any]) -> str:
     state, goal, command = (about[name] for name in ("state", "goal", "command"))
     # A command that tells a position has no value that stops the robot.
     is_position = _POSITIONS.intersection(command.get("units", ()))
-    return _PAGE.format(
-        **{key: about[key] for key in ("task", "row", "seed", "rate_hz")},
-        minute=round(60 * about["rate_hz"]),
-        stop=None if is_position else [0.0] * len(command["names"]),
-        state_names=state["names"],
-        goal_names=goal["names"],
-        state=_table(state),
-        goal=_table(goal) if goal["names"] else "None: all episodes have the same.",
-        command=_table(command),
-        states=len(state["names"]),
-        goals=len(goal["names"]),
-        commands=len(command["names"]),
-        hidden=about["hidden"]["size"],
-        dataset=about["trained_on"]["dataset"],
-        hash=about["trained_on"]["hash"],
-    )
+    values: dict[str, Any] = {key: about[key] for key in ("task", "row", "seed", "rate_hz")} | about["trained_on"]
+    values |= {"minute": round(60 * about["rate_hz"]), "hidden": about["hidden"]["size"]}
+    values |= {"stop": None if is_position else [0.0] * len(command["names"])}
+    for name, column in (("state", state), ("goal", goal), ("command", command)):
+        values |= {f"{name}_names": column["names"], f"{name}s": len(column["names"]), name: _table(column)}
+    if not goal["names"]:
+        values["goal"] = "None: all episodes have the same."
+    return _PAGE.format(**values)
 
 
 def _table(values: Mapping[str, Any]) -> str:
@@ -112,14 +104,9 @@ FORMAT = 1
 
 
 def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None = None) -> Path:
-    """Write the policy of a row into the new folder `out`, which runs without this package; return it.
+    """Write the policy of a row of a run into the new folder `out`, which runs without this package; return it.
 
-    Args:
-        run: the folder of a run.
-        row: a row of its recipe, such as "astra_plus".
-        out: the folder to write.
-        seed: one of the recipe's seeds.
-        percent: the size of the dataset, where the recipe sweeps over sizes.
+    `seed` is one of the recipe's, `percent` the size of the dataset, where the recipe sweeps over sizes.
     """
     refuse_existing(out)
     trained = trained_policy(run, row, seed=seed, percent=percent)
@@ -127,11 +114,8 @@ def deploy(run: Path, row: str, out: Path, *, seed: int = 0, percent: int | None
     digests = {stage: file_digest(path) for stage, path in trained.files.items()}
     with atomic_folder(out) as folder:
         parts, apart = write_graph(deployed, folder)
-        about = {
-            "format": FORMAT,
-            "row": row,
-            "seed": seed,
-            **({} if percent is None else {"percent": percent}),
+        about = {"format": FORMAT, "row": row, "seed": seed} | ({} if percent is None else {"percent": percent})
+        about |= {
             "trained_on": {"dataset": trained.file.dataset, "hash": trained.file.content_hash},
             **describe(deployed, parts, trained.recorded()),
             "largest_difference": apart,
@@ -158,13 +142,9 @@ def describe(
     encoders = {"target": deployed.target_encoder, "source": deployed.source_encoder}
     least, largest = zip(*task.limits.values(), strict=True)
     ranges = {"recorded_least": recorded[0], "recorded_largest": recorded[1]} if recorded else {}
-    return {
-        "task": task.name,
-        "instruction": task.instruction,
-        "rate_hz": 1.0 / task.timestep_s,
-        "file": ONNX,
-        "inputs": list(INPUTS),
-        "outputs": list(OUTPUTS),
+    graph = {"file": ONNX, "inputs": list(INPUTS), "outputs": list(OUTPUTS)}
+    about = {"task": task.name, "instruction": task.instruction, "rate_hz": 1.0 / task.timestep_s, **graph}
+    return about | {
         "state": _values(task.state, "state") | ranges,
         "goal": _values(task.goal, "goal") if task.goal else {"names": []},
         "command": _values(task.action, "command") | {"least": least, "largest": largest},
@@ -186,23 +166,22 @@ def _values(column: Column, called: str) -> dict[str, Any]:
 TYPE = "astra_data"
 """The name under which LeRobot knows the policy and the environment."""
 
-_ON_CPU = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
-_BATCHED: list[dict[str, Any]] = [
-    {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
-    {"registry_name": "to_batch_processor", "config": {}},
-    _ON_CPU,
-]
-_PIPELINES = {"policy_preprocessor": _BATCHED, "policy_postprocessor": [_ON_CPU]}
-"""Scaling is inside the policy."""
-
 
 def write_lerobot_files(about: Mapping[str, Any], folder: Path) -> None:
-    """Write what LeRobot reads of a policy with the description `about`: settings, and its pipelines."""
+    """Write what LeRobot reads of a policy with the description `about`: settings, and its pipelines.
+
+    These only batch: scaling is inside the policy.
+    """
 
     def features(kind: str, name: str, column: str) -> dict[str, Any]:
         size = len(about[column]["names"])
         return {name: {"type": kind, "shape": [size]}} if size else {}
 
+    def steps(*named: tuple[str, dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{"registry_name": f"{name}_processor", "config": config} for name, config in named]
+
+    cpu = ("device", {"device": "cpu", "float_dtype": None})
+    batched = steps(("rename_observations", {"rename_map": {}}), ("to_batch", {}), cpu)
     config = {
         "type": TYPE,
         "input_features": features("STATE", STATE, "state") | features("ENV", GOAL, "goal"),
@@ -210,6 +189,7 @@ def write_lerobot_files(about: Mapping[str, Any], folder: Path) -> None:
         "device": "cpu",
         "push_to_hub": False,
     }
-    written = {name: {"name": name, "steps": steps} for name, steps in _PIPELINES.items()}
+    pipelines = {"policy_preprocessor": batched, "policy_postprocessor": steps(cpu)}
+    written = {name: {"name": name, "steps": them} for name, them in pipelines.items()}
     for name, values in (written | {"config": config}).items():
         (folder / f"{name}.json").write_text(json.dumps(values, indent=1))

@@ -14,6 +14,10 @@ from astra_data.core.errors import BadInputError
 from astra_data.core.optional import optional
 from astra_data.policies.running_policy import Memory, RunningPolicy, UserPolicy
 
+_DECOMPOSED: dict[Any, Callable[..., Any]] = {
+    torch.ops.aten.hypot.default: lambda x, y: (x.square() + y.square()).sqrt()
+}
+"""Operations that ONNX has not."""
 ONNX = "policy.onnx"
 INPUTS, OUTPUTS = ("state", "goal", "hidden"), ("command", "next_hidden")
 TOLERANCE = 1e-3
@@ -27,10 +31,7 @@ Graph = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class PolicyGraph(nn.Module):
-    """One step of a policy on one robot: its hidden state is an argument and a result, zeros at the start.
-
-    `parts` are the sizes of the parts of the hidden state, (1, H), one after the other.
-    """
+    """One step of a policy on one robot: its hidden state, of `parts` (1, H), is an argument and a result."""
 
     def __init__(self, deployed: RunningPolicy) -> None:
         super().__init__()
@@ -43,15 +44,11 @@ class PolicyGraph(nn.Module):
     @property
     def example(self) -> tuple[Tensor, Tensor, Tensor]:
         """A state (1, S), a goal (1, G) and the hidden state (1, H) at the start, all zeros."""
-        task = self._deployed.task
-        sizes = (task.state.size, task.objective.goal_size, sum(self.parts.values()))
-        return torch.zeros(1, sizes[0]), torch.zeros(1, sizes[1]), torch.zeros(1, sizes[2])
+        task, hidden = self._deployed.task, sum(self.parts.values())
+        return torch.zeros(1, task.state.size), torch.zeros(1, task.objective.goal_size), torch.zeros(1, hidden)
 
     def forward(self, state: Tensor, goal: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the command (1, A), in its units, and the next hidden state (1, H).
-
-        `state` (1, S) is the target's, `goal` (1, G) may have no values, `hidden` is (1, H).
-        """
+        """Return the command (1, A), in its units, and the next hidden state (1, H)."""
         robot = replace(self._deployed)
         robot.resume(Memory(*hidden.split(list(self.parts.values()), dim=-1)))
         # Not `command`, whose checks depend on values and cannot be traced.
@@ -62,8 +59,7 @@ class PolicyGraph(nn.Module):
 def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], float]:
     """Write the policy as ONNX into `folder`, and compare the file with it.
 
-    Returns:
-        the sizes of the parts of the hidden state, and the largest difference of commands, in half ranges.
+    Returns the sizes of the parts of the hidden state, and the largest difference of commands, in half ranges.
     """
     optional("onnxscript")
     if isinstance(deployed.policy, UserPolicy):
@@ -78,7 +74,7 @@ def write_graph(deployed: RunningPolicy, folder: Path) -> tuple[dict[str, int], 
             model = _onnx(graph, graph.example, input_names=INPUTS, output_names=OUTPUTS)
         except Exception as error:
             raise _not_traceable(deployed, error) from error
-        (folder / ONNX).write_bytes(model.SerializeToString(deterministic=True))
+    (folder / ONNX).write_bytes(model.SerializeToString(deterministic=True))
     return graph.parts, _apart(graph, load_onnx(folder / ONNX), ONNX)
 
 
@@ -109,29 +105,24 @@ def _onnx(module: nn.Module, example: tuple[Tensor, ...], **names: Sequence[str]
     return model
 
 
-_DECOMPOSED: dict[Any, Callable[..., Any]] = {
-    torch.ops.aten.hypot.default: lambda x, y: (x.square() + y.square()).sqrt()
-}
-"""Operations that ONNX has not."""
-
-
 def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
     """Return the error that names the task's function which cannot be traced."""
-    task, (state, goal, _) = deployed.task, PolicyGraph(deployed).example
-    objective = task.objective
-    given = torch.zeros(1, objective.action_size), torch.zeros(1, task.abstract_state.size)
-    functions: dict[str, Callable[[], Any]] = {
-        "abstraction": lambda: _onnx(_Call(task.abstraction), (state,)),
-        "objective.observe": lambda: _onnx(_Call(objective.observe), (given[1], goal)),
-        "beyond": lambda: _onnx(_Call(task.beyond), (state,)),
-        "objective.limit_command": lambda: _onnx(
-            _Call(lambda action: objective.limit_command(action, deployed.command_limit)), (given[0],)
+    task, objective, (state, goal, _) = deployed.task, deployed.task.objective, PolicyGraph(deployed).example
+    functions: dict[str, tuple[Callable[..., Any], tuple[Tensor, ...]]] = {
+        "abstraction": (task.abstraction, (state,)),
+        "objective.observe": (objective.observe, (torch.zeros(1, task.abstract_state.size), goal)),
+        "beyond": (task.beyond, (state,)),
+        "objective.limit_command": (
+            lambda action: objective.limit_command(action, deployed.command_limit),
+            (torch.zeros(1, objective.action_size),),
         ),
     }
     name, cause = "the policy", error
-    for candidate, trace in functions.items():
+    for candidate, (function, given) in functions.items():
+        module = nn.Module()
+        module.forward = function
         try:
-            trace()
+            _onnx(module, given)
         except Exception as found:  # noqa: BLE001 - it is the user's code
             name, cause = candidate, found
             break
@@ -144,23 +135,10 @@ def _not_traceable(deployed: RunningPolicy, error: Exception) -> BadInputError:
     )
 
 
-class _Call(nn.Module):
-    """A function as a module."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__()
-        self._function = function
-
-    def forward(self, *given: Tensor) -> Any:  # noqa: ANN401 - whatever it returns
-        """Call it."""
-        return self._function(*given)
-
-
 def _apart(graph: PolicyGraph, written: Graph, name: str) -> float:
     """Return how far the commands of a written graph are from the policy's, for random states and goals.
 
-    Only states for which the policy has a command count: φ may have none for others, as of an angle by its
-    sine.
+    States without a command do not count: φ may have none, as of an angle by its sine.
     """
     rng = np.random.default_rng(0)
     deployed = graph._deployed

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from astra_data.core.arrays import normalized
-from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, add_scales, take_scales
+from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, take_scales
 
 LEAST_LATENT_R2 = 0.9
 """Of a target encoder on held-out episodes, to be deployed in place of the source encoder."""
@@ -20,9 +20,7 @@ class TargetEncoder(nn.Module):
     of the source encoder: without them, ψ^t cannot match how ψ^s represents walls. With 0 octaves there are
     none.
 
-    Attributes:
-        sizes: the arguments that it was made with.
-        latent_r2: share of the variance of ψ^s's latents that it explains on held-out episodes.
+    `sizes` are the arguments that it was made with.
     """
 
     def __init__(
@@ -37,14 +35,9 @@ class TargetEncoder(nn.Module):
         encoder: str = HistoryEncoder.kind,
     ) -> None:
         super().__init__()
-        self.sizes: dict[str, Any] = {
-            "state_size": state_size,
-            "goal_size": goal_size,
-            "action_size": action_size,
-            "embedding_size": embedding_size,
-            "latent_size": latent_size,
-            "position_octaves": position_octaves,
-        }
+        self.sizes: dict[str, Any] = {"state_size": state_size, "goal_size": goal_size, "action_size": action_size}
+        self.sizes |= {"embedding_size": embedding_size, "latent_size": latent_size}
+        self.sizes |= {"position_octaves": position_octaves}
         if encoder != HistoryEncoder.kind:
             self.sizes["encoder"] = encoder
         self.position_features = PositionFeatures(position_octaves)
@@ -53,13 +46,10 @@ class TargetEncoder(nn.Module):
             embedding_size=embedding_size,
             latent_size=latent_size,
         )
-        add_scales(self, {"state": state_size, "goal": goal_size})
-        self.register_buffer("latent_r2", torch.zeros(()))
-        self.latent_r2: Tensor
-        self.state_mean: Tensor
-        self.state_std: Tensor
-        self.goal_mean: Tensor
-        self.goal_std: Tensor
+        self.state_mean, self.state_std = nn.Buffer(torch.zeros(state_size)), nn.Buffer(torch.ones(state_size))
+        self.goal_mean, self.goal_std = nn.Buffer(torch.zeros(goal_size)), nn.Buffer(torch.ones(goal_size))
+        self.latent_r2 = nn.Buffer(torch.zeros(()))
+        """Share of the variance of ψ^s's latents that it explains on held-out episodes."""
 
     @property
     def is_deployed(self) -> bool:
@@ -83,20 +73,11 @@ class TargetEncoder(nn.Module):
 
 
 def gaussian_mmd(mean_1: Tensor, variance_1: Tensor, mean_2: Tensor, variance_2: Tensor, bandwidths: Tensor) -> Tensor:
-    """Return the squared MMD between two diagonal Gaussians in closed form.
+    """Return the squared MMD (...) between two diagonal Gaussians (..., Z) in closed form.
 
-    With the kernel k(x, y) = exp(-|x - y|² / 2h²), the mean of k over N(m1, v1) and N(m2, v2) is
-    Π_d sqrt(h² / (h² + v1 + v2)) exp(-(m1 - m2)² / 2(h² + v1 + v2)).
-
-    Args:
-        mean_1: m1, (..., Z).
-        variance_1: v1, (..., Z).
-        mean_2: m2, (..., Z).
-        variance_2: v2, (..., Z).
-        bandwidths: h, (K,); the kernels are averaged. h near sqrt(Z) keeps the gradient alive.
-
-    Returns:
-        MMD² of each pair, (...).
+    With the kernel k(x, y) = exp(-|x - y|² / 2h²), averaged over the `bandwidths` h, (K,), the mean of k over
+    N(m1, v1) and N(m2, v2) is Π_d sqrt(h² / (h² + v1 + v2)) exp(-(m1 - m2)² / 2(h² + v1 + v2)). h near sqrt(Z)
+    keeps the gradient alive.
     """
     squared = bandwidths.square().unsqueeze(-1)
     apart = (mean_1 - mean_2).square().unsqueeze(-2)

@@ -75,28 +75,18 @@ _PATIENCE_SHARE = 0.3
 
 
 class Descent:
-    """A fit in progress, with AdamW.
+    """A fit in progress, with AdamW, after `done` updates.
 
-    Attributes:
-        parameters: the fitted ones.
-        done: updates so far. best: the update with the least held-out error; None without one.
-        points: measurements during the fit.
-        stopwatch: measures from the start, including the time before an interruption.
+    Its `points` are measurements, and `stopwatch` includes the time before an interruption.
     """
 
     def __init__(
         self, model: nn.Module, config: DescentConfig, *, checkpoint: Path | None = None, weight_decay: float = 0.0
     ) -> None:
-        """Start, or resume from `checkpoint` if it exists.
-
-        Args:
-            model: its parameters that require gradients are fitted.
-            config: settings.
-            checkpoint: the file that `keep` writes; None for none.
-            weight_decay: of AdamW.
-        """
+        """Start to fit the parameters of `model` that require gradients, or resume from `checkpoint` if it exists."""
         self.done = 0
         self.best: int | None = None
+        """The update with the least held-out error."""
         self._least, self._weights = float("inf"), dict[str, Tensor]()
         self._model, self._config = model, config
         self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
@@ -109,8 +99,7 @@ class Descent:
         self._model.load_state_dict(state["model"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._schedule.load_state_dict(state["schedule"])
-        self.done, self.best, self._least = state["done"], state["best"], state["least"]
-        self._weights = state["weights"]
+        self.done, self.best, self._least, self._weights = (state[k] for k in ("done", "best", "least", "weights"))
 
     @property
     def is_over(self) -> bool:

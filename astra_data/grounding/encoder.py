@@ -34,17 +34,12 @@ class Members(nn.Module):
         # As of one layer, since all see the same.
         self.first = nn.Linear(input_size, count * hidden_size)
         least = hidden_size**-0.5  # as torch's layers begin
-        for name, sizes in {
-            "second_weight": (hidden_size, hidden_size),
-            "second_bias": (1, hidden_size),
-            "last_weight": (hidden_size, 1),
-            "last_bias": (1, 1),
-        }.items():
-            self.register_parameter(name, nn.Parameter(torch.empty(count, *sizes).uniform_(-least, least)))
-        self.second_weight: Tensor
-        self.second_bias: Tensor
-        self.last_weight: Tensor
-        self.last_bias: Tensor
+
+        def drawn(*sizes: int) -> nn.Parameter:
+            return nn.Parameter(torch.empty(count, *sizes).uniform_(-least, least))
+
+        self.second_weight, self.second_bias = drawn(hidden_size, hidden_size), drawn(1, hidden_size)
+        self.last_weight, self.last_bias = drawn(hidden_size, 1), drawn(1, 1)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Return the log-odds (K, ...) of `inputs` (..., I)."""
@@ -64,8 +59,7 @@ class PositionFeatures(nn.Module):
     def __init__(self, octaves: int) -> None:
         super().__init__()
         wavelengths = _LONGEST_M * 0.5 ** torch.arange(octaves)
-        self.register_buffer("frequencies", 2 * torch.pi / wavelengths)
-        self.frequencies: Tensor
+        self.frequencies = nn.Buffer(2 * torch.pi / wavelengths)
         self.size = 4 * octaves
 
     def forward(self, position: Tensor) -> Tensor:
@@ -80,12 +74,10 @@ class Encoder(nn.Module, ABC):
     x_i holds the state s_i and the action a_{i-1} that led to it (zero at the start). What is remembered of a
     history is an argument and a result, `memory` (B, M), never kept.
 
-    Attributes:
-        kind: names the class in files, see `ENCODERS`.
-        latent_size: Z.
     """
 
     kind: ClassVar[str]
+    """Names the class in files, see `ENCODERS`."""
     latent_size: int
 
     def __init__(self, input_size: int, *, embedding_size: int, latent_size: int) -> None:
@@ -133,7 +125,8 @@ class HistoryEncoder(Encoder):
 
     def step(self, inputs: Tensor, memory: Tensor) -> Tensor:
         """Return the next hidden state (B, Z)."""
-        return self._next(functional.elu(self.embedding(inputs)), memory)
+        (weights,) = self.recurrence.all_weights
+        return torch.gru_cell(functional.elu(self.embedding(inputs)), memory, *weights)
 
     def latent(self, memory: Tensor) -> Tensor:
         """Return the latent of a hidden state (..., Z)."""
@@ -154,10 +147,6 @@ class HistoryEncoder(Encoder):
         keep = (1.0 - start).t().unsqueeze(-1)
         states = _Recurrence.apply(embedded, hidden, keep, *weights)  # type: ignore[no-untyped-call]
         return torch.as_tensor(states).transpose(0, 1)
-
-    def _next(self, embedded: Tensor, hidden: Tensor) -> Tensor:
-        (weights,) = self.recurrence.all_weights
-        return torch.gru_cell(embedded, hidden, *weights)
 
 
 class _Recurrence(torch.autograd.Function):
@@ -241,13 +230,6 @@ class LatentEncoder(Protocol):
 
 _LEAST = 1e-3
 """Lower bound of a deviation."""
-
-
-def add_scales(network: nn.Module, sizes: Mapping[str, int]) -> None:
-    """Give `network` buffers (size,) for each name, as of values that are normal already."""
-    for name, size in sizes.items():
-        network.register_buffer(f"{name}_mean", torch.zeros(size))
-        network.register_buffer(f"{name}_std", torch.ones(size))
 
 
 def take_scales(network: nn.Module, values: Mapping[str, Tensor]) -> None:

@@ -20,7 +20,7 @@ from torch.nn import functional
 from astra_data.core.arrays import normalized
 from astra_data.core.seeding import derive
 from astra_data.grounding.descent import Descent, DescentConfig, seeded
-from astra_data.grounding.encoder import Members, add_scales, take_scales
+from astra_data.grounding.encoder import Members, take_scales
 from astra_data.grounding.open_loop import Moments
 from astra_data.grounding.paired_episodes import RISK_STEPS, PairedEpisodes, PairedWindows, before_failures
 from astra_data.grounding.simulator import Grounding
@@ -36,43 +36,29 @@ moments of failures on a cart, an ant and a NAO."""
 _FARTHEST_M = 3.0
 """Walls farther away than this are alike."""
 _MAGNITUDES = 5
+_AVERAGES = len(AVERAGED_S) * _MAGNITUDES
 
 
 @dataclass(frozen=True)
 class FailureShape:
-    """Sizes of the failure model.
-
-    Attributes:
-        state_size: X. action_size: A. timestep_s: of the task.
-        maze_cells: (height, width) of the maze's fine grid; zeros where there is no maze.
-        cell_m: side of its cells.
-        members: networks, whose probabilities are averaged.
-        risk_steps: within how many steps failures are predicted.
-        latent_size: Z, of the latent among the inputs; 0 where it is none of them.
-        hidden_size: of their two layers. dropout: rate after each.
-    """
+    """Sizes of the failure model."""
 
     state_size: int
     action_size: int
     timestep_s: float
-    maze_cells: tuple[int, int] = (0, 0)
-    cell_m: float = 1.0
-    members: int = 5
-    risk_steps: int = FAILURE_STEPS
-    latent_size: int = 0
-    hidden_size: int = 32
-    dropout: float = 0.2
+    maze_cells: tuple[int, int] = (0, 0)  # (height, width) of the maze's fine grid; zeros where there is none
+    cell_m: float = 1.0  # side of its cells
+    members: int = 5  # networks, whose probabilities are averaged
+    risk_steps: int = FAILURE_STEPS  # within which failures are predicted
+    latent_size: int = 0  # of the latent among the inputs; 0 where it is none of them
+    hidden_size: int = 32  # of the networks' two layers
+    dropout: float = 0.2  # after each
 
     @property
     def input_size(self) -> int:
         """I: magnitudes, their averages, distances from walls, and the latent."""
-        return self.motion_size + self.latent_size
-
-    @property
-    def motion_size(self) -> int:
-        """The inputs but for the latent."""
         walls = 1 + 2 * len(AHEAD_S) if any(self.maze_cells) else 0
-        return _MAGNITUDES * (1 + len(AVERAGED_S)) + walls
+        return _MAGNITUDES + _AVERAGES + walls + self.latent_size
 
 
 class FailureModel(nn.Module):
@@ -86,77 +72,67 @@ class FailureModel(nn.Module):
         super().__init__()
         self.shape = shape
         self.members = Members(shape.members, shape.input_size, shape.hidden_size, shape.dropout)
-        for name in ("wanted", "moved", "missed"):
-            self.register_buffer(f"{name}_std", torch.ones(shape.state_size))
-        add_scales(self, {"input": shape.input_size})
-        self.register_buffer("log_odds_shift", torch.zeros(()))
-        self.register_buffer("clearance", torch.zeros(shape.maze_cells))
-        self.register_buffer("half_extent", torch.zeros(2))
+        self.wanted_std, self.moved_std, self.missed_std = (nn.Buffer(torch.ones(shape.state_size)) for _ in range(3))
+        self.input_mean = nn.Buffer(torch.zeros(shape.input_size))
+        self.input_std = nn.Buffer(torch.ones(shape.input_size))
+        self.log_odds_shift = nn.Buffer(torch.zeros(()))
+        self.clearance = nn.Buffer(torch.zeros(shape.maze_cells))
+        self.half_extent = nn.Buffer(torch.zeros(2))
         rates = [1 - torch.tensor(-shape.timestep_s / seconds).exp() for seconds in AVERAGED_S]
-        self.register_buffer("rates", torch.stack(rates)[:, None], persistent=False)
-        self.wanted_std: Tensor
-        self.moved_std: Tensor
-        self.missed_std: Tensor
-        self.input_mean: Tensor
-        self.input_std: Tensor
-        self.log_odds_shift: Tensor
-        self.clearance: Tensor
-        self.half_extent: Tensor
-        self.rates: Tensor
+        self.rates = nn.Buffer(torch.stack(rates)[:, None], persistent=False)
+        self._parts = [shape.state_size, shape.state_size, shape.action_size, _AVERAGES]
+        self.memory_size = sum(self._parts)
 
     def set_move_scales(self, windows: PairedWindows) -> None:
         """Take the deviations of moves from training episodes."""
         mask = windows.mask.bool()
-        for name, moves in {
-            "wanted": windows.simulated_next - windows.state,
-            "moved": windows.next_state - windows.state,
-            "missed": windows.next_state - windows.simulated_next,
-        }.items():
-            getattr(self, f"{name}_std").copy_(moves[mask].std(0).clamp_min(1e-3))
-
-    def set_input_scales(self, inputs: Tensor) -> None:
-        """Take the means and deviations of inputs (N, I)."""
-        take_scales(self, {"input": inputs})
+        for deviation, moves in (
+            (self.wanted_std, windows.simulated_next - windows.state),
+            (self.moved_std, windows.next_state - windows.state),
+            (self.missed_std, windows.next_state - windows.simulated_next),
+        ):
+            deviation.copy_(moves[mask].std(0).clamp_min(1e-3))
 
     def initial_memory(self, state: Tensor, previous_action: Tensor, averages: Tensor | None = None) -> Tensor:
         """Return the memory (n, M) of episodes that start in `state` (n, X).
 
         `averages` (n, 15) are those of the history before; by default there is none.
         """
-        if averages is None:
-            averages = state.new_zeros(len(state), self.averages_size)
+        averages = state.new_zeros(len(state), _AVERAGES) if averages is None else averages
         return torch.cat([state, state, previous_action, averages], dim=-1)
-
-    def averages_of(self, inputs: Tensor) -> Tensor:
-        """Return the averages (..., 15) among what the networks saw of a step, (..., I)."""
-        return inputs[..., _MAGNITUDES : _MAGNITUDES + self.averages_size]
-
-    def step(
-        self, state: Tensor, action: Tensor, landed: Tensor, latent: Tensor | None, memory: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the probability (B,) of a failure within `risk_steps`, and the next memory (B, M).
-
-        Args:
-            state: s_i, (B, X).
-            action: a_i, (B, A).
-            landed: where the simulator landed from there, not corrected, (B, X).
-            latent: z_i, (B, Z).
-            memory: before the step, (B, M).
-        """
-        inputs, memory = self.inputs(state, action, landed, latent, memory)
-        return self.probability(inputs), memory
 
     def inputs(
         self, state: Tensor, action: Tensor, landed: Tensor, latent: Tensor | None, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return what the networks see of a step, (B, I), and the next memory (B, M); see `step`."""
+        """Return what the networks see of a step, (B, I), and the next memory (B, M).
+
+        That are magnitudes: how far the simulator would move from s_i to where it `landed`, (B, X), how far the
+        target moved, how far that was from where the simulator had landed; the change of the action, and the
+        action. Then their averages, distances from walls in a maze, and the latent.
+        """
         before, landed_before, action_before, averages = memory.split(self._parts, dim=-1)
-        magnitudes, walls = self._signals(state, action, landed, before, landed_before, action_before)
-        averages = self._averaged(averages, magnitudes)
-        seen = [magnitudes, averages, walls]
+        wanted, moved, missed = landed - state, state - before, state - landed_before
+        moves = (wanted / self.wanted_std, moved / self.moved_std, missed / self.missed_std)
+        commands = ((action - action_before).norm(dim=-1), action.norm(dim=-1))
+        magnitudes = torch.stack([*(move.square().mean(-1).sqrt() for move in moves), *commands], dim=-1)
+        now = averages.unflatten(-1, (len(AVERAGED_S), _MAGNITUDES))
+        averages = (now + self.rates * (magnitudes.unsqueeze(-2) - now)).flatten(-2)
+        seen = [magnitudes, averages]
+        if self.clearance.numel():
+            seen.append(self._clearances(state, wanted, moved))
         if latent is not None:
             seen.append(latent[..., : self.shape.latent_size])
         return torch.cat(seen, dim=-1), torch.cat([state, landed, action, averages], dim=-1)
+
+    def _clearances(self, state: Tensor, *moves: Tensor) -> Tensor:
+        """Return distances (..., 11) in m to the nearest wall, as far as it matters, here and along `moves`."""
+        seconds = torch.tensor(AHEAD_S, device=state.device)[:, None]
+        position = state[..., None, :2]
+        ways = [move[..., None, :2] * seconds / self.shape.timestep_s for move in moves]
+        places = torch.cat([position, *(position + way for way in ways)], dim=-2)
+        column, row = ((places + self.half_extent) / self.shape.cell_m).floor().long().unbind(-1)
+        height, width = self.clearance.shape
+        return self.clearance[row.clamp(0, height - 1), column.clamp(0, width - 1)].clamp_max(_FARTHEST_M)
 
     def probability(self, inputs: Tensor) -> Tensor:
         """Return the mean (...) of the members' probabilities for `inputs` (..., I)."""
@@ -167,81 +143,11 @@ class FailureModel(nn.Module):
 
         Failures are drawn more often than they come: `log_odds_shift` is not added yet.
         """
-        odds: Tensor = self.members(normalized(inputs, self.input_mean, self.input_std))
-        return odds
-
-    @torch.no_grad()
-    def calibrate(self, scale: Tensor, shift: Tensor) -> None:
-        """Scale the members' log-odds, and shift them by the rate of failures."""
-        for parameter in (self.members.last_weight, self.members.last_bias):
-            parameter.mul_(scale)
-        self.log_odds_shift.copy_(shift)
+        return torch.as_tensor(self.members(normalized(inputs, self.input_mean, self.input_std)))
 
     def hazard(self, probability: Tensor) -> Tensor:
         """Return the probability (...) of a failure in the very step, given that within `risk_steps`."""
         return probability / self.shape.risk_steps
-
-    @property
-    def memory_size(self) -> int:
-        """M."""
-        return sum(self._parts)
-
-    @property
-    def averages_size(self) -> int:
-        """Of the averages of each magnitude over each time."""
-        return len(AVERAGED_S) * _MAGNITUDES
-
-    @property
-    def _parts(self) -> list[int]:
-        shape = self.shape
-        return [shape.state_size, shape.state_size, shape.action_size, self.averages_size]
-
-    def _averaged(self, averages: Tensor, magnitudes: Tensor) -> Tensor:
-        """Move averages (B, 3 * 5) toward `magnitudes` (B, 5), each at its rate."""
-        now = averages.unflatten(-1, (len(AVERAGED_S), _MAGNITUDES))
-        moved: Tensor = now + self.rates * (magnitudes.unsqueeze(-2) - now)
-        return moved.flatten(-2)
-
-    def _signals(
-        self,
-        state: Tensor,
-        action: Tensor,
-        landed: Tensor,
-        before: Tensor,
-        landed_before: Tensor,
-        action_before: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Return magnitudes (..., 5) and distances from walls (..., 11), or (..., 0) without a maze.
-
-        The magnitudes: how far the simulator would move, how far the target moved, how far that was from
-        where the simulator had landed; the change of the action, and the action.
-        """
-        wanted, moved, missed = landed - state, state - before, state - landed_before
-        magnitudes = [
-            _root_mean_square(wanted / self.wanted_std),
-            _root_mean_square(moved / self.moved_std),
-            _root_mean_square(missed / self.missed_std),
-            (action - action_before).norm(dim=-1),
-            action.norm(dim=-1),
-        ]
-        if not self.clearance.numel():
-            return torch.stack(magnitudes, dim=-1), state[..., :0]
-        seconds = torch.tensor(AHEAD_S, device=state.device)[:, None]
-        position = state[..., None, :2]
-        ways = [move[..., None, :2] * seconds / self.shape.timestep_s for move in (wanted, moved)]
-        places = torch.cat([position, *(position + way for way in ways)], dim=-2)
-        return torch.stack(magnitudes, dim=-1), self._clearance_at(places)
-
-    def _clearance_at(self, places: Tensor) -> Tensor:
-        """Return the distance (...) in m from `places` (..., 2) to the nearest wall, as far as it matters."""
-        column, row = ((places + self.half_extent) / self.shape.cell_m).floor().long().unbind(-1)
-        height, width = self.clearance.shape
-        nearest = self.clearance[row.clamp(0, height - 1), column.clamp(0, width - 1)]
-        return nearest.clamp_max(_FARTHEST_M)
-
-
-def _root_mean_square(values: Tensor) -> Tensor:
-    return values.square().mean(-1).sqrt()
 
 
 _MOST_FOLDS = 5
@@ -320,11 +226,7 @@ def failing(task: Task, episodes: PairedEpisodes, risk_steps: int = FAILURE_STEP
 
 def has_failures(task: Task, episodes: PairedEpisodes) -> bool:
     """Whether a failure model can be fitted: some steps are before a failure, and not every one."""
-    return _is_mixed(failing(task, episodes, RISK_STEPS))
-
-
-def _is_mixed(episodes: PairedEpisodes) -> bool:
-    return _has_both(episodes.steps(episodes.windows.fails_soon))
+    return _has_both(episodes.steps(failing(task, episodes, RISK_STEPS).windows.fails_soon))
 
 
 def fit_failures(
@@ -340,83 +242,60 @@ def fit_failures(
         nats per failure over a constant rate, None where a single recording fails.
     """
     torch.manual_seed(derive(seed, "failure model"))
-    untrained = _untrained(task, grounding, training, sees_latent=True)
-    inputs = replayed_inputs(task, grounding, untrained, training)
-    divided = folds(failing(task, training).windows.fails_soon.any(1), training.recordings)
-    compared: list[dict[str, Any]] = []
-    chosen, best = None, -math.inf
+    episodes = failing(task, training)
+    seen = replayed_inputs(task, grounding, _untrained(task, grounding, training, sees_latent=True), training)
+    divided = folds(episodes.windows.fails_soon.any(1), training.recordings)
+    candidates = []
     for sees_latent in (False, True):
         torch.manual_seed(derive(seed, f"failure model {sees_latent}"))
-        candidate = _Candidate.of(task, grounding, training, inputs, sees_latent=sees_latent)
-        gain = candidate.cross_fit(divided)
-        compared.append({"latent": sees_latent, "nats_per_failure": gain})
-        if chosen is None or (gain is not None and gain > best):
-            chosen, best = candidate, -math.inf if gain is None else gain
-    assert chosen is not None
-    model = chosen.fitted()
-    return model, {"latent": bool(model.shape.latent_size), "candidates": compared}
-
-
-@dataclass
-class _Candidate:
-    """A failure model to fit to what is seen of each step, `inputs` (E, T, I).
-
-    Attributes:
-        odds, happened: log-odds (K, N) and outcomes (N,) of steps that were predicted in cross-fitting.
-    """
-
-    untrained: FailureModel
-    episodes: PairedEpisodes
-    inputs: Tensor
-    odds: Tensor | None = None
-    happened: Tensor | None = None
-
-    @classmethod
-    def of(
-        cls, task: Task, grounding: Grounding, training: PairedEpisodes, inputs: Tensor, *, sees_latent: bool
-    ) -> "_Candidate":
-        """Return the candidate; `inputs` (E, T, I) end with the latent."""
         untrained = _untrained(task, grounding, training, sees_latent=sees_latent)
-        inputs = inputs[..., : untrained.shape.input_size]
-        untrained.set_input_scales(training.steps(inputs))
-        return cls(untrained, failing(task, training), inputs)
+        inputs = seen[..., : untrained.shape.input_size]
+        take_scales(untrained, {"input": training.steps(inputs)})
+        candidates.append((_cross_fitted(untrained, episodes, inputs, divided), untrained, inputs))
+    found, untrained, inputs = max(candidates, key=lambda one: one[0][0] if one[0] else -math.inf)
+    model = _descended(untrained, *_steps(episodes, inputs))
+    if found:
+        _, scale, shift = found
+        with torch.no_grad():
+            for parameter in (model.members.last_weight, model.members.last_bias):
+                parameter.mul_(scale)
+        model.log_odds_shift.copy_(shift)
+    gains = [
+        {"latent": bool(number), "nats_per_failure": one[0] and one[0][0]} for number, one in enumerate(candidates)
+    ]
+    figures = {"latent": bool(model.shape.latent_size), "candidates": gains}
+    return model.requires_grad_(False).eval(), figures
 
-    def cross_fit(self, divided: Sequence[Tensor]) -> float | None:
-        """Predict each fold's episodes by the others; return the log-likelihood of the failures' moments.
 
-        That is of the hazard at every step, over that of a constant one, in nats per failure; None without
-        folds.
-        """
-        windows, predicted = self.episodes.windows, []
-        for fold in divided:
-            others = self.episodes.select((~fold).nonzero().squeeze(1))
-            if not _is_mixed(others):
-                continue
-            fitted = _descended(self.untrained, *_steps(others, self.inputs[~fold]))
+def _cross_fitted(
+    untrained: FailureModel, episodes: PairedEpisodes, inputs: Tensor, divided: Sequence[Tensor]
+) -> tuple[float, Tensor, Tensor] | None:
+    """Predict each fold's episodes by the others, from `inputs` (E, T, I).
+
+    Returns the log-likelihood of the failures' moments, of the hazard at every step over a constant one, in
+    nats per failure, and the scale and shift of log-odds by which it is calibrated; None without folds.
+    """
+    windows, predicted = episodes.windows, []
+    for fold in divided:
+        others = episodes.select((~fold).nonzero().squeeze(1))
+        if _has_both(others.steps(others.windows.fails_soon)):
+            fitted = _descended(untrained, *_steps(others, inputs[~fold]))
             mask = windows.mask[fold].bool()
-            predicted.append((fitted.log_odds(self.inputs[fold][mask]).detach(), fold, mask))
-        if not predicted:
-            return None
-        self.odds = torch.cat([odds for odds, *_ in predicted], dim=1)
-        self.happened = torch.cat([windows.fails_soon[fold][mask] for _, fold, mask in predicted])
-        if not _has_both(self.happened):
-            return None
-        scale, shift = calibration(self.odds, self.happened, self.untrained.shape.risk_steps)
-        soon = (scale * self.odds + shift).sigmoid().mean(0)
-        hazard = self.untrained.hazard(soon).clamp(1e-9, 1 - 1e-9)
-        failing_step = before_failures(windows.fails_soon.bool().any(1), windows.mask, 1)
-        now = torch.cat([failing_step[fold][mask] for _, fold, mask in predicted])
-        rate = now.mean()
-        constant = now.sum() * rate.log() + (len(now) - now.sum()) * (1 - rate).log()
-        likelihood = (now * hazard.log() + (1 - now) * (1 - hazard).log()).sum()
-        return float((likelihood - constant) / now.sum())
-
-    def fitted(self) -> FailureModel:
-        """Return the model fitted to all episodes, and calibrated if it was cross-fitted."""
-        model = _descended(self.untrained, *_steps(self.episodes, self.inputs))
-        if self.odds is not None and self.happened is not None and _has_both(self.happened):
-            model.calibrate(*calibration(self.odds, self.happened, model.shape.risk_steps))
-        return model.requires_grad_(False).eval()
+            predicted.append((fitted.log_odds(inputs[fold][mask]).detach(), fold, mask))
+    if not predicted:
+        return None
+    odds = torch.cat([odds for odds, *_ in predicted], dim=1)
+    happened = torch.cat([windows.fails_soon[fold][mask] for _, fold, mask in predicted])
+    if not _has_both(happened):
+        return None
+    scale, shift = calibration(odds, happened, untrained.shape.risk_steps)
+    hazard = untrained.hazard((scale * odds + shift).sigmoid().mean(0)).clamp(1e-9, 1 - 1e-9)
+    failing_step = before_failures(windows.fails_soon.bool().any(1), windows.mask, 1)
+    now = torch.cat([failing_step[fold][mask] for _, fold, mask in predicted])
+    rate = now.mean()
+    constant = now.sum() * rate.log() + (len(now) - now.sum()) * (1 - rate).log()
+    likelihood = (now * hazard.log() + (1 - now) * (1 - hazard).log()).sum()
+    return float((likelihood - constant) / now.sum()), scale, shift
 
 
 def _steps(episodes: PairedEpisodes, inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -495,7 +374,8 @@ def replayed_inputs(task: Task, grounding: Grounding, failures: FailureModel, ep
 def averages_before(task: Task, grounding: Grounding, failures: FailureModel, episodes: PairedEpisodes) -> Tensor:
     """Return the averages that a failure model remembers before each step, (E, T, 15), as in replays."""
     with seeded(0, episodes.windows.mask.device):
-        after = failures.averages_of(replayed_inputs(task, grounding, failures, episodes))
+        seen = replayed_inputs(task, grounding, failures, episodes)
+    after = seen[..., _MAGNITUDES : _MAGNITUDES + _AVERAGES]
     return functional.pad(after[:, :-1], (0, 0, 1, 0))
 
 

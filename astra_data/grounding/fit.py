@@ -16,7 +16,7 @@ from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive
 from astra_data.dataset.columns import REWARD
 from astra_data.grounding.descent import Descent, DescentConfig, WindowedConfig
-from astra_data.grounding.encoder import Encoder, HistoryEncoder
+from astra_data.grounding.encoder import Encoder, HistoryEncoder, take_scales
 from astra_data.grounding.failures import failure_figures, fit_failures, has_failures
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, recorded_rewards, telemetry
@@ -45,26 +45,17 @@ class GroundConfig(WindowedConfig):
 
 @dataclass(frozen=True)
 class Fitting:
-    """What a method is given to fit its grounding to.
-
-    Attributes:
-        task: the task. config: the recipe's `[ground]`.
-        settings: the method's own table of the recipe, if it has one.
-        training: paired episodes to fit. held_out: paired episodes to measure on.
-        seed: of all randomness. device: of the networks.
-        folder: for checkpoints and further files; files left in it become part of the artifact.
-        progress: called with the share done and a note.
-    """
+    """What a method is given to fit its grounding to."""
 
     task: Task
-    config: GroundConfig
-    settings: Config | None
-    training: PairedEpisodes
-    held_out: PairedEpisodes
-    seed: int
-    device: str
-    folder: Path
-    progress: Progress
+    config: GroundConfig  # the recipe's `[ground]`
+    settings: Config | None  # the method's own table of the recipe, if it has one
+    training: PairedEpisodes  # to fit
+    held_out: PairedEpisodes  # to measure on
+    seed: int  # of all randomness
+    device: str  # of the networks
+    folder: Path  # for checkpoints and further files; files left in it become part of the artifact
+    progress: Progress  # called with the share done and a note
 
     @property
     def descent(self) -> DescentConfig:
@@ -78,24 +69,16 @@ Fit = Callable[[Fitting], tuple[FittedGrounding, dict[str, Any]]]
 
 @dataclass(frozen=True)
 class HistoryFit:
-    """Fit a history model: the correction, and the other parts that a method has (paper, Section IV-A).
+    """Fit a history model: the correction, and the other parts that a method has (paper, Section IV-A)."""
 
-    Attributes:
-        latent: whether the next latent is predicted.
-        reward: whether the target's reward is predicted.
-        failures: whether failures are predicted by a failure model, if there are some.
-        scatter: whether the simulator scatters around the correction as the target does.
-        encoder: the class of ψ.
-        printed: whether R_pred learns the whole reward, failures included, as the paper prints it. By default
-            it learns the residual reward: the target's less the task's own on the recorded abstract states.
-    """
-
-    latent: bool
-    reward: bool
-    failures: bool = True
-    scatter: bool = True
-    encoder: type[Encoder] = HistoryEncoder
+    latent: bool  # whether the next latent is predicted
+    reward: bool  # whether the target's reward is predicted
+    failures: bool = True  # whether failures are predicted by a failure model, if there are some
+    scatter: bool = True  # whether the simulator scatters around the correction as the target does
+    encoder: type[Encoder] = HistoryEncoder  # the class of ψ
     printed: bool = False
+    """Whether R_pred learns the whole reward, failures included, as the paper prints it. By default it learns
+    the residual reward: the target's less the task's own on the recorded abstract states."""
 
     def weights(self, config: GroundConfig) -> LossWeights:
         """Return the weights of the losses."""
@@ -151,7 +134,7 @@ class HistoryFit:
         model = GroundingModel(shape).to(fitting.device)
         correction = windows.next_state - windows.simulated_next
         columns = {"state": windows.state, "goal": windows.goal, "correction": correction}
-        model.set_scales({name: training.steps(values) for name, values in columns.items()})
+        take_scales(model, {name: training.steps(values) for name, values in columns.items()})
         rewards = recorded_rewards(windows)
         model.set_reward_scales(*map(training.steps, (rewards, windows.goes_on, windows.failed)))
         return model, _optimize(model, self.weights(fitting.config), fitting)

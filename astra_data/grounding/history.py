@@ -23,38 +23,24 @@ _FAILURES, _SCATTER = "failures", "scatter"
 class GroundedSimulator(EpisodeSimulator):
     """Step the simulator, correct where it landed, set it there, and encode the longer history.
 
-    Attributes:
-        model: the trained grounding model; only read.
-        failures: the failure model, if one is used; only read.
-        scatter_model: the model of the target's scatter around the correction, if one is used; only read.
-        hidden: the memory of the encoder, (B, M). goal: (B, G).
+    `hidden` (B, M) is the memory of the encoder.
     """
 
-    def __init__(
-        self,
-        simulator: PlacedSimulator,
-        model: GroundingModel,
-        failures: FailureModel | None = None,
-        scatter_model: ScatterModel | None = None,
-        clearance_m: float | None = None,
-        *,
-        fails_at_walls: bool = False,
-    ) -> None:
-        """Wrap `simulator`; corrections end no closer to walls than `clearance_m`.
-
-        With `fails_at_walls`, states are `blocked` where their correction touches a wall, not their scatter.
-        """
+    def __init__(self, simulator: PlacedSimulator, grounding: "HistoryGrounding") -> None:
+        """Wrap `simulator`."""
         super().__init__(simulator)
-        self._touches: Tensor | None = simulator.blocked if fails_at_walls else None
-        if clearance_m is not None:
-            keep_clear(simulator, clearance_m)
-        self.model, self.failures, self.scatter_model = model, failures, scatter_model
-        shape, (count, _), device = model.shape, simulator.state.shape, simulator.state.device
+        # States are `blocked` where their correction touches a wall, not their scatter.
+        self._touches: Tensor | None = simulator.blocked if grounding.fails_at_walls else None
+        if grounding.clearance_m is not None:
+            keep_clear(simulator, grounding.clearance_m)
+        self.model, self.failures, self.scatter_model = grounding.model, grounding.failures, grounding.scatter_model
+        shape, (count, _), device = self.model.shape, simulator.state.shape, simulator.state.device
         self.latent_size = shape.latent_size
-        self.hidden = model.encoder.initial(count)
+        self.hidden = self.model.encoder.initial(count)
         self.goal = torch.zeros(count, shape.goal_size, device=device)
         self._last = self.latent, torch.zeros(count, shape.action_size, device=device)
-        self._remembered = torch.zeros(count, 0 if failures is None else failures.memory_size, device=device)
+        memory_size = self.failures.memory_size if self.failures else 0
+        self._remembered = torch.zeros(count, memory_size, device=device)
         self._hazard: Tensor | None = None
 
     @property
@@ -102,8 +88,8 @@ class GroundedSimulator(EpisodeSimulator):
         self._last = latent, action
         landed = self.landed = self.simulator.step(action)
         if self.failures is not None:
-            soon, self._remembered = self.failures.step(before, action, landed, latent, self._remembered)
-            self._hazard = self.failures.hazard(soon)
+            seen, self._remembered = self.failures.inputs(before, action, landed, latent, self._remembered)
+            self._hazard = self.failures.hazard(self.failures.probability(seen))
         inputs = self.model.correction_inputs(latent, action, landed)
         state = corrected = self.model.corrected(inputs, landed)
         if self._touches is not None or self.scatter_model is None:
@@ -143,23 +129,19 @@ class GroundedSimulator(EpisodeSimulator):
 
 @dataclass(frozen=True)
 class HistoryGrounding(FittedGrounding):
-    """Correct each step by a history model, whose latents policies observe.
-
-    Attributes:
-        model: fitted to all training episodes. failures: the failure model, if there is one.
-        clearance_m: how close to walls corrections may end; None for as close as the simulator itself.
-        fails_at_walls: whether touching a wall is a failure. Then the correction touches it, not the scatter,
-            which holds the errors of where the robot was believed to be.
-        scatter_model: the model of the target's scatter around the correction, if one was fitted.
-    """
+    """Correct each step by a history model, whose latents policies observe."""
 
     kind: ClassVar[str] = "history"
 
     model: GroundingModel
     failures: FailureModel | None = None
     clearance_m: float | None = None
+    """How close to walls corrections may end; None for as close as the simulator itself."""
     scatter_model: ScatterModel | None = None
+    """Of the target around the correction, if one was fitted."""
     fails_at_walls: bool = False
+    """Whether touching a wall is a failure. Then the correction touches it, not the scatter, which holds the
+    errors of where the robot was believed to be."""
 
     @property
     def encoder(self) -> GroundingModel:
@@ -172,14 +154,7 @@ class HistoryGrounding(FittedGrounding):
 
     def corrected(self, simulator: PlacedSimulator) -> GroundedSimulator:
         """Wrap `simulator`; see `Grounding.corrected`."""
-        return GroundedSimulator(
-            simulator,
-            self.model,
-            self.failures,
-            self.scatter_model,
-            clearance_m=self.clearance_m,
-            fails_at_walls=self.fails_at_walls,
-        )
+        return GroundedSimulator(simulator, self)
 
     @torch.no_grad()
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor:
@@ -205,18 +180,16 @@ class HistoryGrounding(FittedGrounding):
     @classmethod
     def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
         """Read what `to_file` returned."""
-        prefixes = f"{_FAILURES}.", f"{_SCATTER}."
-        own = {name: one for name, one in tensors.items() if not name.startswith(prefixes)}
-        shape, failures, scatter_model = GroundingShape(**_tuples(metadata["shape"])), None, None
-        if _FAILURES in metadata:
-            failures = FailureModel(FailureShape(**_tuples(metadata[_FAILURES])))
-            failures = loaded(failures, part_of(tensors, _FAILURES), device)
-        if _SCATTER in metadata:
-            scatter_model = ScatterModel(ScatterShape(**_tuples(metadata[_SCATTER])))
-            scatter_model = loaded(scatter_model, part_of(tensors, _SCATTER), device)
-        model = loaded(GroundingModel(shape), own, device)
+        parts = {_FAILURES: (FailureModel, FailureShape), _SCATTER: (ScatterModel, ScatterShape)}
+        own = {name: one for name, one in tensors.items() if not name.startswith(tuple(f"{part}." for part in parts))}
+        read: dict[str, Any] = {
+            part: loaded(made(shape(**_tuples(metadata[part]))), part_of(tensors, part), device)
+            for part, (made, shape) in parts.items()
+            if part in metadata
+        }
+        model = loaded(GroundingModel(GroundingShape(**_tuples(metadata["shape"]))), own, device)
         clearance_m, fails_at_walls = metadata.get("clearance_m"), metadata["fails_at_walls"]
-        return cls(model, failures, clearance_m, scatter_model, fails_at_walls)
+        return cls(model, read.get(_FAILURES), clearance_m, read.get(_SCATTER), fails_at_walls)
 
 
 def _tuples(shape: Mapping[str, Any]) -> dict[str, Any]:

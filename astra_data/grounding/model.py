@@ -4,7 +4,6 @@ Paper, Section IV-A. With the weights (0, 0, 1) it is NAS in the paper's sense: 
 """
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor, nn
 
 from astra_data.core.arrays import normalized
 from astra_data.core.errors import BadInputError
-from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, add_scales, mlp, take_scales
+from astra_data.grounding.encoder import ENCODERS, HistoryEncoder, PositionFeatures, mlp
 from astra_data.grounding.paired_episodes import PairedEpisodes, PairedWindows
 
 _BALL_M = 0.1
@@ -32,34 +31,25 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class GroundingShape:
-    """Sizes of the networks; the paper prints none.
-
-    Attributes:
-        state_size: X. action_size: A. goal_size: G, appended to the state where the encoder sees it.
-        position_octaves: of `PositionFeatures`; 0 for none, as in states without a position.
-        ball_index: index in the state where the position of a ball begins; None where there is no ball.
-        encoder: the kind of the encoder, see `ENCODERS`.
-        corrects_reward: R_pred predicts the residual reward, the target's less the task's own, beside the
-            target's.
-    """
+    """Sizes of the networks; the paper prints none."""
 
     state_size: int
     action_size: int
-    goal_size: int
+    goal_size: int  # of what is appended to the state where the encoder sees it
     latent_size: int = 64
     embedding_size: int = 64
     head_sizes: tuple[int, ...] = (128, 128)
-    position_octaves: int = 4
-    ball_index: int | None = None
-    corrects_reward: bool = True
+    position_octaves: int = 4  # of `PositionFeatures`; 0 for none, as in states without a position
+    ball_index: int | None = None  # in the state, where the position of a ball begins; None where there is none
+    corrects_reward: bool = True  # R_pred predicts the residual reward, the target's less the task's own, as well
     log_variance_bounds: tuple[float, float] = (-6.0, 2.0)
-    encoder: str = HistoryEncoder.kind
+    encoder: str = HistoryEncoder.kind  # see `ENCODERS`
 
 
 class GroundingModel(nn.Module):
     """ψ^s, P_lat, R_pred and f_abs on one GRU backbone.
 
-    Scales are buffers, so checkpoints hold them; `set_scales` and `set_reward_scales` take them from the
+    Scales are buffers, so checkpoints hold them; `take_scales` and `set_reward_scales` take them from the
     training episodes.
     """
 
@@ -72,32 +62,19 @@ class GroundingModel(nn.Module):
         self.encoder = ENCODERS[shape.encoder](
             features + shape.goal_size + actions, embedding_size=shape.embedding_size, latent_size=latent
         )
-        heads = shape.head_sizes
+        heads, rewards = shape.head_sizes, 2 if shape.corrects_reward else 1
         self.latent_dynamics = mlp((latent + actions, *heads, 2 * latent))
-        self.reward_head = mlp((latent + actions, *heads, 2 if shape.corrects_reward else 1))
+        self.reward_head = mlp((latent + actions, *heads, rewards))
         self.correction = mlp((latent + actions + features, *heads, states))
         # An untrained correction is the identity: the raw simulator.
         for parameter in list(self.correction.parameters())[-2:]:
             nn.init.zeros_(parameter)
         self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False)
-        add_scales(self, {"state": states, "goal": shape.goal_size, "correction": states})
-        self.register_buffer("reward_mean", torch.zeros(2 if shape.corrects_reward else 1))
-        self.register_buffer("reward_std", torch.ones(2 if shape.corrects_reward else 1))
-        self.register_buffer("reward_shrinkage", torch.ones(()))
-        self.register_buffer("failure_cost", torch.zeros(()))
-        self.state_mean: Tensor
-        self.state_std: Tensor
-        self.goal_mean: Tensor
-        self.goal_std: Tensor
-        self.correction_std: Tensor
-        self.reward_mean: Tensor
-        self.reward_std: Tensor
-        self.reward_shrinkage: Tensor
-        self.failure_cost: Tensor
-
-    def set_scales(self, columns: Mapping[str, Tensor]) -> None:
-        """Take means and deviations from training steps: state, goal, correction (N, ...)."""
-        take_scales(self, columns)
+        self.state_mean, self.state_std = nn.Buffer(torch.zeros(states)), nn.Buffer(torch.ones(states))
+        self.goal_mean, self.goal_std = nn.Buffer(torch.zeros(shape.goal_size)), nn.Buffer(torch.ones(shape.goal_size))
+        self.correction_mean, self.correction_std = nn.Buffer(torch.zeros(states)), nn.Buffer(torch.ones(states))
+        self.reward_mean, self.reward_std = nn.Buffer(torch.zeros(rewards)), nn.Buffer(torch.ones(rewards))
+        self.reward_shrinkage, self.failure_cost = nn.Buffer(torch.ones(())), nn.Buffer(torch.zeros(()))
 
     @torch.no_grad()
     def set_reward_scales(self, reward: Tensor, known: Tensor, failed: Tensor) -> None:
@@ -140,13 +117,10 @@ class GroundingModel(nn.Module):
             features.append(normalized(near, 0.0, _BALL_M))
         return torch.cat(features, dim=-1)
 
-    def normal_goal(self, goal: Tensor) -> Tensor:
-        """Normalize goals (..., G)."""
-        return normalized(goal, self.goal_mean, self.goal_std)
-
     def encoder_input(self, state: Tensor, goal: Tensor, previous_action: Tensor) -> Tensor:
         """Assemble x_i = [φ(s_i), goal, a_{i-1}] (..., I) for the encoder."""
-        return torch.cat([self.state_features(state), self.normal_goal(goal), previous_action], dim=-1)
+        features, normal_goal = self.state_features(state), normalized(goal, self.goal_mean, self.goal_std)
+        return torch.cat([features, normal_goal, previous_action], dim=-1)
 
     def encode(self, windows: PairedWindows) -> tuple[Tensor, Tensor]:
         """Return the latents (B, T, Z) and memories (B, T, M) of histories that begin with `windows`."""
@@ -175,10 +149,8 @@ class GroundingModel(nn.Module):
 
     def rewards(self, latent: Tensor, action: Tensor) -> Tensor:
         """Return the predicted rewards (..., R), see `set_reward_scales`."""
-        return self._normal_rewards(latent, action) * self.reward_std + self.reward_mean
-
-    def _normal_rewards(self, latent: Tensor, action: Tensor) -> Tensor:
-        return torch.as_tensor(self.reward_head(torch.cat([latent, action], dim=-1)))
+        normal: Tensor = self.reward_head(torch.cat([latent, action], dim=-1))
+        return normal * self.reward_std + self.reward_mean
 
     def correct(self, latent: Tensor, action: Tensor, simulated_next: Tensor) -> Tensor:
         """f_abs: return the corrected next abstract state (..., X)."""
@@ -211,37 +183,27 @@ class GroundingModel(nn.Module):
             mean, log_variance = self.predict_latent(latent[:, :-1], action[:, :-1])
             nll = 0.5 * ((following - mean).square() / log_variance.exp() + log_variance).mean(-1)
             both = mask[:, :-1] * mask[:, 1:]
-            parts["latent"] = (nll * both).sum() / both.sum().clamp_min(1.0)
+            parts["latent"] = _masked_mean(nll, both)
             total = total + weights.latent * parts["latent"]
         if weights.reward > 0:
-            parts["reward"] = self._reward_loss(latent, windows)
+            # The reward itself shapes the latent (paper, L_rew); the residual is what policies are paid.
+            true = (recorded_rewards(windows) - self.reward_mean) / self.reward_std
+            normal = self.reward_head(torch.cat([latent, action], dim=-1))
+            parts["reward"] = 0.5 * _masked_mean((normal - true).square().sum(-1), windows.goes_on * mask)
             total = total + weights.reward * parts["reward"]
-        parts["state"] = self._correction_loss(latent, windows)
+        corrected = self.correct(latent, action, windows.simulated_next)
+        error = ((corrected - windows.next_state) / self.correction_std).square().mean(-1)
+        parts["state"] = _masked_mean(error, mask)
         total = total + weights.state * parts["state"]
         return total, parts
 
-    def _reward_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
-        """Return half the squared error of the reward, and of the residual reward, where R_pred learns them.
-
-        The reward itself shapes the latent (paper, L_rew); the residual is what policies are paid.
-        """
-        true = (recorded_rewards(windows) - self.reward_mean) / self.reward_std
-        error = (self._normal_rewards(latent, windows.action) - true).square().sum(-1)
-        return 0.5 * _masked_mean(error, windows.goes_on * windows.mask)
-
-    def _correction_loss(self, latent: Tensor, windows: PairedWindows) -> Tensor:
-        corrected = self.correct(latent, windows.action, windows.simulated_next)
-        error = ((corrected - windows.next_state) / self.correction_std).square().mean(-1)
-        return _masked_mean(error, windows.mask)
-
+    @torch.no_grad()
     def _following_latent(self, inputs: Tensor) -> Tensor:
         """Return the latents (B, T - 1, Z) of the next steps, by a slow copy of the encoder.
 
         With the encoder itself the loss is unbounded below: it can predict a constant latent exactly.
         """
-        with torch.no_grad():
-            slow, _ = self.target_encoder.sequence(inputs)
-        return slow[:, 1:]
+        return self.target_encoder.sequence(inputs)[0][:, 1:]
 
 
 def recorded_rewards(windows: PairedWindows) -> Tensor:
@@ -298,9 +260,8 @@ def correction_r2(corrected: Tensor, windows: PairedWindows, std: Tensor) -> flo
     no error.
     """
     mask = windows.mask.bool()
-    wrong, raw = (
-        ((landed - windows.next_state) / std)[mask].square().sum() for landed in (corrected, windows.simulated_next)
-    )
+    landed = (corrected, windows.simulated_next)
+    wrong, raw = (((one - windows.next_state) / std)[mask].square().sum() for one in landed)
     return _explained(wrong, raw)
 
 

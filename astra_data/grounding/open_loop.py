@@ -129,13 +129,8 @@ class Moments:
 
     def start(self, simulator: EpisodeSimulator, hidden: Tensor | None) -> None:
         """Start a row of `simulator` at each, with what a grounding remembers of the history, (N, H)."""
-        simulator.start(
-            self.state,
-            torch.arange(len(self), device=self.first.device),
-            self.windows.goal[self.episode, self.first],
-            hidden=hidden,
-            previous_action=self.previous_action,
-        )
+        rows, goal = torch.arange(len(self), device=self.first.device), self.windows.goal[self.episode, self.first]
+        simulator.start(self.state, rows, goal, hidden=hidden, previous_action=self.previous_action)
 
     def action(self, count: int) -> Tensor:
         """Return the commands (N, A) of the steps that come `count` later."""
@@ -150,8 +145,7 @@ class Moments:
 def replay_open_loop(task: Task, grounding: Grounding, episodes: PairedEpisodes, *, seed: int) -> Tensor:
     """Replay whole `episodes` in the simulator of `task` as `grounding` corrects it, without scatter.
 
-    Returns:
-        φ(s_0) and where each of T steps ended, (E, T + 1, X); what comes after an episode is void.
+    Returns φ(s_0) and where each of T steps ended, (E, T + 1, X); what comes after an episode is void.
     """
     windows, device = episodes.windows, str(episodes.windows.state.device)
     torch.manual_seed(derive(seed, "open-loop replay"))

@@ -38,34 +38,24 @@ RISK_STEPS = 20
 
 @dataclass(frozen=True)
 class PairedWindows:
-    """B windows of T steps each from paired episodes; the mask marks real steps, not padding.
+    """B windows of T steps each from paired episodes."""
 
-    Attributes:
-        state: φ(s_i), (B, T, X). action: a_i, (B, T, A). previous_action: a_{i-1}, (B, T, A).
-        goal: (B, T, G). simulated_next: where the abstract simulator landed, (B, T, X).
-        next_state: φ(s_{i+1}), (B, T, X).
-        fails_soon: (B, T), 1 where the episode fails within `RISK_STEPS`; see also `failing`.
-        reward: r_i, (B, T).
-        goes_on: (B, T), 1 where R_pred learns the reward: where the step ends nothing, as simulators detect
-            and pay what ends an episode; without a failure model, also where it fails.
-        failed: (B, T), 1 where the step ends in a failure that no abstract state shows, whatever it pays.
-        mask: (B, T), 1 on real steps.
-        own_reward: the task's own reward of the step on abstract states, (B, T); None where R_pred predicts
-            no residual reward, `reward` less this.
-    """
-
-    state: Tensor
-    action: Tensor
-    previous_action: Tensor
-    goal: Tensor
-    simulated_next: Tensor
-    next_state: Tensor
-    reward: Tensor
+    state: Tensor  # φ(s_i), (B, T, X)
+    action: Tensor  # a_i, (B, T, A)
+    previous_action: Tensor  # a_{i-1}, (B, T, A)
+    goal: Tensor  # (B, T, G)
+    simulated_next: Tensor  # where the abstract simulator landed, (B, T, X)
+    next_state: Tensor  # φ(s_{i+1}), (B, T, X)
+    reward: Tensor  # r_i, (B, T)
     goes_on: Tensor
-    failed: Tensor
-    fails_soon: Tensor
-    mask: Tensor
+    """(B, T), 1 where R_pred learns the reward: where the step ends nothing, as simulators detect and pay what
+    ends an episode; without a failure model, also where it fails."""
+    failed: Tensor  # (B, T), 1 where the step ends in a failure that no abstract state shows, whatever it pays
+    fails_soon: Tensor  # (B, T), 1 where the episode fails within `RISK_STEPS`; see also `failing`
+    mask: Tensor  # (B, T), 1 on real steps, 0 on padding
     own_reward: Tensor | None = None
+    """The task's own reward of the step on abstract states, (B, T); None where R_pred predicts no residual
+    reward, `reward` less this."""
 
 
 def before_failures(fails: Tensor, mask: Tensor, steps: int) -> Tensor:
@@ -78,16 +68,10 @@ def draw_steps(lengths: Tensor, count: int, length: int) -> tuple[Tensor, Tensor
     """Draw windows of `length` steps, each step equally likely; from torch's global generator.
 
     A window that is drawn across an end of its episode is shifted inside. Otherwise the last steps, where
-    robots fall, would hardly be seen.
+    robots fall, would hardly be seen. No window is longer than the longest episode.
 
-    Args:
-        lengths: of the episodes, (E,).
-        count: of windows.
-        length: of each window; at most the longest episode's.
-
-    Returns:
-        episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn before the
-        shift, (count, length) bool. In episodes shorter than `length` some lie beyond the end.
+    Returns episodes (count, 1) and steps (count, length) of the windows, and which steps were drawn before the
+    shift, (count, length) bool. In episodes shorter than `length` some lie beyond the end.
     """
     length = min(length, int(lengths.max()))
     beginnings = lengths + length - 1
@@ -103,35 +87,20 @@ _COLUMNS = (*(STATE, ACTION, TERMINATED), *(ABSTRACT_STATE, ABSTRACT_NEXT_STATE,
 
 @dataclass(frozen=True)
 class PairedEpisodes:
-    """E paired episodes, padded at the end to T steps.
+    """E paired episodes, padded at the end to T steps."""
 
-    Attributes:
-        target_state: s_i, (E, T, S).
-        reward: the target's reward r_i, (E, T).
-        terminated: (E, T) bool, the task ended there, in success or failure; not set by time-outs.
-        windows: everything else, (E, T, ...), with the mask of real steps.
-        reference: name and version of the dataset.
-        content_hash: its hash.
-        has_rewards: whether rewards were recorded; otherwise they are 0 here.
-        uids: of the episodes, (E,) int64.
-        recordings: the number of the recording that each is, or is a copy of, (E,) int64.
-        held_out: the episodes that the dataset marks as held out, (E,) bool; None if it marks none.
-        dropped_place: the entries of s_i with the robot's position, if φ drops all of them.
-        commands: the bounds of the commands, where these are not ±1 in their own units.
-    """
-
-    target_state: Tensor
-    reward: Tensor
-    terminated: Tensor
-    windows: PairedWindows
-    reference: str
+    target_state: Tensor  # s_i, (E, T, S)
+    reward: Tensor  # the target's, r_i, (E, T)
+    terminated: Tensor  # (E, T) bool, the task ended there, in success or failure; not set by time-outs
+    windows: PairedWindows  # everything else, (E, T, ...), with the mask of real steps
+    reference: str  # name and version of the dataset
     content_hash: str
-    has_rewards: bool
-    uids: Tensor
-    recordings: Tensor
-    held_out: Tensor | None = None
-    dropped_place: tuple[int, ...] = ()
-    commands: Commands | None = None
+    has_rewards: bool  # otherwise they are 0 here
+    uids: Tensor  # (E,) int64
+    recordings: Tensor  # the number of the recording that each is, or is a copy of, (E,) int64
+    held_out: Tensor | None = None  # those that the dataset marks as held out, (E,) bool; None if it marks none
+    dropped_place: tuple[int, ...] = ()  # the entries of s_i with the robot's position, if φ drops all of them
+    commands: Commands | None = None  # their bounds, where these are not ±1 in their own units
 
     @property
     def named(self) -> dict[str, str]:
@@ -144,10 +113,6 @@ class PairedEpisodes:
 
         A terminated last step whose next state was made up, as it is its own, is no step of the robot: its
         reward, termination and success become those of the step before.
-
-        Raises:
-            BadInputError: the dataset has not been paired, or has no step of the robot.
-            CorruptDatasetError: it is incomplete.
         """
         dataset = open_dataset(root)
         if ABSTRACT_STATE not in dataset.features:
@@ -235,16 +200,9 @@ class PairedEpisodes:
 
     def select(self, episodes: Tensor) -> "PairedEpisodes":
         """Return the episodes `episodes` (n,)."""
-        return replace(
-            self,
-            target_state=self.target_state[episodes],
-            reward=self.reward[episodes],
-            terminated=self.terminated[episodes],
-            windows=_gather(self.windows, episodes),
-            uids=self.uids[episodes],
-            recordings=self.recordings[episodes],
-            held_out=None if self.held_out is None else self.held_out[episodes],
-        )
+        columns = ("target_state", "reward", "terminated", "uids", "recordings", "held_out")
+        given = {name: values[episodes] for name in columns if (values := getattr(self, name)) is not None}
+        return replace(self, windows=_gather(self.windows, episodes), **given)
 
     def split(self, held_out_share: float, seed: int) -> tuple["PairedEpisodes", "PairedEpisodes"]:
         """Split into training and held-out episodes, as the dataset marks them, else at random.
@@ -274,10 +232,9 @@ class PairedEpisodes:
         return values[self.windows.mask.bool()]
 
     def draw_windows(self, count: int, length: int) -> tuple[PairedWindows, Tensor]:
-        """Draw windows of `length` steps with `draw_steps`; the mask marks only the steps that were drawn.
+        """Draw windows (count, length, ...) with `draw_steps`, and their target states (count, length, S).
 
-        Returns:
-            the windows (count, length, ...), and their target states (count, length, S).
+        The mask marks only the steps that were drawn.
         """
         episodes, steps, is_drawn = draw_steps(self.lengths, count, length)
         windows = _gather(self.windows, (episodes, steps))

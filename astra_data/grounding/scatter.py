@@ -22,27 +22,16 @@ _MOST = 2.0
 
 @dataclass(frozen=True)
 class ScatterShape:
-    """Sizes of the scatter model.
+    """Sizes of the scatter model."""
 
-    Attributes:
-        input_size: I, of what the correction sees. state_size: X.
-        forms: F, residuals that are kept to draw from.
-        hidden_sizes: of the network.
-    """
-
-    input_size: int
-    state_size: int
-    forms: int
+    input_size: int  # I, of what the correction sees
+    state_size: int  # X
+    forms: int  # F, residuals that are kept to draw from
     hidden_sizes: tuple[int, ...] = (64, 64)
 
 
 class ScatterModel(nn.Module):
-    """Draw residuals of a correction: a scale told by the moment, times the form of a recorded residual.
-
-    Attributes:
-        usual: deviation of the residuals, (X,).
-        forms: residuals of held-out steps in units of their scales, (F, X).
-    """
+    """Draw residuals of a correction: a scale told by the moment, times the form of a recorded residual."""
 
     def __init__(self, shape: ScatterShape) -> None:
         super().__init__()
@@ -51,10 +40,10 @@ class ScatterModel(nn.Module):
         # An untrained network says that every moment is usual.
         for parameter in list(self.network.parameters())[-2:]:
             nn.init.zeros_(parameter)
-        self.register_buffer("usual", torch.ones(shape.state_size))
-        self.register_buffer("forms", torch.zeros(shape.forms, shape.state_size))
-        self.usual: Tensor
-        self.forms: Tensor
+        self.usual = nn.Buffer(torch.ones(shape.state_size))
+        """Deviation of the residuals, (X,)."""
+        self.forms = nn.Buffer(torch.zeros(shape.forms, shape.state_size))
+        """Residuals of held-out steps in units of their scales, (F, X)."""
 
     def log_scale(self, inputs: Tensor) -> Tensor:
         """Return the logarithm of the scale (..., X), in units of the usual, given `inputs` (..., I)."""

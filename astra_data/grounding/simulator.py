@@ -16,14 +16,13 @@ from astra_data.worlds.variation import Variation, VariedSimulator
 class EpisodeSimulator:
     """B abstract simulators. As it is, steps are the simulator's own; subclasses correct where they land.
 
-    Attributes:
-        simulator: the abstract simulator that is stepped; the parameters of a `VariedSimulator` are redrawn
-            for each episode.
-        latent_size: Z, of the latents that policies observe; 0 where there are none.
-        landed: where the simulator landed in the last step, before any correction, (B, X).
+    The parameters of a `VariedSimulator` are redrawn for each episode.
     """
 
     latent_size: int = 0
+    """Z, of the latents that policies observe; 0 where there are none."""
+    landed: Tensor
+    """Where the simulator landed in the last step, before any correction, (B, X)."""
 
     def __init__(self, simulator: PlacedSimulator) -> None:
         """Wrap `simulator`."""
@@ -63,12 +62,8 @@ class EpisodeSimulator:
     ) -> None:
         """Start episodes in `rows` (n,), either new ones or within a known history.
 
-        Args:
-            state: abstract states, (n, X).
-            rows: which of the B simulators.
-            goal: (n, G).
-            hidden: what the grounding remembers of the history before `state`, (n, H); by default nothing.
-            previous_action: the actions (n, A) that led to `state`; by default zero.
+        Then `hidden` (n, H) is what the grounding remembers of it before `state` (n, X), by default nothing, and
+        `previous_action` (n, A) what led there, by default zero.
         """
         self.simulator.reset_to(state, rows)
         varied = self._varied
@@ -121,21 +116,11 @@ def _remembering_within(simulator: object) -> RememberingSimulator | None:
     return simulator if isinstance(simulator, RememberingSimulator) else None
 
 
-def abstract_simulator(task: Task, num_envs: int, device: str, variation: Variation | None) -> PlacedSimulator:
-    """Build `num_envs` abstract simulators of `task`; with a `variation`, their parameters vary."""
-    if variation is None:
-        return task.simulator(num_envs, device)
-    return task.varied_simulator(num_envs, variation, device)
-
-
 class Grounding(Protocol):
-    """How an abstract simulator is corrected, if it is.
-
-    Attributes:
-        start_stride: recorded steps between those that episodes may start from.
-    """
+    """How an abstract simulator is corrected, if it is."""
 
     start_stride: ClassVar[int] = 1
+    """Recorded steps between those that episodes may start from."""
 
     @property
     def encoder(self) -> LatentEncoder | None:
@@ -149,15 +134,10 @@ class Grounding(Protocol):
     def simulator(
         self, task: Task, num_envs: int, device: str = "cpu", *, variation: Variation | None = None
     ) -> EpisodeSimulator:
-        """Build `num_envs` abstract simulators of `task`, corrected.
-
-        Args:
-            task: the task.
-            num_envs: B.
-            device: torch device.
-            variation: ranges of the simulator's parameters, unless the grounding has its own.
-        """
-        return self.corrected(abstract_simulator(task, num_envs, device, variation))
+        """Build `num_envs` abstract simulators of `task`, corrected; with a `variation`, their parameters vary."""
+        if variation is None:
+            return self.corrected(task.simulator(num_envs, device))
+        return self.corrected(task.varied_simulator(num_envs, variation, device))
 
     def hidden_before(self, windows: PairedWindows, every: int = 1) -> Tensor | None:
         """Return its memory before each `every`-th step, (E, ceil(T / every), H); None if it has none.
@@ -172,13 +152,10 @@ class Grounding(Protocol):
 
 
 class FittedGrounding(Grounding, Protocol):
-    """A grounding that was fitted to pairs, and can be saved.
-
-    Attributes:
-        kind: names the class in files; see `files.KINDS`.
-    """
+    """A grounding that was fitted to pairs, and can be saved."""
 
     kind: ClassVar[str]
+    """Names the class in files; see `files.KINDS`."""
 
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
@@ -186,11 +163,7 @@ class FittedGrounding(Grounding, Protocol):
 
     @classmethod
     def from_file(cls, tensors: dict[str, Tensor], metadata: Mapping[str, Any], device: str) -> Self:
-        """Rebuild it on `device`, with frozen parameters.
-
-        Raises:
-            KeyError, TypeError, ValueError, RuntimeError: something is missing or of another shape.
-        """
+        """Rebuild it on `device`, with frozen parameters."""
         ...
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from astra_data.core.arrays import as_column
 from astra_data.core.checkpoint import Logbook
-from astra_data.core.config import Config, NotNegative, in_order
+from astra_data.core.config import NotNegative, in_order
 from astra_data.core.errors import BadInputError
 from astra_data.core.progress import Progress
 from astra_data.core.seeding import derive, generator
@@ -33,7 +33,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.inspection import outcome_of
 from astra_data.dataset.staging import StagedWriter
 from astra_data.policies.episodes import ObservedTargetEnv
-from astra_data.policies.networks import ActorCritic, ActorCriticShape, Policy, PolicyShape, SoftActor
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, PolicyShape, SoftActor
 from astra_data.policies.ppo import Ppo, PpoConfig
 from astra_data.policies.running_policy import Observed, PolicyFile, RunningPolicy
 from astra_data.policies.sac import Sac, SacConfig
@@ -70,8 +70,7 @@ class WallWatch:
 
     def __init__(self, task: Task, clearance_m: float) -> None:
         """Keep robots `clearance_m` away from the walls of the task's maze."""
-        self.clearance_m = clearance_m
-        self._task, self._maze = task, task.maze
+        self.clearance_m, self._task, self._maze = clearance_m, task, task.maze
 
     def clearance(self, state: Tensor, commands: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the least clearance in m (B, K) if `commands` (B, K, A) are held from `state` (B, S)."""
@@ -91,9 +90,7 @@ class RandomCommands:
 
     def __init__(self, action_size: int, hold_steps: tuple[int, int], watch: WallWatch | None = None) -> None:
         """Hold commands (A,) for `hold_steps` (fewest, most), or until `watch` predicts a wall."""
-        self._size = action_size
-        self._hold_steps = hold_steps
-        self._watch = watch
+        self._size, self._hold_steps, self._watch = action_size, hold_steps, watch
 
     def start(self, rows: range, seed: int) -> None:
         """Begin new episodes of as many robots as `rows`."""
@@ -113,10 +110,7 @@ class RandomCommands:
         return torch.from_numpy(self._command).float()
 
     def _drawn(self, state: Tensor, due: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Draw commands (n, A) for the robots `due` (n,).
-
-        With a watch, take the first of 16 that stays clear of walls, or else the clearest.
-        """
+        """Draw commands (n, A) for robots `due` (n,); with a watch, the first of 16 clear of walls, or the clearest."""
         if self._watch is None:
             return self._proposed(due, 1)[:, 0]
         choices = self._proposed(due, _CHOICES)
@@ -200,23 +194,12 @@ def record(
 ) -> int:
     """Record the episodes `rows` as one batch, staging each when it ends; return the number of steps.
 
-    Random numbers are drawn for the whole batch, so episodes that are staged already are simulated again,
-    with the same outcome, but not written again.
-
-    Args:
-        task: of the target.
-        env: the target, reset, with a row for each of `rows`.
-        behavior: started on these rows.
-        rows: numbers of the episodes.
-        writer: of the dataset.
-        max_steps: after which episodes are truncated.
-        seed: that the episodes are said to be of.
-        progress: called with the fraction done of this batch.
+    `env` has been reset, with a row for each, `behavior` started on them, and `seed` is what the episodes are
+    said to be of. Random numbers are drawn for the whole batch, so episodes that are staged already are
+    simulated again, with the same outcome, but not written again.
     """
-    active = torch.ones(len(rows), dtype=torch.bool)
-    columns: dict[str, Array] = {}
-    steps = 0
-    began = time.perf_counter()
+    active, began = torch.ones(len(rows), dtype=torch.bool), time.perf_counter()
+    columns, steps = dict[str, Array](), 0
     for step in range(max_steps):
         row = _step(env, behavior, active, last=step == max_steps - 1)
         row[ACTION] = task.limits.in_units(row[ACTION])
@@ -273,10 +256,7 @@ def suboptimal_by_ppo(
 ) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory by PPO in the target, on φ of its state; stop after `steps`.
 
-    A checkpoint in `folder` lets the same call resume after an interruption.
-
-    Returns:
-        the policy, and how it was trained.
+    A checkpoint in `folder` lets the same call resume after an interruption. Returns how it was trained as well.
     """
     torch.manual_seed(derive(seed, "suboptimal policy"))
     world = ObservedTargetEnv(task, _PPO_ENVS, num_threads=num_threads)
@@ -287,8 +267,7 @@ def suboptimal_by_ppo(
     def judge(figures: Mapping[str, float]) -> tuple[float, str]:
         return ppo.steps / steps, f"reward per step {figures['reward']:.3f}"
 
-    spent = _train(ppo, world, judge, folder, progress)
-    return _finished(policy, "abstract"), _metadata(ppo, policy, config, spent)
+    return _trained(ppo, world, judge, folder, progress, "abstract")
 
 
 def suboptimal_by_sac(
@@ -296,11 +275,7 @@ def suboptimal_by_sac(
 ) -> tuple[PolicyFile, Metadata]:
     """Train a policy without memory by SAC in the target, on its full state.
 
-    Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest. A checkpoint in
-    `folder` lets the same call resume after an interruption.
-
-    Returns:
-        the policy, and how it was trained.
+    Stop as soon as episodes last `episode_steps` on average, after `steps` at the latest; otherwise as by PPO.
     """
     if not task.objective.is_lasting:
         raise BadInputError(f"in {task.name} good episodes are short: use 'suboptimal_ppo'")
@@ -315,22 +290,18 @@ def suboptimal_by_sac(
         lasted = _lasts(running, derive(seed, f"trial {sac.steps}"), num_threads)
         return max(sac.steps / steps, lasted / episode_steps), f"episodes last {lasted:.0f} steps"
 
-    spent = _train(sac, world, judge, folder, progress)
-    return _finished(actor, "full"), _metadata(sac, actor, config, spent)
+    return _trained(sac, world, judge, folder, progress, "full")
 
 
-def _train(
+def _trained(
     learner: Ppo | Sac,
     world: ObservedTargetEnv,
     judge: Callable[[Mapping[str, float]], tuple[float, str]],
     folder: Path,
     progress: Progress,
-) -> dict[str, float]:
-    """Train until `judge`, given the figures of an iteration, returns a share done of 1, with a note.
-
-    Returns:
-        the time spent, including that before an interruption.
-    """
+    observed: Observed,
+) -> tuple[PolicyFile, Metadata]:
+    """Train until `judge`, given the figures of an iteration, returns a share done of 1, with a note."""
 
     def go_on(state: dict[str, Any]) -> None:
         observation = world.load_state_dict(state["world"])
@@ -345,7 +316,11 @@ def _train(
         progress(min(1.0, share), f"training the behavior: {rate:,.0f} steps/s  {note}")
         if logbook.is_due or share >= 1.0:
             logbook.keep({"learner": learner.state_dict(), "world": world.state_dict()})
-    return logbook.stopwatch.spent()
+    policy, config = learner.policy.requires_grad_(False), learner.config.model_dump(mode="json")
+    settings = {"num_envs": learner.env.num_envs, "hidden_sizes": list(policy.shape.hidden_sizes), **config}
+    spent = logbook.stopwatch.spent()
+    metadata = {"trained_steps": learner.steps, "learner": settings, "spent": spent}
+    return PolicyFile(policy, None, None, None, observed), metadata
 
 
 def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
@@ -364,13 +339,3 @@ def _lasts(running: RunningPolicy, seed: int, num_threads: int | None) -> float:
         lasted += int(active.sum())
         active &= ~env.step(behavior.act(env.state, env.goal), active).terminated
     return lasted / _TEST_EPISODES
-
-
-def _finished(policy: Policy, observed: Observed) -> PolicyFile:
-    return PolicyFile(policy.requires_grad_(False), None, None, None, observed)
-
-
-def _metadata(learner: Ppo | Sac, policy: Policy, config: Config, spent: Mapping[str, float]) -> Metadata:
-    sizes = list(policy.shape.hidden_sizes)
-    settings = {"num_envs": learner.env.num_envs, "hidden_sizes": sizes, **config.model_dump(mode="json")}
-    return {"trained_steps": learner.steps, "learner": settings, "spent": spent}

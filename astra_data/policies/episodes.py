@@ -237,15 +237,8 @@ def in_target(
 ) -> TargetEpisodes:
     """Run so many episodes side by side; starts and goals depend on the seed alone.
 
-    Args:
-        task: with a target.
-        begin: starts the policy.
-        episodes: their number.
-        seed: of the target.
-        leg_scale: factor on the legs' length, of tasks with the fact `leg_scale`: the ant's.
-        num_threads: of the physics, by default one per core; the outcome is the same with any number.
-        progress: called with the fraction done and the speed.
-        asked: counts commands beyond what was recorded.
+    `leg_scale` is a factor on the legs' length, of tasks with the fact `leg_scale`: the ant's. The physics has
+    `num_threads`, by default one per core; the outcome is the same with any number.
     """
     if leg_scale != 1.0 and "leg_scale" not in task.facts:
         raise BadInputError(

@@ -7,7 +7,7 @@ are in [-1, 1] along each axis; `task.limits.in_units` returns them in the units
 touched a wall ("wall_contact"; never, where there are none).
 """
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -18,34 +18,18 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from astra_data.core.progress import Progress
-from astra_data.core.seeding import fresh_seed
+from astra_data.core.seeding import derive, fresh_seed
 from astra_data.grounding.descent import seeded
 from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.learner import lately, penalty_scale
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import task_named
-from astra_data.worlds.protocols import BatchedEnv, Step
+from astra_data.worlds.protocols import Step, TargetEnv
+
+if TYPE_CHECKING:
+    from astra_data.policies.train import Training
 
 Array = NDArray[Any]
-
-
-class SeededEnv(BatchedEnv, Protocol):
-    """A batched environment with its own randomness."""
-
-    @property
-    def failed(self) -> Tensor:
-        """Which rows failed in the last step, (B,) bool."""
-        ...
-
-    @property
-    def wall_contact(self) -> Tensor:
-        """Which rows touched a wall in the last step, (B,) bool."""
-        ...
-
-    def reseed(self, seed: int) -> None:
-        """Draw all later randomness from `seed`."""
-        ...
 
 
 class SeededSimulatorEnv:
@@ -85,6 +69,10 @@ class SeededSimulatorEnv:
             step = self.env.step(action)
             self._noise = torch.get_rng_state()
         return step
+
+
+SeededEnv = TargetEnv | SeededSimulatorEnv
+"""A batched environment with its own randomness."""
 
 
 class SingleEnv(gymnasium.Env[Array, Array]):
@@ -216,30 +204,17 @@ _POINTS = 50  # of a learning curve
 
 
 class WatchedEnv(BatchedVectorEnv):
-    """The environment that a row is trained in, which keeps the learning curve of who learns there.
+    """The environment that a row is trained in, which keeps the learning curve, `points`, of who learns there."""
 
-    Attributes:
-        points: of the curve so far.
-    """
-
-    def __init__(
-        self,
-        env: SimulatorEnv,
-        *,
-        seed: int,
-        max_episode_steps: int,
-        total_steps: int,
-        ramps: bool,
-        is_lasting: bool,
-        progress: Progress,
-    ) -> None:
-        """Show `env`, whose randomness comes from `seed`; with `ramps`, penalties grow with success."""
+    def __init__(self, env: SimulatorEnv, training: "Training") -> None:
+        """Show `env` to the learner of a `training`; with the plus settings, penalties grow with success."""
         seeded = SeededSimulatorEnv(env)
-        seeded.reseed(seed)
-        super().__init__(seeded, max_episode_steps)
+        seeded.reseed(derive(training.seed, "own learner"))
+        super().__init__(seeded, training.simulated_steps)
         self.points: list[dict[str, Any]] = []
-        self._simulated, self._total, self._progress = env, total_steps, progress
-        self._ramps, self._is_lasting = ramps, is_lasting
+        self._simulated, self._total, self._progress = env, training.config.total_steps, training.progress
+        self._is_lasting = training.task.objective.is_lasting
+        self._ramps = training.is_plus and not self._is_lasting
         self._steps = self._ended = self._succeeded = self._lasted = 0
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:

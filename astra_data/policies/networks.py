@@ -16,16 +16,12 @@ _SMALLEST_SQUASHED = 1e-6 - 1.0  # actions beyond it are taken for it, since the
 
 @dataclass(frozen=True)
 class PolicyShape:
-    """Sizes of a policy.
+    """Sizes of a policy."""
 
-    Attributes:
-        observation_size: O. action_size: A. memory_size: M, of the GRU that encodes (observation, previous
-            action); 0 for none, where the observation already holds a latent.
-    """
-
-    observation_size: int
-    action_size: int
+    observation_size: int  # O
+    action_size: int  # A
     memory_size: int = 0
+    """M, of the GRU that encodes (observation, previous action); 0 where the observation already holds a latent."""
     embedding_size: int = 64
     hidden_sizes: tuple[int, ...] = (64, 64)
 
@@ -65,12 +61,10 @@ class Policy(nn.Module, ABC):
     """Acts on observations and its memory of them.
 
     The memory is an argument and a result, `hidden` (B, M), never kept; without memory M = 0.
-
-    Attributes:
-        squashes: whether actions are the tanh of draws from the Gaussian that `policy` returns.
     """
 
     squashes: ClassVar[bool] = False
+    """Whether actions are the tanh of draws from the Gaussian that `policy` returns."""
 
     def __init__(self, shape: PolicyShape) -> None:
         super().__init__()
@@ -111,13 +105,9 @@ class Policy(nn.Module, ABC):
 
 @dataclass(frozen=True)
 class ActorCriticShape(PolicyShape):
-    """Sizes of actor and critic, and their actions.
+    """Sizes of actor and critic, and their actions."""
 
-    Attributes:
-        initial_log_std: logarithm of the initial standard deviation.
-    """
-
-    initial_log_std: float = -0.5
+    initial_log_std: float = -0.5  # logarithm of the initial standard deviation
 
 
 def bounded(output: Tensor) -> Tensor:
@@ -201,14 +191,10 @@ SHORTEST_HISTORY = 40  # steps that the student's convolutions span
 
 @dataclass(frozen=True)
 class AdaptiveShape(ActorCriticShape):
-    """Sizes of teacher and student.
+    """Sizes of teacher and student."""
 
-    Attributes:
-        extrinsics_size: E. history_length: H, steps that the student's estimate is made from.
-    """
-
-    extrinsics_size: int = 8
-    history_length: int = 50
+    extrinsics_size: int = 8  # E
+    history_length: int = 50  # H, steps that the student's estimate is made from
 
     @property
     def feature_size(self) -> int:
@@ -299,8 +285,7 @@ class Student(ActorCritic):
         features, memory = super().remember(observation, previous_action, memory)
         newest = torch.cat([observation, previous_action], dim=-1)
         history = torch.cat([history[:, newest.shape[1] :], newest], dim=-1)
-        features = torch.cat([features, self.adaptation(history)], dim=-1)
-        return features, torch.cat([memory, history], dim=-1)
+        return torch.cat([features, self.adaptation(history)], dim=-1), torch.cat([memory, history], dim=-1)
 
     def remember_sequence(self, observation: Tensor, previous_action: Tensor, hidden: Tensor, start: Tensor) -> Tensor:
         """Return the features (B, T, F) of T steps, from `hidden`; `start` (B, T) is 1 at new episodes."""

@@ -42,13 +42,10 @@ class ActingPolicy(Protocol):
 
 
 class SavedPolicy(ActingPolicy, Protocol):
-    """What a policy has to have that a learner of the user's makes for a row.
-
-    Attributes:
-        kind: names the class in files; see `KINDS`.
-    """
+    """What a policy has to have that a learner of the user's makes for a row."""
 
     kind: ClassVar[str]
+    """Names the class in files; see `KINDS`."""
 
     def to_file(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """Return tensors, at least one, and metadata (JSON values) from which `from_file` rebuilds it."""
@@ -116,38 +113,24 @@ def target_observation(task: Task, state: Tensor, goal: Tensor, latent: Tensor |
 
 
 class Memory(NamedTuple):
-    """What B robots remember of their episodes: zeros at the start.
+    """What B robots remember of their episodes: zeros at the start."""
 
-    Attributes:
-        previous_output: what the policy put out last, (B, A). previous_action: the same as it was given to
-            the robot, (B, A).
-        policy: the policy's own memory. encoder: that of the encoder, (B, ...) each.
-    """
-
-    previous_output: Tensor
-    previous_action: Tensor
-    policy: Tensor
-    encoder: Tensor
+    previous_output: Tensor  # what the policy put out last, (B, A)
+    previous_action: Tensor  # the same as it was given to the robot, (B, A)
+    policy: Tensor  # the policy's own memory, (B, ...)
+    encoder: Tensor  # that of the encoder, (B, ...)
 
 
 @dataclass
 class RunningPolicy:
-    """A policy that acts on B robots. Latents come from ψ^t on full states, or from ψ^s on φ of them.
-
-    Attributes:
-        task: the task. policy: the networks.
-        source_encoder: ψ^s; None for a policy without latents.
-        target_encoder: ψ^t; where it is None, ψ^s is used.
-        command_limit: that of the environment in which the policy was trained.
-        observed: whether the policy observes φ of the target's state, or the full state.
-    """
+    """A policy that acts on B robots. Latents come from ψ^t on full states, or from ψ^s on φ of them."""
 
     task: Task
     policy: Policy
-    source_encoder: LatentEncoder | None = None
-    target_encoder: LatentEncoder | None = None
-    command_limit: float = NO_LIMIT
-    observed: Observed = "abstract"
+    source_encoder: LatentEncoder | None = None  # ψ^s; None for a policy without latents
+    target_encoder: LatentEncoder | None = None  # ψ^t; where it is None, ψ^s is used
+    command_limit: float = NO_LIMIT  # that of the environment in which the policy was trained
+    observed: Observed = "abstract"  # whether the policy observes φ of the target's state, or the full state
 
     @property
     def observation_size(self) -> int:
@@ -155,7 +138,7 @@ class RunningPolicy:
         state = torch.zeros(1, self.task.state_columns[0].size)
         goal = torch.zeros(1, self.task.objective.goal_size)
         seen = target_observation(self.task, state, goal, None, self.observed)
-        return seen.shape[1] + self._latent_size
+        return seen.shape[1] + (self.source_encoder.encoder.latent_size if self.source_encoder else 0)
 
     def start(self, count: int, generator: torch.Generator | None = None) -> None:
         """Start B = `count` episodes without history; with `generator`, draw actions as in training."""
@@ -200,10 +183,6 @@ class RunningPolicy:
         latent = self._latent(self.source_encoder, abstract, goal)
         return self._act(policy_observation(self.task.objective, abstract, goal, latent))
 
-    @property
-    def _latent_size(self) -> int:
-        return self.source_encoder.encoder.latent_size if self.source_encoder is not None else 0
-
     @torch.no_grad()
     def _latent(self, encoder: LatentEncoder | None, seen: Tensor, goal: Tensor) -> Tensor | None:
         if encoder is None:
@@ -242,40 +221,24 @@ def add_policy_kind(made: type[SavedPolicy]) -> None:
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A trained policy.
-
-    Attributes:
-        policy: the networks.
-        simulation: the simulator that it was trained in; None if it was trained in the target, or on data.
-        dataset, content_hash: the dataset that everything was learned from; None for a policy that was
-            trained to collect one.
-        observed: which part of the target's state it observes.
-    """
+    """A trained policy."""
 
     policy: Policy
-    simulation: Simulation | None
-    dataset: str | None
-    content_hash: str | None
-    observed: Observed = "abstract"
+    simulation: Simulation | None  # that it was trained in; None if it was trained in the target, or on data
+    dataset: str | None  # that everything was learned from; None for a policy that was trained to collect one
+    content_hash: str | None  # of the dataset
+    observed: Observed = "abstract"  # which part of the target's state it observes
 
     def save(self, path: Path) -> None:
         """Write the policy to `path`."""
         kind, networks, own = _taken_apart(self.policy)
-        tensors = as_part(networks, _PART)
-        metadata: dict[str, Any] = own | {
-            "kind": kind,
-            "shape": asdict(self.policy.shape),
-            "dataset": self.dataset,
-            "hash": self.content_hash,
-            "observed": self.observed,
-        }
+        metadata = own | {"kind": kind, "shape": asdict(self.policy.shape), "dataset": self.dataset}
+        metadata |= {"hash": self.content_hash, "observed": self.observed}
         if self.simulation:
-            variation = self.simulation.variation
-            metadata["simulation"] = {
-                "world": self.simulation.world.model_dump(mode="json"),
-                "variation": variation.model_dump() if variation else None,
-            }
-        save_tensors(path, tensors, metadata)
+            world, variation = self.simulation.world, self.simulation.variation
+            parts = {"world": world.model_dump(mode="json"), "variation": variation and variation.model_dump()}
+            metadata["simulation"] = parts
+        save_tensors(path, as_part(networks, _PART), metadata)
 
     @classmethod
     def load(cls, path: Path | str, device: str = "cpu") -> "PolicyFile":

@@ -97,50 +97,22 @@ AnyTrainConfig = Annotated[
 """Training by the `learner` that is named, by default PPO."""
 
 
-def learner_of(
-    config: PpoTrainConfig | SacTrainConfig,
-    env: BatchedEnv,
-    shape: PolicyShape,
-    device: str,
-    *,
-    horizon: int,
-    seed: int,
-) -> Ppo | Sac:
-    """Build the learner and a new policy of `shape`."""
-    if isinstance(config, SacTrainConfig):
-        actor = SoftActor(shape).to(device)
-        return Sac(env, actor, config, horizon=horizon, seed=seed)
-    policy = ActorCritic(ActorCriticShape(**asdict(shape))).to(device)
-    return Ppo(env, policy, config, horizon=horizon, seed=seed)
-
-
 @dataclass(frozen=True)
 class Training:
-    """What a method is given to train a policy.
-
-    Attributes:
-        task: the task. config: the recipe's `[train]`. is_plus: whether the row has the plus settings.
-        settings: the method's own table of the recipe, if it has one.
-        episodes: paired episodes. grounding: of the method; `NO_GROUNDING` where it fits none.
-        initial: the policy that the training starts from, if the method names one.
-        seed: of all randomness. device: of the networks.
-        folder: for checkpoints.
-        progress: called with the share done and a note.
-        num_threads: of the target's physics, for methods that train in the target; None is one per core.
-    """
+    """What a method is given to train a policy."""
 
     task: Task
-    config: PpoTrainConfig | SacTrainConfig
-    settings: Config | None
+    config: PpoTrainConfig | SacTrainConfig  # the recipe's `[train]`
+    settings: Config | None  # the method's own table of the recipe, if it has one
     episodes: PairedEpisodes
-    grounding: Grounding
-    initial: PolicyFile | None
-    seed: int
-    device: str
-    folder: Path
-    progress: Progress
-    num_threads: int | None = None
-    is_plus: bool = False
+    grounding: Grounding  # of the method; `NO_GROUNDING` where it fits none
+    initial: PolicyFile | None  # that the training starts from, if the method names one
+    seed: int  # of all randomness
+    device: str  # of the networks
+    folder: Path  # for checkpoints
+    progress: Progress  # called with the share done and a note
+    num_threads: int | None = None  # of the target's physics, for methods that train there; None is one per core
+    is_plus: bool = False  # whether the row has the plus settings
 
     @property
     def simulated_steps(self) -> int:
@@ -152,13 +124,10 @@ Learn = Callable[[Training], tuple[PolicyFile, dict[str, Any]]]  # returns the p
 
 
 class ResumableEnv(BatchedEnv, Protocol):
-    """A batched environment in which a training can be resumed.
-
-    Attributes:
-        penalty_scale: factor on penalties in the reward, which the training ramps up.
-    """
+    """A batched environment in which a training can be resumed."""
 
     penalty_scale: float
+    """Factor on penalties in the reward, which the training ramps up."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all that `load_state_dict` needs to continue from here."""
@@ -171,16 +140,13 @@ class ResumableEnv(BatchedEnv, Protocol):
 
 @dataclass(frozen=True)
 class InSimulator:
-    """Train in the abstract simulator.
-
-    Attributes:
-        reward: where the reward comes from, but for the plus settings.
-        ranges: which of the task's ranges the simulator's parameters are drawn from, unless the grounding has
-            ranges or the method's own settings are ranges; None where they stay plain.
-    """
+    """Train in the abstract simulator."""
 
     reward: RewardSource = "abstract"
+    """Where the reward comes from, but for the plus settings."""
     ranges: Literal["randomized", "wide"] | None = None
+    """Which of the task's ranges the simulator's parameters are drawn from, unless the grounding has ranges or
+    the method's own settings are ranges; None where they stay plain."""
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
@@ -216,13 +182,18 @@ class InSimulator:
 def train_in(
     env: ResumableEnv, config: PpoTrainConfig | SacTrainConfig, memory_size: int, training: Training, horizon: int
 ) -> tuple[Policy, dict[str, Any]]:
-    """Train a new policy in `env`; return it and its learning curve.
+    """Train a new policy in `env`, of episodes of at most `horizon` steps; return it and its learning curve.
 
-    The policy has a memory of `memory_size`; episodes are cut off after `horizon` steps.
+    The policy has a memory of `memory_size`.
     """
     torch.manual_seed(derive(training.seed, "policy"))
     shape = PolicyShape(env.observation_size, env.action_size, memory_size, hidden_sizes=config.hidden_sizes)
-    learner = learner_of(config, env, shape, training.device, horizon=horizon, seed=training.seed)
+    device, options = training.device, {"horizon": horizon, "seed": training.seed}
+    learner: Ppo | Sac
+    if isinstance(config, SacTrainConfig):
+        learner = Sac(env, SoftActor(shape).to(device), config, **options)
+    else:
+        learner = Ppo(env, ActorCritic(ActorCriticShape(**asdict(shape))).to(device), config, **options)
     return learner.policy, optimize(learner, env, training)
 
 
@@ -283,13 +254,10 @@ class TargetConfig(Config):
 
 @dataclass(frozen=True)
 class InTarget:
-    """Train in the target, from its own rewards.
-
-    Attributes:
-        observed: whether the policy observes φ of the state or the full state.
-    """
+    """Train in the target, from its own rewards."""
 
     observed: Observed
+    """Whether the policy observes φ of the state or the full state."""
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
@@ -311,46 +279,39 @@ class InTarget:
 def with_restarts(learn: Learn, training: Training, grounding_file: Path | None) -> tuple[PolicyFile, dict[str, Any]]:
     """Train until a policy masters its own simulator, `tries` times at most, each from another seed.
 
-    Args:
-        learn: trains once.
-        training: what it is given.
-        grounding_file: of its grounding, which is read again where that is not on the CPU: policies are
-            tested there.
+    The grounding is read again from `grounding_file` where that is not on the CPU: policies are tested there.
 
     Returns:
         the policy that does, or else the one with the most success there; and its learning curve, with the
         time that all tries took, and with them as "tries": their seeds, what they reached, and their points.
     """
-    config = training.config
+    config, made = training.config, list[tuple[Reached, PolicyFile, dict[str, Any]]]()
     if config.tries == 1:
         return learn(training)
     grounding = training.grounding if training.device == "cpu" else grounding_at(grounding_file)
-    made: list[tuple[Reached, PolicyFile, dict[str, Any]]] = []
     seeds = [training.seed, *(derive(training.seed, f"try {number}") for number in range(1, config.tries))]
     for number, seed in enumerate(seeds):
         attempt = _attempt(training, seed, number)
         policy, curve = learn(attempt)
         policy.save(attempt.folder / POLICY)
-        reached = reached_in_own_world(
-            training.task, PolicyFile.load(attempt.folder / POLICY), grounding, training.seed
-        )
-        made.append((reached, policy, curve))
-        if _masters(reached, training):
+        saved = PolicyFile.load(attempt.folder / POLICY)
+        made.append((reached_in_own_world(training.task, saved, grounding, training.seed), policy, curve))
+        if made[-1][0].success >= config.least_success:
             break
-    _, policy, curve = max(made, key=lambda one: (_masters(one[0], training), one[0].success))
+    _, policy, curve = max(made, key=lambda one: (one[0].success >= config.least_success, one[0].success))
     tries = [
         {"seed": seed, "success": one.success, "episode_steps": one.steps, "points": of_try["points"]}
         for seed, (one, _, of_try) in zip(seeds, made, strict=False)
     ]
     spent = {clock: sum(of_try[clock] for _, _, of_try in made) for clock in CLOCKS if clock in curve}
-    for number in range(1, len(made)):
-        shutil.rmtree(_folder(training, number))
+    for folder in training.folder.glob("try_*"):
+        shutil.rmtree(folder)
     return policy, curve | spent | {"tries": tries}
 
 
 def _attempt(training: Training, seed: int, number: int) -> Training:
     """Return the training of a try; the first is the one that there would be without tries."""
-    tries, folder = training.config.tries, _folder(training, number)
+    tries, folder = training.config.tries, training.folder / (f"try_{number}" if number else "")
     folder.mkdir(exist_ok=True)
     share = part(training.progress, number / tries, (number + 1) / tries)
 
@@ -360,31 +321,19 @@ def _attempt(training: Training, seed: int, number: int) -> Training:
     return replace(training, seed=seed, folder=folder, progress=progress)
 
 
-def _folder(training: Training, number: int) -> Path:
-    return training.folder / f"try_{number}" if number else training.folder
-
-
-def _masters(reached: Reached, training: Training) -> bool:
-    return reached.success >= training.config.least_success
-
-
 if TYPE_CHECKING:
     from astra_data.policies.gymnasium import WatchedEnv
 
 
 @dataclass(frozen=True, kw_only=True)
 class UserLearner(InSimulator):
-    """Train in the abstract simulator by a function of the user's.
-
-    Attributes:
-        learn: given the environment, a vector environment of Gymnasium, and the training, which has the
-            recipe's settings (`training.config.total_steps`) and the seed, returns the policy. A hand-written
-            one needs no step.
-        policy: the class of what it returns.
-    """
+    """Train in the abstract simulator by a function of the user's."""
 
     learn: Callable[["WatchedEnv", Training], SavedPolicy]
+    """Given the environment, a vector environment of Gymnasium, and the training, which has the recipe's settings
+    (`training.config.total_steps`) and the seed, returns the policy. A hand-written one needs no step."""
     policy: type[SavedPolicy]
+    """The class of what it returns."""
 
     def __call__(self, training: Training) -> tuple[PolicyFile, dict[str, Any]]:
         """Return the policy and its learning curve."""
@@ -396,16 +345,7 @@ class UserLearner(InSimulator):
         from astra_data.policies.gymnasium import WatchedEnv
 
         env, simulation = self.world(training)
-        is_lasting = training.task.objective.is_lasting
-        watched = WatchedEnv(
-            env,
-            seed=derive(training.seed, "own learner"),
-            max_episode_steps=training.simulated_steps,
-            total_steps=training.config.total_steps,
-            ramps=training.is_plus and not is_lasting,
-            is_lasting=is_lasting,
-            progress=training.progress,
-        )
+        watched = WatchedEnv(env, training)
         torch.manual_seed(derive(training.seed, "policy"))
         learned = self.learn(watched, training)
         if not isinstance(learned, self.policy):

@@ -131,7 +131,7 @@ class Forgetful:
     [
         (through_numpy, "abstraction cannot be written as a graph .*: expected operations of torch"),
         (branching, "abstraction cannot be written as a graph .*, and no branch"),
-        (Forgetful(), r"in step 0 policy.onnx gives the command \[.*\], the policy \[.*\]: does φ"),
+        (Forgetful(), r"in step \d policy.onnx gives the command \[.*\], the policy \[.*\]: does φ"),
     ],
 )
 def test_code_that_is_no_graph_is_named_in_one_line(abstraction: Any, told: str, tmp_path: Path) -> None:

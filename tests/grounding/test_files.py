@@ -8,6 +8,7 @@ from toy_episodes import no_episodes
 from astra_data.core.checkpoint import load_tensors, save_tensors
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.encoder import take_scales
 from astra_data.grounding.files import (
     KINDS,
     load_grounding,
@@ -23,7 +24,7 @@ from astra_data.grounding.model import GroundingModel, GroundingShape
 def test_a_history_model_comes_back_frozen(tmp_path: Path) -> None:
     shape = GroundingShape(4, 2, 2, latent_size=8, head_sizes=(16, 8), position_octaves=2)
     model = GroundingModel(shape)
-    model.set_scales({"state": torch.randn(50, 4)})
+    take_scales(model, {"state": torch.randn(50, 4)})
     failed = (torch.arange(50) == 7).float()
     model.set_reward_scales(torch.randn(50, 2) - 10.0 * failed[:, None], 1.0 - failed, failed)
     model.reward_shrinkage.fill_(0.4)

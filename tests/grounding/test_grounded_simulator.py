@@ -4,7 +4,7 @@ from grounding_models import GOAL, HERE, failure_model, model
 from torch import Tensor
 
 from astra_data.grounding.failures import FailureModel
-from astra_data.grounding.history import GroundedSimulator
+from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.model import GroundingModel
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
@@ -13,7 +13,7 @@ ROWS = torch.arange(3)
 
 
 def simulator(used: GroundingModel, failures: FailureModel | None = None) -> GroundedSimulator:
-    one = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), used, failures)
+    one = HistoryGrounding(used, failures).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
     one.start(HERE.expand(3, 4), ROWS, GOAL)
     return one
 
@@ -85,7 +85,8 @@ def test_a_failure_model_is_asked_before_each_correction_and_prices_failures(lat
     for action in actions(5):
         raw.reset_to(one.state)
         latent = one.latent
-        said, memory = failures.step(one.state, action, raw.step(action), latent, memory)
+        seen, memory = failures.inputs(one.state, action, raw.step(action), latent, memory)
+        said = failures.probability(seen)
         torch.testing.assert_close(one.step(action), plain.step(action))
         torch.testing.assert_close(one.failure_risk(), said / 2)  # within two steps
         expected = used.predict_reward(latent, action) - 10.0 * said / 2

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from astra_data.grounding.encoder import add_scales, take_scales
+from astra_data.grounding.encoder import take_scales
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
 from astra_data.grounding.paired_episodes import PairedWindows
 
@@ -48,12 +48,13 @@ def untrained() -> GroundingModel:
         2, 2, 2, latent_size=SIZE, embedding_size=32, head_sizes=(32,), position_octaves=0, corrects_reward=False
     )
     model = GroundingModel(shape)
-    model.set_scales(
+    take_scales(
+        model,
         {
             "state": TRAINING.state.flatten(0, 1),
             "goal": TRAINING.goal.flatten(0, 1),
             "correction": (TRAINING.next_state - TRAINING.simulated_next).flatten(0, 1),
-        }
+        },
     )
     model.set_reward_scales(TRAINING.reward.reshape(-1, 1), TRAINING.goes_on.flatten(), TRAINING.failed.flatten())
     return model
@@ -114,7 +115,9 @@ def test_masked_steps_do_not_count() -> None:
 
 def test_scales_are_those_of_the_values_and_plain_without_any() -> None:
     network, values = nn.Module(), torch.tensor([[1.0, 5.0], [3.0, 5.0]])
-    add_scales(network, {"state": 2, "goal": 0, "unseen": 1})
+    for name, size in {"state": 2, "goal": 0, "unseen": 1}.items():
+        network.register_buffer(f"{name}_mean", torch.zeros(size))
+        network.register_buffer(f"{name}_std", torch.ones(size))
     take_scales(network, {"state": values, "goal": torch.zeros(2, 0)})
     found = {name: buffer.tolist() for name, buffer in network.state_dict().items()}
     assert found == {

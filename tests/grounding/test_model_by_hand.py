@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from astra_data.grounding.encoder import take_scales
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights
 from astra_data.grounding.paired_episodes import PairedWindows
 
@@ -52,7 +53,7 @@ def model(*, corrects_reward: bool = True) -> GroundingModel:
         "goal": given.goal - 1.0,
         "correction": 0.5 * (given.next_state - given.simulated_next),
     }
-    made.set_scales({name: values.flatten(0, 1) for name, values in columns.items()})
+    take_scales(made, {name: values.flatten(0, 1) for name, values in columns.items()})
     real = given.mask.bool()
     rewards = both_rewards(given) if corrects_reward else given.reward.unsqueeze(-1)
     made.set_reward_scales(rewards[real], given.goes_on[real], given.failed[real])
@@ -83,7 +84,7 @@ def test_scales_are_means_and_deviations_of_the_columns() -> None:
     torch.testing.assert_close(used.state_mean, state.mean(0))
     torch.testing.assert_close(used.state_std, state.std(0))
     torch.testing.assert_close(used.goal_mean, goal.mean(0))
-    used.set_scales({"state": torch.ones(5, 4), "goal": torch.zeros(5, 0)})
+    take_scales(used, {"state": torch.ones(5, 4), "goal": torch.zeros(5, 0)})
     assert used.state_std.tolist() == pytest.approx([1e-3] * 4)
     torch.testing.assert_close(used.goal_std, goal.std(0))  # no goals: nothing to take
 

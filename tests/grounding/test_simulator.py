@@ -1,6 +1,6 @@
 import torch
 
-from astra_data.grounding.simulator import EpisodeSimulator, abstract_simulator
+from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.point_mass import PointMass
@@ -16,7 +16,7 @@ def simulator(count: int) -> EpisodeSimulator:
 
 
 def varied(count: int) -> EpisodeSimulator:
-    return EpisodeSimulator(abstract_simulator(TASK, count, "cpu", TASK.varied.wide))
+    return NO_GROUNDING.simulator(TASK, count, variation=TASK.varied.wide)
 
 
 def test_it_is_the_simulator_itself() -> None:

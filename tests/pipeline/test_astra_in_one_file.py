@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from astra_data import collect, pair
 from astra_data.core.seeding import derive
 from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.encoder import take_scales
 from astra_data.grounding.fit import HistoryFit
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape, LossWeights, recorded_rewards
@@ -53,7 +54,7 @@ def both(folder: Path) -> tuple[Any, ...]:
     windows = episodes.windows
     correction = episodes.steps(windows.next_state - windows.simulated_next)
     state, goal = episodes.steps(windows.state), episodes.steps(windows.goal)
-    model.set_scales({"state": state, "goal": goal, "correction": correction})
+    take_scales(model, {"state": state, "goal": goal, "correction": correction})
     rewards = recorded_rewards(windows), windows.goes_on, windows.failed
     model.set_reward_scales(*map(episodes.steps, rewards))
     mine = of_the_file("Grounding")(1, 1, 1)

@@ -50,7 +50,7 @@ def world_of(run: Path, row: str, **options: Any) -> SimulatorEnv:
     """Return what Grounded-v0 wraps, as `train` builds it."""
     env = gymnasium.make(ID, run=run, row=row, **options).unwrapped
     assert isinstance(env, SingleEnv)
-    world: SimulatorEnv = env.env.env  # type: ignore[attr-defined]
+    world: SimulatorEnv = env.env.env  # type: ignore[union-attr]
     return world
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from astra_data.grounding.failures import FailureModel, FailureShape
-from astra_data.grounding.history import GroundedSimulator
+from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
 from astra_data.grounding.simulator import EpisodeSimulator
 from astra_data.policies.simulator_env import DataStarts, SimulatorEnv, WorldConfig, policy_observation
@@ -36,7 +36,7 @@ def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> 
     """Return episodes of which every second one reaches the goal in the first step."""
     torch.manual_seed(0)
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
-    simulator = Risky(PointMass(U_MAZE, count, timestep_s=0.05), model)
+    simulator = Risky(PointMass(U_MAZE, count, timestep_s=0.05), HistoryGrounding(model))
     simulator.risk = risk
     one = SimulatorEnv(TASK, simulator, WorldConfig(reward=reward), **options)
     state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
@@ -106,7 +106,7 @@ def test_a_predicted_reward_is_the_tasks_own_corrected_and_what_the_risk_costs()
         getattr(model, f"reward_{name}").fill_(value)
     model.failure_cost.fill_(-8.0)
     failures = FailureModel(FailureShape(4, 2, 0.05, members=1, risk_steps=2)).eval()
-    grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model, failures)
+    grounded = HistoryGrounding(model, failures).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
     one = SimulatorEnv(TASK, grounded, PREDICTED)
     one.reset()
     before, latent, action = one.simulator.state, grounded.latent, torch.full((3, 2), 0.2)
@@ -122,7 +122,7 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     torch.manual_seed(0)
     task = TASKS["nao-kick"]
     model = GroundingModel(GroundingShape(8, 3, 2, latent_size=8, ball_index=4, corrects_reward=False))
-    one = SimulatorEnv(task.objective, GroundedSimulator(task.simulator(3), model), PREDICTED)
+    one = SimulatorEnv(task.objective, HistoryGrounding(model).corrected(task.simulator(3)), PREDICTED)
     # Balls that roll on in the field, into the goal, and over the side line.
     balls = torch.tensor([[0.0, 0.0, 0.5, 0.0], [1.4, 0.0, 1.0, 0.0], [0.0, 1.9, 0.0, 1.0]])
     state = torch.cat([torch.tensor([[-1.0, 0.0, 0.0, 0.0]]).expand(3, 4), balls], dim=-1)
@@ -181,7 +181,7 @@ def test_recorded_starts_hand_over_their_history() -> None:
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
     state, goal = torch.tensor([[4.0, 0.0, 0.1, -0.9]]), torch.tensor([[-4.2, -4.1]])
     starts = DataStarts(state, goal, torch.tensor([[0.5, -1.0]]), hidden=torch.randn(1, 8))
-    grounded = GroundedSimulator(PointMass(U_MAZE, 3, timestep_s=0.05), model)
+    grounded = HistoryGrounding(model).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
     one = SimulatorEnv(TASK, grounded, WorldConfig(data_start_share=1.0), starts=starts)
     one.reset()
     assert starts.hidden is not None

@@ -91,7 +91,7 @@ def test_prices_grow_as_in_other_trainings(
             # After a tenth of the training, over a quarter of which prices grow.
             env.points[:] = [] if len(scales) < 10 else [{"share": 0.1, "success": max(0.0, command)}]
             env.step(np.full((4, 1), command))
-            scales.append(env.env.env.penalty_scale)  # type: ignore[attr-defined]
+            scales.append(env.env.env.penalty_scale)  # type: ignore[union-attr]
         return Constant(command)
 
     UserLearner(learn=learn, policy=Constant)(given)

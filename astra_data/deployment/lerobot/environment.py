@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Space
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
@@ -48,10 +48,7 @@ class AstraDataEnv(EnvConfig):  # type: ignore[misc]
         self.features = {name: PolicyFeature(kind, (size,)) for name, (kind, size) in sizes.items() if size}
         self.features_map = {name: name for name in self.features}
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Nothing: the environment is made here, not by an id."""
-        return {}
+    gym_kwargs: ClassVar[dict[str, Any]] = {}  # the environment is made here, not by an id
 
     def get_env_processors(self) -> tuple[Any, Any]:
         """Return what takes the prefix away again that LeRobot gives to names which are not its own."""
@@ -78,11 +75,11 @@ class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
         self.render_mode = "rgb_array"
         self._max_episode_steps = task.objective.horizon
         self._sizes = {STATE: task.state.size} | ({GOAL: goal} if (goal := task.objective.goal_size) else {})
-        self.observation_space = Dict(
-            {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in self._sizes.items()}
-        )
-        least, largest = np.array(list(task.limits.values()), np.float32).T
-        self.action_space = Box(least, largest)
+        boxes: dict[str, Space[Any]] = {
+            name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in self._sizes.items()
+        }
+        self.observation_space = Dict(boxes)
+        self.action_space = Box(*np.array(list(task.limits.values()), np.float32).T)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -98,20 +95,17 @@ class TargetRobot(gymnasium.Env[dict[str, Any], Array]):
     def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Give the robot a command (A,) for one control period."""
         command = torch.tensor(action, dtype=torch.float32)[None]
-        step = self._env.step(self._task.limits.normal(command))
+        step, objective = self._env.step(self._task.limits.normal(command)), self._task.objective
         self._age += 1
-        objective = self._task.objective
-        success = objective.succeeded(step.success, self._env.failed, self._age)
-        truncated = self._age >= objective.horizon
-        info = {"is_success": bool(success[0])}
-        return self._observe(), float(step.reward[0]), bool(step.terminated[0]), truncated, info
+        info = {"is_success": bool(objective.succeeded(step.success, self._env.failed, self._age)[0])}
+        is_over = self._age >= objective.horizon
+        return self._observe(), float(step.reward[0]), bool(step.terminated[0]), is_over, info
 
     def render(self) -> Array:
         """Return a picture (height, width, 3) of the state; a blank one, if the task has no `photograph`."""
         if self._task.photograph is None:
             return np.full((64, 64, 3), 255, np.uint8)
-        picture: Array = self._task.photograph(self._env.state.double().numpy())[0]
-        return picture
+        return np.asarray(self._task.photograph(self._env.state.double().numpy())[0])
 
     def _observe(self) -> dict[str, Array]:
         shown = {STATE: self._env.state, GOAL: self._env.goal}

@@ -45,8 +45,7 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Return the policy in a folder, ready to act."""
         config = config or AstraDataConfig.from_pretrained(pretrained_name_or_path)
         config.pretrained_path = Path(pretrained_name_or_path)
-        policy: AstraDataPolicy = cls(config).eval()
-        return policy
+        return cls(config).eval()  # type: ignore[no-any-return]
 
     def reset(self) -> None:
         """Forget the last episodes."""
@@ -80,13 +79,11 @@ class AstraDataPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Return chunks (B, 1, A) of one command."""
         return self.select_action(batch).unsqueeze(1)
 
-    def forward(self, batch: dict[str, Tensor]) -> NoReturn:
+    def forward(self, *_: object) -> NoReturn:
         """Refuse with a NotImplementedError."""
         raise NotImplementedError("LeRobot does not train this policy: astra-data train does")
 
-    def get_optim_params(self) -> NoReturn:
-        """Refuse, likewise."""
-        self.forward({})
+    get_optim_params = forward
 
     def _checked(self, batch: dict[str, Tensor], column: str, called: str) -> Tensor:
         names, given = self._about[called]["names"], batch.get(column)
