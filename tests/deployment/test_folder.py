@@ -107,18 +107,6 @@ def alone(folder: Path, code: str) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
-@pytest.mark.parametrize("what", ["dataset", "grounding"])
-def test_a_policy_that_was_made_from_others_is_noticed(what: str, run: Path, tmp_path: Path) -> None:
-    copied = Path(shutil.copytree(run, tmp_path / "run"))
-    manifest = copied / "train/nas/seed_0/manifest.json"
-    values = json.loads(manifest.read_text())
-    values["made_from"][what] = "0" * 64
-    manifest.write_text(json.dumps(values))
-    with pytest.raises(BadInputError, match=f"seed_0 was made from another {what} than the one used with it"):
-        deploy(copied, "nas", tmp_path / "policy")
-    assert not (tmp_path / "policy").exists()
-
-
 def recorded(run: Path) -> NDArray[np.float32]:
     """Return the states (N, S) of the dataset of seed 0."""
     return Dataset.open(run / "pair/seed_0").columns(["observation.state"])["observation.state"]

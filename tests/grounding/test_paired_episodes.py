@@ -28,7 +28,7 @@ from astra_data.dataset.columns import (
 from astra_data.dataset.edit import delete
 from astra_data.dataset.reader import Dataset
 from astra_data.dataset.writer import DatasetWriter
-from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.paired_episodes import PairedEpisodes, draw_steps
 from astra_data.robots.registry import TASKS
 from astra_data.worlds.commands import Commands
 
@@ -247,3 +247,22 @@ def test_commands_are_multiples_of_their_bounds(root: Path, tmp_path: Path) -> N
     torch.testing.assert_close(given.windows.action[mask], expected[mask])
     assert not given.windows.action[~mask].any() and not given.windows.previous_action[:, 0].any()
     assert given.commands is not None and dict(given.commands) == bounds
+
+
+DRAWN = torch.tensor([3, 10, 25])
+
+
+def test_windows_are_steps_in_a_row_inside_their_episodes() -> None:
+    torch.manual_seed(0)
+    episodes, steps, drawn = draw_steps(DRAWN, 2_000, 8)
+    assert (steps.diff(dim=1) == 1).all()
+    first, last = steps[:, 0], steps[:, -1]
+    short = episodes[:, 0] == 0
+    assert (first[short] == 0).all()  # padded at the end
+    assert (first >= 0).all() and (last[~short] < DRAWN[episodes[~short, 0]]).all()
+    for row in range(3):
+        reach = sorted(set(first[episodes[:, 0] == row].tolist()))
+        assert reach == list(range(max(1, int(DRAWN[row]) - 7)))
+    # Of a window that was drawn across an end only the part inside counts: one stretch of at least a step.
+    assert drawn.any(dim=1).all()
+    assert (drawn.int().diff(dim=1).abs().sum(1) <= 1).all()

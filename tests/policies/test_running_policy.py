@@ -1,16 +1,24 @@
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from constant_policy import Constant
 from small_cart import TASK as RAIL_CART
 from torch import Tensor
+from toy_episodes import no_episodes
 
 from astra_data.core.errors import BadInputError
 from astra_data.grounding.alignment import TargetEncoder
+from astra_data.grounding.files import save_grounding
+from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.policies.networks import ActorCritic, ActorCriticShape
-from astra_data.policies.running_policy import RunningPolicy
-from astra_data.policies.simulator_env import policy_observation
+from astra_data.policies.networks import ActorCritic, ActorCriticShape, AdaptiveShape, Student
+from astra_data.policies.running_policy import KINDS, Array, PolicyFile, RunningPolicy, UserPolicy
+from astra_data.policies.simulator_env import Simulation, WorldConfig, policy_observation
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.variation import PlanarVariation
 
 TASK = TASKS["antmaze-umaze"]
 STATE, GOAL = torch.randn(3, 6, 29), torch.randn(3, 2)
@@ -113,3 +121,112 @@ def test_states_and_goals_come_as_arrays_too_and_are_looked_at_first() -> None:
     state[2, 1] = np.nan
     with pytest.raises(BadInputError, match="state: expected finite values, got nan in row 2, entry 1"):
         running.command(state, goal)
+
+
+class Doubling:
+    def act(self, observation: Array) -> Array:
+        assert observation.dtype == np.float32
+        return 2.0 * observation[:, :2].astype(np.float64)
+
+
+def test_it_acts_in_batches_within_the_bounds_and_remembers_nothing() -> None:
+    policy = UserPolicy(Doubling(), observation_size=3, action_size=2)
+    observation = torch.tensor([[0.1, -0.2, 9.0], [0.3, 4.0, 9.0]])
+    hidden = policy.initial_hidden(2)
+    features, after = policy.remember(observation, torch.zeros(2, 2), hidden)
+    assert hidden.shape == after.shape == (2, 0)
+    action = policy.act(features)
+    assert action.dtype == torch.float32
+    torch.testing.assert_close(action, torch.tensor([[0.2, -0.4], [0.6, 1.0]]))
+    location, scale = policy.policy(features)
+    assert torch.equal(location, action) and not scale.any()
+    assert policy.name == "Doubling"
+
+
+@pytest.mark.parametrize(
+    ("act", "message"),
+    [
+        (lambda seen: seen, r"Mine\.act: expected actions of shape \(2, 2\), got \(2, 3\)"),
+        (lambda seen: seen[:, :2] * np.nan, r"Mine\.act: expected finite actions, got NaN or infinity"),
+        (lambda seen: dict[int, int]()[0], r"Mine\.act fails with KeyError: 0"),
+        (lambda seen: "left", r"Mine\.act fails with ValueError"),
+        (None, r"Mine is no policy: expected act\(observation\) -> action"),
+    ],
+)
+def test_what_is_no_policy_is_answered_by_a_line(act: Any, message: str) -> None:
+    class Mine:
+        def __init__(self) -> None:
+            self.act = act
+
+    with pytest.raises(BadInputError, match=message):
+        UserPolicy(Mine(), 3, 2).act(torch.ones(2, 3))
+
+
+def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
+    policy = ActorCritic(ActorCriticShape(3, 2, memory_size=8, hidden_sizes=(16, 8)))
+    world = WorldConfig(reward="priced", change_penalty=0.02, command_limit=0.7, data_start_share=0.5)
+    variation = PlanarVariation(friction=(0.8, 1.2))
+    simulation = Simulation(world, variation)
+    saved = PolicyFile(policy, simulation, "toy@data-1.0.0", "abc")
+    saved.save(tmp_path / "policy.safetensors")
+    loaded = PolicyFile.load(tmp_path / "policy.safetensors")
+    assert (loaded.dataset, loaded.content_hash) == ("toy@data-1.0.0", "abc")
+    assert loaded.simulation == simulation
+    assert loaded.policy.shape == policy.shape
+    assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
+    step = torch.randn(4, 3), torch.randn(4, 2), torch.randn(4, 8)
+    for one, other in zip(loaded.policy.remember(*step), policy.remember(*step), strict=True):
+        assert torch.equal(one, other)
+    features = torch.randn(4, 11)
+    assert torch.equal(loaded.policy.policy(features)[0], policy.policy(features)[0])
+    assert isinstance(loaded.policy, ActorCritic)
+    assert torch.equal(loaded.policy.value(features), policy.value(features))
+
+
+def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
+    student = Student(AdaptiveShape(3, 2, hidden_sizes=(16, 8), extrinsics_size=4, history_length=44))
+    PolicyFile(student, None, "toy@data-1.0.0", "abc").save(tmp_path / "policy.safetensors")
+    loaded = PolicyFile.load(tmp_path / "policy.safetensors").policy
+    assert isinstance(loaded, Student)
+    assert loaded.shape == student.shape
+    step = torch.randn(4, 3), torch.randn(4, 2), torch.randn_like(student.initial_hidden(4))
+    for one, other in zip(loaded.remember(*step), student.remember(*step), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_grounding_is_no_policy(tmp_path: Path) -> None:
+    grounding = HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)))
+    path = tmp_path / "policy.safetensors"
+    save_grounding(path, grounding, no_episodes())
+    with pytest.raises(
+        BadInputError,
+        match=r"policy.safetensors: expected a policy \(kind actor_critic or adaptive or soft_actor\), "
+        "found kind history: run that stage again$",
+    ):
+        PolicyFile.load(path)
+
+
+def test_networks_that_could_not_be_read_again_are_not_written(tmp_path: Path) -> None:
+    class Mine(ActorCritic):
+        pass
+
+    made = PolicyFile(Mine(ActorCriticShape(3, 2)), None, None, None)
+    with pytest.raises(BadInputError, match=r"^a Mine cannot be read again: expected a .*SoftActor, or what"):
+        made.save(tmp_path / "policy.safetensors")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_what_a_policy_of_another_learner_saves_and_asks_for_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, made = (tmp_path / "policy.safetensors", PolicyFile(UserPolicy(Constant(0.5), 3, 1), None, None, None))
+    monkeypatch.setitem(KINDS, Constant.kind, Constant)
+    monkeypatch.setattr(Constant, "to_file", lambda self: ({"command": np.ones(1)}, {"unit": "none"}))
+    with pytest.raises(BadInputError, match=r"^Constant.to_file: 'command' is a ndarray, expected a torch"):
+        made.save(path)
+    assert not path.exists()
+    monkeypatch.setattr(Constant, "to_file", lambda self: ({"speed": torch.ones(1)}, {"unit": "none"}))
+    made.save(path)
+    told = r"^Constant.from_file, given the tensors speed and the values unit, fails with KeyError: 'command'"
+    with pytest.raises(BadInputError, match=told):
+        PolicyFile.load(path)

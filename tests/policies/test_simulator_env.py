@@ -1,26 +1,40 @@
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+from toy_episodes import toy_episodes
 
-from astra_data.grounding.failures import FailureModel, FailureShape
+from astra_data.grounding.failures import FailureModel, FailureShape, averages_before
 from astra_data.grounding.history import GroundedSimulator, HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.grounding.simulator import EpisodeSimulator
-from astra_data.policies.simulator_env import DataStarts, SimulatorEnv, WorldConfig, policy_observation
+from astra_data.grounding.paired_episodes import PairedEpisodes
+from astra_data.grounding.simulator import NO_GROUNDING, EpisodeSimulator, Grounding
+from astra_data.policies.simulator_env import (
+    DataStarts,
+    Simulation,
+    SimulatorEnv,
+    WorldConfig,
+    command_limit,
+    data_starts,
+    plus,
+    policy_observation,
+    training_env,
+)
 from astra_data.robots.registry import TASKS
+from astra_data.worlds.objective import NO_LIMIT
 from astra_data.worlds.plane.mazes import U_MAZE
 from astra_data.worlds.plane.navigation import Navigation
 from astra_data.worlds.plane.point_mass import PointMass, VariedPlanar
 from astra_data.worlds.variation import PlanarVariation
 
-TASK = Navigation(U_MAZE, horizon=700)
+NAVIGATION = Navigation(U_MAZE, horizon=700)
 PREDICTED = WorldConfig(reward="predicted")
 
 
 def world(num_envs: int = 4, **options: Any) -> SimulatorEnv:
     simulator = EpisodeSimulator(PointMass(U_MAZE, num_envs, timestep_s=0.05))
-    return SimulatorEnv(TASK, simulator, WorldConfig(**options))
+    return SimulatorEnv(NAVIGATION, simulator, WorldConfig(**options))
 
 
 class Risky(GroundedSimulator):
@@ -38,7 +52,7 @@ def risky(count: int, risk: float, reward: Any = "abstract", **options: Any) -> 
     model = GroundingModel(GroundingShape(4, 2, 2, latent_size=8)).requires_grad_(False)
     simulator = Risky(PointMass(U_MAZE, count, timestep_s=0.05), HistoryGrounding(model))
     simulator.risk = risk
-    one = SimulatorEnv(TASK, simulator, WorldConfig(reward=reward), **options)
+    one = SimulatorEnv(NAVIGATION, simulator, WorldConfig(reward=reward), **options)
     state = torch.tensor([[-4.0, 4.0, 0.0, 0.0], [-3.54, -4.0, 0.0, 0.0]]).repeat(count // 2, 1)
     goal = torch.tensor([[-4.0, -4.0]]).expand(count, 2)
     one.load_state_dict({"state": state, "goal": goal, "hidden": torch.zeros(count, 8)})
@@ -50,9 +64,9 @@ BACK = torch.tensor([[-1.0, 0.0]])
 
 def test_observations_are_scaled_positions_velocity_and_the_way_to_the_goal() -> None:
     state, goal = torch.tensor([[5.0, -10.0, 0.5, -0.5]]), torch.tensor([[-4.0, 4.0]])
-    seen = policy_observation(TASK, state, goal, None)
+    seen = policy_observation(NAVIGATION, state, goal, None)
     assert seen[0].tolist() == pytest.approx([0.5, -1.0, 0.5, -0.5, -0.4, 0.4, -0.9, 1.4])
-    with_latent = policy_observation(TASK, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
+    with_latent = policy_observation(NAVIGATION, state, goal, torch.tensor([[7.0, 1.0, -5.0, 5.0]]))
     assert with_latent.tolist() == [[3.5, 0.5, -2.5, 2.5, *seen[0].tolist()]]
 
 
@@ -94,7 +108,7 @@ def test_failures_are_drawn_at_their_probability_and_end_episodes_that_did_not_s
     assert not one.failed[1::2].any()
     assert float(one.failed[::2].float().mean()) == pytest.approx(share, abs=0.015)
     assert torch.equal(step.terminated, step.success | one.failed)
-    own = TASK.reward(before, one.simulator.state, goal, one.failed)
+    own = NAVIGATION.reward(before, one.simulator.state, goal, one.failed)
     torch.testing.assert_close(step.reward, own)
 
 
@@ -107,14 +121,14 @@ def test_a_predicted_reward_is_the_tasks_own_corrected_and_what_the_risk_costs()
     model.failure_cost.fill_(-8.0)
     failures = FailureModel(FailureShape(4, 2, 0.05, members=1, risk_steps=2)).eval()
     grounded = HistoryGrounding(model, failures).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
-    one = SimulatorEnv(TASK, grounded, PREDICTED)
+    one = SimulatorEnv(NAVIGATION, grounded, PREDICTED)
     one.reset()
     before, latent, action = one.simulator.state, grounded.latent, torch.full((3, 2), 0.2)
     step = one.step(action)
     hazard = grounded.failure_risk()
     assert hazard is not None and (hazard > 0).all()
     normal = model.reward_head(torch.cat([latent, action], dim=-1))[:, -1]
-    own = TASK.reward(before, one.simulator.state, one.goal, torch.zeros(3, dtype=torch.bool))
+    own = NAVIGATION.reward(before, one.simulator.state, one.goal, torch.zeros(3, dtype=torch.bool))
     torch.testing.assert_close(step.reward, own + 0.25 * (0.3 + 2.0 * normal) - 8.0 * hazard)
 
 
@@ -162,8 +176,8 @@ def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -
 def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     variation = PlanarVariation(friction=(0.8, 1.2), heading_bias_deg=(-5.0, 5.0))
     simulator = VariedPlanar(PointMass(U_MAZE, 4, timestep_s=0.05), variation)
-    assert SimulatorEnv(TASK, EpisodeSimulator(simulator)).observation_size == 8
-    showing = SimulatorEnv(TASK, EpisodeSimulator(simulator), shows_parameters=True)
+    assert SimulatorEnv(NAVIGATION, EpisodeSimulator(simulator)).observation_size == 8
+    showing = SimulatorEnv(NAVIGATION, EpisodeSimulator(simulator), shows_parameters=True)
     assert (showing.observation_size, showing.parameter_count) == (8 + 7, 7)
     before = showing.reset()
     torch.testing.assert_close(before[:, 8], (simulator.parameters[:, 0] - 1.0) / 0.2)
@@ -182,9 +196,138 @@ def test_recorded_starts_hand_over_their_history() -> None:
     state, goal = torch.tensor([[4.0, 0.0, 0.1, -0.9]]), torch.tensor([[-4.2, -4.1]])
     starts = DataStarts(state, goal, torch.tensor([[0.5, -1.0]]), hidden=torch.randn(1, 8))
     grounded = HistoryGrounding(model).corrected(PointMass(U_MAZE, 3, timestep_s=0.05))
-    one = SimulatorEnv(TASK, grounded, WorldConfig(data_start_share=1.0), starts=starts)
+    one = SimulatorEnv(NAVIGATION, grounded, WorldConfig(data_start_share=1.0), starts=starts)
     one.reset()
     assert starts.hidden is not None
     expected = model.encoder.step(model.encoder_input(state, goal, starts.previous_action), starts.hidden)
     torch.testing.assert_close(grounded.hidden, expected.expand(3, 8))
     assert torch.equal(one.goal, goal.expand(3, 2)) and torch.equal(grounded.goal, one.goal)
+
+
+TASK = TASKS["antmaze-umaze"]
+FROM_DATA = WorldConfig(data_start_share=1.0)
+
+
+@pytest.fixture
+def episodes() -> PairedEpisodes:
+    """Return two episodes of 400 and 300 steps around the middle of a corridor."""
+    torch.manual_seed(0)
+    here = torch.tensor(TASK.maze.cell_center(1, 2), dtype=torch.float32)
+    state = torch.cat([here + 0.5 * torch.rand(2, 401, 2), torch.randn(2, 401, 2)], dim=-1)
+    mask = torch.ones(2, 400)
+    mask[1, 300:] = 0.0
+    return toy_episodes(
+        state[:, :-1], torch.rand(2, 400, 2) * 2 - 1, next_state=state[:, 1:], goal=torch.randn(2, 400, 2), mask=mask
+    )
+
+
+@pytest.fixture
+def grounding() -> HistoryGrounding:
+    torch.manual_seed(0)
+    return HistoryGrounding(GroundingModel(GroundingShape(4, 2, 2, latent_size=8)))
+
+
+def built(world: WorldConfig, grounding: Grounding, **given: Any) -> SimulatorEnv:
+    options: dict[str, Any] = {"num_envs": 4, "device": "cpu"} | given
+    return training_env(TASK, Simulation(world), grounding, **options)
+
+
+def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, grounding: HistoryGrounding) -> None:
+    kinds: dict[type[EpisodeSimulator], Grounding] = {EpisodeSimulator: NO_GROUNDING, GroundedSimulator: grounding}
+    for kind, used in kinds.items():
+        assert data_starts(TASK, WorldConfig(), episodes, used) is None
+        world = built(WorldConfig(), used)
+        assert type(world.simulator) is kind
+        assert type(world.simulator.simulator) is PointMass
+        assert (world.world, world.num_envs) == (WorldConfig(), 4)
+        drawn = torch.get_rng_state()
+        world.step(torch.zeros(4, 2))
+        assert torch.equal(torch.get_rng_state(), drawn)
+
+
+def test_plus_settings_reach_the_environment_and_leave_the_rest(episodes: PairedEpisodes) -> None:
+    plain = WorldConfig(reward="predicted", data_start_share=0.3)
+    settings = plus(plain, 0.75)
+    changes = {"reward": "priced", "change_penalty": 0.02, "command_limit": 0.75}
+    assert settings.model_dump() == plain.model_dump() | changes
+    starts = data_starts(TASK, settings, episodes, NO_GROUNDING)
+    world = built(settings, NO_GROUNDING, starts=starts)
+    assert world.world == settings
+
+
+@pytest.mark.parametrize(("reward", "prices"), [("abstract", False), ("predicted", True), ("priced", True)])
+def test_a_failure_model_is_used_and_starts_know_what_it_remembers_where_failures_have_a_price(
+    reward: Any, prices: bool, episodes: PairedEpisodes, grounding: HistoryGrounding
+) -> None:
+    failures = FailureModel(FailureShape(4, 2, TASK.timestep_s, members=1)).eval()
+    foresees = replace(grounding, failures=failures)
+    config = WorldConfig(reward=reward, data_start_share=0.5)
+    starts = data_starts(TASK, config, episodes, foresees)
+    assert starts is not None and starts.hidden is not None
+    world: Any = built(config, foresees, starts=starts).simulator
+    assert world.failures is (failures if prices else None)
+    averages = averages_before(TASK, foresees, failures, episodes)
+    assert float(averages[:, 50].abs().sum()) > 0
+    known = averages[episodes.windows.mask.bool()] if prices else averages[0, :, :0]
+    torch.testing.assert_close(starts.hidden[:, 8:], known if prices else starts.hidden[:, :0])
+    hidden = grounding.hidden_before(episodes.windows)[episodes.windows.mask.bool()]
+    assert torch.equal(starts.hidden[:, :8], hidden)
+
+
+def test_recorded_starts_come_with_the_history_before_them(
+    episodes: PairedEpisodes, grounding: HistoryGrounding
+) -> None:
+    starts = data_starts(TASK, FROM_DATA, episodes, grounding)
+    assert starts is not None and starts.hidden is not None
+    assert len(starts.state) == len(starts.hidden) == 700
+    windows, model = episodes.windows, grounding.model
+    inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
+    hidden = torch.zeros(1, 8)
+    for step in range(5):
+        row = 400 + step  # of the second episode
+        torch.testing.assert_close(starts.hidden[row : row + 1], hidden)
+        assert torch.equal(starts.state[row], windows.state[1, step])
+        assert torch.equal(starts.previous_action[row], windows.previous_action[1, step])
+        hidden = model.encoder.step(inputs[1:, step], hidden)
+
+
+SHORT, LONG = 0.8, 1.4
+"""Lengths of commands, kept through an episode."""
+
+
+def recorded(failing: dict[float, int], lengths: tuple[float, ...] = (SHORT, LONG)) -> PairedEpisodes:
+    """Return 40 episodes of 30 steps for each length of commands, of which so many fail."""
+    length = torch.tensor(lengths).repeat_interleave(40)[:, None].expand(-1, 30)
+    angle = torch.linspace(0.0, 3.0, 30).expand_as(length)
+    action = torch.stack([length * angle.cos(), length * angle.sin()], dim=-1)
+    fails = torch.cat([torch.arange(40) < failing.get(one, 0) for one in lengths])
+    state = torch.tensor([-4.0, 4.0, 0.0, 0.0]).expand(len(fails), 30, 4)
+    made = toy_episodes(state, action, next_state=state, goal=torch.zeros(len(fails), 30, 2))
+    soon = (fails[:, None] & (torch.arange(30) >= 10)).float()
+    return replace(made, windows=replace(made.windows, fails_soon=soon))
+
+
+@pytest.mark.parametrize(
+    ("failing", "lengths", "expected"),
+    [
+        ({}, (SHORT, LONG), NO_LIMIT),
+        ({LONG: 12}, (SHORT, LONG), 1.0),
+        ({SHORT: 4, LONG: 7}, (SHORT, LONG), 1.0),
+        ({SHORT: 4, LONG: 5}, (SHORT, LONG), NO_LIMIT),
+        ({SHORT: 12}, (SHORT, LONG), NO_LIMIT),
+        ({SHORT: 12}, (SHORT,), NO_LIMIT),
+        ({LONG: 1}, (LONG,), 1.0),
+    ],
+)
+def test_it_is_one_where_failures_are_half_as_frequent_again_above(
+    failing: dict[float, int], lengths: tuple[float, ...], expected: float
+) -> None:
+    assert command_limit(TASK, recorded(failing, lengths)) == expected
+
+
+def test_commands_of_the_last_second_count() -> None:
+    """Commands that were long until 20 steps before a failure are no part of it."""
+    whole = recorded({LONG: 12})
+    windows, late = whole.windows, torch.arange(30)[:, None] >= 10
+    gone = replace(windows, action=torch.where(late, windows.action * 0.5 / LONG, windows.action))
+    assert command_limit(TASK, replace(whole, windows=gone)) == NO_LIMIT

@@ -3,19 +3,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from grounding_models import HERE, TASK, failure_model, model
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
 from astra_data.core.seeding import generator
 from astra_data.grounding.history import HistoryGrounding
 from astra_data.grounding.model import GroundingModel, GroundingShape
-from astra_data.grounding.open_loop import _interval, _starts, distances, gap_report
+from astra_data.grounding.open_loop import _interval, _starts, distances, gap_report, replay_open_loop
 from astra_data.grounding.paired_episodes import PairedEpisodes
-from astra_data.grounding.simulator import NO_GROUNDING
-from astra_data.robots.registry import TASKS
+from astra_data.grounding.simulator import NO_GROUNDING, Grounding
 from astra_data.worlds.plane.point_mass import PointMass
 
-TASK = TASKS["antmaze-umaze"]
 STEPS = 60
 
 
@@ -134,3 +133,20 @@ def test_a_simulator_that_diverges_is_told() -> None:
     task = replace(TASK, make_simulator=lambda count: Exploding(TASK.maze, count, timestep_s=TASK.timestep_s))
     with pytest.raises(BadInputError, match=r"the raw simulator of antmaze-umaze diverges: .* in step 1 of"):
         gap_report(task, NO_GROUNDING, episodes(speed=0.9), seed=0)
+
+
+REPLAYED = 6
+
+
+@pytest.mark.parametrize("grounding", [NO_GROUNDING, HistoryGrounding(model(), failure_model())])
+def test_recorded_commands_are_replayed_from_where_episodes_began(grounding: Grounding) -> None:
+    """Three episodes that start apart; where the target went afterwards is not to be seen in a replay."""
+    torch.manual_seed(1)
+    state = HERE + torch.cat([0.2 * torch.rand(3, REPLAYED, 2), torch.zeros(3, REPLAYED, 2)], dim=-1)
+    episodes = toy_episodes(state, 2 * torch.rand(3, REPLAYED, 2) - 1, next_state=state)
+    found = replay_open_loop(TASK, grounding, episodes, seed=0)
+    simulator = grounding.simulator(TASK, 3)
+    simulator.start(state[:, 0], torch.arange(3), torch.zeros(3, 2))
+    assert torch.equal(found[:, 0], state[:, 0]) and found.shape == (3, REPLAYED + 1, 4)
+    for step in range(REPLAYED):
+        torch.testing.assert_close(found[:, step + 1], simulator.step(episodes.windows.action[:, step]))
