@@ -7,7 +7,7 @@ are in [-1, 1] along each axis; `task.limits.in_units` returns them in the units
 touched a wall ("wall_contact"; never, where there are none).
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -25,9 +25,6 @@ from astra_data.policies.learner import lately, penalty_scale
 from astra_data.policies.simulator_env import SimulatorEnv
 from astra_data.robots.registry import task_named
 from astra_data.worlds.protocols import Step, TargetEnv
-
-if TYPE_CHECKING:
-    from astra_data.policies.train import Training
 
 Array = NDArray[Any]
 
@@ -206,7 +203,7 @@ _POINTS = 50  # of a learning curve
 class WatchedEnv(BatchedVectorEnv):
     """The environment that a row is trained in, which keeps the learning curve, `points`, of who learns there."""
 
-    def __init__(self, env: SimulatorEnv, training: "Training") -> None:
+    def __init__(self, env: SimulatorEnv, training: Any) -> None:  # noqa: ANN401 - a Training, whose module imports this
         """Show `env` to the learner of a `training`; with the plus settings, penalties grow with success."""
         seeded = SeededSimulatorEnv(env)
         seeded.reseed(derive(training.seed, "own learner"))

@@ -195,8 +195,7 @@ def test_failures_that_abstract_states_show_are_left_to_the_simulator() -> None:
     unseen = failing(kick, made, 20)
     expected = torch.zeros(3, 30)
     expected[1, 10:] = expected[2, :20] = 1
-    assert torch.equal(unseen.windows.fails_soon, expected)
-    assert torch.equal(unseen.windows.state, state)
+    assert torch.equal(unseen.windows.fails_soon, expected) and torch.equal(unseen.windows.state, state)
     assert has_failures(kick, made) and not has_failures(kick, made.select(torch.tensor([0])))
 
 
@@ -346,8 +345,7 @@ def test_walls_are_seen_where_the_robot_and_where_the_simulator_goes() -> None:
     for second in AHEAD_S:
         place = state[0, :2].double() + torch.tensor([0.0, second]).double()
         to_wall.append(float(U_MAZE.clearance(place.numpy())))
-    assert walls[:6].tolist() == pytest.approx(to_wall, abs=0.11)
-    assert to_wall[5] < 0.2 < to_wall[1] < to_wall[0]
+    assert walls[:6].tolist() == pytest.approx(to_wall, abs=0.11) and to_wall[5] < 0.2 < to_wall[1] < to_wall[0]
     assert walls[6:].tolist() == pytest.approx([to_wall[0]] * 5, abs=1e-5)
 
 
@@ -358,8 +356,7 @@ def test_log_odds_are_scaled_and_shifted_to_what_happens() -> None:
     happens = (torch.rand(len(true)) < true.sigmoid()).float()
     for factor in (2.0, 0.5):
         scale, shift = calibration((factor * (true + 1.0)).expand(2, -1), happens, 1)
-        assert float(scale) == pytest.approx(1 / factor, rel=0.05)
-        assert float(shift) == pytest.approx(-1.0, abs=0.05)
+        assert float(scale) == pytest.approx(1 / factor, rel=0.05) and float(shift) == pytest.approx(-1.0, abs=0.05)
 
 
 @pytest.mark.parametrize(("failing", "count"), [(1, 0), (2, 2), (4, 4), (13, 5)])

@@ -54,8 +54,7 @@ def test_an_episode_taken_up_in_its_midst_goes_on_as_it_went(every: int) -> None
         goal=goal.unsqueeze(1).expand(COUNT, STEPS, 2),
     ).windows
     hidden = grounding.hidden_before(windows, every)
-    assert hidden is not None
-    assert hidden.shape[:2] == (COUNT, -(-STEPS // every))
+    assert hidden is not None and hidden.shape[:2] == (COUNT, -(-STEPS // every))
     for index, first in enumerate(range(0, STEPS, every)):
         late = grounding.simulator(TASK, COUNT)
         late.start(states[first], rows, goal, hidden=hidden[:, index], previous_action=previous[:, first])
@@ -93,8 +92,7 @@ def test_each_step_is_corrected_given_the_latent_of_the_history_before_it() -> N
         before, state, previous = state, one.step(action), action
         # Nothing is near a wall: the state is where the correction put it.
         torch.testing.assert_close(state, corrected)
-        assert torch.equal(one.state, state)
-        assert not torch.equal(state, before)
+        assert torch.equal(one.state, state) and not torch.equal(state, before)
 
 
 def test_a_start_changes_its_rows_alone() -> None:
@@ -107,8 +105,7 @@ def test_a_start_changes_its_rows_alone() -> None:
     one.start(there, torch.tensor([1]), torch.ones(1, 2), hidden=known, previous_action=before)
     expected = used.encoder.step(used.encoder_input(there, torch.ones(1, 2), before), known)
     torch.testing.assert_close(one.hidden[[1]], expected)
-    assert torch.equal(one.goal[[1]], torch.ones(1, 2))
-    assert torch.equal(one.state[[1]], there)
+    assert torch.equal(one.goal[[1]], torch.ones(1, 2)) and torch.equal(one.state[[1]], there)
     others = torch.tensor([0, 2])
     for ours, theirs in ((one.hidden, hidden), (one.goal, goal), (one.state, state)):
         assert torch.equal(ours[others], theirs[others])
@@ -123,8 +120,7 @@ def test_a_saved_state_goes_on_as_it_would_have() -> None:
     second.goal.zero_()
     second.load_state_dict(saved)
     for action in actions(3):
-        assert torch.equal(first.step(action), second.step(action))
-        assert torch.equal(first.latent, second.latent)
+        assert torch.equal(first.step(action), second.step(action)) and torch.equal(first.latent, second.latent)
     second.load_state_dict(saved)
     second.start(HERE, ROWS[:1], torch.ones(1, 2))
     assert torch.equal(saved["goal"], GOAL)  # what was saved stays as it was
@@ -186,8 +182,7 @@ def test_it_is_the_simulator_itself() -> None:
     for _ in range(10):
         action = torch.tensor([[0.3, 0.9]])
         state = raw.step(action)
-        assert torch.equal(one.step(action), state)
-        assert torch.equal(one.state, state)
+        assert torch.equal(one.step(action), state) and torch.equal(one.state, state)
         assert torch.equal(one.blocked, raw.blocked)
 
 
@@ -201,8 +196,7 @@ def test_a_start_draws_the_parameters_of_its_rows_anew() -> None:
     assert after is not None
     names = TASK.varied.wide.names
     drawn = [names.index(name) for name in ("friction", "heading_bias_deg", "timestep_scale")]
-    assert (after[2, drawn] != before[2, drawn]).all()
-    assert torch.equal(after[[0, 1, 3]], before[[0, 1, 3]])
+    assert (after[2, drawn] != before[2, drawn]).all() and torch.equal(after[[0, 1, 3]], before[[0, 1, 3]])
     # From -1 at the lower to 1 at the upper end.
     friction = after[:, names.index("friction")]
     low, high = TASK.varied.wide.friction  # type: ignore[attr-defined]

@@ -96,8 +96,7 @@ def test_the_latents_loss_does_not_collapse_them(monkeypatch: pytest.MonkeyPatch
     lowest = 0.5 * GroundingShape(2, 2, 2).log_variance_bounds[0]
     slow, online = untrained(), untrained()
     monkeypatch.setattr(online, "_following_latent", lambda inputs: online.encoder.sequence(inputs)[0][:, 1:])
-    assert fit(online, LATENT_ALONE) == pytest.approx(lowest, abs=0.1)
-    assert fit(slow, LATENT_ALONE) > lowest + 0.2
+    assert fit(online, LATENT_ALONE) == pytest.approx(lowest, abs=0.1) and fit(slow, LATENT_ALONE) > lowest + 0.2
     assert spread(online) < 0.05 < 0.4 < spread(slow)
 
 
@@ -355,8 +354,7 @@ def test_the_latents_spread_and_rank() -> None:
     shares = torch.linalg.svdvals(samples - samples.mean(0)).square()
     shares = shares / shares.sum()
     rank = float((-(shares * shares.clamp_min(1e-30).log()).sum()).exp())
-    assert figures["latent_rank"] == pytest.approx(rank, rel=1e-3)
-    assert 1.0 < rank < 6.0
+    assert figures["latent_rank"] == pytest.approx(rank, rel=1e-3) and 1.0 < rank < 6.0
 
 
 def test_a_fit_that_diverged_is_told() -> None:

@@ -87,8 +87,7 @@ def test_a_next_state_that_was_made_up_is_no_step(tmp_path: Path) -> None:
     assert episodes.lengths.tolist() == [7, 1, 12, 30, 5] and merged.lengths.tolist() == [7, 1, 11, 29, 5]
     assert merged.terminated.nonzero().tolist() == [[2, 10], [3, 28]]
     assert merged.reward[2, :11].tolist() == [*(-label(2, step) for step in range(10)), -621.0]
-    assert torch.equal(merged.windows.reward, merged.reward)
-    assert merged.reward[3, 28] == -label(3, 28) - label(3, 29)
+    assert torch.equal(merged.windows.reward, merged.reward) and merged.reward[3, 28] == -label(3, 28) - label(3, 29)
     assert merged.windows.next_state[3, 28, 0] == label(3, 28)
     assert merged.windows.failed.nonzero().tolist() == [[3, 28]]  # the third still succeeds
     assert merged.held_out is not None and merged.held_out.tolist() == [False, True, False, True, False]
@@ -264,5 +263,4 @@ def test_windows_are_steps_in_a_row_inside_their_episodes() -> None:
         reach = sorted(set(first[episodes[:, 0] == row].tolist()))
         assert reach == list(range(max(1, int(DRAWN[row]) - 7)))
     # Of a window that was drawn across an end only the part inside counts: one stretch of at least a step.
-    assert drawn.any(dim=1).all()
-    assert (drawn.int().diff(dim=1).abs().sum(1) <= 1).all()
+    assert drawn.any(dim=1).all() and (drawn.int().diff(dim=1).abs().sum(1) <= 1).all()

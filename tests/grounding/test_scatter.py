@@ -63,8 +63,7 @@ def test_the_scale_is_told_by_the_moment_and_the_forms_are_those_of_held_out_ste
     right = fresh.steps(windows.action)[:, 0] > 0
     drawn = scatters.draw(inputs)
     assert float(drawn[right].std()) == pytest.approx(WILD, rel=0.15)
-    assert float(drawn[~right].std()) == pytest.approx(CALM, rel=0.3)
-    assert len(scatters.forms) == 30 * (50 - MASKED)
+    assert float(drawn[~right].std()) == pytest.approx(CALM, rel=0.3) and len(scatters.forms) == 30 * (50 - MASKED)
     assert float(scatters.forms.std()) == pytest.approx(1.0, abs=0.15)
     # Of a Gaussian whose size is one of two, against one of the average size: nats of each of four entries.
     usual = ((CALM**2 + WILD**2) / 2) ** 0.5

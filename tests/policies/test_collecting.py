@@ -59,8 +59,7 @@ def test_a_watch_foresees_the_clearance_of_a_second() -> None:
     toward, along = [0.0, 1.0], [1.0, 0.0]
     clearance = WallWatch(TASK, 0.2).clearance(believed(STARTS[1:2]), np.array([[toward, along]]))
     # 0.25 m/s for five steps of 0.192 s, on a grid of 0.05 m.
-    assert clearance.shape == (1, 2)
-    assert clearance[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)
+    assert clearance.shape == (1, 2) and clearance[0] == pytest.approx([0.5 - 0.24, 0.5], abs=0.051)
 
 
 def test_commands_that_are_watched_keep_clear_of_walls() -> None:
@@ -83,8 +82,7 @@ def test_commands_are_held_and_repeat_with_the_seed() -> None:
     state = believed(torch.zeros(5, 2))
     commands = torch.stack([first.act(state, state[:, :2]) for _ in range(8)])
     assert torch.equal(commands, torch.stack([second.act(state, state[:, :2]) for _ in range(8)]))
-    assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4])
-    assert not torch.equal(commands[3], commands[4])
+    assert torch.equal(commands[:1].expand(4, 5, 2), commands[:4]) and not torch.equal(commands[3], commands[4])
 
 
 def commands_of(behavior: RandomCommands, steps: int) -> Tensor:
@@ -96,8 +94,7 @@ def test_stress_commands_are_at_the_bounds_and_half_of_them_reverse_the_one_befo
     behavior = StressCommands(3, (1, 1))
     behavior.start(range(200), seed=0)
     commands = commands_of(behavior, 20)
-    assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200))
-    assert (commands[0] != 0).all()
+    assert torch.allclose(commands.abs().amax(-1), torch.ones(20, 200)) and (commands[0] != 0).all()
     is_reversed = (commands[1:] == -commands[:-1]).all(-1)
     assert 0.45 < float(is_reversed.float().mean()) < 0.55
     new = commands[1:][~is_reversed]
@@ -131,8 +128,7 @@ def test_an_episode_that_ends_in_its_last_step_is_terminated_and_not_truncated()
     behavior: Any = SimpleNamespace(act=lambda state, goal: torch.zeros(2, 2))
     for last, truncated in ((True, ~ends), (False, torch.zeros(2, dtype=torch.bool))):
         row = _step(env, behavior, ends, last=last)
-        assert torch.equal(row[TERMINATED], ends)
-        assert torch.equal(row[TRUNCATED], truncated)
+        assert torch.equal(row[TERMINATED], ends) and torch.equal(row[TRUNCATED], truncated)
         assert torch.equal(row[DONE], ends | truncated)
 
 
@@ -180,17 +176,14 @@ def test_ppo_stops_after_its_steps(tmp_path: Path) -> None:
 
     trained, metadata = suboptimal_by_ppo(MAZE, steps=250, seed=7, folder=tmp_path, num_threads=1, progress=progress)
     (ppo,) = Counting.made
-    assert shares == pytest.approx([0.4, 0.8, 1.0])
-    assert notes[0].endswith("reward per step 0.250")
+    assert shares == pytest.approx([0.4, 0.8, 1.0]) and notes[0].endswith("reward per step 0.250")
     assert (ppo.horizon, ppo.seed, ppo.config) == (MAZE.objective.horizon, 7, PpoConfig(total_steps=250))
     assert type(trained.policy) is ActorCritic and trained.policy.memory is None
     assert (trained.observed, trained.simulation, trained.dataset) == ("abstract", None, None)
     assert trained.policy.shape.observation_size == 8
     assert not any(parameter.requires_grad for parameter in trained.policy.parameters())
-    assert metadata["trained_steps"] == 300
-    assert metadata["learner"]["num_envs"] == 2
-    assert metadata["learner"]["hidden_sizes"] == [64, 64]
-    assert metadata["learner"]["total_steps"] == 250
+    assert metadata["trained_steps"] == 300 and metadata["learner"]["num_envs"] == 2
+    assert metadata["learner"]["hidden_sizes"] == [64, 64] and metadata["learner"]["total_steps"] == 250
     assert metadata["spent"].keys() == {"wall_seconds", "cpu_seconds", "finished_at"}
 
 
@@ -204,8 +197,7 @@ def test_it_goes_on_from_its_checkpoint(
     with pytest.raises(Stopped):
         suboptimal_by_ppo(task, **given, progress=stop_past(0.7))
     _, metadata = suboptimal_by_ppo(task, **given, progress=silent)
-    assert [one.went_on_from for one in Counting.made] == [0, 100]
-    assert Counting.made[-1].goes_on == episodes_go_on
+    assert [one.went_on_from for one in Counting.made] == [0, 100] and Counting.made[-1].goes_on == episodes_go_on
     assert metadata["trained_steps"] == 300
     # What is finished is not trained again.
     suboptimal_by_ppo(task, **given, progress=silent)
@@ -233,11 +225,9 @@ def test_sac_stops_once_episodes_last_or_after_its_steps(
         num_threads=1,
         progress=lambda share, note: shares.append(share),
     )
-    assert metadata["trained_steps"] == trained
-    assert shares[0] == pytest.approx(max(100 / steps, 10 / 50))
+    assert metadata["trained_steps"] == trained and shares[0] == pytest.approx(max(100 / steps, 10 / 50))
     assert shares[-1] == 1.0
     assert seeds == [derive(3, f"trial {100 * (count + 1)}") for count in range(len(seeds))]
     assert type(policy.policy) is SoftActor and policy.observed == "full"
     config = Counting.made[0].config
-    assert isinstance(config, SacConfig)
-    assert (config.total_steps, config.discount) == (steps, 0.99)
+    assert isinstance(config, SacConfig) and (config.total_steps, config.discount) == (steps, 0.99)

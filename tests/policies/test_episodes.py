@@ -50,8 +50,7 @@ def test_what_happens_after_the_end_does_not_count() -> None:
         ]
     ):
         record.add(torch.full((3, 2), float(step + 1)), torch.tensor(reward), success, failed, contact)
-    assert record.active.tolist() == [False, False, True]
-    assert record.total_steps == 3 + 3 + 2
+    assert record.active.tolist() == [False, False, True] and record.total_steps == 3 + 3 + 2
     outcome = record.outcome()
     assert outcome.to_json() == {
         "success": [1.0, 0.0, 0.0],
@@ -90,8 +89,7 @@ def test_episodes_end_in_success_in_failure_or_with_their_time() -> None:
     assert tipped.outcome.failed == [1.0] * 5 and tipped.outcome.steps == [1] * 5
     late = in_target(CART, lambda goal: driving(-0.5), 5, seed=3)
     assert late.outcome.success == [0.0] * 5 and late.outcome.steps == [CART.objective.horizon] * 5
-    assert late.filmed.shape == (CART.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2)
-    assert late.rate > 0
+    assert late.filmed.shape == (CART.objective.horizon + 1, 2) and tipped.filmed.shape == (2, 2) and late.rate > 0
 
 
 @pytest.mark.parametrize("task", [CART, TASKS["nao-navigation"], TASKS["humanoid-walker2d"]])
@@ -248,9 +246,9 @@ def test_all_of_the_state_is_observed_in_full_and_the_planar_part_otherwise() ->
 
         def observe(state: Tensor, env: ObservedTargetEnv = env) -> Tensor:
             # The physics has the state in doubles; its clock, first, is not observed.
-            physics = env.state_dict()["physics"]
-            physics[:, 1:30] = state.double()
-            return env.load_state_dict({"physics": physics, "goal": goal[None]})[0]
+            saved = env.state_dict() | {"goal": goal[None]}
+            saved["physics"][:, 1:30] = state.double()
+            return env.load_state_dict(saved)[0]
 
         before = observe(state)
         moved = [not torch.equal(observe(state + 0.1 * unit), before) for unit in torch.eye(29)]

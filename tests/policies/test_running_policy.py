@@ -139,8 +139,7 @@ def test_it_acts_in_batches_within_the_bounds_and_remembers_nothing() -> None:
     assert action.dtype == torch.float32
     torch.testing.assert_close(action, torch.tensor([[0.2, -0.4], [0.6, 1.0]]))
     location, scale = policy.policy(features)
-    assert torch.equal(location, action) and not scale.any()
-    assert policy.name == "Doubling"
+    assert torch.equal(location, action) and not scale.any() and policy.name == "Doubling"
 
 
 @pytest.mark.parametrize(
@@ -171,24 +170,21 @@ def test_a_policy_comes_back_frozen_with_its_world(tmp_path: Path) -> None:
     saved.save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors")
     assert (loaded.dataset, loaded.content_hash) == ("toy@data-1.0.0", "abc")
-    assert loaded.simulation == simulation
-    assert loaded.policy.shape == policy.shape
+    assert loaded.simulation == simulation and loaded.policy.shape == policy.shape
     assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
     step = torch.randn(4, 3), torch.randn(4, 2), torch.randn(4, 8)
     for one, other in zip(loaded.policy.remember(*step), policy.remember(*step), strict=True):
         assert torch.equal(one, other)
     features = torch.randn(4, 11)
     assert torch.equal(loaded.policy.policy(features)[0], policy.policy(features)[0])
-    assert isinstance(loaded.policy, ActorCritic)
-    assert torch.equal(loaded.policy.value(features), policy.value(features))
+    assert isinstance(loaded.policy, ActorCritic) and torch.equal(loaded.policy.value(features), policy.value(features))
 
 
 def test_a_student_comes_back_as_one(tmp_path: Path) -> None:
     student = Student(AdaptiveShape(3, 2, hidden_sizes=(16, 8), extrinsics_size=4, history_length=44))
     PolicyFile(student, None, "toy@data-1.0.0", "abc").save(tmp_path / "policy.safetensors")
     loaded = PolicyFile.load(tmp_path / "policy.safetensors").policy
-    assert isinstance(loaded, Student)
-    assert loaded.shape == student.shape
+    assert isinstance(loaded, Student) and loaded.shape == student.shape
     step = torch.randn(4, 3), torch.randn(4, 2), torch.randn_like(student.initial_hidden(4))
     for one, other in zip(loaded.remember(*step), student.remember(*step), strict=True):
         assert torch.equal(one, other)

@@ -80,8 +80,7 @@ def test_it_resumes_where_it_was_from_a_state_that_stays_as_it_was() -> None:
     for _ in range(3):
         action = 2 * torch.rand(4, 2) - 1
         a, b = first.step(action), second.step(action)
-        assert torch.equal(a.observation, b.observation)
-        assert torch.equal(a.reward, b.reward)
+        assert torch.equal(a.observation, b.observation) and torch.equal(a.reward, b.reward)
     second.reset(torch.tensor([True, False, False, True]))
     assert all(torch.equal(saved[name], values) for name, values in kept.items())
 
@@ -104,8 +103,7 @@ def test_failures_are_drawn_at_their_probability_and_end_episodes_that_did_not_s
     one = risky(count, risk, draws_failures=True)
     before, goal = one.simulator.state, one.goal
     step = one.step(BACK.expand(count, 2))
-    assert step.success[1::2].all() and not step.success[::2].any()
-    assert not one.failed[1::2].any()
+    assert step.success[1::2].all() and not step.success[::2].any() and not one.failed[1::2].any()
     assert float(one.failed[::2].float().mean()) == pytest.approx(share, abs=0.015)
     assert torch.equal(step.terminated, step.success | one.failed)
     own = NAVIGATION.reward(before, one.simulator.state, goal, one.failed)
@@ -150,9 +148,7 @@ def test_predicted_rewards_leave_to_the_task_what_the_simulated_state_shows() ->
     predicted = model.predict_reward(latent, action).detach()
     assert step.terminated.tolist() == [False, True, True]
     torch.testing.assert_close(step.reward, torch.cat([predicted[:1], own[1:]]))
-    assert float(own[1]) > 9.0
-    assert float(own[2]) < -9.0
-    assert float(predicted[0]) != pytest.approx(float(own[0]))
+    assert float(own[1]) > 9.0 and float(own[2]) < -9.0 and float(predicted[0]) != pytest.approx(float(own[0]))
 
 
 def test_a_change_of_the_command_costs_its_square_whatever_the_penalty_scale() -> None:
@@ -185,8 +181,7 @@ def test_parameters_of_the_episode_are_observed_where_asked_for() -> None:
     assert not before[:, [9, 10, 11, 12, 14]].any()  # these do not vary
     assert torch.equal(showing.step(torch.ones(4, 2)).observation[:, 8:], before[:, 8:])
     after = showing.reset(torch.tensor([True, False, False, False]))
-    assert (after[0, [8, 13]] != before[0, [8, 13]]).all()
-    assert torch.equal(after[1:, 8:], before[1:, 8:])
+    assert (after[0, [8, 13]] != before[0, [8, 13]]).all() and torch.equal(after[1:, 8:], before[1:, 8:])
     assert torch.equal(showing.load_state_dict(showing.state_dict()), after)
 
 
@@ -237,8 +232,7 @@ def test_without_settings_it_is_the_plain_simulator(episodes: PairedEpisodes, gr
     for kind, used in kinds.items():
         assert data_starts(TASK, WorldConfig(), episodes, used) is None
         world = built(WorldConfig(), used)
-        assert type(world.simulator) is kind
-        assert type(world.simulator.simulator) is PointMass
+        assert type(world.simulator) is kind and type(world.simulator.simulator) is PointMass
         assert (world.world, world.num_envs) == (WorldConfig(), 4)
         drawn = torch.get_rng_state()
         world.step(torch.zeros(4, 2))
@@ -278,8 +272,7 @@ def test_recorded_starts_come_with_the_history_before_them(
     episodes: PairedEpisodes, grounding: HistoryGrounding
 ) -> None:
     starts = data_starts(TASK, FROM_DATA, episodes, grounding)
-    assert starts is not None and starts.hidden is not None
-    assert len(starts.state) == len(starts.hidden) == 700
+    assert starts is not None and starts.hidden is not None and len(starts.state) == len(starts.hidden) == 700
     windows, model = episodes.windows, grounding.model
     inputs = model.encoder_input(windows.state, windows.goal, windows.previous_action)
     hidden = torch.zeros(1, 8)

@@ -1,8 +1,9 @@
 """A learner of the user's in the simulator of a row."""
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,13 @@ from small_cart import TASK, Last
 from toy_episodes import toy_episodes
 
 from astra_data.core.errors import BadInputError
+from astra_data.core.progress import Progress, silent
+from astra_data.core.seeding import derive
 from astra_data.deployment.graph import write_graph
 from astra_data.grounding.simulator import NO_GROUNDING
 from astra_data.policies.gymnasium import WatchedEnv
-from astra_data.policies.running_policy import KINDS, Array, PolicyFile, add_policy_kind, running
-from astra_data.policies.train import PpoTrainConfig, Training, UserLearner
+from astra_data.policies.running_policy import KINDS, PolicyFile, UserPolicy, add_policy_kind, running
+from astra_data.policies.train import PpoTrainConfig, Training, UserLearner, with_restarts
 from astra_data.worlds.task import Task
 
 
@@ -25,7 +28,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(KINDS, "constant", Constant)
 
 
-def training(folder: Path, progress: Callable[[float, str], None] = lambda share, note: None) -> Training:
+def training(folder: Path, progress: Progress = silent) -> Training:
     one = torch.zeros(1, 3, 1)
     return Training(
         task=TASK,
@@ -41,13 +44,11 @@ def training(folder: Path, progress: Callable[[float, str], None] = lambda share
     )
 
 
-def driving(command: float, steps: int, seen: list[Array] | None = None) -> UserLearner:
+def driving(command: float, steps: int) -> UserLearner:
     def learn(env: WatchedEnv, training: Training) -> Constant:
         env.reset()
         for _ in range(steps // env.num_envs):
-            observation, *_ = env.step(np.full((env.num_envs, 1), command))
-            if seen is not None:
-                seen.append(observation)
+            env.step(np.full((env.num_envs, 1), command))
         return Constant(command)
 
     return UserLearner(learn=learn, policy=Constant)
@@ -60,8 +61,7 @@ def test_its_curve_is_kept_for_it(tmp_path: Path, command: float, success: float
     given = training(tmp_path, lambda share, note: told.append((share, note)))
     _, curve = driving(command, steps=400)(given)
     points = curve["points"]
-    assert [point["steps"] for point in points[:3]] == [8, 16, 24]
-    assert points[-1]["steps"] == 400 and len(points) == 50
+    assert [point["steps"] for point in points[:3]] == [8, 16, 24] and points[-1]["steps"] == 400 and len(points) == 50
     assert [point["share"] for point in points] == pytest.approx([step / 50 for step in range(1, 51)])
     ended = [point["success"] for point in points if point["success"] is not None]
     assert set(ended) == {success} and told[-1][0] == 1.0
@@ -130,3 +130,68 @@ def test_another_learners_kind_is_not_replaced() -> None:
         add_policy_kind(other)
     add_policy_kind(Constant)
     assert KINDS["constant"] is Constant
+
+
+SEEDS = [7, derive(7, "try 1"), derive(7, "try 2")]
+
+
+def restarted(
+    folder: Path, commands: Iterable[float], progress: Progress = silent, clocks: bool = False, **settings: Any
+) -> tuple[float, dict[str, Any], list[int]]:
+    """Train policies that give these commands, one a try; return what is kept, the curve and the seeds."""
+    rest, seeds = iter(commands), list[int]()
+
+    def learn(env: Any, given: Training) -> Constant:
+        seeds.append(given.seed)
+        given.progress(1.0, "")
+        assert given.folder.is_dir()
+        policy = Constant(next(rest))
+        observation, _ = env.reset()
+        env.step(policy.act(observation))
+        return policy
+
+    config = PpoTrainConfig(num_envs=4, total_steps=4, data_start_share=0.0, **settings)
+    given = replace(training(folder, progress), config=config)
+    learner = UserLearner(learn=learn, policy=Constant)
+
+    def timed(given: Training) -> tuple[PolicyFile, dict[str, Any]]:
+        kept, curve = learner(given)
+        return kept, curve | ({"wall_seconds": 2.0 * len(seeds), "cpu_seconds": len(seeds)} if clocks else {})
+
+    kept, curve = with_restarts(timed, given, None)
+    assert isinstance(kept, PolicyFile) and isinstance(kept.policy, UserPolicy)
+    return kept.policy.acting.command, curve, seeds  # type: ignore[attr-defined]
+
+
+def test_a_policy_that_masters_its_simulator_is_kept(tmp_path: Path) -> None:
+    command, curve, seeds = restarted(tmp_path, [1.0], tries=3)
+    assert (command, seeds) == (1.0, SEEDS[:1])
+    assert [(one["seed"], one["success"]) for one in curve["tries"]] == [(7, 1.0)]
+    assert curve["points"] == curve["tries"][0]["points"]
+
+
+def test_it_is_trained_again_until_it_does(tmp_path: Path) -> None:
+    shares, notes = list[float](), list[str]()
+
+    def progress(share: float, note: str) -> None:
+        shares.append(share)
+        notes.append(note.partition("  ")[0])
+
+    command, curve, seeds = restarted(tmp_path, [-1.0, 0.9, 1.0], progress, tries=3)
+    assert (command, seeds) == (0.9, SEEDS[:2]) and [one["success"] for one in curve["tries"]] == [0.0, 1.0]
+    # Forward at 3.75 m/s goals from 1 to 2 m are reached in 3 to 6 steps; backward none in all 40.
+    assert curve["tries"][0]["episode_steps"] == 40 and 3 < curve["tries"][1]["episode_steps"] < 6
+    assert shares == sorted(shares) and max(shares) == pytest.approx(2 / 3)
+    assert sorted(set(notes)) == ["try 1 of 3", "try 2 of 3"] and not (tmp_path / "try_1").exists()
+
+
+def test_of_those_that_do_not_the_best_is_kept(tmp_path: Path) -> None:
+    # At 0.4 m/s, -0.44 of the range, goals up to 1.6 m are in reach within the 4 s of an episode.
+    command, curve, seeds = restarted(tmp_path, [-1.0, -0.44, -0.9], tries=3)
+    assert (command, seeds) == (-0.44, SEEDS) and 0.4 < curve["tries"][1]["success"] < 0.8
+
+
+def test_all_tries_cost_time(tmp_path: Path) -> None:
+    command, curve, _ = restarted(tmp_path, [-0.44, -1.0, -0.9], tries=3, clocks=True)
+    assert command == -0.44 and (curve["wall_seconds"], curve["cpu_seconds"]) == (2 + 4 + 6, 1 + 2 + 3)
+    assert "wall_seconds" not in restarted(tmp_path, [-1.0, 1.0], tries=2)[1]
