@@ -3,13 +3,14 @@
 import itertools
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from astra_data.core.errors import CorruptDatasetError, in_short
 from astra_data.dataset import columns as names
@@ -20,10 +21,7 @@ from astra_data.dataset.parquet import UNREADABLE, open_parquet, read_blocks, to
 TIMESTAMP_TOLERANCE_S = 1e-4  # as LeRobot's own; what float32 cannot tell apart is allowed beside it
 EPISODES_AT_ONCE = 100  # rows of meta/episodes held in memory
 MOST_FPS = 2**31  # upper bound of steps per second
-_NUMBERS = (
-    *("bool", "float16", "float32", "float64"),
-    *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
-)
+_NUMBERS = ("bool", "float16", "float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
 _END_FLAGS = (names.TERMINATED, names.TRUNCATED, names.DONE)
 _DATA_PATH = re.compile(r"([\w./ -]|\{(chunk|file)_index(:0?\d{1,2}d)?\})+")
 _LOCATION = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
@@ -80,12 +78,8 @@ def plain_columns(features: Mapping[str, Any]) -> tuple[list[PlainColumn], list[
     """Return the numeric columns of `features`, and the names of all others."""
     columns, others = [], []
     for name, feature in features.items():
-        try:
-            [size] = feature["shape"]
-            dtype = feature["dtype"]
-        except (KeyError, TypeError, ValueError):
-            others.append(name)
-            continue
+        shape, dtype = (feature.get(key) if isinstance(feature, Mapping) else None for key in ("shape", "dtype"))
+        size = shape[0] if isinstance(shape, Sequence) and len(shape) == 1 else None
         if dtype in _NUMBERS and type(size) is int and 0 < size <= names.MOST_VALUES:
             columns.append(PlainColumn(name, dtype, size))
         else:
@@ -122,32 +116,30 @@ def is_data_path(pattern: object) -> bool:
 
 def read_places(root: Path, info: Mapping[str, Any]) -> tuple[dict[int, Place], list[str]]:
     """Return where the metadata have each episode, as far as they can be read, and their faults."""
-    places: dict[int, Place] = {}
+    places, faults = dict[int, Place](), list[str]()
     if is_format_2(root):
         rows = _read_lines(root / _FORMAT_2["episodes"])
         if isinstance(rows, str):
             return places, [f"{_FORMAT_2['episodes']} {rows}"]
-        first, chunk = 0, _whole(info.get("chunks_size")) or layout.CHUNK_SIZE
+        first, chunks = 0, _whole(info.get("chunks_size")) or layout.CHUNK_SIZE
         for row in rows:
             number, length = (_whole(row.get(key)) for key in ("episode_index", "length"))
             if number is None or length is None:
                 return places, [f"{_FORMAT_2['episodes']} has no whole numbers as episode_index and length"]
-            path = root / _FORMAT_2["data"].format(number // chunk, number)
-            places[number] = Place(length, first, path)
+            places[number] = Place(length, first, root / _FORMAT_2["data"].format(number // chunks, number))
             first += length
         return places, []
-    pattern, faults = info.get("data_path"), []
+    pattern = str(info.get("data_path")) if is_data_path(info.get("data_path")) else None
     for path in episodes_files(root):
         try:
-            for block in read_blocks([path], _LOCATION):
-                for row in block.to_pylist():
-                    number, length, first, chunk, file = (row.get(name) for name in _LOCATION)
-                    if type(number) is not int or type(length) is not int:
-                        raise CorruptDatasetError(f"{path.name} has no whole episode_index or length")
-                    located = is_data_path(pattern) and type(chunk) is int and type(file) is int
-                    inside = str(pattern).format(chunk_index=chunk, file_index=file) if located else None
-                    start = first if type(first) is int else None
-                    places[number] = Place(length, start, root / inside if inside else None)
+            for row in (row for block in read_blocks([path], _LOCATION) for row in block.to_pylist()):
+                facts = (row.get(name) for name in _LOCATION)
+                number, length, start, chunk, file = (fact if type(fact) is int else None for fact in facts)
+                if number is None or length is None:
+                    raise CorruptDatasetError(f"{path.name} has no whole episode_index or length")
+                located = pattern and chunk is not None and file is not None
+                inside = root / pattern.format(chunk_index=chunk, file_index=file) if pattern and located else None
+                places[number] = Place(length, start, inside)
         except (*UNREADABLE, CorruptDatasetError) as error:
             faults.append(f"{path.name}: {in_short(error)}")
     return places, faults
@@ -205,29 +197,31 @@ def read_tasks(root: Path) -> dict[int, str] | str:
     return tasks
 
 
-def read_small_table(path: Path) -> pa.Table | str:
-    """Return the parquet file at `path`, or what is wrong with it."""
+def _opened[T](path: Path, fault: str, read: Callable[[pq.ParquetFile], T]) -> T | str:
+    """Return what `read` returns of the parquet file at `path`, or what is wrong with it."""
     try:
-        # Not with read_table, which imports pandas.
         with open_parquet(path) as file:
-            table = file.read()
-        table.validate(full=True)
-        return table.select(table.column_names)  # raises where names are not valid UTF-8
+            return read(file)
     except FileNotFoundError:
         return "is missing"
     except UNREADABLE as error:
-        return f"cannot be read ({in_short(error)})"
+        return f"{fault} ({in_short(error)})"
+
+
+def read_small_table(path: Path) -> pa.Table | str:
+    """Return the parquet file at `path`, or what is wrong with it."""
+
+    def read(file: pq.ParquetFile) -> pa.Table:
+        table = file.read()  # not with read_table, which imports pandas
+        table.validate(full=True)
+        return table.select(table.column_names)  # raises where names are not valid UTF-8
+
+    return _opened(path, "cannot be read", read)
 
 
 def read_footer(path: Path) -> tuple[int, pa.Schema] | str:
     """Return the number of rows and the schema of the parquet file at `path`, or what is wrong with it."""
-    try:
-        with open_parquet(path) as file:
-            return file.metadata.num_rows, file.schema_arrow
-    except FileNotFoundError:
-        return "is missing"
-    except UNREADABLE as error:
-        return f"is truncated or no parquet file ({in_short(error)})"
+    return _opened(path, "is truncated or no parquet file", lambda file: (file.metadata.num_rows, file.schema_arrow))
 
 
 def data_files(root: Path) -> list[Path]:
@@ -278,27 +272,25 @@ def runs(path: Path, tables: Iterator[pa.Table], columns: Sequence[PlainColumn])
 def schema_faults(schema: pa.Schema, columns: Sequence[PlainColumn]) -> list[str]:
     """List the columns that `schema` lacks or has as another type."""
     faults = [f"lacks column {column.name}" for column in columns if column.name not in schema.names]
-    present = [column for column in columns if column.name in schema.names]
-    for column in present:
-        kind = schema.field(column.name).type
-        if not column.fits(kind):
-            faults.append(f"has {column.name} as {kind}, expected {column.arrow_type}")
-    return faults
+    return faults + [
+        f"has {column.name} as {schema.field(column.name).type}, expected {column.arrow_type}"
+        for column in columns
+        if column.name in schema.names and not column.fits(schema.field(column.name).type)
+    ]
 
 
 def block_values(table: pa.Table, columns: Sequence[PlainColumn]) -> dict[str, Array]:
     """Return `columns` of `table` by name, (n,) or (n, size)."""
-    return {column.name: _values(table.column(column.name), column) for column in columns}
-
-
-def _values(stored: pa.ChunkedArray, column: PlainColumn) -> Array:
-    if pa.types.is_list(stored.type):
-        # Raises where a row has more or fewer values.
-        try:
-            stored = stored.cast(column.arrow_type)
-        except pa.ArrowInvalid as error:
-            raise CorruptDatasetError(f"{column.name}: expected {column.size} values in every row") from error
-    return to_numpy(stored, column.size, column.dtype)
+    values = {}
+    for column in columns:
+        stored = table.column(column.name)
+        if pa.types.is_list(stored.type):
+            try:
+                stored = stored.cast(column.arrow_type)
+            except pa.ArrowInvalid as error:
+                raise CorruptDatasetError(f"{column.name}: expected {column.size} values in every row") from error
+        values[column.name] = to_numpy(stored, column.size, column.dtype)
+    return values
 
 
 def run_faults(run: Run, *, number: int, row: int, fps: float) -> Iterator[tuple[str, str]]:

@@ -77,28 +77,18 @@ class StagedWriter:
         resume: bool = False,
     ) -> None:
         """Prepare to record as `DatasetWriter` does; with `resume`, continue what was interrupted."""
-        self._writer = DatasetWriter(
-            root, columns, fps=fps, task=task, description=description, subset_seed=subset_seed
-        )
-        self.root = root
+        settings = {"fps": fps, "task": task, "subset_seed": subset_seed}
+        self._writer = DatasetWriter(root, columns, **settings, description=description)  # type: ignore[arg-type]
+        self.root, self.folder = root, root.parent / f".{root.name}.staged"
         self.made: dict[str, Any] = {}
         self.policy: Path | None = None
         self.staged: dict[int, Mapping[str, Scalar]] = {}
         self.lengths: dict[int, int] = {}
-        self.folder = root.parent / f".{root.name}.staged"
-        self._columns = list(columns)
-        self._schema = layout.data_schema(columns)
-        self._settings = {
-            "columns": {column.name: column.feature() for column in columns},
-            "fps": fps,
-            "task": task,
-            "description": json.loads(json.dumps(dict(description))),
-            "subset_seed": subset_seed,
-        }
-        self._resume = resume
-        self._admission = Admission(columns)
-        self._exit = ExitStack()
-        self._is_open = False
+        self._columns, self._schema = list(columns), layout.data_schema(columns)
+        features = {column.name: column.feature() for column in columns}
+        self._settings = json.loads(json.dumps({"columns": features, "description": dict(description), **settings}))
+        self._resume, self._is_open = resume, False
+        self._admission, self._exit = Admission(columns), ExitStack()
 
     def __enter__(self) -> "StagedWriter":
         """Start or resume the recording."""
@@ -121,7 +111,7 @@ class StagedWriter:
                 discard(self.folder, self.root)  # a kill came between the dataset and this
                 refuse_existing(self.root)
             self._agree_on_the_settings()
-            for path in sorted(self.folder.glob("*.arrow")):
+            for path in self._paths():
                 episode = load_staged(path, self._columns)
                 try:
                     self._admission.admit(episode)
@@ -194,13 +184,15 @@ class StagedWriter:
         kept = (path for path in self.folder.glob("*") if not path.name.startswith("."))
         return any(path.name != _SETTINGS and path.suffix != ".partial" for path in kept)
 
+    def _paths(self) -> list[Path]:
+        return sorted(self.folder.glob("*.arrow"))
+
     def _left(self) -> str:
-        waiting = len(list(self.folder.glob("*.arrow")))
-        return f"{waiting} episodes" if waiting else "an unfinished recording"
+        return f"{len(self._paths())} episodes" if self._paths() else "an unfinished recording"
 
     def _is_written(self) -> bool:
         """Return whether the dataset at `root` holds every staged episode, value for value."""
-        paths = sorted(self.folder.glob("*.arrow"))
+        paths = self._paths()
         try:
             dataset = Dataset.open(self.root)
             staged = {episode.uid: path for path in paths for episode in [load_staged(path, self._columns)]}
@@ -222,13 +214,11 @@ class StagedWriter:
 
     def _agree_on_the_settings(self) -> None:
         """Write the settings, or check that what was staged was made with the same."""
-        now = json.loads(json.dumps(self._settings))
         before = read_object(self.folder / _SETTINGS)
         if isinstance(before, dict):
-            differing = [key for key, *_ in changed_values(before, now)]
-            if differing:
+            if differing := ", ".join(key for key, *_ in changed_values(before, self._settings)):
                 raise BadInputError(
-                    f"{self.root}: the interrupted recording differs in {', '.join(differing)}; "
+                    f"{self.root}: the interrupted recording differs in {differing}; "
                     f"resume it with the same settings, or delete {self.folder}."
                 )
         elif self._holds_work():
