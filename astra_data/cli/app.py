@@ -44,10 +44,7 @@ def _options(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
     no_fsync: Annotated[
-        bool,
-        typer.Option(
-            "--no-fsync", help="Do not wait for the disk: faster, but a power failure may lose what was written."
-        ),
+        bool, typer.Option("--no-fsync", help="Do not wait for the disk; a power failure may lose what was written.")
     ] = False,
 ) -> None:
     """Options before any command."""

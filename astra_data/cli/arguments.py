@@ -62,16 +62,19 @@ def _stage(name: str | None) -> str | None:
     return name
 
 
-DatasetName = Annotated[
-    str, typer.Argument(metavar="DATASET", help="A folder, name@data-1.2.0, or a name (for its highest version).")
-]
+_PLACES = "a folder, name@data-1.2.0, or a name (for its highest version)"
+_HAS_ITS_OWN = "The settings below are not for a recipe, which has its own."
+DatasetName = Annotated[str, typer.Argument(metavar="DATASET", help=f"A dataset: {_PLACES}.")]
 Source = Annotated[
+    str, typer.Argument(metavar="RECIPE|DATASET", help=f"A recipe (.toml), or a dataset: {_PLACES}. {_HAS_ITS_OWN}")
+]
+TaskOrRecipe = Annotated[
     str,
-    typer.Argument(
-        metavar="RECIPE|DATASET",
-        help="A recipe (.toml), or a dataset: a folder, name@data-1.2.0, or a name (for its highest "
-        "version). The settings below apply to a dataset only; a recipe has its own.",
-    ),
+    typer.Argument(metavar="RECIPE|TASK", help=f"A recipe (.toml), or a task such as antmaze-umaze. {_HAS_ITS_OWN}"),
+]
+StoredSeeds = Annotated[
+    list[int] | None,
+    typer.Option("--seed", help="Random seed; of a recipe, run only this one.", show_default="stored; all of a recipe"),
 ]
 Out = Annotated[
     Path | None,
@@ -79,12 +82,7 @@ Out = Annotated[
 ]
 NewName = Annotated[
     str | None,
-    typer.Option(
-        "--name",
-        help="Name of the new dataset, which starts at version 1.0.0; where there are datasets of that name, "
-        "it is their next version.",
-        show_default="a new version",
-    ),
+    typer.Option("--name", help="Name of the new dataset, whose next version it is.", show_default="a new version"),
 ]
 RecipePath = Annotated[Path, typer.Argument(metavar="RECIPE", help="A recipe (TOML file).")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run, such as runs/cart.")]
@@ -95,11 +93,7 @@ Seeds = Annotated[list[int] | None, typer.Option("--seed", help="Run only this s
 Device = Annotated[str, typer.Option(help="PyTorch device for the networks: cpu, cuda, cuda:1, …")]
 Jobs = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        help="Number of parallel processes; on a CUDA device, each has its own CUDA context.",
-        show_default="one per core; 2 with --device cuda",
-    ),
+    typer.Option(min=1, help="Number of parallel processes.", show_default="one per core; 2 with --device cuda"),
 ]
 Root = Annotated[Path, typer.Option(help="Folder that contains the runs.")]
 Until = Annotated[
@@ -136,9 +130,8 @@ def with_settings(place: str) -> Callable[[Callable[..., None]], Callable[..., N
             typed = {one.name: value for one in options if (value := given.pop(one.name)) is not None}
             command(settings=typed, **given)
 
-        parameters: list[Parameter] = []
-        for parameter in signature(command).parameters.values():
-            parameters += options if parameter.name == "settings" else [parameter]
+        given = signature(command).parameters.values()
+        parameters = [one for other in given for one in (options if other.name == "settings" else [other])]
         run.__dict__.pop("__wrapped__")
         run.__dict__["__signature__"] = Signature(parameters)
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

@@ -13,6 +13,7 @@ from astra_data.cli.arguments import (
     Root,
     Seeds,
     Source,
+    TaskOrRecipe,
     refuse,
     refuse_of_recipes,
     resumable,
@@ -26,28 +27,15 @@ from astra_data.core.naming import RUNS
 
 @with_settings("astra_data.pipeline.stages.collect:CollectConfig")
 def collect(
-    task: Annotated[
-        str,
-        typer.Argument(
-            metavar="RECIPE|TASK",
-            help="A recipe (.toml), or a task such as antmaze-umaze. "
-            "The settings below apply to a task only; a recipe has its own.",
-        ),
-    ],
+    task: TaskOrRecipe,
     settings: dict[str, Any],
     seeds: Annotated[
         list[int] | None,
-        typer.Option(
-            "--seed",
-            help="Random seed; with a recipe, run only this one of its seeds (may be repeated).",
-            show_default="0; all seeds of a recipe",
-        ),
+        typer.Option("--seed", help="Random seed; of a recipe, run only this one.", show_default="0; all of a recipe"),
     ] = None,
     jobs: Jobs = None,
     root: Root = RUNS,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the dataset.", show_default="task, behavior and seed")
-    ] = None,
+    name: Annotated[str | None, typer.Option(help="Its name.", show_default="task, behavior and seed")] = None,
     out: Out = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the same command after an interruption.")] = False,
 ) -> None:
@@ -75,10 +63,7 @@ def pair(
     root: Root = RUNS,
     simulator: Annotated[
         str | None,
-        typer.Option(
-            help="A task (to use its abstract simulator), a simulator of an installed package, or your own "
-            "class: path.py:MySimulator. Its code is run."
-        ),
+        typer.Option(help="A task, an installed simulator, or your own class: path.py:MySimulator. Its code is run."),
     ] = None,
     name: NewName = None,
     out: Out = None,
@@ -103,10 +88,7 @@ def augment(
     dataset: DatasetName,
     settings: dict[str, Any],
     task: Annotated[
-        str | None,
-        typer.Option(
-            help="Task that computes the rewards and endings of the copies.", show_default="the dataset's own task"
-        ),
+        str | None, typer.Option(help="Task that computes rewards and ends of copies.", show_default="the dataset's")
     ] = None,
     name: NewName = None,
     out: Out = None,

@@ -14,13 +14,14 @@ from astra_data.cli.arguments import (
     Out,
     Root,
     Source,
+    StoredSeeds,
     refuse,
     refuse_of_recipes,
     run_stage,
     show_table,
 )
 from astra_data.core.durable import write_file
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
 from astra_data.core.naming import RUNS, first_few, printable
 
 
@@ -31,22 +32,11 @@ def subset(
         int | None, typer.Option(min=1, help="The same as a percentage of --of; may exceed 100.")
     ] = None,
     of: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Number of episodes that counts as 100 percent.", show_default="all episodes of DATASET"
-        ),
+        int | None, typer.Option(min=1, help="Episodes that count as 100 percent.", show_default="all")
     ] = None,
-    seeds: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--seed",
-            help="Seed of the random choice; with a recipe, run only this of its seeds (may be repeated).",
-            show_default="the one stored in DATASET; all seeds of a recipe",
-        ),
-    ] = None,
+    seeds: StoredSeeds = None,
     stratify: Annotated[
-        str | None,
-        typer.Option(help="Key of the episodes' metadata, such as success, whose values keep their proportions."),
+        str | None, typer.Option(help="Key of the episodes' metadata whose values keep their proportions.")
     ] = None,
     name: NewName = None,
     out: Out = None,
@@ -54,9 +44,9 @@ def subset(
     root: Root = RUNS,
 ) -> None:
     """Write a random subset; with the same seed, smaller subsets are contained in larger ones."""
+    size = {"episodes": episodes, "percent": percent, "of": of}
     if dataset.endswith(".toml"):
-        options = {"episodes": episodes, "percent": percent, "of": of, "stratify": stratify}
-        refuse(options | {"name": name, "out": out}, "subset", "sweep")
+        refuse(size | {"stratify": stratify, "name": name, "out": out}, "subset", "sweep")
         run_stage(Path(dataset), "subset", seeds=seeds, jobs=jobs, root=root)
         return
     seed = refuse_of_recipes("subset", seeds, jobs)
@@ -69,10 +59,7 @@ def subset(
 
 def merge(
     datasets: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="DATASET", help="Two or more datasets with the same columns, fps, task, environment and simulator."
-        ),
+        list[str], typer.Argument(metavar="DATASET", help="Two or more of the same columns, fps, task and simulator.")
     ],
     new_uids: Annotated[
         bool, typer.Option("--new-uids", help="Give new uids to episodes whose uid is already taken.")
@@ -106,13 +93,8 @@ def filter_(
     from astra_data.dataset.edit import delete, filter_episodes
     from astra_data.dataset.versions import open_dataset
 
-    conditions: dict[str, Any] = {
-        "success": success,
-        "min_return": min_return,
-        "max_return": max_return,
-        "min_length": min_length,
-        "max_length": max_length,
-    }
+    conditions: dict[str, Any] = {"success": success, "min_return": min_return, "max_return": max_return}
+    conditions |= {"min_length": min_length, "max_length": max_length}
     if without:
         if given := [f"--{key.replace('_', '-')}" for key, value in conditions.items() if value is not None]:
             raise BadInputError(f"--without goes alone: leave out {', '.join(given)}, or filter twice")
@@ -179,8 +161,7 @@ def list_(
         list[Path] | None, typer.Argument(metavar="FOLDER", help="More folders for --clean, such as runs.")
     ] = None,
     clean: Annotated[
-        bool,
-        typer.Option("--clean", help="Instead, remove leftovers of killed commands from the home folder and FOLDER."),
+        bool, typer.Option("--clean", help="Instead, remove leftovers of killed commands from home and FOLDER.")
     ] = False,
     tasks: Annotated[bool, typer.Option("--tasks", help="Instead, list the named tasks.")] = False,
 ) -> None:
@@ -195,8 +176,6 @@ def list_(
         raise BadInputError("list: folders are for --clean; without it, list shows the datasets in the home folder")
     from rich.table import Table
 
-    from astra_data.core.errors import AstraDataError, CorruptDatasetError
-    from astra_data.core.naming import printable
     from astra_data.dataset.description import full_name
     from astra_data.dataset.versions import home, names_at_home, open_dataset, versions_at_home
 
@@ -228,13 +207,9 @@ def _list_tasks() -> None:
     table.columns[0].no_wrap = True
     for name, known in known_tasks().items():
         states = known.abstract_state.names or (f"{known.abstract_state.size} values",)
-        table.add_row(
-            name if name in TASKS else f"{name} (installed)",
-            first_few(list(known.limits), _NAMED),
-            first_few(states, _NAMED),
-            "yes" if known.has_target else "no",
-            str(known.fps),
-        )
+        shown = name if name in TASKS else f"{name} (installed)"
+        values = first_few(list(known.limits), _NAMED), first_few(states, _NAMED)
+        table.add_row(shown, *values, "yes" if known.has_target else "no", str(known.fps))
     show_table(table)
     typer.echo(
         "`astra-data check TASK` tests one and shows all its values. Name your own task by its place: "
@@ -244,7 +219,6 @@ def _list_tasks() -> None:
 
 def _clean(folders: list[Path]) -> None:
     from astra_data.core.durable import clean
-    from astra_data.core.naming import printable
     from astra_data.dataset.versions import home
 
     notes = {
@@ -270,7 +244,6 @@ def validate(
     ] = False,
 ) -> None:
     """Check every file and value of a LeRobot dataset and list all errors."""
-    from astra_data.core.errors import BadInputError, CorruptDatasetError
     from astra_data.dataset.columns import TERMINATED
     from astra_data.dataset.doctor.check import check, compare_with_lerobot
     from astra_data.dataset.inspection import endings_of
@@ -304,11 +277,7 @@ def repair(
     out: Annotated[Path, typer.Option(help="Folder of the new dataset.")],
     like: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="ORIGINAL",
-            help="The dataset that LeRobot's tools made DATASET from. Its origin and its episodes' metadata "
-            "are copied to episodes with the same uid and values. After a merge, give each dataset merged.",
-        ),
+        typer.Option(metavar="ORIGINAL", help="What LeRobot's tools made DATASET from: its metadata are copied."),
     ] = None,
     new_uids: Annotated[
         bool, typer.Option("--new-uids", help="Keep episodes whose uid is already taken, under new uids.")
@@ -347,12 +316,8 @@ def log(
     found = differences(first, second)
     for one in (first, second):
         typer.echo(f"{one.reference}: {len(one)} episodes, {one.lengths.sum()} steps")
-    listed = {
-        f"only in {first.reference}": found.only_in_a,
-        f"only in {second.reference}": found.only_in_b,
-        "differ in values": found.values,
-    }
-    for title, uids in listed.items():
+    only = {f"only in {first.reference}": found.only_in_a, f"only in {second.reference}": found.only_in_b}
+    for title, uids in (only | {"differ in values": found.values}).items():
         if uids:
             typer.echo(f"{len(uids)} episodes {title}: {', '.join(map(str, uids))}")
     if found.metadata:

@@ -46,10 +46,7 @@ def run(
     ] = "processes",
     address: Annotated[
         str | None,
-        typer.Option(
-            help="Address of a Ray cluster; its machines must share this folder and installation.",
-            show_default="a cluster on this machine",
-        ),
+        typer.Option(help="Of a Ray cluster, whose machines share this folder and installation.", show_default="here"),
     ] = None,
     trackio: Annotated[
         str | None, typer.Option(metavar="PROJECT", help="Log each finished point to this trackio project.")
@@ -59,34 +56,18 @@ def run(
     recipe_at(recipe)
     from astra_data.pipeline.run import run as run_recipe
 
+    which: dict[str, Any] = {"methods": methods or (), "seeds": seeds or (), "percents": percents or (), "until": until}
+    how: dict[str, Any] = {"jobs": jobs, "device": device, "engine": engine, "address": address, "trackio": trackio}
     with resumable():
-        folder = run_recipe(
-            recipe,
-            methods=methods or (),
-            seeds=seeds or (),
-            percents=percents or (),
-            root=root,
-            jobs=jobs,
-            device=device,
-            until=until,
-            engine=engine,
-            address=address,
-            trackio=trackio,
-        )
-        show_made(folder, until)
+        show_made(run_recipe(recipe, **which, root=root, **how), until)
 
 
 def check(
     recipes: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RECIPE|TASK...", help="Recipes (TOML files); or tasks: names, or places like cart.py:TASK."
-        ),
+        list[str], typer.Argument(metavar="RECIPE|TASK...", help="Recipes (.toml); or tasks: names, or cart.py:TASK.")
     ],
     root: Root = RUNS,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Read every byte of the artifacts instead of comparing only their sizes.")
-    ] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Read every byte, instead of comparing sizes.")] = False,
 ) -> None:
     """Check recipes, listing which artifacts are finished, damaged or stale; or tasks. Nothing is run."""
     is_task = [":" in name or not (Path(name).suffix or Path(name).exists()) for name in recipes]
@@ -195,11 +176,7 @@ def report(recipe: RecipePath, seeds: Seeds = None, publish: Publish = False, ro
 
 
 def show_made(folder: Path, until: str | None) -> None:
-    """Print what a run that went on `until` a stage has found, and the paths of its pages.
-
-    After the report: the verdict, best method, floor and the interval between them, and the command that
-    deploys it. Where it ends with its groundings: the page of their held-out errors.
-    """
+    """Print what a run that went on `until` a stage has found: held-out errors, or the verdict; and its pages."""
     from astra_data.pipeline.plan import stages_until
     from astra_data.pipeline.run import POINTS
     from astra_data.pipeline.stages.report import HTML, JSON
@@ -236,27 +213,18 @@ def select(
     ] = None,
     judge: Annotated[
         str | None,
-        typer.Option(
-            metavar="ROW",
-            help="The row whose groundings serve as judges.",
-            show_default="nas, else the first that grounds",
-        ),
+        typer.Option(metavar="ROW", help="Its groundings are the judges.", show_default="nas, else the first with any"),
     ] = None,
     episodes: Annotated[
-        int | None,
-        typer.Option(help="Episodes of each policy with each judge.", min=1, show_default="the recipe's, or 100"),
+        int | None, typer.Option(help="Episodes of each policy with each judge.", min=1, show_default="recipe's or 100")
     ] = None,
     trials: Annotated[
-        int | None,
-        typer.Option(help="Make the final choice with this many episodes in the target.", min=1, show_default="none"),
+        int | None, typer.Option(help="Make the final choice with so many episodes in the target.", min=1)
     ] = None,
     field: Annotated[
-        int | None,
-        typer.Option(help="With --trials: number of candidates to try.", show_default="as many as the trials allow"),
+        int | None, typer.Option(help="With --trials: number of candidates to try.", show_default="as many as possible")
     ] = None,
-    percent: Annotated[
-        int | None, typer.Option(help="With --trials, after a sweep: the dataset size whose policies are tried.")
-    ] = None,
+    percent: Annotated[int | None, typer.Option(help="With --trials, after a sweep: of this dataset size.")] = None,
 ) -> None:
     """Rank the trained policies of a run without the target, or with a few trials in it."""
     run_at(run)
@@ -267,23 +235,20 @@ def select(
     from astra_data.pipeline.selecting import select as rank
     from astra_data.reports.choice import FOLDER
 
-    given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes}
     with shown("select") as progress:
+        given: dict[str, Any] = {"rows": row or (), "judge": judge, "episodes": episodes, "progress": progress}
         if trials is not None:
-            made = choose_by_trials(run, trials, field=field, percent=percent, progress=progress, **given)
+            made = choose_by_trials(run, trials, field=field, percent=percent, **given)
+            assert made.chosen is not None
+            best, seed = made.chosen
+            lines = [f"chosen with {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}"]
         else:
-            judged = rank(run, progress=progress, **given)
-    if trials is not None:
-        assert made.chosen is not None
-        best, seed = made.chosen
-        typer.echo(f"chosen with {made.spent} trials: {best}, seed {seed}: success {made.mean:.2f}")
-    else:
-        for percent in judged.percents:
-            first = judged.ranked(percent)[0]
-            reached = f"{first.lower:.2f} in the lower quartile of its judges"
-            size = f" at {percent} %" if percent else ""
-            typer.echo(f"chosen{size}: {first.row}, seed {first.seed}: {reached}")
-    typer.echo(f"written: {run / FOLDER / 'select.md'}")
+            judged, lines = rank(run, **given), []
+            for percent in judged.percents:
+                first, size = judged.ranked(percent)[0], f" at {percent} %" if percent else ""
+                reached = f"{first.lower:.2f} in the lower quartile of its judges"
+                lines.append(f"chosen{size}: {first.row}, seed {first.seed}: {reached}")
+    typer.echo("\n".join([*lines, f"written: {run / FOLDER / 'select.md'}"]))
 
 
 def deploy(

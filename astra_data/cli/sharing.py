@@ -1,7 +1,7 @@
 """`astra-data import`, `export`, `card`, `push` and `pull`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,30 +15,18 @@ NotesPath = Annotated[
 Recordings = Annotated[list[Path], typer.Argument(metavar="SOURCE", help="Files, folders or archives of one format.")]
 MappingFile = Annotated[
     Path | None,
-    typer.Option(
-        "--mapping",
-        help="TOML file that says which fields become which columns. D4RL, robomimic, d3rlpy, Minari and "
-        "PACE need none.",
-    ),
+    typer.Option("--mapping", help="TOML file: which fields become which columns. D4RL, Minari and others need none."),
 ]
 FileFormat = Annotated[
     str | None,
-    typer.Option(
-        "--format",
-        help="csv, hdf5, json, mcap, minari, npz, parquet or torch.",
-        show_default="inferred from the files' names",
-    ),
+    typer.Option("--format", help="csv, hdf5, json, mcap, minari, npz, parquet or torch.", show_default="by name"),
 ]
 Name = Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the mapping's")]
 Fps = Annotated[int | None, typer.Option(min=1, help="Steps per second.", show_default="the mapping's")]
 Task = Annotated[str | None, typer.Option(help="What the robot does in the episodes.", show_default="the mapping's")]
 MaxBytes = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        help="Refuse recordings that unpack to more bytes (8 per value).",
-        show_default="100 times their size, or 256 MB",
-    ),
+    typer.Option(min=1, help="Refuse what unpacks to more bytes.", show_default="100 times their size, or 256 MB"),
 ]
 SkipBad = Annotated[
     bool, typer.Option("--skip-bad", help="Skip files and episodes that cannot be imported and list them at the end.")
@@ -60,30 +48,15 @@ def import_(
     from astra_data.core.naming import printable
     from astra_data.io.importing import import_dataset
 
-    report = import_dataset(
-        recordings,
-        mapping,
-        out=out,
-        file_format=file_format,
-        name=name,
-        fps=fps,
-        task=task,
-        max_bytes=max_bytes,
-        skip_bad=skip_bad,
-    )
+    told: dict[str, Any] = {"name": name, "fps": fps, "task": task, "file_format": file_format}
+    report = import_dataset(recordings, mapping, out=out, max_bytes=max_bytes, skip_bad=skip_bad, **told)
     typer.echo("\n".join(map(printable, f"finished: {report}".split("\n"))))
 
 
 def export(
     dataset: DatasetName,
     format: Annotated[str, typer.Option(help="minari, d4rl, robomimic or d3rlpy; or card: its dataset card.")],
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="The new file; for minari a folder, such as maze/random-v0; for a card the Markdown file, "
-            "next to which a figure is written."
-        ),
-    ],
+    out: Annotated[Path, typer.Option(help="The new file; for minari a folder, such as maze/random-v0.")],
     notes: NotesPath = None,
 ) -> None:
     """Convert a dataset to the format of another library, or write its card: contents, origin, loading."""
@@ -134,10 +107,7 @@ def push(
 
 def pull(
     source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE", help="user/name on the Hugging Face Hub, or the URL or path of the dataset's folder."
-        ),
+        str, typer.Argument(metavar="SOURCE", help="user/name on the Hugging Face Hub, or the folder's URL or path.")
     ],
     out: Out = None,
     version: Annotated[
