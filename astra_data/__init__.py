@@ -13,7 +13,7 @@ all of it   run
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from astra_data.core.optional import missing_extra
+from astra_data.core.errors import missing_extra
 
 if TYPE_CHECKING:
     from astra_data.dataset.columns import Column as Column

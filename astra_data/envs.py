@@ -8,7 +8,7 @@
 Everything else stays unloaded until an environment is made.
 """
 
-from astra_data.core.optional import optional
+from astra_data.core.errors import optional
 
 gymnasium = optional("gymnasium")
 

@@ -11,8 +11,7 @@ import pytest
 from fake_dataset import write_fake
 
 import astra_data
-from astra_data.core.errors import BadInputError
-from astra_data.core.optional import EXTRAS
+from astra_data.core.errors import EXTRAS, BadInputError
 from astra_data.core.progress import silent
 from astra_data.pipeline.stages.collect import CollectConfig, collect
 

@@ -12,9 +12,8 @@ from typer.core import TyperArgument, TyperOption
 
 from astra_data.cli import building, datasets, recipes, sharing, starting
 from astra_data.core.durable import NO_FSYNC, disk_error
-from astra_data.core.errors import AstraDataError
+from astra_data.core.errors import AstraDataError, missing_extra
 from astra_data.core.naming import in_lines
-from astra_data.core.optional import missing_extra
 
 app = typer.Typer(
     help="Turn robot logs into datasets, and datasets into policies trained in a simplified simulator.",

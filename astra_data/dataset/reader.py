@@ -12,9 +12,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from astra_data.core.arrays import Ints
-from astra_data.core.errors import BadInputError, CorruptDatasetError
+from astra_data.core.errors import BadInputError, CorruptDatasetError, optional
 from astra_data.core.naming import RECORD, first_few
-from astra_data.core.optional import optional
 from astra_data.dataset.columns import RESERVED, SUCCESS, Array, Column, Episode
 from astra_data.dataset.contents import Contents, read_contents, read_values
 from astra_data.dataset.description import Digests, alteration, altered_columns, full_name, identity_of, read_digests

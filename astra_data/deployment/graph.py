@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from astra_data.core.errors import BadInputError
-from astra_data.core.optional import optional
+from astra_data.core.errors import BadInputError, optional
 from astra_data.policies.running_policy import Memory, RunningPolicy, UserPolicy
 
 _DECOMPOSED: dict[Any, Callable[..., Any]] = {

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from astra_data.core.arrays import as_rows
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import atomic_file, atomic_folder
-from astra_data.core.errors import BadInputError
-from astra_data.core.optional import optional
+from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array, Episode
 from astra_data.dataset.compare import recordings_of
 from astra_data.dataset.reader import Dataset

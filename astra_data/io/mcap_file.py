@@ -20,8 +20,7 @@ from zlib import crc32
 import numpy as np
 
 from astra_data.core.config import did_you_mean
-from astra_data.core.errors import BadInputError
-from astra_data.core.optional import optional
+from astra_data.core.errors import BadInputError, optional
 from astra_data.io.recording import MOST_UNPACKED, Source
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -24,9 +24,8 @@ from typing import Any
 import numpy as np
 
 from astra_data.core.durable import disk_error
-from astra_data.core.errors import AstraDataError, BadInputError
+from astra_data.core.errors import AstraDataError, BadInputError, optional
 from astra_data.core.naming import stage_of_key
-from astra_data.core.optional import optional
 from astra_data.core.progress import Progress
 from astra_data.core.provenance import cores
 from astra_data.core.seeding import derive

@@ -18,9 +18,8 @@ from rich.console import Console
 
 from astra_data.core.config import did_you_mean
 from astra_data.core.durable import alone_in, clean, folder_for, make_folder, move, write_file
-from astra_data.core.errors import BadInputError, MissingStageError
+from astra_data.core.errors import BadInputError, MissingStageError, optional
 from astra_data.core.naming import RECORD, RUNS, reference_of, row_of_key, stage_of_key
-from astra_data.core.optional import optional
 from astra_data.methods import grounded_as, method_named
 from astra_data.pipeline.condition import Condition, condition, data_condition, to_make_again
 from astra_data.pipeline.display import display

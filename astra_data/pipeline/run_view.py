@@ -10,9 +10,8 @@ import torch
 from astra_data.core.artifact import check_made_from
 from astra_data.core.config import validated
 from astra_data.core.durable import write_file
-from astra_data.core.errors import BadInputError
+from astra_data.core.errors import BadInputError, optional
 from astra_data.core.naming import row_of_key
-from astra_data.core.optional import optional
 from astra_data.dataset.columns import ABSTRACT_NEXT_STATE, ABSTRACT_STATE, ACTION, Array, Column
 from astra_data.dataset.edit import check_uids
 from astra_data.dataset.reader import Dataset

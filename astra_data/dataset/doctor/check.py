@@ -14,8 +14,7 @@ import numpy as np
 
 from astra_data.core.arrays import Floats
 from astra_data.core.durable import file_digest
-from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError
-from astra_data.core.optional import optional
+from astra_data.core.errors import AstraDataError, BadInputError, CorruptDatasetError, optional
 from astra_data.dataset import columns as names
 from astra_data.dataset import format as layout
 from astra_data.dataset import plain

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from astra_data.core.durable import file_digest, sync_tree, write_file, writing
-from astra_data.core.errors import AstraDataError, BadInputError, SharingError
-from astra_data.core.optional import how_to_install
+from astra_data.core.errors import AstraDataError, BadInputError, SharingError, how_to_install
 from astra_data.core.progress import Progress
 from astra_data.dataset import format as layout
 from astra_data.dataset.description import VERSION

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.errors import BadInputError
-from astra_data.core.optional import optional
+from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import NEXT_STATE, STATE, SUCCESS, TRUNCATED
 from astra_data.io.hdf5_file import D3RLPY, D4RL, NUMBERED, ROBOMIMIC, check_storage, stored_datasets, unpacked_bytes
 from astra_data.io.mapping import ImportMapping

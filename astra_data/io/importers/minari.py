@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from astra_data.core.errors import BadInputError
-from astra_data.core.optional import optional
+from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import ACTION, GOAL, NEXT_STATE, REWARD, STATE, TERMINATED, TRUNCATED, Array
 from astra_data.io.hdf5_file import check_storage, refuse_links, stored_datasets, unpacked_bytes
 from astra_data.io.mapping import ImportMapping

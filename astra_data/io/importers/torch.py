@@ -10,8 +10,7 @@ from zipfile import ZipFile, is_zipfile
 
 import numpy as np
 
-from astra_data.core.errors import BadInputError
-from astra_data.core.optional import optional
+from astra_data.core.errors import BadInputError, optional
 from astra_data.dataset.columns import ACTION, STATE
 from astra_data.io.mapping import ImportMapping
 from astra_data.io.recording import VALUE_BYTES, Block, Source, row_count

@@ -65,9 +65,9 @@ class AugmentConfig(Config):
     @model_validator(mode="after")
     def _changes_something(self) -> Self:
         if self.episodes is not None and self.copies is not None:
-            raise ValueError("expected either copies or episodes, got both")
+            raise ValueError("episodes: expected either copies or episodes, got both")
         if not self.translations and self.rotations == "none":
-            raise ValueError("expected rotations or translations, got neither")
+            raise ValueError("translations: expected rotations or translations, got neither")
         return self
 
 
